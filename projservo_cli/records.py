@@ -99,3 +99,14 @@ class Calibration:
         """The kernels' view of the calibration."""
         types = np.array([PRISMATIC if t == "P" else REVOLUTE for t in self.joint_types], dtype=np.int64)
         return Model(self.P, self.H_hat_0, types, self.q_reference, self.a_inf)
+
+
+class InputError(ValueError):
+    """Usage, configuration or data that cannot be read or make no sense (exit code 2).
+
+    The message is one line a user can act on: where, what is wrong, what to do.
+    """
+
+
+class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming error
+    """The data were read, but the work they ask for cannot be done (exit code 1)."""
