@@ -1,0 +1,153 @@
+"""Projective displacements between the group and its algebra: [RH00] equations (2), (4) and (5)."""
+
+import math
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import Mat4, combine, mul
+from projservo_cli.geometry.jit import inline
+from projservo_cli.records import FloatArray, WorkFailed
+
+IDENTITY: Mat4 = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+# Below this sine the quotient in (4) loses more than half the digits of a double.
+LEAST_SINE = 1e-6
+
+
+@inline
+def rotation(H_hat: Mat4, H_hat_squared: Mat4, theta: float) -> Mat4:
+    """Projective rotation I + sin θ Ĥ + (1 − cos θ) Ĥ² of [RH00] eq. (4), θ in rad."""
+    half = math.sin(0.5 * theta)
+    H = combine(math.sin(theta), H_hat, 2.0 * half * half, H_hat_squared)
+    return combine(1.0, IDENTITY, 1.0, H)
+
+
+@inline
+def translation(H_hat: Mat4, tau: float) -> Mat4:
+    """Projective translation I + τ Ĥ of [RH00] eq. (5)."""
+    return combine(1.0, IDENTITY, tau, H_hat)
+
+
+def exp_rotation(H_hat: FloatArray, theta: float) -> FloatArray:
+    """Projective rotation of a revolute operator, [RH00] eq. (4).
+
+    Parameters
+    ----------
+    H_hat : (4, 4) operator with Ĥ³ = −Ĥ.
+    theta : angle, rad.
+
+    Returns
+    -------
+    (4, 4) projective rotation.
+    """
+    H = as_mat(H_hat)
+    return as_array(rotation(H, mul(H, H), float(theta)))
+
+
+def exp_translation(H_hat: FloatArray, tau: float) -> FloatArray:
+    """Projective translation of a prismatic operator, [RH00] eq. (5).
+
+    Parameters
+    ----------
+    H_hat : (4, 4) operator with Ĥ² = 0.
+    tau : amplitude, m for a joint.
+
+    Returns
+    -------
+    (4, 4) projective translation.
+    """
+    return as_array(translation(as_mat(H_hat), float(tau)))
+
+
+def log_rotation(H: FloatArray, theta: float) -> FloatArray:
+    """Operator of an observed projective rotation, [RH00] eq. (4).
+
+    Parameters
+    ----------
+    H : (4, 4) projective rotation with det H = 1.
+    theta : its angle, rad.
+
+    Returns
+    -------
+    (4, 4) operator Ĥ.
+
+    Raises
+    ------
+    WorkFailed
+        If θ is a multiple of π, where H − H⁻¹ vanishes and the operator is undefined.
+    """
+    sine = math.sin(theta)
+    if abs(sine) < LEAST_SINE:
+        raise WorkFailed(
+            f"a rotation by {math.degrees(theta):.6g}° does not determine its operator: "
+            "use an angle away from 0° and ±180°"
+        )
+    result: FloatArray = (H - np.linalg.inv(H)) / (2.0 * sine)
+    return result
+
+
+def log_translation(H: FloatArray, tau: float) -> FloatArray:
+    """Operator of an observed projective translation, [RH00] eq. (5).
+
+    Parameters
+    ----------
+    H : (4, 4) projective translation with det H = 1.
+    tau : its amplitude, m for a joint.
+
+    Returns
+    -------
+    (4, 4) operator Ĥ.
+
+    Raises
+    ------
+    WorkFailed
+        If τ = 0, where the operator is undefined.
+    """
+    if abs(tau) < LEAST_SINE:
+        raise WorkFailed(f"a translation by {tau:.3g} does not determine its operator: use a longer one")
+    result: FloatArray = (H - np.linalg.inv(H)) / (2.0 * tau)
+    return result
+
+
+def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> FloatArray:
+    """Scale a 4×4 homography to a displacement with det H = 1, [RH00] eq. (2).
+
+    The determinant leaves ±H; the sign is the one that keeps the sign of a_inf·A.
+
+    Parameters
+    ----------
+    H : (4, 4) homography.
+    A : (..., 4) points it moves.
+    a_inf : (4,) plane at infinity.
+
+    Returns
+    -------
+    (4, 4) displacement.
+
+    Raises
+    ------
+    WorkFailed
+        If det H is not positive: then H is no displacement.
+    """
+    determinant = float(np.linalg.det(H))
+    if not determinant > 0.0:
+        raise WorkFailed(
+            f"a homography with determinant {determinant:.3g} is no displacement: check the correspondences"
+        )
+    result: FloatArray = H / determinant**0.25
+    if np.sum((A @ a_inf) * (A @ result.T @ a_inf)) < 0.0:
+        result = -result
+    return result
+
+
+def as_mat(H: FloatArray) -> Mat4:
+    """(4, 4) array as the tuple of sixteen floats the kernels take."""
+    values = [float(x) for x in np.asarray(H, dtype=np.float64).ravel()]
+    if len(values) != 16:
+        raise ValueError(f"expected a 4×4 matrix, got shape {np.shape(H)}")
+    return tuple(values)  # type: ignore[return-value]
+
+
+def as_array(H: Mat4) -> FloatArray:
+    """Tuple of sixteen floats as a (4, 4) array."""
+    return np.array(H, dtype=np.float64).reshape(4, 4)

@@ -1,0 +1,71 @@
+"""How the mathematics is compiled: one decorator, and a cache that never serves stale code.
+
+Numba decides whether cached machine code is fresh by the file of the function itself, so an edited
+helper in another file would go unnoticed. The cache folder therefore carries a hash of all sources
+of the compiled packages; where no folder can be written, the functions compile anew in each process.
+"""
+
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar, cast
+
+import numba
+import numpy as np
+
+_Params = ParamSpec("_Params")
+_Result = TypeVar("_Result")
+
+COMPILED_PACKAGES = ("geometry", "task", "control", "loop", "plants")
+
+
+def source_hash(root: Path) -> str:
+    """Hash of the sources that machine code depends on, and of the compiler's version."""
+    digest = hashlib.sha256(f"{sys.version}|{numba.__version__}|{np.__version__}".encode())
+    files = [root / "records.py"]
+    for package in COMPILED_PACKAGES:
+        files += sorted((root / package).glob("*.py"))
+    for file in files:
+        digest.update(file.relative_to(root).as_posix().encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cache_folder(root: Path) -> Path | None:
+    """Folder for machine code of exactly these sources, or None where nothing can be written."""
+    base = os.environ.get("PROJSERVO_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    if base is None:
+        try:
+            base = str(Path.home() / ".cache")
+        except RuntimeError:
+            return None
+    folder = Path(base) / "projservo" / f"kernels-{source_hash(root)}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        return None
+    return folder
+
+
+CACHE_FOLDER = None if numba.config.DISABLE_JIT else cache_folder(Path(__file__).parents[1])
+if CACHE_FOLDER is not None:
+    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+
+
+def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Compile with strict arithmetic: no reordering and no contraction, so that every mode agrees."""
+    decorate = numba.njit(cache=CACHE_FOLDER is not None, error_model="numpy", fastmath=False, nogil=True)
+    return cast(Callable[_Params, _Result], decorate(function))
+
+
+def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Compile a small helper that is always merged into its caller by the optimiser."""
+    decorate: Any = numba.njit(
+        cache=CACHE_FOLDER is not None, error_model="numpy", fastmath=False, nogil=True, forceinline=True
+    )
+    return cast(Callable[_Params, _Result], decorate(function))
