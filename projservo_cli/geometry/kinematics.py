@@ -1,0 +1,151 @@
+"""Projective kinematics of a robot: [RH00] equations (6), (7) and (19)."""
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, put_mat, vec
+from projservo_cli.geometry.displacement import IDENTITY, as_array, rotation, translation
+from projservo_cli.geometry.jit import njit
+from projservo_cli.records import PRISMATIC, FloatArray, Model
+
+
+@njit
+def joint_displacement(H_hat: Mat4, prismatic: bool, q: float) -> Mat4:
+    """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
+    if prismatic:
+        return translation(H_hat, q)
+    return rotation(H_hat, mul(H_hat, H_hat), q)
+
+
+@njit
+def forward(model: Model, q: FloatArray) -> Mat4:
+    """Forward kinematics, the product of exponentials of [RH00] eq. (6), q rad or m."""
+    H = IDENTITY
+    for i in range(q.shape[0]):
+        prismatic = model.joint_types[i] == PRISMATIC
+        amount = float(q[i]) - float(model.q_reference[i])
+        H = mul(H, joint_displacement(mat(model.H_hat_0[i]), prismatic, amount))
+    return H
+
+
+@njit
+def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> None:
+    """Joint operators at q, [RH00] eq. (19) with the truncated product H̄_i of (6).
+
+    Each joint is undone, moved about its reference and redone: Ĥ_i(q) = H̄_i Ĥ_i⁰ H̄_i⁻¹, where the
+    joint's own factor of H̄_i commutes with Ĥ_i⁰ and is left out.
+    """
+    n = q.shape[0]
+    H = IDENTITY
+    H_inverse = IDENTITY
+    for i in range(n):
+        operator = mat(model.H_hat_0[i])
+        put_mat(H_hat[i], mul(mul(H, operator), H_inverse))
+        if i < n - 1:
+            amount = float(q[i]) - float(model.q_reference[i])
+            if model.joint_types[i] == PRISMATIC:
+                H = mul(H, translation(operator, amount))
+                H_inverse = mul(translation(operator, -amount), H_inverse)
+            else:
+                squared = mul(operator, operator)
+                H = mul(H, rotation(operator, squared, amount))
+                H_inverse = mul(rotation(operator, squared, -amount), H_inverse)
+
+
+@njit
+def image_velocity(P: FloatArray, M: FloatArray, M_dot: FloatArray) -> tuple[float, float, float, float]:
+    """Pixel of a point and its velocity for one camera, [RH00] eq. (7), second row corrected.
+
+    Returns u, v (px) and their velocities. The point must not lie in the camera's principal plane.
+    """
+    A = vec(M)
+    D = vec(M_dot)
+    m = (row(P, 0, A), row(P, 1, A), row(P, 2, A))
+    d = (row(P, 0, D), row(P, 1, D), row(P, 2, D))
+    u = m[0] / m[2]
+    v = m[1] / m[2]
+    return u, v, (d[0] - u * d[2]) / m[2], (d[1] - v * d[2]) / m[2]
+
+
+@njit
+def row(P: FloatArray, i: int, A: tuple[float, float, float, float]) -> float:
+    """Product of row i of a camera with a point, [RH00] eq. (1)."""
+    return (float(P[i, 0]) * A[0] + float(P[i, 1]) * A[1]) + (float(P[i, 2]) * A[2] + float(P[i, 3]) * A[3])
+
+
+@njit
+def move(H: Mat4, M: FloatArray, moved: FloatArray) -> None:
+    """Apply a displacement to the rows of M."""
+    for k in range(M.shape[0]):
+        A = apply(H, vec(M[k]))
+        for i in range(4):
+            moved[k, i] = A[i]
+
+
+def forward_kinematics(model: Model, q: FloatArray) -> FloatArray:
+    """Displacement H_q of the end-effector from the reference, [RH00] eq. (6).
+
+    Parameters
+    ----------
+    model : projective or metric model of n joints.
+    q : (n,) joint readings, rad or m.
+
+    Returns
+    -------
+    (4, 4) displacement.
+    """
+    return as_array(forward(model, np.asarray(q, dtype=np.float64)))
+
+
+def joint_operators(model: Model, q: FloatArray) -> FloatArray:
+    """Joint operators at q, [RH00] eq. (19).
+
+    Parameters
+    ----------
+    model : projective or metric model of n joints.
+    q : (n,) joint readings, rad or m.
+
+    Returns
+    -------
+    (n, 4, 4) operators.
+    """
+    H_hat = np.empty_like(model.H_hat_0)
+    operators_at(model, np.asarray(q, dtype=np.float64), H_hat)
+    return H_hat
+
+
+def project(P: FloatArray, M: FloatArray) -> FloatArray:
+    """Pixels of points in both views, [RH00] eq. (1).
+
+    Parameters
+    ----------
+    P : (2, 3, 4) cameras.
+    M : (..., 4) points.
+
+    Returns
+    -------
+    (2, ..., 2) pixels.
+    """
+    m = np.einsum("vij,...j->v...i", P, M)
+    pixels: FloatArray = m[..., :2] / m[..., 2:]
+    return pixels
+
+
+def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArray:
+    """Interaction matrix from joint to image velocities, [RH00] eq. (7), second row corrected.
+
+    Parameters
+    ----------
+    P : (2, 3, 4) cameras.
+    M : (m, 4) points.
+    H_hat : (n, 4, 4) operators at the current joints.
+
+    Returns
+    -------
+    (2, m, 2, n) derivatives of u, v with respect to the joints, px per rad or m.
+    """
+    J = np.empty((2, M.shape[0], 2, H_hat.shape[0]))
+    for view in range(2):
+        for k in range(M.shape[0]):
+            for i in range(H_hat.shape[0]):
+                _, _, J[view, k, 0, i], J[view, k, 1, i] = image_velocity(P[view], M[k], H_hat[i] @ M[k])
+    return J

@@ -1,0 +1,237 @@
+"""Visual mechanisms: one-parameter motions defined by what they leave still, [RH00] section 3.
+
+Every mechanism is the kernel of a stack of operator velocities. The generic functions return
+``Mechanism(q_hat, H_hat)``; the compiled ones write the joint motion into a row of the workspace.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import (
+    Mat4,
+    Vec4,
+    apply,
+    apply_transposed,
+    dual_pencil,
+    inner,
+    mat,
+    multiple,
+    sub,
+)
+from projservo_cli.geometry.displacement import as_array
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kernels import kernel_vector
+from projservo_cli.records import FloatArray, IntArray, WorkFailed
+
+NO_OPERATOR: Mat4 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Work(NamedTuple):
+    """Arrays the compiled functions write to, so that nothing is allocated in a loop.
+
+    Attributes
+    ----------
+    H_hat : (n, 4, 4) operators at the current joints.
+    B : (n, rows) columns of the matrix being factorised.
+    rhs : (rows,) right-hand side.
+    z, pivot : (n,) of the factorisation.
+    """
+
+    H_hat: FloatArray
+    B: FloatArray
+    rhs: FloatArray
+    z: FloatArray
+    pivot: IntArray
+
+
+class Mechanism(NamedTuple):
+    """One-parameter motion of the robot.
+
+    Attributes
+    ----------
+    q_hat : (n,) joint motion.
+    H_hat : (4, 4) operator Σ q̂_i Ĥ_i.
+    """
+
+    q_hat: FloatArray
+    H_hat: FloatArray
+
+
+def workspace(n: int, rows: int) -> Work:
+    """Arrays for n joints and matrices of at most ``rows`` rows."""
+    return Work(
+        np.zeros((n, 4, 4)),
+        np.zeros((n, max(rows, 8))),
+        np.zeros(max(rows, 8)),
+        np.zeros(n),
+        np.zeros(n, dtype=np.int64),
+    )
+
+
+@njit
+def put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
+    """Write a velocity into four rows of column i."""
+    work.B[i, first] = A[0]
+    work.B[i, first + 1] = A[1]
+    work.B[i, first + 2] = A[2]
+    work.B[i, first + 3] = A[3]
+
+
+@njit
+def operator_of(work: Work, q_hat: FloatArray) -> Mat4:
+    """Operator Σ q̂_i Ĥ_i of a joint motion."""
+    H = multiple(float(q_hat[0]), mat(work.H_hat[0]))
+    for i in range(1, q_hat.shape[0]):
+        K = mat(work.H_hat[i])
+        k = float(q_hat[i])
+        H = (
+            H[0] + k * K[0], H[1] + k * K[1], H[2] + k * K[2], H[3] + k * K[3],
+            H[4] + k * K[4], H[5] + k * K[5], H[6] + k * K[6], H[7] + k * K[7],
+            H[8] + k * K[8], H[9] + k * K[9], H[10] + k * K[10], H[11] + k * K[11],
+            H[12] + k * K[12], H[13] + k * K[13], H[14] + k * K[14], H[15] + k * K[15],
+        )  # fmt: skip
+    return H
+
+
+@njit
+def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
+    """Translation along the line through A and A + D, [RH00] eq. (8).
+
+    The joint motion of unit norm under which two planes through the line have no velocity.
+    """
+    a_1, a_2 = dual_pencil(A, D)
+    n = q_hat.shape[0]
+    for i in range(n):
+        operator = mat(work.H_hat[i])
+        put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
+        put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
+    if not kernel_vector(work.B, 8, n, q_hat, work.pivot, work.z, work.rhs):
+        return False, NO_OPERATOR
+    return True, operator_of(work, q_hat)
+
+
+@njit
+def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
+    """Revolution around the axis through two points, [RH00] eq. (9), scaled to radians."""
+    n = q_hat.shape[0]
+    for i in range(n):
+        operator = mat(work.H_hat[i])
+        put_rows(work, i, 0, apply(operator, A_1))
+        put_rows(work, i, 4, apply(operator, A_2))
+    if not kernel_vector(work.B, 8, n, q_hat, work.pivot, work.z, work.rhs):
+        return False, NO_OPERATOR
+    return to_radians(work, q_hat)
+
+
+@njit
+def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
+    """Revolution around a point within a plane, [RH00] eq. (10), scaled to radians."""
+    n = q_hat.shape[0]
+    for i in range(n):
+        operator = mat(work.H_hat[i])
+        put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
+        put_rows(work, i, 4, apply(operator, A))
+    if not kernel_vector(work.B, 8, n, q_hat, work.pivot, work.z, work.rhs):
+        return False, NO_OPERATOR
+    return to_radians(work, q_hat)
+
+
+@njit
+def to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
+    """Scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
+    H = operator_of(work, q_hat)
+    trace = 0.0
+    for i in range(4):
+        for k in range(4):
+            trace += H[4 * i + k] * H[4 * k + i]
+    size = inner(H, H)
+    if not -trace > 1e-12 * size:
+        return False, NO_OPERATOR
+    nu = math.sqrt(-2.0 / trace)
+    for i in range(q_hat.shape[0]):
+        q_hat[i] *= nu
+    return True, multiple(nu, H)
+
+
+def _mechanism(kind: str, H_hat: FloatArray, first: FloatArray, second: FloatArray) -> Mechanism:
+    """Run one compiled mechanism on plain arrays."""
+    n = len(H_hat)
+    work = workspace(n, 8)
+    work.H_hat[:] = H_hat
+    q_hat = np.zeros(n)
+    u = tuple(float(x) for x in first)
+    v = tuple(float(x) for x in second)
+    compiled = {
+        "translation": translation_mechanism,
+        "rotation": rotation_mechanism,
+        "planar rotation": planar_mechanism,
+    }[kind]
+    found, H = compiled(work, u, v, q_hat)  # type: ignore[operator]
+    if not found:
+        raise WorkFailed(
+            f"the robot has no unique {kind} of this kind here: its operators are near a singularity"
+        )
+    return Mechanism(q_hat, as_array(H))
+
+
+def translation_along(H_hat: FloatArray, A_1: FloatArray, A_2: FloatArray) -> Mechanism:
+    """Translation along the line through two points, [RH00] eq. (8).
+
+    Parameters
+    ----------
+    H_hat : (n, 4, 4) operators at the current joints.
+    A_1, A_2 : (4,) points of equal scale a_inf·A.
+
+    Returns
+    -------
+    Mechanism of unit joint norm; only the products with its amplitude have a meaning.
+
+    Raises
+    ------
+    WorkFailed
+        If the motion is not unique.
+    """
+    return _mechanism("translation", H_hat, A_1, A_2 - A_1)
+
+
+def rotation_about(H_hat: FloatArray, A_1: FloatArray, A_2: FloatArray) -> Mechanism:
+    """Revolution around the axis through two points, [RH00] eq. (9).
+
+    Parameters
+    ----------
+    H_hat : (n, 4, 4) operators at the current joints.
+    A_1, A_2 : (4,) points on the axis.
+
+    Returns
+    -------
+    Mechanism per rad; the sense of rotation is arbitrary.
+
+    Raises
+    ------
+    WorkFailed
+        If the motion is not unique.
+    """
+    return _mechanism("rotation", H_hat, A_1, A_2)
+
+
+def rotation_within(H_hat: FloatArray, a: FloatArray, A: FloatArray) -> Mechanism:
+    """Revolution around a point within a plane, [RH00] eq. (10).
+
+    Parameters
+    ----------
+    H_hat : (n, 4, 4) operators at the current joints.
+    a : (4,) plane.
+    A : (4,) point.
+
+    Returns
+    -------
+    Mechanism per rad; the sense of rotation is arbitrary.
+
+    Raises
+    ------
+    WorkFailed
+        If the motion is not unique.
+    """
+    return _mechanism("planar rotation", H_hat, a, A)
