@@ -17,6 +17,10 @@ BoolArray = npt.NDArray[np.bool_]
 
 REVOLUTE = 0
 PRISMATIC = 1
+FREE = 2  # a twist of a free-flying rig: its operator does not move with the others
+
+LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points")
+METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
 
 
 def array(*dims: str, units: str = "1", about: str = "") -> Any:
@@ -39,7 +43,7 @@ class Model(NamedTuple):
     ----------
     P : (2, 3, 4) cameras, left and right, to pixels.
     H_hat_0 : (n, 4, 4) joint operators at the reference, one unit of motion per rad or m.
-    joint_types : (n,) ``REVOLUTE`` or ``PRISMATIC``.
+    joint_types : (n,) ``REVOLUTE``, ``PRISMATIC`` or ``FREE``.
     q_reference : (n,) joint reading at the reference, rad or m.
     a_inf : (4,) plane at infinity, the common left null vector of the operators.
     """

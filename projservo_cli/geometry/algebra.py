@@ -150,7 +150,7 @@ def apply_transposed(H: Mat4, a: Vec4) -> Vec4:
 
 
 @inline
-def combine(k: float, A: Mat4, l: float, B: Mat4) -> Mat4:  # noqa: E741
+def combine(k: float, A: Mat4, l: float, B: Mat4) -> Mat4:
     """Sum k A + l B."""
     return (
         k * A[0] + l * B[0],
@@ -243,6 +243,6 @@ def dual_pencil(A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
         if size < least:
             least = size
             k = i
-    e = (float(k == 0), float(k == 1), float(k == 2), float(k == 3))
+    e = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0, 1.0 if k == 3 else 0.0)
     w = unit(axpy(-u[k], u, axpy(-v[k], v, e)))
     return w, meet(u, v, w)

@@ -151,3 +151,24 @@ def as_mat(H: FloatArray) -> Mat4:
 def as_array(H: Mat4) -> FloatArray:
     """Tuple of sixteen floats as a (4, 4) array."""
     return np.array(H, dtype=np.float64).reshape(4, 4)
+
+
+@inline
+def twist_exponential(X: Mat4) -> Mat4:
+    """Displacement exp(X) of any twist, rotation and translation together.
+
+    Rodrigues' formula with the cubic term, I + X + (1 − cos θ)/θ² X² + (θ − sin θ)/θ³ X³ with
+    θ² = −trace(X²)/2; below θ = 1e-4 the coefficients are their series, exact to 1e-18.
+    """
+    X2 = mul(X, X)
+    square = max(-0.5 * (X2[0] + X2[5] + X2[10] + X2[15]), 0.0)
+    theta = math.sqrt(square)
+    if theta < 1e-4:
+        second = 0.5 - square / 24.0
+        third = 1.0 / 6.0 - square / 120.0
+    else:
+        half = math.sin(0.5 * theta)
+        second = 2.0 * half * half / square
+        third = (theta - math.sin(theta)) / (square * theta)
+    H = combine(1.0, X, second, X2)
+    return combine(1.0, IDENTITY, 1.0, combine(1.0, H, third, mul(X2, X)))

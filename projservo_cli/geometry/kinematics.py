@@ -5,13 +5,13 @@ import numpy as np
 from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, put_mat, vec
 from projservo_cli.geometry.displacement import IDENTITY, as_array, rotation, translation
 from projservo_cli.geometry.jit import njit
-from projservo_cli.records import PRISMATIC, FloatArray, Model
+from projservo_cli.records import FREE, PRISMATIC, FloatArray, Model
 
 
 @njit
-def joint_displacement(H_hat: Mat4, prismatic: bool, q: float) -> Mat4:
+def joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
     """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
-    if prismatic:
+    if joint_type == PRISMATIC:
         return translation(H_hat, q)
     return rotation(H_hat, mul(H_hat, H_hat), q)
 
@@ -21,9 +21,8 @@ def forward(model: Model, q: FloatArray) -> Mat4:
     """Forward kinematics, the product of exponentials of [RH00] eq. (6), q rad or m."""
     H = IDENTITY
     for i in range(q.shape[0]):
-        prismatic = model.joint_types[i] == PRISMATIC
         amount = float(q[i]) - float(model.q_reference[i])
-        H = mul(H, joint_displacement(mat(model.H_hat_0[i]), prismatic, amount))
+        H = mul(H, joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], amount))
     return H
 
 
@@ -40,7 +39,7 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> None:
     for i in range(n):
         operator = mat(model.H_hat_0[i])
         put_mat(H_hat[i], mul(mul(H, operator), H_inverse))
-        if i < n - 1:
+        if i < n - 1 and model.joint_types[i] != FREE:
             amount = float(q[i]) - float(model.q_reference[i])
             if model.joint_types[i] == PRISMATIC:
                 H = mul(H, translation(operator, amount))

@@ -1,0 +1,29 @@
+"""Control laws: one file a law, one contract, one if-chain."""
+
+from projservo_cli.control.blockwise import blockwise
+from projservo_cli.control.direct_three import direct_three
+from projservo_cli.control.direct_two import direct_two
+from projservo_cli.control.euclidean_points import euclidean_points
+from projservo_cli.control.law import Gains, State
+from projservo_cli.control.stacked import stacked
+from projservo_cli.geometry.jit import njit
+from projservo_cli.records import LAWS, FloatArray, Model
+from projservo_cli.task.face import Task
+
+CODES = {law: code for code, law in enumerate(LAWS)}
+
+
+@njit
+def command(
+    code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Run the law of a code: the only place that tells the laws apart."""
+    if code == 0:
+        return direct_three(model, task, gains, s, q, state)
+    if code == 1:
+        return direct_two(model, task, gains, s, q, state)
+    if code == 2:
+        return stacked(model, task, gains, s, q, state)
+    if code == 3:
+        return blockwise(model, task, gains, s, q, state)
+    return euclidean_points(model, task, gains, s, q, state)

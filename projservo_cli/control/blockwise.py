@@ -1,0 +1,30 @@
+"""Classical stereo law: the sum of two monocular laws."""
+
+from projservo_cli.control.image_based import put_view
+from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kernels import least_squares
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
+
+
+@njit
+def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+    """Joint velocity −λ (J_left⁺ e_left + J_right⁺ e_right), each view by itself.
+
+    Source: the law of reference [10] in [RH00], with the Jacobian of [RH00] eq. (7) at each instant.
+    """
+    if not measure(model, task, s, q, state):
+        return LOST
+    n = q.shape[0]
+    work = state.work
+    for i in range(n):
+        state.q_dot[i] = 0.0
+    for view in range(2):
+        put_view(model, task, s, state, view, 0)
+        rows = 2 * state.A.shape[0]
+        if not least_squares(work.B, rows, n, state.q_hat[0], work.pivot, work.z, work.rhs):
+            return SINGULAR
+        for i in range(n):
+            state.q_dot[i] -= gains.gain * state.q_hat[0, i]
+    return OK

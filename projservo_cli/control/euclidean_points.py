@@ -1,0 +1,38 @@
+"""Classical stereo law: triangulated Euclidean points, with a metric model."""
+
+from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
+from projservo_cli.geometry.algebra import apply, mat, vec
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kernels import least_squares
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
+
+
+@njit
+def euclidean_points(
+    model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Joint velocity −λ J⁺ (X − X*) for points X in metres; the model must be metric.
+
+    Source: "a Jacobian for 3D Euclidean points (like (6) but in Euclidean space)", [RH00] section 6.
+    """
+    if not measure(model, task, s, q, state):
+        return LOST
+    n = q.shape[0]
+    m = state.A.shape[0]
+    work = state.work
+    for i in range(n):
+        operator = mat(work.H_hat[i])
+        for k in range(m):
+            velocity = apply(operator, vec(state.A[k]))
+            work.B[i, 3 * k] = velocity[0]
+            work.B[i, 3 * k + 1] = velocity[1]
+            work.B[i, 3 * k + 2] = velocity[2]
+    for k in range(m):
+        for j in range(3):
+            work.rhs[3 * k + j] = state.A[k, j] - task.A_star[k, j]
+    if not least_squares(work.B, 3 * m, n, state.q_dot, work.pivot, work.z, work.rhs):
+        return SINGULAR
+    for i in range(n):
+        state.q_dot[i] *= -gains.gain
+    return OK

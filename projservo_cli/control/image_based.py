@@ -1,0 +1,24 @@
+"""What the image-based laws share: velocities of the face in one view."""
+
+from projservo_cli.control.law import State
+from projservo_cli.geometry.algebra import apply, mat, put_vec, vec
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kinematics import image_velocity
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
+
+
+@njit
+def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
+    """Interaction matrix and image error of one view, [RH00] eq. (7), into rows from ``first`` on."""
+    work = state.work
+    for i in range(work.H_hat.shape[0]):
+        operator = mat(work.H_hat[i])
+        for k in range(state.A.shape[0]):
+            put_vec(state.A_t[k], apply(operator, vec(state.A[k])))
+            _, _, u_dot, v_dot = image_velocity(model.P[view], state.A[k], state.A_t[k])
+            work.B[i, first + 2 * k] = u_dot
+            work.B[i, first + 2 * k + 1] = v_dot
+    for k in range(state.A.shape[0]):
+        work.rhs[first + 2 * k] = s[view, k, 0] - task.s_star[view, k, 0]
+        work.rhs[first + 2 * k + 1] = s[view, k, 1] - task.s_star[view, k, 1]

@@ -1,0 +1,144 @@
+"""What every control law gets and gives.
+
+A compiled law is ``law(model, task, gains, s, q, state) -> status``: it sees the model, the task,
+the pixels ``s`` of the face and the joint readings ``q``, never the truth; it writes joint
+velocities to ``state.q_dot`` (rad/s or m/s) and its control errors to ``state.errors``.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import dot, put_vec, sub
+from projservo_cli.geometry.composition import composed_angle
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kinematics import operators_at
+from projservo_cli.geometry.mechanisms import Work, workspace
+from projservo_cli.geometry.stereo import triangulate
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task, center_of
+from projservo_cli.task.partition import Memory, Parts, no_parts, partition
+from projservo_cli.task.visibility import limited_translation
+
+OK = 0
+LOST = 1
+SINGULAR = 2
+
+TAU, TAU_AFFINE, THETA_R, THETA_P, THETA_S = range(5)
+ERRORS = ("tau", "tau_affine", "theta_r", "theta_p", "theta_s")
+
+
+class Gains(NamedTuple):
+    """Gains and limits of the laws.
+
+    Attributes
+    ----------
+    gain_t, gain_r, gain_p : of ``direct_three``, 1/s.
+    gain_s : rotation of ``direct_two``, 1/s.
+    ratio_rp : λ_r/λ_p of ``direct_two``.
+    gain : of the classical laws, 1/s.
+    period : control period, s.
+    delta : share of τ_0 that one pure translation may use.
+    """
+
+    gain_t: float
+    gain_r: float
+    gain_p: float
+    gain_s: float
+    ratio_rp: float
+    gain: float
+    period: float
+    delta: float
+
+
+class State(NamedTuple):
+    """Workspace of a law and what it returns.
+
+    Attributes
+    ----------
+    work : arrays of the kernels, the current operators among them.
+    A, A_t, A_r : (m, 4) current points, target without translation, target without both.
+    q_hat : (4, n) joint motions t, r, p, s.
+    q_dot : (n,) joint velocity commanded, rad/s or m/s.
+    errors : (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad.
+    memory : what is carried to the next step.
+    limited : (1,) how often visibility limited the translation.
+    """
+
+    work: Work
+    A: FloatArray
+    A_t: FloatArray
+    A_r: FloatArray
+    q_hat: FloatArray
+    q_dot: FloatArray
+    errors: FloatArray
+    memory: Memory
+    limited: FloatArray
+
+
+def new_state(n: int, m: int) -> State:
+    """Fresh state for n joints and m face markers."""
+    return State(
+        workspace(n, 4 * m),
+        np.zeros((m, 4)),
+        np.zeros((m, 4)),
+        np.zeros((m, 4)),
+        np.zeros((4, n)),
+        np.zeros(n),
+        np.full(len(ERRORS), np.nan),
+        Memory(np.zeros((2, n))),
+        np.zeros(1),
+    )
+
+
+@njit
+def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> bool:
+    """Triangulate the face and move the operators to the current joints, [RH00] eq. (19).
+
+    Returns False where a marker is unseen in a view or has no finite point.
+    """
+    for k in range(state.A.shape[0]):
+        if not (
+            math.isfinite(s[0, k, 0])
+            and math.isfinite(s[0, k, 1])
+            and math.isfinite(s[1, k, 0])
+            and math.isfinite(s[1, k, 1])
+        ):
+            return False
+        found, M = triangulate(model.P, task.F, model.a_inf, s[0, k], s[1, k])
+        if not found:
+            return False
+        put_vec(state.A[k], M)
+    operators_at(model, q, state.work.H_hat)
+    return True
+
+
+@njit
+def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> tuple[int, Parts]:
+    """Measure and partition the remaining task; the errors are written to the state."""
+    for i in range(state.q_dot.shape[0]):
+        state.q_dot[i] = 0.0
+    if not measure(model, task, s, q, state):
+        return LOST, no_parts()
+    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    if not parts.found:
+        return SINGULAR, parts
+    way = sub(center_of(task.A_star, task.center), parts.A_c)
+    theta_s, _, _, _ = composed_angle(parts.theta_r, parts.theta_p)
+    state.errors[TAU] = parts.tau
+    state.errors[TAU_AFFINE] = math.sqrt(dot(way, way))
+    state.errors[THETA_R] = parts.theta_r
+    state.errors[THETA_P] = parts.theta_p
+    state.errors[THETA_S] = theta_s
+    return OK, parts
+
+
+@njit
+def translation_rate(task: Task, gains: Gains, parts: Parts, state: State) -> float:
+    """Rate λ_t τ of the translation, its step kept within δ τ_0 of both cameras."""
+    wanted = gains.gain_t * parts.tau * gains.period
+    allowed = limited_translation(parts.a, parts.H_t, wanted, gains.delta, task)
+    if allowed < wanted:
+        state.limited[0] += 1.0
+    return allowed / gains.period

@@ -1,0 +1,28 @@
+"""Classical stereo law: pseudo-inverse of the stacked image Jacobians."""
+
+from projservo_cli.control.image_based import put_view
+from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kernels import least_squares
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
+
+
+@njit
+def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+    """Joint velocity −λ J⁺ (s − s*) with both views stacked.
+
+    Source: the law of reference [8] in [RH00], with the Jacobian of [RH00] eq. (7) at each instant.
+    """
+    if not measure(model, task, s, q, state):
+        return LOST
+    n = q.shape[0]
+    rows = 2 * state.A.shape[0]
+    put_view(model, task, s, state, 0, 0)
+    put_view(model, task, s, state, 1, rows)
+    work = state.work
+    if not least_squares(work.B, 2 * rows, n, state.q_dot, work.pivot, work.z, work.rhs):
+        return SINGULAR
+    for i in range(n):
+        state.q_dot[i] *= -gains.gain
+    return OK

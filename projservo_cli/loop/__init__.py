@@ -1,0 +1,1 @@
+"""The closed loop: compiled for the built-in laws, in Python for any law or plant."""

@@ -1,0 +1,183 @@
+"""The whole closed loop of a built-in law and an analytic plant, compiled."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.control import command
+from projservo_cli.control.law import LOST, SINGULAR, Gains, State
+from projservo_cli.geometry.algebra import axpy, dot, mat, put_mat, vec
+from projservo_cli.geometry.displacement import IDENTITY
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kinematics import forward
+from projservo_cli.loop.step import (
+    JOINT_LIMIT,
+    MAX_STEPS,
+    PLATEAU,
+    RUNNING,
+    Limits,
+    all_seen,
+    beyond_limits,
+    finite,
+    image_error,
+    limit_speed,
+    on_plateau,
+    outside,
+    verdict_at,
+)
+from projservo_cli.plants.plant import Plant, observe, pose_after
+from projservo_cli.records import FREE, FloatArray, Model
+from projservo_cli.task.face import Task, center_of
+
+
+class Log(NamedTuple):
+    """What a run records at each instant; one row more than commands.
+
+    Attributes
+    ----------
+    q : (k, n) joints, rad or m.
+    H : (k, 4, 4) true displacement of the face from the reference.
+    s : (k, 2, m, 2) measured pixels.
+    hidden : (k, 2) 1 where a view is self-occluded.
+    error : (k,) image error, px rms per marker and view.
+    errors : (k, 5) control errors of the law.
+    q_dot : (k, n) commanded joint velocities after the limit; zero where none was sent.
+    factor : (k,) factor of the joint-speed limit.
+    events : (4,) first instant outside an image, first beyond a joint limit, that joint, and how
+        often visibility limited the translation; −1 for never.
+    """
+
+    q: FloatArray
+    H: FloatArray
+    s: FloatArray
+    hidden: FloatArray
+    error: FloatArray
+    errors: FloatArray
+    q_dot: FloatArray
+    factor: FloatArray
+    events: FloatArray
+
+
+def new_log(n: int, m: int, max_steps: int, errors: int) -> Log:
+    """Empty log for n joints, m markers and at most ``max_steps`` commands."""
+    rows = max_steps + 1
+    return Log(
+        np.zeros((rows, n)),
+        np.zeros((rows, 4, 4)),
+        np.zeros((rows, 2, m, 2)),
+        np.zeros((rows, 2)),
+        np.zeros(rows),
+        np.full((rows, errors), np.nan),
+        np.zeros((rows, n)),
+        np.ones(rows),
+        np.full(4, -1.0),
+    )
+
+
+@njit
+def rig_distance(plant: Plant, M: FloatArray) -> float:
+    """Distance of the centre of the face from the middle of the optical centres, m."""
+    middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
+    way = axpy(-0.5, middle, center_of(M, plant.center))
+    return math.sqrt(dot(way, way))
+
+
+@njit
+def start_pose(plant: Plant, q: FloatArray) -> tuple[float, ...]:
+    """Displacement of the face at the first joints; a free-flying rig starts at the reference."""
+    if plant.model.joint_types[0] == FREE:
+        return IDENTITY
+    return forward(plant.model, q)
+
+
+@njit
+def run(
+    code: int,
+    model: Model,
+    task: Task,
+    gains: Gains,
+    limits: Limits,
+    plant: Plant,
+    noise: FloatArray,
+    q_start: FloatArray,
+    state: State,
+    log: Log,
+) -> tuple[int, int]:
+    """Drive one law to its verdict.
+
+    Parameters
+    ----------
+    code : of the law.
+    model : what the law believes; its frame is that of the task.
+    noise : (≥ max_steps + 1, 2, m, 2) added to the true pixels, px.
+    q_start : (n,) first joints, rad or m.
+    log : filled up to the last instant.
+
+    Returns
+    -------
+    verdict : code of the verdict.
+    steps : commands sent; the log has one instant more.
+    """
+    n = q_start.shape[0]
+    M = np.empty_like(plant.M)
+    dq = np.empty(n)
+    for i in range(n):
+        log.q[0, i] = q_start[i]
+    put_mat(log.H[0], start_pose(plant, q_start))
+    first_distance = 0.0
+    for k in range(limits.max_steps + 1):
+        s = log.s[k]
+        in_front = observe(plant, mat(log.H[k]), M, s, log.hidden[k])
+        for view in range(2):
+            for j in range(s.shape[1]):
+                s[view, j, 0] += noise[k, view, j, 0]
+                s[view, j, 1] += noise[k, view, j, 1]
+        distance = rig_distance(plant, M)
+        if k == 0:
+            first_distance = distance
+        left = outside(s, plant.image_size)
+        if left and log.events[0] < 0.0:
+            log.events[0] = k
+        log.error[k] = image_error(s, task.s_star)
+        seen = all_seen(s)
+        singular = False
+        sound = True
+        if in_front and seen:
+            status = command(code, model, task, gains, s, log.q[k], state)
+            seen = status != LOST
+            singular = status == SINGULAR
+            sound = finite(state.q_dot)
+            for i in range(log.errors.shape[1]):
+                log.errors[k, i] = state.errors[i]
+        verdict = verdict_at(
+            in_front,
+            seen,
+            left,
+            log.error[k],
+            log.error[0],
+            distance,
+            first_distance,
+            sound,
+            singular,
+            limits,
+        )
+        if verdict != RUNNING:
+            return verdict, k
+        if k == limits.max_steps:
+            break
+        log.factor[k] = limit_speed(state.q_dot, limits.speed)
+        for i in range(n):
+            dq[i] = state.q_dot[i] * gains.period
+        H = pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1])
+        joint = beyond_limits(log.q[k + 1], plant.lower, plant.upper)
+        if joint >= 0 and log.events[1] < 0.0:
+            log.events[1] = k + 1
+            log.events[2] = joint
+        if joint >= 0 and limits.stop_at_joint_limit:
+            return JOINT_LIMIT, k
+        for i in range(n):
+            log.q_dot[k, i] = state.q_dot[i]
+        put_mat(log.H[k + 1], H)
+    last = limits.max_steps
+    return PLATEAU if on_plateau(log.error, last, limits.plateau_steps) else MAX_STEPS, last

@@ -1,0 +1,173 @@
+"""What one period of the loop does beside the law: limits, counting, verdict.
+
+Precedence of the verdicts at one instant, first match wins:
+
+1. ``behind camera``: a marker is not in front of a camera.
+2. ``left image``: a marker is outside an image and ``image_border`` is stop.
+3. ``markers lost``: the law needs a marker that was not seen.
+4. ``converged``: the image error is within the tolerance.
+5. ``diverged``: the image error or the distance of the face exceeds its first value by the factor,
+   or the command is not finite.
+6. ``singular``: the joint motion of the law is not unique.
+7. ``plateau``, ``max steps``: no step is left; plateau where the error fell by less than 1 % in
+   the last window.
+8. ``joint limit``: the command would pass a joint limit and ``joint_limits`` is stop.
+"""
+
+import math
+from typing import NamedTuple
+
+from projservo_cli.geometry.jit import njit
+from projservo_cli.records import FloatArray
+
+RUNNING = -1
+(
+    BEHIND_CAMERA,
+    LEFT_IMAGE,
+    MARKERS_LOST,
+    CONVERGED,
+    DIVERGED,
+    SINGULAR_VERDICT,
+    PLATEAU,
+    MAX_STEPS,
+    JOINT_LIMIT,
+) = range(9)
+VERDICTS = (
+    "behind camera",
+    "left image",
+    "markers lost",
+    "converged",
+    "diverged",
+    "singular",
+    "plateau",
+    "max steps",
+    "joint limit",
+)
+PLATEAU_FALL = 0.01
+
+
+class Limits(NamedTuple):
+    """When a run ends and what bounds its commands.
+
+    Attributes
+    ----------
+    speed : (n,) most joint motion per second, rad/s or m/s; infinite for none.
+    image_px : image error that counts as converged, px rms per marker and view.
+    diverged_factor : growth of error or distance that counts as diverged.
+    plateau_steps : window of the plateau test.
+    max_steps : most commands.
+    stop_at_joint_limit, stop_at_border : end the run, or only record.
+    """
+
+    speed: FloatArray
+    image_px: float
+    diverged_factor: float
+    plateau_steps: int
+    max_steps: int
+    stop_at_joint_limit: bool
+    stop_at_border: bool
+
+
+@njit
+def image_error(s: FloatArray, s_star: FloatArray) -> float:
+    """Root mean square over markers and views of the Euclidean pixel error; NaN where unseen."""
+    total = 0.0
+    m = s.shape[1]
+    for view in range(2):
+        for k in range(m):
+            du = s[view, k, 0] - s_star[view, k, 0]
+            dv = s[view, k, 1] - s_star[view, k, 1]
+            total += du * du + dv * dv
+    return math.sqrt(total / (2 * m))
+
+
+@njit
+def all_seen(s: FloatArray) -> bool:
+    """Whether every marker was seen in both views."""
+    for view in range(2):
+        for k in range(s.shape[1]):
+            if not (math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])):
+                return False
+    return True
+
+
+@njit
+def outside(s: FloatArray, image_size: FloatArray) -> bool:
+    """Whether a seen marker lies outside an image; pixel centres reach from −½ to size − ½."""
+    for view in range(2):
+        for k in range(s.shape[1]):
+            for j in range(2):
+                x = s[view, k, j]
+                if math.isfinite(x) and not -0.5 <= x <= image_size[j] - 0.5:
+                    return True
+    return False
+
+
+@njit
+def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
+    """Scale the command uniformly to the joint-speed limit; returns the factor, 1 where it holds."""
+    factor = 1.0
+    for i in range(q_dot.shape[0]):
+        size = abs(q_dot[i])
+        if size * factor > speed[i]:
+            factor = speed[i] / size
+    if factor < 1.0:
+        for i in range(q_dot.shape[0]):
+            q_dot[i] *= factor
+    return factor
+
+
+@njit
+def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
+    """First joint outside its limits, or −1."""
+    for i in range(q.shape[0]):
+        if not lower[i] <= q[i] <= upper[i]:
+            return i
+    return -1
+
+
+@njit
+def finite(q_dot: FloatArray) -> bool:
+    """Whether every entry is a finite number."""
+    for i in range(q_dot.shape[0]):
+        if not math.isfinite(q_dot[i]):
+            return False
+    return True
+
+
+@njit
+def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
+    """Whether the image error fell by less than 1 % over the last ``window`` steps."""
+    if k < window:
+        return False
+    return errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window]
+
+
+@njit
+def verdict_at(
+    in_front: bool,
+    seen: bool,
+    left: bool,
+    error: float,
+    first_error: float,
+    distance: float,
+    first_distance: float,
+    finite_command: bool,
+    singular: bool,
+    limits: Limits,
+) -> int:
+    """Verdict of one instant before its command, in the order the module states; RUNNING for none."""
+    if not in_front:
+        return BEHIND_CAMERA
+    if left and limits.stop_at_border:
+        return LEFT_IMAGE
+    if not seen:
+        return MARKERS_LOST
+    if error <= limits.image_px:
+        return CONVERGED
+    grown = error > limits.diverged_factor * first_error
+    if grown or distance > limits.diverged_factor * first_distance or not finite_command:
+        return DIVERGED
+    if singular:
+        return SINGULAR_VERDICT
+    return RUNNING

@@ -1,0 +1,1 @@
+"""What is being controlled: simulated robots and rigs that know the truth."""

@@ -1,0 +1,140 @@
+"""The true robot and rig as the compiled loop sees them."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import (
+    Mat4,
+    apply,
+    axpy,
+    combine,
+    dot,
+    mat,
+    mul,
+    put_vec,
+    vec,
+)
+from projservo_cli.geometry.displacement import twist_exponential
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kinematics import forward, row
+from projservo_cli.records import FREE, FloatArray, IntArray, Model
+from projservo_cli.task.face import center_of, face_plane
+
+
+class Plant(NamedTuple):
+    """True robot, rig and face in the metric frame.
+
+    Attributes
+    ----------
+    model : metric model; ``FREE`` joint types make the rig fly.
+    M : (m, 4) points of the face at the reference, m.
+    order : (m,) markers around the face.
+    center : index of the centre marker, or ``MIDPOINT``.
+    O : (2, 4) optical centres.
+    visible : (2,) sign of a·O on the visible side of the face.
+    image_size : (2,) width and height, px; infinite where an image has no border.
+    lower, upper : (n,) joint limits, rad or m.
+    opaque : whether the face hides its markers from a camera behind it.
+    """
+
+    model: Model
+    M: FloatArray
+    order: IntArray
+    center: int
+    O: FloatArray
+    visible: FloatArray
+    image_size: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    opaque: bool
+
+
+@njit
+def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: FloatArray) -> Mat4:
+    """Displacement of the face after the joint step dq, rad or m; the joints are written to q_next.
+
+    A serial robot is moved by its joints; a free-flying rig by one exponential of its twist.
+    """
+    n = q.shape[0]
+    for i in range(n):
+        q_next[i] = q[i] + dq[i]
+    if plant.model.joint_types[0] != FREE:
+        return forward(plant.model, q_next)
+    X = combine(float(dq[0]), mat(plant.model.H_hat_0[0]), 0.0, mat(plant.model.H_hat_0[0]))
+    for i in range(1, n):
+        X = combine(1.0, X, float(dq[i]), mat(plant.model.H_hat_0[i]))
+    return mul(twist_exponential(X), H)
+
+
+@njit
+def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatArray) -> bool:
+    """True pixels of the face after the displacement H.
+
+    Parameters
+    ----------
+    M : (m, 4) on return the points of the face.
+    s : (2, m, 2) on return the pixels, NaN where an opaque face hides them.
+    hidden : (2,) on return 1 where the face is self-occluded in a view.
+
+    Returns
+    -------
+    False where a marker is not in front of a camera.
+    """
+    m = M.shape[0]
+    for k in range(m):
+        put_vec(M[k], apply(H, vec(plant.M[k])))
+    a = face_plane(M, plant.order, center_of(M, plant.center))
+    in_front = True
+    for view in range(2):
+        seen = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
+        hidden[view] = 0.0 if seen else 1.0
+        camera = plant.model.P[view]
+        for k in range(m):
+            A = vec(M[k])
+            depth = row(camera, 2, A)
+            if not depth > 0.0:
+                in_front = False
+                s[view, k, 0] = math.nan
+                s[view, k, 1] = math.nan
+            elif plant.opaque and not seen:
+                s[view, k, 0] = math.nan
+                s[view, k, 1] = math.nan
+            else:
+                s[view, k, 0] = row(camera, 0, A) / depth
+                s[view, k, 1] = row(camera, 1, A) / depth
+    return in_front
+
+
+@njit
+def center_deviation(
+    plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, start: FloatArray, goal: FloatArray, samples: int
+) -> float:
+    """Largest distance of the centre from the line start–goal during one joint step, m.
+
+    The joints move linearly; the step is sampled at ``samples`` equal parts, its end included.
+    """
+    M = np.empty_like(plant.M)
+    part = np.empty_like(dq)
+    reached = np.empty_like(dq)
+    most = 0.0
+    for j in range(1, samples + 1):
+        for i in range(dq.shape[0]):
+            part[i] = dq[i] * (j / samples)
+        H_part = pose_after(plant, H, q, part, reached)
+        for k in range(M.shape[0]):
+            put_vec(M[k], apply(H_part, vec(plant.M[k])))
+        most = max(most, line_distance(center_of(M, plant.center), start, goal))
+    return most
+
+
+@njit
+def line_distance(A: tuple[float, float, float, float], start: FloatArray, goal: FloatArray) -> float:
+    """Distance of a metric point from the line through start and goal; from start where they agree."""
+    way = axpy(-1.0, vec(start), vec(goal))
+    off = axpy(-1.0, vec(start), A)
+    length = dot(way, way)
+    if length > 0.0:
+        off = axpy(-dot(off, way) / length, way, off)
+    return math.sqrt(dot(off, off))

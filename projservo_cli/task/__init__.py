@@ -1,0 +1,1 @@
+"""The reaching task as a translation and two rotations that keep the face visible: [RH00] section 4."""

@@ -1,0 +1,283 @@
+"""Partition of a reaching task into a translation and two rotations: [RH00] section 4.1."""
+
+import math
+from typing import NamedTuple
+
+from projservo_cli.geometry.algebra import (
+    Mat4,
+    Vec4,
+    add,
+    apply,
+    apply_transposed,
+    axpy,
+    dot,
+    dual_pencil,
+    meet,
+    mul,
+    multiple,
+    put_vec,
+    scale,
+    sub,
+    unit,
+    vec,
+)
+from projservo_cli.geometry.composition import incidence_angles
+from projservo_cli.geometry.displacement import rotation
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.mechanisms import (
+    NO_OPERATOR,
+    Work,
+    planar_mechanism,
+    rotation_mechanism,
+    translation_mechanism,
+)
+from projservo_cli.records import FloatArray
+from projservo_cli.task.face import Task, center_of, face_plane
+from projservo_cli.task.visibility import CONTINUITY_BAND, HALF_TURN_TOLERANCE, choose_sense
+
+# Two vectors of unit size closer than this are equal to working precision: no direction is left.
+COINCIDENT = 1e-14
+
+
+class Memory(NamedTuple):
+    """What a law carries from one step to the next.
+
+    Attributes
+    ----------
+    rotation : (2, n) joint motions of the last rotations r and p, in the sense they were driven.
+    """
+
+    rotation: FloatArray
+
+
+class Parts(NamedTuple):
+    """Partition of the task at one instant; the joint motions are in rows t, r, p of ``q_hat``.
+
+    Attributes
+    ----------
+    found : False where an operator kernel is not unique.
+    tau : amplitude of the translation, ≥ 0, in the unit of ``H_t``.
+    theta_r, theta_p : angles onto and within the plane, rad.
+    H_t, H_r, H_p : operators, zero where the part is nothing.
+    a, a_t : oriented planes of the face and of the translated target.
+    A_c : centre of the face.
+    """
+
+    found: bool
+    tau: float
+    theta_r: float
+    theta_p: float
+    H_t: Mat4
+    H_r: Mat4
+    H_p: Mat4
+    a: Vec4
+    a_t: Vec4
+    A_c: Vec4
+
+
+@njit
+def no_parts() -> Parts:
+    """Partition of a task that could not be measured."""
+    nothing = (0.0, 0.0, 0.0, 0.0)
+    return Parts(False, 0.0, 0.0, 0.0, NO_OPERATOR, NO_OPERATOR, NO_OPERATOR, nothing, nothing, nothing)
+
+
+@njit
+def clear(q_hat: FloatArray) -> None:
+    """Set a joint motion to zero."""
+    for i in range(q_hat.shape[0]):
+        q_hat[i] = 0.0
+
+
+@njit
+def negate(q_hat: FloatArray) -> None:
+    """Reverse a joint motion."""
+    for i in range(q_hat.shape[0]):
+        q_hat[i] = -q_hat[i]
+
+
+@njit
+def agreement(q_hat: FloatArray, previous: FloatArray) -> float:
+    """Positive where a joint motion goes on with the previous one, 0 where there was none."""
+    total = 0.0
+    for i in range(q_hat.shape[0]):
+        total += q_hat[i] * previous[i]
+    return total
+
+
+@njit
+def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tuple[bool, float, Mat4]:
+    """Translation of the centre onto its target, [RH00] eqs. (8), (11).
+
+    The plane of (11) is the one through the target centre that is perpendicular, as a vector, to it
+    within the span of both centres, hence as transversal as the coordinates allow. The sense is the
+    one with τ ≥ 0; equal centres leave no direction and τ = 0.
+    """
+    D = sub(A_cs, A_c)
+    if dot(D, D) <= COINCIDENT * COINCIDENT * dot(A_cs, A_cs):
+        clear(q_hat)
+        return True, 0.0, NO_OPERATOR
+    found, H_t = translation_mechanism(work, A_c, D, q_hat)
+    a_cs = axpy(-dot(D, A_cs) / dot(A_cs, A_cs), A_cs, D)
+    rate = dot(a_cs, apply(H_t, A_c))
+    if not found or rate == 0.0:
+        return False, 0.0, NO_OPERATOR
+    tau = -dot(a_cs, A_c) / rate
+    if tau < 0.0:
+        negate(q_hat)
+        return True, -tau, multiple(-1.0, H_t)
+    return True, tau, H_t
+
+
+@njit
+def onto_plane_part(
+    work: Work, task: Task, A: FloatArray, a: Vec4, a_t: Vec4, A_c: Vec4, q_hat: FloatArray, memory: Memory
+) -> tuple[bool, float, Mat4]:
+    """Rotation of the face onto the translated target plane, [RH00] eqs. (9), (13)–(15).
+
+    The axis is the intersection of both planes; for opposite planes, which leave it open, the line
+    through the centre and the first marker. A_d is the marker farthest from the axis.
+    """
+    same = dot(a, a_t)
+    D = sub(a_t, a) if same >= 0.0 else add(a_t, a)
+    if dot(D, D) <= COINCIDENT * COINCIDENT:
+        if same >= 0.0:
+            clear(q_hat)
+            return True, 0.0, NO_OPERATOR
+        first = sub(vec(A[task.order[0]]), A_c)
+        if dot(first, first) <= COINCIDENT * COINCIDENT * dot(A_c, A_c):
+            first = sub(vec(A[task.order[1]]), A_c)
+        found, H_r = rotation_mechanism(work, unit(A_c), unit(first), q_hat)
+    else:
+        A_1, A_2 = dual_pencil(a, D)
+        found, H_r = rotation_mechanism(work, A_1, A_2, q_hat)
+    if not found:
+        return False, 0.0, NO_OPERATOR
+    found, theta = oriented_angle(A, a, a_t, H_r)
+    if not found:
+        return False, 0.0, NO_OPERATOR
+    if theta < 0.0:
+        negate(q_hat)
+        H_r = multiple(-1.0, H_r)
+        theta = -theta
+    theta = choose_sense(a, a_t, H_r, theta, task, agreement(q_hat, memory.rotation[0]) < 0.0)
+    return True, theta, H_r
+
+
+@njit
+def oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, float]:
+    """Angle of [RH00] eq. (15), in (−π, π], that brings the front of a onto the front of a_t."""
+    p_0 = 0.0
+    p_s = 0.0
+    p_c = 0.0
+    most = -1.0
+    for k in range(A.shape[0]):
+        A_d = vec(A[k])
+        first = apply(H_r, A_d)
+        second = apply(H_r, first)
+        s = dot(a_t, first)
+        c = -dot(a_t, second)
+        if s * s + c * c > most:
+            most = s * s + c * c
+            p_0 = dot(a_t, A_d) - c
+            p_s = s
+            p_c = c
+    found, plus, minus = incidence_angles(p_0, p_s, p_c)
+    if not found:
+        return False, 0.0
+    turned = apply_transposed(rotation(H_r, mul(H_r, H_r), -plus), a)
+    return True, plus if dot(turned, a_t) > 0.0 else minus
+
+
+@njit
+def within_plane_part(
+    work: Work, A: FloatArray, A_r: FloatArray, a: Vec4, A_c: Vec4, q_hat: FloatArray, memory: Memory
+) -> tuple[bool, float, Mat4]:
+    """Rotation of the face within its plane, [RH00] eqs. (10), (13)–(15).
+
+    A_e is the marker farthest from the axis. The plane through its target and the axis is met
+    twice; the solution on the target's side is taken. The operator turns the oriented plane in one
+    fixed sense, so that θ_p is comparable from step to step; half a turn counts as +π unless the
+    step before turned the other way.
+    """
+    found, H_p = planar_mechanism(work, a, unit(A_c), q_hat)
+    if not found:
+        return False, 0.0, NO_OPERATOR
+    H_p2 = mul(H_p, H_p)
+    e = 0
+    most = -1.0
+    for k in range(A.shape[0]):
+        radius = apply(H_p2, vec(A[k]))
+        if dot(radius, radius) > most:
+            most = dot(radius, radius)
+            e = k
+    A_e = vec(A[e])
+    A_er = vec(A_r[e])
+    # The plane's coefficients, read as a point, never lie on it; their foot is on the axis.
+    A_c2 = add(a, apply(H_p2, a))
+    velocity = apply(H_p, A_e)
+    if dot(meet(A_e, A_c, A_c2), velocity) < 0.0:
+        negate(q_hat)
+        H_p = multiple(-1.0, H_p)
+        velocity = scale(-1.0, velocity)
+    a_i = meet(A_er, A_c, A_c2)
+    second = apply(H_p2, A_e)
+    found, plus, minus = incidence_angles(
+        dot(a_i, A_e) + dot(a_i, second), dot(a_i, velocity), -dot(a_i, second)
+    )
+    if not found:
+        return False, 0.0, NO_OPERATOR
+    miss_plus = sub(apply(rotation(H_p, H_p2, plus), A_e), A_er)
+    miss_minus = sub(apply(rotation(H_p, H_p2, minus), A_e), A_er)
+    theta = plus if dot(miss_plus, miss_plus) <= dot(miss_minus, miss_minus) else minus
+    if math.pi - abs(theta) <= HALF_TURN_TOLERANCE:
+        theta = abs(theta)
+    if math.pi - abs(theta) < CONTINUITY_BAND:
+        previous = agreement(q_hat, memory.rotation[1])
+        if theta > 0.0 and previous < 0.0:
+            theta -= 2.0 * math.pi
+        elif theta < 0.0 and previous > 0.0:
+            theta += 2.0 * math.pi
+    return True, theta, H_p
+
+
+@njit
+def partition(
+    work: Work, task: Task, A: FloatArray, A_t: FloatArray, A_r: FloatArray, q_hat: FloatArray, memory: Memory
+) -> Parts:
+    """Partition of the remaining task, [RH00] eqs. (8)–(16).
+
+    Parameters
+    ----------
+    work : operators at the current joints in ``work.H_hat``.
+    task : target and visibility.
+    A : (m, 4) current points of the face, a_inf·A = 1.
+    A_t, A_r : (m, 4) on return the target without the translation, and without both.
+    q_hat : (≥3, n) on return the joint motions t, r, p.
+    memory : sense of the last rotations, updated.
+    """
+    A_c = center_of(A, task.center)
+    A_cs = center_of(task.A_star, task.center)
+    a = face_plane(A, task.order, A_c)
+    a_star = face_plane(task.A_star, task.order, A_cs)
+    found, tau, H_t = translation_part(work, A_c, A_cs, q_hat[0])
+    a_t = unit(axpy(tau, apply_transposed(H_t, a_star), a_star))
+    for k in range(A.shape[0]):
+        A_ks = vec(task.A_star[k])
+        put_vec(A_t[k], axpy(-tau, apply(H_t, A_ks), A_ks))
+    theta_r = 0.0
+    theta_p = 0.0
+    H_r = NO_OPERATOR
+    H_p = NO_OPERATOR
+    if found:
+        found, theta_r, H_r = onto_plane_part(work, task, A, a, a_t, A_c, q_hat[1], memory)
+    if found:
+        back = rotation(H_r, mul(H_r, H_r), -theta_r)
+        for k in range(A.shape[0]):
+            put_vec(A_r[k], apply(back, vec(A_t[k])))
+        found, theta_p, H_p = within_plane_part(work, A, A_r, a, A_c, q_hat[2], memory)
+    if found:
+        for i in range(q_hat.shape[1]):
+            memory.rotation[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]
+            memory.rotation[1, i] = q_hat[2, i] if theta_p >= 0.0 else -q_hat[2, i]
+    return Parts(found, tau, theta_r, theta_p, H_t, H_r, H_p, a, a_t, A_c)

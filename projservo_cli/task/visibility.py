@@ -1,0 +1,168 @@
+"""When a camera sees the face, and which way to turn it: [RH00] section 4.2.
+
+The margin of a camera is a·O, carried along with the face by H⁻ᵀ; it changes sign exactly where the
+camera loses or gains sight of the face. Signs are relative to the face as first seen.
+"""
+
+import math
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, vec
+from projservo_cli.geometry.composition import incidence_angles
+from projservo_cli.geometry.jit import njit
+from projservo_cli.records import FloatArray
+from projservo_cli.task.face import Task
+
+# Near half a turn either sense is as good as the other: within this angle of it, rad, the sense of
+# the step before is kept, so that noise cannot make the axis chatter.
+CONTINUITY_BAND = 0.5
+HALF_TURN_TOLERANCE = 1e-9
+
+
+@njit
+def margin_coefficients(a: Vec4, H_hat: Mat4, O: Vec4) -> tuple[float, float, float]:
+    """Coefficients of the margin (H(θ)⁻ᵀ a)·O = c_0 + c_s sin θ + c_c cos θ, [RH00] eqs. (13), (14)."""
+    first = apply(H_hat, O)
+    second = apply(H_hat, first)
+    return dot(a, O) + dot(a, second), -dot(a, first), -dot(a, second)
+
+
+@njit
+def arc_minimum(c_0: float, c_s: float, c_c: float, theta: float) -> float:
+    """Least value of c_0 + c_s sin t + c_c cos t for t between 0 and θ, |θ| ≤ 2π."""
+    least = min(c_0 + c_c, c_0 + c_s * math.sin(theta) + c_c * math.cos(theta))
+    if c_s == 0.0 and c_c == 0.0:
+        return least
+    trough = math.atan2(-c_s, -c_c)
+    if theta >= 0.0 and trough < 0.0:
+        trough += 2.0 * math.pi
+    if theta < 0.0 and trough > 0.0:
+        trough -= 2.0 * math.pi
+    if abs(trough) <= abs(theta):
+        least = min(least, c_0 - math.sqrt(c_s * c_s + c_c * c_c))
+    return least
+
+
+@njit
+def translation_limit(a: Vec4, H_t: Mat4, O: Vec4) -> tuple[bool, float]:
+    """Amplitude τ_0 at which a translated face changes visibility, [RH00] eq. (11) on the optical centre."""
+    rate = dot(a, apply(H_t, O))
+    if rate == 0.0:
+        return False, 0.0
+    return True, dot(a, O) / rate
+
+
+@njit
+def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: Task) -> float:
+    """Amplitude of a pure translation kept within δ τ_0 of both cameras, [RH00] section 4.2.
+
+    ``amount`` ≥ 0 is the amplitude wanted; the most conservative camera decides.
+    """
+    for view in range(2):
+        O = vec(task.O[view])
+        found, tau_0 = translation_limit(a, H_t, O)
+        seen = task.visible[view] * dot(a, O) > 0.0
+        if found and seen and tau_0 > 0.0 and amount > delta * tau_0:
+            amount = delta * tau_0
+    return amount
+
+
+@njit
+def violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, float]:
+    """Cameras that lose sight of the face while it turns by θ, and the worst margin over its start's."""
+    lost = 0
+    worst = math.inf
+    for view in range(2):
+        sign = float(task.visible[view])
+        c_0, c_s, c_c = margin_coefficients(a, H_r, vec(task.O[view]))
+        start = abs(c_0 + c_c)
+        least = arc_minimum(sign * c_0, sign * c_s, sign * c_c, theta)
+        if least <= 0.0:
+            lost += 1
+        if start > 0.0:
+            worst = min(worst, least / start)
+    return lost, worst
+
+
+@njit
+def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, against_previous: bool) -> float:
+    """Sense of the rotation onto the target plane, [RH00] section 4.2: θ or θ − 2π, 0 ≤ θ ≤ π.
+
+    Both senses bring the front onto the front. The one that fewer cameras lose sight of is taken;
+    between equals, near half a turn the sense of the step before, else the larger worst margin.
+    The axis lies in the face, so a camera that sees the face at both ends of the shorter arc sees
+    it throughout, and that common case needs no arc.
+    """
+    seen = True
+    for view in range(2):
+        O = vec(task.O[view])
+        sign = float(task.visible[view])
+        seen = seen and sign * dot(a, O) > 0.0 and sign * dot(a_t, O) > 0.0
+    near_half_turn = math.pi - theta < CONTINUITY_BAND
+    if seen and math.pi - theta > HALF_TURN_TOLERANCE:
+        return theta
+    other = theta - 2.0 * math.pi
+    lost, worst = violations(a, H_r, theta, task)
+    lost_other, worst_other = violations(a, H_r, other, task)
+    if lost != lost_other:
+        return theta if lost < lost_other else other
+    if near_half_turn:
+        return other if against_previous else theta
+    if lost > 0 and worst_other > worst:
+        return other
+    return theta
+
+
+def margin(a: FloatArray, O: FloatArray, visible: FloatArray) -> FloatArray:
+    """Visibility margin of planes for both cameras: positive where a camera sees the face.
+
+    Parameters
+    ----------
+    a : (..., 4) planes, carried along from one start by H⁻ᵀ.
+    O : (2, 4) optical centres.
+    visible : (2,) sign of a·O on the visible side.
+
+    Returns
+    -------
+    (..., 2) margins.
+    """
+    return np.asarray(a @ O.T * visible)
+
+
+def visibility_translation(a: FloatArray, H_hat_t: FloatArray, O: FloatArray) -> float | None:
+    """Amplitude τ_0 at which a translated face changes visibility, [RH00] section 4.2.
+
+    Parameters
+    ----------
+    a : (4,) plane of the face.
+    H_hat_t : (4, 4) translation operator.
+    O : (4,) optical centre.
+
+    Returns
+    -------
+    τ_0 in the unit of the operator, or None where translating never changes visibility.
+    """
+    rate = float(a @ H_hat_t @ O)
+    if abs(rate) <= 1e-14 * float(np.linalg.norm(H_hat_t) * np.linalg.norm(a) * np.linalg.norm(O)):
+        return None
+    return float(a @ O) / rate
+
+
+def visibility_angles(a: FloatArray, H_hat: FloatArray, O: FloatArray) -> tuple[float, float] | None:
+    """Angles θ_0± at which a rotated face changes visibility, [RH00] section 4.2.
+
+    Parameters
+    ----------
+    a : (4,) plane of the face.
+    H_hat : (4, 4) revolute operator.
+    O : (4,) optical centre.
+
+    Returns
+    -------
+    θ_0⁺ and θ_0⁻ in (−π, π], rad, or None where the rotation never changes visibility.
+    """
+    first = H_hat @ O
+    second = H_hat @ first
+    found, plus, minus = incidence_angles(float(a @ (O + second)), float(-(a @ first)), float(-(a @ second)))
+    return (plus, minus) if found else None
