@@ -105,6 +105,94 @@ class Calibration:
         return Model(self.P, self.H_hat_0, types, self.q_reference, self.a_inf)
 
 
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A reaching task as a translation and two rotations, and the motion planned for it.
+
+    Everything comes from the calibration and the start and goal images. Amplitudes are per view
+    where they concern visibility: None is stored as NaN where a motion never changes it.
+    """
+
+    profile: str = scalar(about="which part is driven when")
+    feasible: bool = scalar(about="whether both cameras see the face all along")
+    reason: str = scalar(about="what makes the plan feasible or not, in words")
+    tau: float = scalar(about="amplitude of the translation, unit-norm kernel of (8)")
+    theta_r: float = scalar(units="rad", about="angle onto the target plane, in the sense chosen")
+    theta_p: float = scalar(units="rad", about="angle within the plane")
+    theta_s: float = scalar(units="rad", about="angle of both rotations together")
+    tau_limit: float = scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
+    sigma: FloatArray = array("sample", about="path parameter from 0 to 1")
+    mu: FloatArray = array("sample", "part", about="shares of t, r, p that are done")
+    H_d: FloatArray = array("sample", "row", "coordinate", about="planned displacement of the face")
+    s: FloatArray = array("sample", "view", "marker", "xy", units="px", about="predicted images of the face")
+    margin: FloatArray = array("sample", "view", about="visibility margin a·O, 1 at the start")
+    s_start: FloatArray = array("view", "marker", "xy", units="px", about="images at the start")
+    s_star: FloatArray = array("view", "marker", "xy", units="px", about="images at the goal")
+    A: FloatArray = array("marker", "coordinate", about="face at the start")
+    A_star: FloatArray = array("marker", "coordinate", about="face at the goal")
+    A_t: FloatArray = array("marker", "coordinate", about="goal less the translation")
+    A_r: FloatArray = array("marker", "coordinate", about="goal less translation and rotation onto the plane")
+    a: FloatArray = array("coordinate", about="plane of the face at the start")
+    a_star: FloatArray = array("coordinate", about="plane of the face at the goal")
+    a_t: FloatArray = array("coordinate", about="plane of the goal less the translation")
+    A_c: FloatArray = array("coordinate", about="centre of the face at the start")
+    A_c_star: FloatArray = array("coordinate", about="centre of the face at the goal")
+    q_start: FloatArray = array("joint", units="rad or m", about="joint readings at the start")
+    q_hat: FloatArray = array("part", "joint", about="joint motions t, r, p at the start")
+    H_hat: FloatArray = array("part", "row", "coordinate", about="operators t, r, p at the start")
+    optical_center: FloatArray = array("view", "coordinate", about="optical centres")
+    tau_0: FloatArray = array("view", about="translation at which visibility changes")
+    theta_0: FloatArray = array("view", "solution", units="rad", about="angles at which visibility changes")
+    sense: FloatArray = array("solution", units="rad", about="both senses of the rotation onto the plane")
+    sense_margin: FloatArray = array(
+        "solution", "view", about="least margin along each sense, 1 at the start"
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """One closed-loop run of one law, from the first instant to its verdict."""
+
+    law: str = scalar(about="name of the control law")
+    verdict: str = scalar(about="how the run ended")
+    reason: str = scalar(about="why, in a sentence")
+    steps: int = scalar(about="commands sent")
+    period: float = scalar(units="s", about="control period")
+    position_error_mm: float | None = scalar(units="mm", about="true centre to true goal at the end")
+    rotation_error_deg: float | None = scalar(units="deg", about="true rotation to the goal at the end")
+    self_occluded_steps_left: int = scalar(about="instants at which the left camera is behind the face")
+    self_occluded_steps_right: int = scalar(about="instants at which the right camera is behind the face")
+    center_deviation_mm: float | None = scalar(
+        units="mm", about="largest distance of the centre from the line, between samples too"
+    )
+    center_deviation_at_samples_mm: float | None = scalar(
+        units="mm", about="largest distance of the centre from the line at the sampling instants"
+    )
+    plateau_steps: int = scalar(about="longest stretch in which the image error falls < 1 % in 20 steps")
+    speed_limited_steps: int = scalar(about="commands scaled to the joint-speed limit")
+    visibility_limited_steps: int = scalar(about="commands whose translation was kept within delta·tau_0")
+    first_outside_image: int = scalar(about="first instant with a marker outside an image, -1 for never")
+    first_beyond_limit: int = scalar(about="first instant beyond a joint limit, -1 for never")
+    limit_joint: int = scalar(about="the joint that passed its limit first, -1 for none")
+    q: FloatArray = array("instant", "joint", units="rad or m", about="joints")
+    s: FloatArray = array("instant", "view", "marker", "xy", units="px", about="measured images of the face")
+    s_star: FloatArray = array("view", "marker", "xy", units="px", about="target images")
+    image_error: FloatArray = array("instant", units="px", about="rms over markers and views")
+    tau: FloatArray = array("instant", about="translation error, unit-norm kernel of (8)")
+    tau_affine: FloatArray = array("instant", about="translation error, scale fixed through a_inf")
+    theta_r: FloatArray = array("instant", units="rad", about="rotation error onto the plane")
+    theta_p: FloatArray = array("instant", units="rad", about="rotation error within the plane")
+    theta_s: FloatArray = array("instant", units="rad", about="rotation error of both together")
+    q_dot: FloatArray = array("step", "joint", units="rad/s or m/s", about="commands after the limit")
+    speed_factor: FloatArray = array("step", about="factor of the joint-speed limit")
+    self_occluded: BoolArray = array("instant", "view", about="true self-occlusion of the face")
+    pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
+    goal_pose: FloatArray = array(
+        "row", "coordinate", units="m", about="true pose at the goal, NaN if unknown"
+    )
+    center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
+
+
 class InputError(ValueError):
     """Usage, configuration or data that cannot be read or make no sense (exit code 2).
 
