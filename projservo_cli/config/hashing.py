@@ -1,0 +1,72 @@
+"""A configuration as text: resolved YAML to store, canonical JSON to hash."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import yaml
+from pydantic import BaseModel
+
+from projservo_cli.config.models import Config
+
+
+def to_yaml(config: Config) -> str:
+    """The whole configuration, defaults written out, as YAML that loads to an equal one."""
+    values = _without_unset(config)
+    return yaml.dump(
+        values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
+    )
+
+
+def digest(
+    config: Config,
+    keys: Sequence[str],
+    *,
+    without: Sequence[str] = (),
+    extra: Mapping[str, Any] | None = None,
+) -> str:
+    """SHA-256 of the top-level ``keys`` of a configuration, in hexadecimal.
+
+    Parameters
+    ----------
+    config : Config
+    keys : sequence of str
+        Names of top-level keys, in any order.
+    without : sequence of str
+        ``section.key`` left out of the hash.
+    extra : mapping, optional
+        Further JSON values that belong into the hash.
+
+    Raises
+    ------
+    KeyError
+        When a key is not one of the configuration.
+    """
+    values = config.model_dump(mode="json")
+    parts = {key: values[key] for key in keys}
+    for dotted in without:
+        section, key = dotted.split(".")
+        if isinstance(parts.get(section), dict):
+            del parts[section][key]
+    text = json.dumps([parts, extra or {}], sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _without_unset(value: Any) -> Any:
+    """Plain values, less those that are absent by default; a null that overrides a default stays."""
+    if isinstance(value, BaseModel):
+        fields = type(value).model_fields
+        return {
+            key: _without_unset(inner)
+            for key, inner in value
+            if inner is not None or fields[key].default is not None
+        }
+    return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
+
+
+class _Dumper(yaml.SafeDumper):
+    """Dumps without aliases, so that every value stands where it is read."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True

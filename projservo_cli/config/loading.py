@@ -1,0 +1,171 @@
+"""From YAML text and overrides to a checked configuration, or to all that is wrong with it."""
+
+import math
+import pathlib
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+from pydantic import ValidationError, create_model
+
+from projservo_cli.config.checks import problems
+from projservo_cli.config.fields import Section
+from projservo_cli.config.messages import nearest, translated
+from projservo_cli.config.models import Config
+from projservo_cli.config.yaml_source import Document, Path, Problem
+from projservo_cli.records import InputError
+
+
+@dataclass(frozen=True)
+class Override:
+    """A value given on the command line; ``flag`` is how the user wrote it."""
+
+    flag: str
+    path: Path
+    value: Any
+
+    @classmethod
+    def parse(cls, text: str) -> "Override":
+        """Read ``a.b=v``; the value is YAML, list positions are numbers.
+
+        Raises
+        ------
+        InputError
+            When there is no ``=``, no key, or the value is not YAML.
+        """
+        flag = f"--set {text}"
+        key, sign, value = text.partition("=")
+        steps = [step.strip() for step in key.split(".")]
+        if not sign or not all(steps):
+            raise InputError(f"{flag}: expected KEY=VALUE, with a key such as control.gain_t")
+        document = Document(value, flag)
+        if document.problems:
+            raise InputError(f"{flag}: the value is {document.problems[0].what}")
+        path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(steps))
+        return cls(flag, path, document.values)
+
+
+def load_config(
+    path: pathlib.Path | str | None, overrides: Sequence[str | Override] = (), *, text: str | None = None
+) -> Config:
+    """Read and check a configuration.
+
+    Parameters
+    ----------
+    path : Path, str or None
+        The YAML file. None for a blank recorded configuration, which overrides fill.
+    overrides : sequence of str or Override
+        ``a.b=v`` as for ``--set``, applied in order.
+    text : str, optional
+        Its content, where it is already at hand; ``path`` then only names it in messages.
+
+    Returns
+    -------
+    Config
+        ``data.table`` is an absolute path, whatever the working directory later.
+
+    Raises
+    ------
+    InputError
+        All that is wrong, one line ``file:line:column: path: what`` each.
+    """
+    changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
+    document = Document("" if path is None else _read(path) if text is None else text, str(path or ""))
+    found = list(document.problems)
+    values = document.values
+    if values is None:
+        values = {}
+    if not isinstance(values, dict):
+        raise InputError(f"{document.place(())}: expected keys and values such as name: paper")
+    if path is not None and not values and not found:
+        found.append(Problem((), "the configuration is empty; start from one of the shipped ones"))
+    for change in changes:
+        problem = _apply(values, change, document)
+        found += [problem] if problem else []
+    if not any(problem.path == () for problem in found):
+        found += _defects(_defaults(values, path))
+    if found:
+        raise InputError("\n".join(_lines(document, found)))
+    return Config.model_validate(values)
+
+
+def _read(path: pathlib.Path | str) -> str:
+    try:
+        return pathlib.Path(path).read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text; expected a YAML configuration") from error
+
+
+def _apply(values: dict[str, Any], change: Override, document: Document) -> Problem | None:
+    """Set one value in place, making the mappings on the way to it."""
+    holder: Any = values
+    for i, step in enumerate(change.path):
+        last = i == len(change.path) - 1
+        here = change.path[: i + 1]
+        if isinstance(holder, list):
+            if not isinstance(step, int) or step >= len(holder):
+                return Problem(here, f"expected a list position from 0 to {len(holder) - 1}", change.flag)
+        elif isinstance(holder, dict):
+            step = str(step)
+        else:
+            return Problem(here, "there is a plain value where a section is expected", change.flag)
+        if last:
+            holder[step] = change.value
+            document.overridden(here, change.flag)
+        elif isinstance(holder, dict) and holder.get(step) is None:
+            holder[step] = {}
+            document.overridden(here, change.flag)
+        holder = holder[step]
+    return None
+
+
+def _defaults(values: dict[str, Any], path: pathlib.Path | str | None) -> dict[str, Any]:
+    """Fill the name from the file and make the path of the table absolute."""
+    data = values.get("data")
+    table = data.get("table") if isinstance(data, dict) else None
+    if isinstance(table, str) and isinstance(data, dict) and table:
+        base = pathlib.Path(path).parent if path is not None else pathlib.Path()
+        data["table"] = str((base / table).resolve())
+        values.setdefault("name", pathlib.Path(table).stem)
+    if path is not None:
+        values.setdefault("name", pathlib.Path(path).stem)
+    return values
+
+
+def _defects(values: dict[str, Any]) -> Iterable[Problem]:
+    """Check each section by itself, then what must hold between the well-formed ones."""
+    found: list[Problem] = []
+    good = SimpleNamespace()
+    broken = set()
+    for name, field in Config.model_fields.items():
+        section = create_model("Part", __base__=Section, **{name: (field.annotation, field)})  # type: ignore[call-overload]
+        part = {name: values[name]} if name in values else {}
+        try:
+            setattr(good, name, getattr(section.model_validate(part), name))
+        except ValidationError as error:
+            broken.add(name)
+            found += translated(Config, error.errors(include_url=False), part)
+    for key in values:
+        if key not in Config.model_fields:
+            found.append(Problem((key,), f"unknown key; {nearest(key, sorted(Config.model_fields))}"))
+    return found + [Problem(path, what) for path, what in problems(good, frozenset(broken))]
+
+
+def _lines(document: Document, found: Sequence[Problem]) -> list[str]:
+    """One line a problem, flags last, otherwise in the order of the file."""
+    placed = [(problem.source or document.place(problem.path), problem) for problem in found]
+    placed.sort(key=lambda item: _position(item[0]))
+    lines = [
+        ": ".join(part for part in (place, ".".join(map(str, problem.path)), problem.what) if part)
+        for place, problem in placed
+    ]
+    return list(dict.fromkeys(lines))
+
+
+def _position(place: str) -> tuple[float, float]:
+    numbers = re.search(r":(\d+):(\d+)$", place)
+    return (float(numbers[1]), float(numbers[2])) if numbers else (math.inf, math.inf)
