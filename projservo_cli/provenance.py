@@ -1,0 +1,75 @@
+"""What a result was made with: versions, machine, date, command, state of the sources."""
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+import sys
+from datetime import datetime
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from projservo_cli import __version__
+
+_PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
+
+
+def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
+    """Everything that may explain a difference between two runs; values are JSON.
+
+    Parameters
+    ----------
+    seed : int
+        The seed of the configuration.
+    argv : list of str, optional
+        The command, by default that of this process.
+    """
+    return {
+        "projservo": __version__,
+        "python": platform.python_version(),
+        **{package: _version(package) for package in _PACKAGES},
+        "git_commit": _git("rev-parse", "HEAD"),
+        "git_dirty": None if (status := _git("status", "--porcelain", "-uno")) is None else bool(status),
+        "argv": list(sys.argv if argv is None else argv),
+        "seed": seed,
+        "jit": os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0"),
+        "host": platform.node(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "cpu": _cpu(),
+        "cpu_count": os.cpu_count(),
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"),
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+@cache
+def _git(*arguments: str) -> str | None:
+    """Answer of git about the checkout this package runs from; None where it is none."""
+    root = Path(__file__).resolve().parent.parent
+    if not (root / ".git").exists():
+        return None
+    try:
+        answer = subprocess.run(
+            ["git", "-C", str(root), *arguments], capture_output=True, text=True, timeout=5, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return answer.stdout.strip()
+
+
+@cache
+def _cpu() -> str:
+    """Name of the processor, as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()
