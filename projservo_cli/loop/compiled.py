@@ -26,7 +26,7 @@ from projservo_cli.loop.step import (
     outside,
     verdict_at,
 )
-from projservo_cli.plants.plant import Plant, observe, pose_after
+from projservo_cli.plants.plant import Plant, center_deviation, observe, pose_after
 from projservo_cli.records import FREE, FloatArray, Model
 from projservo_cli.task.face import Task, center_of
 
@@ -181,3 +181,23 @@ def run(
         put_mat(log.H[k + 1], H)
     last = limits.max_steps
     return PLATEAU if on_plateau(log.error, last, limits.plateau_steps) else MAX_STEPS, last
+
+
+@njit
+def path_deviation(
+    plant: Plant, log: Log, steps: int, period: float, start: FloatArray, goal: FloatArray, samples: int
+) -> tuple[float, float]:
+    """Largest distance of the true centre from the line start–goal: throughout, and at the samples, m.
+
+    Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
+    """
+    dq = np.empty(log.q.shape[1])
+    most = 0.0
+    at_samples = 0.0
+    for k in range(steps):
+        for i in range(dq.shape[0]):
+            dq[i] = log.q_dot[k, i] * period
+        H = mat(log.H[k])
+        most = max(most, center_deviation(plant, H, log.q[k], dq, start, goal, samples))
+        at_samples = max(at_samples, center_deviation(plant, H, log.q[k], dq, start, goal, 1))
+    return most, at_samples

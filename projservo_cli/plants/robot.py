@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, IntArray, InputError, Model, WorkFailed
+from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, IntArray, Model, WorkFailed
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -161,7 +161,7 @@ def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
 def inverse_kinematics(robot: Robot, goal: FloatArray, q_start: FloatArray) -> FloatArray:
     """Joints within the limits that put the tool at a pose, as near to the start as found.
 
-    Damped Newton steps on the pose from the start and from 200 seeded places within the limits; the
+    Damped Newton steps on the pose from the start and from 60 seeded places within the limits; the
     solution with the least joint motion wins.
 
     Parameters
@@ -179,7 +179,7 @@ def inverse_kinematics(robot: Robot, goal: FloatArray, q_start: FloatArray) -> F
     span_upper = np.minimum(robot.upper, q_start + 2 * math.pi)
     best: FloatArray | None = None
     nearest = math.inf
-    for trial in range(201):
+    for trial in range(61):
         q = q_start if trial == 0 else rng.uniform(span_lower, span_upper)
         found = _newton(robot, goal, q)
         if found is None:

@@ -6,7 +6,8 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Vec4, add, meet, scale, unit, vec
 from projservo_cli.geometry.jit import njit
-from projservo_cli.records import FloatArray, IntArray, WorkFailed
+from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, triangulate_points
+from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 
 MIDPOINT = -1
 
@@ -87,3 +88,41 @@ def cyclic_order(A: FloatArray) -> IntArray:
     x, y = axes[:2] @ offsets.T
     order = np.argsort(np.arctan2(y, x), kind="stable")
     return order.astype(np.int64)
+
+
+def task_from_images(model: Model, s_start: FloatArray, s_star: FloatArray, center: int) -> Task:
+    """What the laws know of a task, from images alone.
+
+    Parameters
+    ----------
+    model : calibrated (or metric) model.
+    s_start, s_star : (2, m, 2) pixels of the face at the start and at the goal.
+    center : index of the centre marker, or ``MIDPOINT``.
+
+    Raises
+    ------
+    WorkFailed
+        If a marker cannot be triangulated, the face is degenerate, or a camera looks along it.
+    """
+    A = triangulate_points(model.P, model.a_inf, s_start)
+    A_star = triangulate_points(model.P, model.a_inf, s_star)
+    order = cyclic_order(A_star)
+    O = optical_centers(model.P, model.a_inf)
+    start = O @ np.array(face_plane(A, order, center_of(A, center)))
+    goal = O @ np.array(face_plane(A_star, order, center_of(A_star, center)))
+    visible = np.where(start > 0.0, 1.0, -1.0)
+    for view, name in enumerate(("left", "right")):
+        if visible[view] * goal[view] <= 0.0:
+            raise WorkFailed(
+                f"the {name} camera sees opposite sides of the face at the start and at the goal: "
+                "choose a goal from which both cameras see the side they see at the start"
+            )
+    return Task(
+        np.ascontiguousarray(s_star, dtype=np.float64),
+        A_star,
+        order,
+        center,
+        fundamental_matrix(model.P),
+        O,
+        visible,
+    )

@@ -1,0 +1,101 @@
+"""Stage calibrate: trial motions or a recorded table in, projective kinematics out."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from projservo_cli.calibration import calibrate
+from projservo_cli.records import PRISMATIC, Calibration, FloatArray, InputError, Observation
+from projservo_cli.stages.truth import CALIBRATION_NOISE, Truth, generator, truth_of
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+
+DEPENDS_ON = ("seed", "robot", "rig", "markers", "noise.calibration_px", "calibration", "data", "task.start")
+
+
+def trial_motions(config: "Config", truth: Truth) -> FloatArray:
+    """Joint readings (k, n) of the reference and of every single-joint trial, rad or m.
+
+    Raises
+    ------
+    InputError
+        If a trial would pass a joint limit, or no reference is set.
+    """
+    settings = config.calibration
+    vector = settings.reference or (config.task.start if config.task is not None else None)
+    if vector is None:
+        raise InputError("trial motions need a reference: set calibration.reference or task.start")
+    robot = truth.robot
+    types = config.robot.joint_types if config.robot is not None else ""
+    reference = np.array(vector.values(types))
+    rows = [reference]
+    for i, kind in enumerate(robot.joint_types):
+        amplitude = settings.amplitude_m if kind == PRISMATIC else np.radians(settings.amplitude_deg)
+        for offset in np.linspace(-amplitude, amplitude, settings.frames_per_joint):
+            q = reference.copy()
+            q[i] += offset
+            if not robot.lower[i] <= q[i] <= robot.upper[i]:
+                raise InputError(
+                    f"calibration: a trial would move joint {i + 1} to {q[i]:.4g}, beyond its limits "
+                    f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose another "
+                    "calibration.reference or a smaller amplitude"
+                )
+            rows.append(q)
+    return np.array(rows)
+
+
+def simulate(config: "Config", truth: Truth) -> Observation:
+    """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
+    q = trial_motions(config, truth)
+    images = np.stack([truth.images(row, truth.M) for row in q])
+    rng = generator(config, CALIBRATION_NOISE)
+    images = images + config.noise.calibration_px * rng.standard_normal(images.shape)
+    inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)
+    images[~inside] = np.nan
+    return Observation(np.arange(len(q)), np.array(truth.number), q, images)
+
+
+def run(config: "Config", *, progress: object = None) -> tuple[Observation, Calibration]:
+    """Calibrate from simulated trial motions, or from the recorded table of the configuration.
+
+    Raises
+    ------
+    InputError
+        If the table or the configuration cannot be used.
+    WorkFailed
+        If the data do not support a calibration.
+    """
+    from projservo_cli.tables import read_table
+
+    if config.data is not None:
+        observation = read_table(config.data.table)
+        types = config.data.joints or "R" * observation.q.shape[1]
+        if len(types) != observation.q.shape[1]:
+            raise InputError(
+                f"{config.data.table}: has {observation.q.shape[1]} joint columns, but the joint string "
+                f"{types} has {len(types)} letters: give one letter a column, R or P"
+            )
+        size = config.rig.image_size_px if config.rig is not None else None
+        return observation, calibrate(
+            observation,
+            types,
+            method=config.calibration.method,
+            sigma_px=config.data.noise_px,
+            source="recorded",
+            image_size=size,
+            seed=config.seed,
+        )
+    truth = truth_of(config)
+    observation = simulate(config, truth)
+    assert config.robot is not None
+    assert config.rig is not None
+    return observation, calibrate(
+        observation,
+        config.robot.joint_types,
+        method=config.calibration.method,
+        sigma_px=config.noise.calibration_px or None,
+        source="simulated",
+        image_size=config.rig.image_size_px,
+        seed=config.seed,
+    )

@@ -1,0 +1,268 @@
+"""The simulated truth a configuration describes: robot, rig, markers, start and goal."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from projservo_cli.geometry.kinematics import project
+from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.plants.plant import Plant
+from projservo_cli.plants.robot import (
+    METRIC_A_INF,
+    Robot,
+    dh_robot,
+    inverse_kinematics,
+    look_at_camera,
+    rigid,
+    roll_axis,
+    rotation_about_axis,
+    twist,
+)
+from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+    from projservo_cli.config.models import Perturbation
+    from projservo_cli.config.robot import Camera
+
+# Independent streams of random numbers, each a child of the configuration's seed.
+CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE = range(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Robot, rig and markers as they are.
+
+    Attributes
+    ----------
+    robot : true kinematics.
+    P : (2, 3, 4) true cameras, px.
+    M : (m, 4) all markers at the robot's reference, m.
+    number : (m,) their numbers.
+    face : indices of the face markers.
+    center : position of the centre marker within the face, or ``MIDPOINT``.
+    image_size : (2,) px.
+    """
+
+    robot: Robot
+    P: FloatArray
+    M: FloatArray
+    number: tuple[int, ...]
+    face: tuple[int, ...]
+    center: int
+    image_size: FloatArray
+
+    @property
+    def model(self) -> Model:
+        """Metric model, for the plant and for the law that is given one."""
+        return self.robot.model(self.P)
+
+    @property
+    def M_face(self) -> FloatArray:
+        """Face markers (k, 4) at the robot's reference, m."""
+        return np.ascontiguousarray(self.M[list(self.face)])
+
+    def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
+        """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
+        return project(self.P, M @ (self.robot.pose(q) @ np.linalg.inv(self.robot.base_tool)).T)
+
+
+def generator(config: "Config", *stream: int) -> np.random.Generator:
+    """Random numbers of one stream of the configuration's seed."""
+    return np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=stream))
+
+
+def face_numbers(config: "Config") -> tuple[int, ...]:
+    """Numbers of the face markers."""
+    if config.markers is None or config.markers.face is None:
+        raise InputError(
+            "this stage needs to know the face: set markers.face to three marker numbers or more"
+        )
+    return config.markers.face
+
+
+def center_index(config: "Config") -> int:
+    """Position of the centre marker within the face, or ``MIDPOINT``."""
+    assert config.markers is not None
+    center = config.markers.center
+    return MIDPOINT if center == "midpoint" else face_numbers(config).index(center)
+
+
+@lru_cache(maxsize=4)
+def truth_of(config: "Config") -> Truth:
+    """Build the truth.
+
+    Raises
+    ------
+    InputError
+        If the configuration lacks a part of it, naming the key to set.
+    """
+    if config.robot is None:
+        raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
+    if config.rig is None:
+        raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
+    if config.markers is None or config.markers.positions_m is None:
+        raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
+    robot = robot_of(config)
+    numbers = config.markers.known
+    assert numbers is not None
+    points = np.c_[np.array(config.markers.positions_m), np.ones(len(numbers))]
+    return Truth(
+        robot,
+        np.array([camera_of(config.rig.left), camera_of(config.rig.right)]),
+        points @ robot.base_tool.T,
+        numbers,
+        tuple(numbers.index(number) for number in face_numbers(config)),
+        center_index(config),
+        np.array(config.rig.image_size_px, dtype=np.float64),
+    )
+
+
+def robot_of(config: "Config") -> Robot:
+    """Robot of the DH table or the screws of a configuration."""
+    assert config.robot is not None
+    limits = config.robot.limits
+    if config.robot.dh is not None:
+        table = config.robot.dh
+        rows = [
+            (j.type == "P", math.radians(j.theta_deg), j.d_m, j.a_m, math.radians(j.alpha_deg))
+            for j in table.joints
+        ]
+        return dh_robot(rows, table.convention == "modified", np.array(table.tool), limits)
+    screws = config.robot.screws
+    assert screws is not None
+    types = config.robot.joint_types
+    bounds = np.array(limits)
+    return Robot(
+        np.array([twist(j.w, j.v) for j in screws.joints]),
+        np.array([PRISMATIC if t == "P" else REVOLUTE for t in types], dtype=np.int64),
+        np.array(screws.reference.values(types)),
+        np.array(screws.base_tool),
+        np.ascontiguousarray(bounds[:, 0]),
+        np.ascontiguousarray(bounds[:, 1]),
+    )
+
+
+def camera_of(camera: "Camera") -> FloatArray:
+    """Camera (3, 4) to px of its matrix or its look-at description."""
+    if camera.matrix is not None:
+        return np.array(camera.matrix)
+    assert camera.focal_px is not None
+    assert camera.principal_point_px is not None
+    assert camera.position_m is not None
+    assert camera.target_m is not None
+    return look_at_camera(
+        camera.focal_px, camera.principal_point_px, camera.position_m, camera.target_m, camera.up
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Reach:
+    """Start and goal of the simulated task.
+
+    Attributes
+    ----------
+    q_start : (n,) rad or m.
+    goal_pose : (4, 4) true pose of the tool at the goal, m; None where only images are known.
+    s_start, s_star : (2, m, 2) measured pixels of the face, px.
+    """
+
+    q_start: FloatArray
+    goal_pose: FloatArray | None
+    s_start: FloatArray
+    s_star: FloatArray
+
+
+@lru_cache(maxsize=4)
+def reach_of(config: "Config", truth: Truth) -> Reach:
+    """Start, goal and their images, with the servo noise of the configuration.
+
+    Raises
+    ------
+    InputError
+        If the configuration has no task.
+    WorkFailed
+        If the goal cannot be reached.
+    """
+    if config.task is None:
+        raise InputError("this stage needs a task: set task.start and task.goal")
+    types = config.robot.joint_types if config.robot is not None else ""
+    q_start = np.array(config.task.start.values(types))
+    rng = generator(config, TARGET_NOISE)
+    clean = truth.images(q_start, truth.M_face)
+    sigma = config.noise.servo_px
+    s_start = clean + sigma * rng.standard_normal(clean.shape)
+    goal = config.task.goal
+    if goal.images is not None:
+        return Reach(q_start, None, s_start, np.array([goal.images.left, goal.images.right]))
+    if goal.joints is not None:
+        q_goal = np.array(goal.joints.values(types))
+    else:
+        assert goal.turn_deg is not None
+        q_goal = _turned(truth, q_start, goal.turn_deg, goal.perturbation)
+    _require_limits(truth.robot, q_goal, "task.goal")
+    s_star = truth.images(q_goal, truth.M_face)
+    return Reach(
+        q_start, truth.robot.pose(q_goal), s_start, s_star + sigma * rng.standard_normal(s_star.shape)
+    )
+
+
+def _turned(
+    truth: Truth, q_start: FloatArray, turn_deg: float, perturbation: "Perturbation | None"
+) -> FloatArray:
+    """Joints after a turn about the roll axis of the rig and a small displacement of the tool."""
+    point, direction = roll_axis(truth.P)
+    goal = rotation_about_axis(point, direction, math.radians(turn_deg)) @ truth.robot.pose(q_start)
+    if perturbation is not None:
+        v = np.array(perturbation.rotation_rad)
+        t = np.array(perturbation.translation_m)
+        angle = float(np.linalg.norm(v))
+        turn = rotation_about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
+        goal = goal @ rigid(np.eye(3), t) @ turn
+    return inverse_kinematics(truth.robot, goal, q_start)
+
+
+def _require_limits(robot: Robot, q: FloatArray, where: str) -> None:
+    """Refuse joints outside the limits."""
+    for i, value in enumerate(q):
+        if not robot.lower[i] <= value <= robot.upper[i]:
+            raise WorkFailed(
+                f"{where}: joint {i + 1} would be at {value:.4g}, outside its limits "
+                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose another goal or wider limits"
+            )
+
+
+def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
+    """The truth as the compiled loop sees it.
+
+    Raises
+    ------
+    WorkFailed
+        If a camera sees the face edge-on at the start.
+    """
+    M = truth.M_face
+    start = M @ (truth.robot.pose(q_start) @ np.linalg.inv(truth.robot.base_tool)).T
+    order = cyclic_order(start)
+    O = optical_centers(truth.P, METRIC_A_INF)
+    sides = O @ np.array(face_plane(start, order, center_of(start, truth.center)))
+    if np.abs(sides).min() < 1e-9 or sides[0] * sides[1] < 0.0:
+        raise WorkFailed(
+            "task.start: the cameras see different sides of the face, or one sees it edge-on: "
+            "turn the face towards both"
+        )
+    return Plant(
+        truth.model,
+        M,
+        order,
+        truth.center,
+        O,
+        np.where(sides > 0.0, 1.0, -1.0),
+        truth.image_size,
+        truth.robot.lower,
+        truth.robot.upper,
+        config.plant.self_occlusion == "opaque",
+    )

@@ -1,0 +1,70 @@
+"""Trajectories that drive the three parts of the task together: [RH00] section 4.3."""
+
+import numpy as np
+
+from projservo_cli.geometry.displacement import exp_rotation, exp_translation
+from projservo_cli.records import FloatArray
+
+# Share of the path that a part driven first, or last, has to itself.
+PLATEAU = 0.5
+PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "planar_first")
+
+
+def profile_shares(profile: str, sigma: FloatArray) -> FloatArray:
+    """Shares μ_t, μ_r, μ_p of the parts along the path, [RH00] eq. (18) and section 4.3.
+
+    The exponential profile (1 − exp(−kσ)) / (1 − exp(−k)), k = 5, is the paper's 1 − exp(−σ/t_*)
+    stretched to reach 1. In the profiles with a part first, that part is done in the first half of
+    the path and the others stay flat until then.
+
+    Parameters
+    ----------
+    profile : one of ``PROFILES``.
+    sigma : (k,) path parameter in [0, 1].
+
+    Returns
+    -------
+    (k, 3) shares, each monotone from 0 to 1.
+
+    Raises
+    ------
+    ValueError
+        If the profile is unknown.
+    """
+    if profile not in PROFILES:
+        raise ValueError(f"unknown profile {profile!r}: choose one of {', '.join(PROFILES)}")
+    if profile == "exponential":
+        share = np.expm1(-5.0 * sigma) / np.expm1(-5.0)
+        return np.stack([share, share, share], axis=1)
+    early = np.minimum(sigma / PLATEAU, 1.0)
+    late = np.maximum((sigma - PLATEAU) / (1.0 - PLATEAU), 0.0)
+    t, r, p = {
+        "linear": (sigma, sigma, sigma),
+        "rotation_first": (late, early, sigma),
+        "translation_first": (early, late, sigma),
+        "planar_first": (late, late, early),
+    }[profile]
+    return np.stack([t, r, p], axis=1)
+
+
+def trajectory_displacement(
+    H_hat: FloatArray, amplitudes: tuple[float, float, float], mu: FloatArray
+) -> FloatArray:
+    """Planned displacement of the face, [RH00] eqs. (17), (18).
+
+    Parameters
+    ----------
+    H_hat : (3, 4, 4) operators t, r, p.
+    amplitudes : τ in the unit of Ĥ_t, θ_r and θ_p in rad.
+    mu : (3,) shares.
+
+    Returns
+    -------
+    (4, 4) displacement exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p).
+    """
+    tau, theta_r, theta_p = amplitudes
+    return (
+        exp_translation(H_hat[0], mu[0] * tau)
+        @ exp_rotation(H_hat[1], mu[1] * theta_r)
+        @ exp_rotation(H_hat[2], mu[2] * theta_p)
+    )
