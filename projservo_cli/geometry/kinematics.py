@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, put_mat, vec
+from projservo_cli.geometry.algebra import Mat4, mat, mul, put_mat, vec
 from projservo_cli.geometry.displacement import IDENTITY, as_array, rotation, translation
 from projservo_cli.geometry.jit import njit
 from projservo_cli.records import FREE, PRISMATIC, FloatArray, Model
@@ -24,6 +24,14 @@ def forward(model: Model, q: FloatArray) -> Mat4:
         amount = float(q[i]) - float(model.q_reference[i])
         H = mul(H, joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], amount))
     return H
+
+
+@njit
+def start_pose(model: Model, q: FloatArray) -> Mat4:
+    """Displacement at the first joints; a free-flying rig starts at its reference."""
+    if model.joint_types[0] == FREE:
+        return IDENTITY
+    return forward(model, q)
 
 
 @njit
@@ -69,15 +77,6 @@ def image_velocity(P: FloatArray, M: FloatArray, M_dot: FloatArray) -> tuple[flo
 def row(P: FloatArray, i: int, A: tuple[float, float, float, float]) -> float:
     """Product of row i of a camera with a point, [RH00] eq. (1)."""
     return (float(P[i, 0]) * A[0] + float(P[i, 1]) * A[1]) + (float(P[i, 2]) * A[2] + float(P[i, 3]) * A[3])
-
-
-@njit
-def move(H: Mat4, M: FloatArray, moved: FloatArray) -> None:
-    """Apply a displacement to the rows of M."""
-    for k in range(M.shape[0]):
-        A = apply(H, vec(M[k]))
-        for i in range(4):
-            moved[k, i] = A[i]
 
 
 def forward_kinematics(model: Model, q: FloatArray) -> FloatArray:

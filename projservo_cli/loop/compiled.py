@@ -1,16 +1,14 @@
 """The whole closed loop of a built-in law and an analytic plant, compiled."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
-from projservo_cli.geometry.algebra import axpy, dot, mat, put_mat, vec
-from projservo_cli.geometry.displacement import IDENTITY
+from projservo_cli.geometry.algebra import mat, put_mat
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kinematics import forward
+from projservo_cli.geometry.kinematics import start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
     MAX_STEPS,
@@ -26,9 +24,9 @@ from projservo_cli.loop.step import (
     outside,
     verdict_at,
 )
-from projservo_cli.plants.plant import Plant, center_deviation, observe, pose_after
-from projservo_cli.records import FREE, FloatArray, Model
-from projservo_cli.task.face import Task, center_of
+from projservo_cli.plants.plant import Plant, center_deviation, observe, pose_after, rig_distance
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
 
 
 class Log(NamedTuple):
@@ -76,22 +74,6 @@ def new_log(n: int, m: int, max_steps: int, errors: int) -> Log:
 
 
 @njit
-def rig_distance(plant: Plant, M: FloatArray) -> float:
-    """Distance of the centre of the face from the middle of the optical centres, m."""
-    middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
-    way = axpy(-0.5, middle, center_of(M, plant.center))
-    return math.sqrt(dot(way, way))
-
-
-@njit
-def start_pose(plant: Plant, q: FloatArray) -> tuple[float, ...]:
-    """Displacement of the face at the first joints; a free-flying rig starts at the reference."""
-    if plant.model.joint_types[0] == FREE:
-        return IDENTITY
-    return forward(plant.model, q)
-
-
-@njit
 def run(
     code: int,
     model: Model,
@@ -124,7 +106,7 @@ def run(
     dq = np.empty(n)
     for i in range(n):
         log.q[0, i] = q_start[i]
-    put_mat(log.H[0], start_pose(plant, q_start))
+    put_mat(log.H[0], start_pose(plant.model, q_start))
     first_distance = 0.0
     for k in range(limits.max_steps + 1):
         s = log.s[k]

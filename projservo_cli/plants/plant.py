@@ -108,6 +108,14 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
 
 
 @njit
+def rig_distance(plant: Plant, M: FloatArray) -> float:
+    """Distance of the centre of the face M (m, 4) from the middle of the optical centres, m."""
+    middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
+    way = axpy(-0.5, middle, center_of(M, plant.center))
+    return math.sqrt(dot(way, way))
+
+
+@njit
 def center_deviation(
     plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, start: FloatArray, goal: FloatArray, samples: int
 ) -> float:

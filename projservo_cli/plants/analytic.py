@@ -1,0 +1,77 @@
+"""The simulated robot as an object: the contract any plant in the Python loop fulfils."""
+
+from typing import Protocol
+
+import numpy as np
+
+from projservo_cli.geometry.displacement import as_array, as_mat
+from projservo_cli.geometry.kinematics import start_pose
+from projservo_cli.plants.plant import Plant, observe, pose_after, rig_distance
+from projservo_cli.records import FloatArray
+
+
+class LoopPlant(Protocol):
+    """What the Python loop asks of a plant."""
+
+    def joints(self) -> FloatArray:
+        """Joint readings (n,), rad or m."""
+
+    def observe(self) -> FloatArray:
+        """Pixels (2, m, 2) of the face, NaN where unseen."""
+
+    def command(self, step: FloatArray, period: float) -> None:
+        """Move by the joint step (n,), rad or m, within one period, s."""
+
+    def stop(self) -> None:
+        """Hold still; called on every way out of the loop."""
+
+
+class AnalyticPlant:
+    """Simulated robot and rig, with given pixel noise.
+
+    Parameters
+    ----------
+    plant : the truth.
+    q_start : (n,) first joints, rad or m.
+    noise : (k, 2, m, 2) added to the pixels of each observation in turn, px.
+
+    Attributes
+    ----------
+    in_front : whether every marker was in front of both cameras when last observed.
+    hidden : (2,) 1 where the face was self-occluded when last observed.
+    """
+
+    def __init__(self, plant: Plant, q_start: FloatArray, noise: FloatArray) -> None:
+        self.plant = plant
+        self.noise = noise
+        self.q = np.array(q_start, dtype=np.float64)
+        self.H = as_array(start_pose(plant.model, self.q))
+        self.M = np.zeros_like(plant.M)
+        self.hidden = np.zeros(2)
+        self.in_front = True
+        self.observations = 0
+
+    def joints(self) -> FloatArray:
+        """Joint readings (n,), rad or m."""
+        return self.q.copy()
+
+    def observe(self) -> FloatArray:
+        """Noisy pixels (2, m, 2) of the face, NaN where unseen."""
+        s = np.zeros((2, len(self.M), 2))
+        self.in_front = observe(self.plant, as_mat(self.H), self.M, s, self.hidden)
+        s += self.noise[self.observations]
+        self.observations += 1
+        return s
+
+    def distance(self) -> float:
+        """Distance of the face from the middle of the optical centres when last observed, m."""
+        return rig_distance(self.plant, self.M)
+
+    def command(self, step: FloatArray, period: float) -> None:
+        """Move by the joint step (n,), rad or m; the simulated robot always arrives."""
+        q_next = np.zeros_like(self.q)
+        self.H = as_array(pose_after(self.plant, as_mat(self.H), self.q, step, q_next))
+        self.q = q_next
+
+    def stop(self) -> None:
+        """Nothing moves between commands."""
