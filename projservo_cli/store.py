@@ -35,7 +35,7 @@ class Result:
     key : hash of all the result depends on.
     configuration : resolved YAML.
     provenance : versions, host, date and so on; JSON values.
-    inputs : hashes of files read; JSON values.
+    inputs : files read and their hashes.
     records : the records by name; the name "" stands for the only one.
     """
 

@@ -138,8 +138,11 @@ def _markers(config: Any) -> Iterator[Finding]:
         for i, number in enumerate(markers.face or ()):
             if number not in known:
                 yield ("markers", "face", i), f"there is no marker {number}; markers: {_listed(known)}"
-        if markers.center != "midpoint" and markers.center not in known:
-            yield ("markers", "center"), f"there is no marker {markers.center}; markers: {_listed(known)}"
+    if markers.face is not None and markers.center not in ("midpoint", *markers.face):
+        yield (
+            ("markers", "center"),
+            f"marker {markers.center} is not on the face; face: {_listed(markers.face)}",
+        )
     if markers.face is not None and len(set(markers.face)) < len(markers.face):
         yield ("markers", "face"), "a marker stands here twice"
 

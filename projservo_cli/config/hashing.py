@@ -26,15 +26,15 @@ def digest(
     without: Sequence[str] = (),
     extra: Mapping[str, Any] | None = None,
 ) -> str:
-    """SHA-256 of the top-level ``keys`` of a configuration, in hexadecimal.
+    """SHA-256 of parts of a configuration, in hexadecimal.
 
     Parameters
     ----------
     config : Config
     keys : sequence of str
-        Names of top-level keys, in any order.
+        Sections such as ``control``, or values in them such as ``noise.servo_px``, in any order.
     without : sequence of str
-        ``section.key`` left out of the hash.
+        Values left out, such as ``control.laws``.
     extra : mapping, optional
         Further JSON values that belong into the hash.
 
@@ -44,13 +44,21 @@ def digest(
         When a key is not one of the configuration.
     """
     values = config.model_dump(mode="json")
-    parts = {key: values[key] for key in keys}
     for dotted in without:
         section, key = dotted.split(".")
-        if isinstance(parts.get(section), dict):
-            del parts[section][key]
+        if values[section] is not None:
+            del values[section][key]
+    parts = {dotted: _part(values, dotted.split(".")) for dotted in keys}
     text = json.dumps([parts, extra or {}], sort_keys=True, allow_nan=False, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _part(values: Any, path: Sequence[str]) -> Any:
+    for key in path:
+        if values is None:  # a value in a section that is absent
+            return None
+        values = values[key]
+    return values
 
 
 def _without_unset(value: Any) -> Any:

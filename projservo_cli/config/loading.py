@@ -27,7 +27,7 @@ class Override:
     value: Any
 
     @classmethod
-    def parse(cls, text: str) -> "Override":
+    def parse(cls, text: str, flag: str = "") -> "Override":
         """Read ``a.b=v``; the value is YAML, list positions are numbers.
 
         Raises
@@ -35,7 +35,7 @@ class Override:
         InputError
             When there is no ``=``, no key, or the value is not YAML.
         """
-        flag = f"--set {text}"
+        flag = flag or f"--set {text}"
         key, sign, value = text.partition("=")
         steps = [step.strip() for step in key.split(".")]
         if not sign or not all(steps):

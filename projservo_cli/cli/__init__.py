@@ -1,0 +1,115 @@
+"""The command ``projservo``: options in any order, messages, exit codes; no mathematics.
+
+Only click is imported here; a command imports what it needs when it runs.
+"""
+
+import difflib
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import click
+from click.core import ParameterSource
+
+from projservo_cli import __version__
+from projservo_cli.cli.options import COMMANDS, OPTIONS, allowed, help_text
+
+DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
+
+
+class _Projservo(click.Command):
+    """A command whose words and options stand in any order, which chained click groups do not allow."""
+
+    def main(self, args: Sequence[str] | None = None, *_: Any, **__: Any) -> NoReturn:
+        """Run the command line and leave with its exit code."""
+        sys.exit(run(sys.argv[1:] if args is None else args))
+
+
+main = _Projservo(
+    "projservo",
+    params=[*OPTIONS.values(), click.Argument(["words"], nargs=-1, type=click.UNPROCESSED)],
+    add_help_option=False,
+)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command line; the exit code is 0, 1, 2 or 130 (see the module's constants)."""
+    try:
+        code = _dispatch(list(arguments))
+        sys.stdout.flush()
+        return code
+    except click.UsageError as error:
+        return _complain(error.format_message(), MALFORMED)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except Exception as error:
+        return _failure(error, verbose="-v" in arguments or "--verbose" in arguments)
+
+
+def _failure(error: Exception, *, verbose: bool) -> int:
+    from projservo_cli.records import InputError, WorkFailed
+
+    if isinstance(error, InputError):
+        return _complain(str(error), MALFORMED)
+    if isinstance(error, WorkFailed):
+        return _complain(str(error), FAILED)
+    if verbose:
+        traceback.print_exception(error)
+    what = " ".join(str(error).split())
+    return _complain(
+        f"internal error, {type(error).__name__}: {what} (-v shows where; please report it)", FAILED
+    )
+
+
+def _complain(text: str, code: int) -> int:
+    """One line a finding, so that a message can be searched for and clicked on."""
+    for line in text.splitlines():
+        click.echo(f"projservo: {line}", err=True)
+    return code
+
+
+def _dispatch(arguments: list[str]) -> int:
+    context = main.make_context("projservo", arguments.copy())
+    given = {name for name in OPTIONS if context.get_parameter_source(name) is ParameterSource.COMMANDLINE}
+    names, rest = _commands(context.params["words"])
+    if "version" in given:
+        click.echo(f"projservo {__version__}")
+        return DONE
+    if "help" in given or not (arguments or names):
+        click.echo(help_text(names))
+        return DONE
+    if not names:
+        raise click.UsageError(f"no command; one of {', '.join(COMMANDS)}")
+    unused = [OPTIONS[name].opts[-1] for name in OPTIONS if name in given - allowed(names)]
+    if unused:
+        raise click.UsageError(f"{', '.join(unused)}: not used by {' '.join(names)}")
+    module = "staged" if COMMANDS[names[0]].stage else names[0]
+    command = importlib.import_module(f"projservo_cli.cli.{module}")
+    code: int = command.run(names, rest, context.params)
+    return code
+
+
+def _commands(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The stages, each once and in their order, or one other command and its arguments."""
+    if not words:
+        return [], []
+    if words[0] in COMMANDS and not COMMANDS[words[0]].stage:
+        most = 1 if COMMANDS[words[0]].argument else 0
+        if len(words) > 1 + most:
+            raise click.UsageError(f"{words[0]} takes {most or 'no'} argument, got {' '.join(words[1:])}")
+        return [words[0]], list(words[1:])
+    stages = [name for name, command in COMMANDS.items() if command.stage]
+    for word in words:
+        if word in COMMANDS and word not in stages:
+            raise click.UsageError(f"{word} stands alone; it does not chain with {words[0]}")
+        if word not in stages:
+            close = difflib.get_close_matches(word, COMMANDS, n=1)
+            hint = f"did you mean {close[0]}? " if close else ""
+            raise click.UsageError(f"no command {word!r}; {hint}commands: {', '.join(COMMANDS)}")
+    return [name for name in stages if name in words], []

@@ -1,0 +1,68 @@
+"""Which configuration and which run file a call is about."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from projservo_cli.config import Config, Override, load_config
+from projservo_cli.records import InputError
+from projservo_cli.store import Run, load, run_path
+
+SHIPPED = "paper.yaml"
+
+
+def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
+    """The configuration with all overrides, and the run as stored so far.
+
+    Raises
+    ------
+    InputError
+        When either cannot be read or makes no sense.
+    """
+    overrides = _overrides(options)
+    stored = stored_run(options["output"]) if options["output"] else None
+    if options["config"]:
+        config = load_config(options["config"], overrides)
+    elif stored is not None and stored.configuration:
+        config = load_config(stored.path, overrides, text=stored.configuration)
+    elif options["data"]:
+        config = load_config(None, overrides)
+    else:
+        config = load_config(shipped(SHIPPED), overrides)
+    target = run_path(options["output"] or Path("results") / config.name)
+    return config, stored or stored_run(target) or Run(target)
+
+
+def stored_run(target: str | Path) -> Run | None:
+    """The run in a folder or file; None where there is none yet."""
+    return load(target) if run_path(target).exists() else None
+
+
+def shipped(name: str) -> Path:
+    """A configuration that comes with projservo, in a checkout as in an installed package.
+
+    Raises
+    ------
+    InputError
+        When the installation lacks it.
+    """
+    package = Path(__file__).resolve().parent.parent
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / name).is_file():
+            return folder / name
+    raise InputError(f"{name}: this installation lacks it; give a configuration with -c")
+
+
+def _overrides(options: dict[str, Any]) -> list[Override]:
+    """``--data, --joints, --noise-px`` and ``--set``, the last one having the last word."""
+    found = []
+    if options["data"] is not None:
+        table = os.path.abspath(options["data"])
+        found.append(Override(f"--data {options['data']}", ("data", "table"), table))
+    if options["joints"] is not None:
+        found.append(Override(f"--joints {options['joints']}", ("data", "joints"), options["joints"]))
+    if options["noise_px"] is not None:
+        found.append(
+            Override.parse(f"data.noise_px={options['noise_px']}", f"--noise-px {options['noise_px']}")
+        )
+    return [*found, *map(Override.parse, options["sets"])]

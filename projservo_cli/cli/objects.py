@@ -1,0 +1,119 @@
+"""What each stage reports: the JSON objects, and the same in words."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from projservo_cli.cli.options import wrapped
+from projservo_cli.config import Config
+from projservo_cli.store import Run
+
+# reports on single observations that a calibration may hold besides its numbers
+FINDINGS = ("outliers", "suspect_joint_readings", "swapped", "merged_poses", "merged_markers")
+NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
+
+
+def stage_object(stage: str, run: Run, config: Config, laws: Sequence[str]) -> dict[str, Any]:
+    """The JSON object of a stage that was made or is up to date."""
+    path = {"run": run.path.resolve()}
+    if stage == "calibrate":
+        return path | _calibration(run, config)
+    if stage == "plan":
+        return path | _plan(run)
+    if stage == "servo":
+        return path | {"laws": [_scalars(run.traces[law]) for law in laws]}
+    return path | _scalars(run.results["report"].records[""])
+
+
+def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
+    """The JSON object of a stage that could not be made, or lacks what it needs."""
+    result: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
+    if stage == "calibrate":
+        numbers = dict.fromkeys(NUMBERS)
+        findings: dict[str, list[Any]] = {name: [] for name in FINDINGS}
+        return result | {"usable": False, "advice": [], **numbers, "joints": [], **findings}
+    if stage == "plan":
+        return result | {"feasible": False}
+    if stage == "servo":
+        return result | {"laws": [_scalars(run.traces[law]) for law in laws]}
+    return result
+
+
+def _scalars(record: Any) -> dict[str, Any]:
+    """All fields of a record but its arrays."""
+    fields = [field.name for field in dataclasses.fields(record) if "dims" not in field.metadata]
+    return {name: getattr(record, name) for name in fields}
+
+
+def _calibration(run: Run, config: Config) -> dict[str, Any]:
+    calibration = run.calibration
+    given = config.robot.joints if config.robot is not None else ()
+    joints = [
+        {
+            "name": (given[i].name if i < len(given) else None) or f"q{i + 1}",
+            "type": letter,
+            "excitation": float(calibration.excitation[i]),
+            "weak": bool(calibration.weak[i]),
+        }
+        for i, letter in enumerate(calibration.joint_types)
+    ]
+    return dict.fromkeys(FINDINGS, ()) | _scalars(calibration) | {"joints": joints}
+
+
+def _plan(run: Run) -> dict[str, Any]:
+    plan = run.plan
+    angles = {f"{name}_deg": math.degrees(getattr(plan, name)) for name in ("theta_r", "theta_p", "theta_s")}
+    radians = ("theta_r", "theta_p", "theta_s")
+    rest = {name: value for name, value in _scalars(plan).items() if name not in radians}
+    return rest | angles | {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0)}
+
+
+def summary(stage: str, value: dict[str, Any]) -> str:
+    """A stage's object in words, at most 80 columns wide."""
+    if "failed" in value:
+        return wrapped(f"{stage}: failed at {value['failed']}: {value['reason']}")
+    lines = {"calibrate": _calibrate_words, "plan": _plan_words, "servo": _servo_words}
+    return "\n".join(lines.get(stage, _other_words)(value))
+
+
+def _calibrate_words(value: dict[str, Any]) -> list[str]:
+    weak = [joint["name"] for joint in value["joints"] if joint["weak"]]
+    found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in FINDINGS[:3] if value[name]]
+    return [
+        wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}"),
+        f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "
+        f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s",
+        wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
+        *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),
+    ]
+
+
+def _plan_words(value: dict[str, Any]) -> list[str]:
+    feasible = "feasible" if value["feasible"] else "NOT feasible"
+    return [
+        wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}"),
+        "  rotation {theta_s_deg:.4g} deg = {theta_r_deg:.4g} deg onto the plane, "
+        "{theta_p_deg:.4g} deg within it".format_map(value),
+    ]
+
+
+def _servo_words(value: dict[str, Any]) -> list[str]:
+    head = f"  {'law':<17}{'verdict':<14}{'steps':>6}{'mm':>10}{'deg':>10}{'occluded':>11}{'drift mm':>11}"
+    rows = [
+        f"  {trace['law']:<17}{trace['verdict']:<14}{trace['steps']:>6}"
+        f"{_number(trace['position_error_mm']):>10}"
+        f"{_number(trace['rotation_error_deg']):>10}"
+        f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}"
+        f"{_number(trace['center_deviation_mm']):>11}"
+        for trace in value["laws"]
+    ]
+    return ["servo: true errors at the end, self-occluded steps left/right", head, *rows]
+
+
+def _other_words(value: dict[str, Any]) -> list[str]:
+    return [wrapped(f"{name.replace('_', ' ')}: {content}", "  ") for name, content in value.items()]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

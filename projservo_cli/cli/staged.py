@@ -1,0 +1,146 @@
+"""The stages: what is to be done, doing it, and saying what came out."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import click
+
+from projservo_cli.cli.output import Console, print_json
+from projservo_cli.records import LAWS, WorkFailed
+
+
+@dataclass
+class _Call:
+    """One call of stages: what was asked for and what became of it."""
+
+    names: list[str]
+    laws: tuple[str, ...]
+    config: Any
+    run: Any
+    steps: Sequence[Any]
+    console: Console
+    reason: str = ""
+    failed: str = ""
+    laws_done: tuple[str, ...] = ()
+
+
+def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
+    """Make the named stages and what they lack; the exit code."""
+    del rest  # stages take no arguments
+    if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
+        os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
+    for law in options["laws"]:
+        if law not in LAWS:
+            raise click.UsageError(f"--law {law}: no such law; laws: {', '.join(LAWS)}")
+    from projservo_cli.cli.configuration import resolve
+    from projservo_cli.stages.chain import steps_for
+
+    console = Console(quiet=options["quiet"], verbose=options["verbose"])
+    config, stored = resolve(options)
+    laws = tuple(dict.fromkeys(options["laws"] or config.control.laws))
+    steps = steps_for(config, stored, names, laws=laws, force=options["force"])
+    call = _Call(names, laws, config, stored, steps, console)
+    if options["dry_run"]:
+        return _dry(call, as_json=options["json"])
+    try:
+        _work(call)
+    finally:
+        console.finish()
+    return _tell(call, as_json=options["json"])
+
+
+def _dry(call: _Call, *, as_json: bool) -> int:
+    if as_json:
+        steps = [
+            {"stage": step.stage, "law": step.law or None, "why": step.why or None} for step in call.steps
+        ]
+        print_json({"run": call.run.path.resolve(), "dry_run": True, "steps": steps})
+    for step in () if as_json else call.steps:
+        call.console.show(f"{step.name}: {f'would be made ({step.why})' if step.why else 'up to date'}")
+    return 0
+
+
+def _work(call: _Call) -> None:
+    """Make what has to be made, stop at the first failure, keep what was made until then."""
+    from projservo_cli.stages.chain import make
+
+    _announce_compilation(call)
+    for step in call.steps:
+        if not step.why:
+            tell = call.console.say if step.stage in call.names else call.console.detail
+            tell(f"{step.name}: up to date")
+        else:
+            needed = "" if step.stage in call.names else f", needed by {call.names[-1]}"
+            call.console.say(f"{step.name}: making it ({step.why}{needed})")
+            try:
+                call.run, dropped = make(step, call.config, call.run, call.console.progress)
+            except WorkFailed as error:
+                call.failed, call.reason = step.name, " ".join(str(error).split())
+                return
+            if dropped:
+                call.console.say(f"{', '.join(dropped)}: dropped, made from what was replaced")
+        if step.law:
+            call.laws_done += (step.law,)
+    _keep_configuration(call)
+
+
+def _keep_configuration(call: _Call) -> None:
+    """Overrides are part of the stored configuration, also where nothing had to be made."""
+    from projservo_cli.config import to_yaml
+    from projservo_cli.store import save
+
+    text = to_yaml(call.config)
+    if call.run.configuration != text:
+        call.run = replace(call.run, configuration=text)
+        save(call.run)
+
+
+def _announce_compilation(call: _Call) -> None:
+    """The first run on a machine is slower by the time of compilation; say so."""
+    if not any(step.why for step in call.steps) or os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        return
+    from projservo_cli.geometry.jit import CACHE_FOLDER
+
+    if CACHE_FOLDER is None:
+        call.console.say("compiling kernels (in every run: no cache folder can be written)")
+    elif not any(CACHE_FOLDER.rglob("*.nbi")):
+        call.console.say("compiling kernels, once")
+
+
+def _tell(call: _Call, *, as_json: bool) -> int:
+    from projservo_cli.cli.objects import failed_object, stage_object, summary
+
+    values = {}
+    for name in call.names:
+        if call.failed and _lacking(call, name):
+            values[name] = failed_object(name, call.run, call.reason, call.failed, call.laws_done)
+        else:
+            values[name] = stage_object(name, call.run, call.config, call.laws)
+    if as_json:
+        print_json(values if len(call.names) > 1 else values[call.names[0]])
+    else:
+        for name, value in values.items():
+            call.console.show(summary(name, value))
+        call.console.show(f"run: {call.run.path}")
+    return _verdict(call)
+
+
+def _lacking(call: _Call, name: str) -> bool:
+    """Whether a stage was not completed by the call."""
+    order = [step.stage for step in call.steps]
+    return order.index(name) >= order.index(call.failed.split("/")[0])
+
+
+def _verdict(call: _Call) -> int:
+    """Exit code 1 when a stage failed or a law that must converge did not."""
+    if call.failed:
+        click.echo(f"projservo: {call.failed}: {call.reason}", err=True)
+        return 1
+    ends = {law: call.run.traces[law] for law in call.laws_done if law in call.config.control.must_converge}
+    missed = [trace for trace in ends.values() if trace.verdict != "converged"]
+    for trace in missed:
+        reason = f": {trace.reason}" if trace.reason else ""
+        click.echo(f"projservo: {trace.law} must converge, but ended in {trace.verdict}{reason}", err=True)
+    return 1 if missed else 0

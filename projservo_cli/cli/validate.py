@@ -1,0 +1,38 @@
+"""``projservo validate``: how well a calibration predicts images it has not seen."""
+
+from typing import Any
+
+import click
+
+from projservo_cli.cli.output import Console, print_json
+
+
+def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
+    """Compare an observation table with the predictions of a run's calibration; the exit code."""
+    del names
+    if options["data"] is None:
+        raise click.UsageError("validate needs an observation table: --data TABLE")
+    if not rest and options["output"] is None:
+        raise click.UsageError("validate needs a run: projservo validate RUN --data TABLE")
+    if rest and options["output"] is not None:
+        raise click.UsageError("validate takes one run, as an argument or with -o")
+    from projservo_cli.calibration import residual_statistics
+    from projservo_cli.store import load
+    from projservo_cli.tables import read_table
+
+    found = load(rest[0] if rest else options["output"])
+    calibration = found.calibration
+    observation = read_table(options["data"], calibration.joint_types)
+    statistics = residual_statistics(calibration, observation)
+    value = {"run": found.path.resolve(), **statistics}
+    if options["json"]:
+        print_json(value)
+        return 0
+    console = Console(quiet=options["quiet"], verbose=options["verbose"])
+    skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
+    console.show(f"validate: {value['count']} marker-view pairs; skipped: {skipped}")
+    if value["count"]:
+        console.show(
+            "  residual px: rms {rms_px:.4g}, median {median_px:.4g}, p95 {p95_px:.4g}".format_map(value)
+        )
+    return 0

@@ -1,0 +1,188 @@
+"""What is up to date, what has to be made first, and making it.
+
+Every result carries a key: a hash of the configuration its stage depends on and of the key of the
+stage before it. Keys follow from the configuration alone, so what is to be done is known before
+anything is done.
+"""
+
+import hashlib
+import importlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from projservo_cli import provenance
+from projservo_cli.config import Config, digest, to_yaml
+from projservo_cli.records import InputError
+from projservo_cli.stages import Progress
+from projservo_cli.store import SERVO, Result, Run, save
+
+STAGES = ("calibrate", "plan", "servo", "report")
+# which laws are run, and which of them must converge, does not change the run of any of them
+NOT_OF_A_TRACE = ("control.laws", "control.must_converge")
+# where a table lies does not matter, only what it says
+NOT_OF_A_CALIBRATION = ("data.table",)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One result that is needed.
+
+    Attributes
+    ----------
+    stage : name of the stage.
+    law : name of the law for ``servo``, else empty.
+    key : what the key of the result will be.
+    why : why it has to be made; empty where the stored one is up to date.
+    inputs : files read and their hashes.
+    """
+
+    stage: str
+    law: str
+    key: str
+    why: str
+    inputs: dict[str, str]
+
+    @property
+    def name(self) -> str:
+        """Name of the result in the run file."""
+        return f"{SERVO}{self.law}" if self.law else self.stage
+
+
+def stage_module(stage: str) -> Any:
+    """The module that does the work of a stage, imported when it is needed."""
+    return importlib.import_module(f"projservo_cli.stages.{stage}")
+
+
+def steps_for(
+    config: Config, run: Run, named: Sequence[str], *, laws: Sequence[str] = (), force: bool = False
+) -> list[Step]:
+    """All results that the named stages consist of or need, in the order of making.
+
+    Parameters
+    ----------
+    config : Config
+    run : Run
+        What is stored so far; possibly nothing.
+    named : sequence of str
+        Stages the user asked for.
+    laws : sequence of str
+        Laws instead of ``control.laws``.
+    force : bool
+        Make the named stages even where they are up to date.
+
+    Raises
+    ------
+    InputError
+        When the table cannot be read, or a recorded calibration would be replaced by a simulated
+        one without ``force``.
+    """
+    last = max(STAGES.index(stage) for stage in named)
+    steps: list[Step] = []
+    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws):
+        if STAGES.index(stage) > last:
+            break
+        step = Step(stage, law, key, "", inputs)
+        remade = any(before.why for before in steps if before.stage != stage)
+        steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
+    if steps[0].why and not force:
+        _keep_recorded(config, run)
+    return steps
+
+
+def _keys(config: Config, run: Run, laws: Sequence[str]) -> Iterator[tuple[str, str, str, dict[str, str]]]:
+    """Stage, law, key and input hashes of every result, each key made from the one before it."""
+    inputs = _table_hash(config, run)
+    read = {"table": inputs.get("table_sha256")}
+    key = digest(config, _depends_on("calibrate"), without=NOT_OF_A_CALIBRATION, extra=read)
+    yield "calibrate", "", key, inputs
+    key = digest(config, _depends_on("plan"), without=NOT_OF_A_CALIBRATION, extra={"before": key})
+    yield "plan", "", key, {}
+    traces = []
+    for law in dict.fromkeys(laws):
+        without = NOT_OF_A_TRACE + NOT_OF_A_CALIBRATION
+        before = {"before": key, "law": law}
+        traces.append(digest(config, _depends_on("servo"), without=without, extra=before))
+        yield "servo", law, traces[-1], {}
+    before_report = {"before": [key, *traces]}
+    yield "report", "", digest(config, _depends_on("report"), extra=before_report), {}
+
+
+def _depends_on(stage: str) -> tuple[str, ...]:
+    keys: tuple[str, ...] = stage_module(stage).DEPENDS_ON
+    return keys
+
+
+def _table_hash(config: Config, run: Run) -> dict[str, str]:
+    """Hash of the observation table; the stored one where that very file is gone since."""
+    if config.data is None:
+        return {}
+    path = Path(config.data.table)
+    stored = run.results["calibrate"].inputs if "calibrate" in run.results else {}
+    if not path.exists() and stored.get("table") == config.data.table:
+        return dict(stored)
+    try:
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        return {"table": config.data.table, "table_sha256": sha256}
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected a table") from error
+
+
+def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
+    stored = run.results.get(step.name)
+    if stored is None:
+        return "none yet"
+    if stored.key != step.key:
+        return "outdated"
+    if remade:
+        return "what it is made from is made anew"
+    return "asked for by --force" if forced else ""
+
+
+def _keep_recorded(config: Config, run: Run) -> None:
+    if config.recorded or "calibrate" not in run.results or run.calibration.source != "recorded":
+        return
+    raise InputError(
+        f"{run.path}: its calibration comes from recorded data and would be replaced by a simulated one; "
+        "choose another folder with -o, give the table with --data, or use --force"
+    )
+
+
+def make(step: Step, config: Config, run: Run, progress: Progress) -> tuple[Run, list[str]]:
+    """Make one result and put it into the run file.
+
+    Returns
+    -------
+    tuple
+        The run with it, and the names of results dropped because they were made from older ones.
+
+    Raises
+    ------
+    InputError, WorkFailed
+        What the stage raises; the run file is then as it was.
+    """
+    records = _records(step, config, run, progress)
+    made_with = provenance.collect(seed=config.seed)
+    result = Result(step.key, to_yaml(config), made_with, step.inputs, records)
+    after = [name for name in run.results if _stage_of(name) > STAGES.index(step.stage)]
+    results = {name: stored for name, stored in run.results.items() if name not in after}
+    run = replace(run, configuration=to_yaml(config), results={**results, step.name: result})
+    save(run)
+    return run, after
+
+
+def _stage_of(name: str) -> int:
+    return STAGES.index(name.split("/")[0])
+
+
+def _records(step: Step, config: Config, run: Run, progress: Progress) -> dict[str, Any]:
+    module = stage_module(step.stage)
+    if step.stage == "calibrate":
+        observation, calibration = module.run(config, progress=progress)
+        return {"observation": observation, "calibration": calibration}
+    if step.stage == "plan":
+        return {"": module.run(config, run.calibration)}
+    if step.stage == "servo":
+        return {"": module.run(config, run.calibration, run.plan, step.law, progress=progress)}
+    return {"": module.run(run, run.path.parent, progress=progress)}
