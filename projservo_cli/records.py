@@ -187,9 +187,7 @@ class Trace:
     speed_factor: FloatArray = array("step", about="factor of the joint-speed limit")
     self_occluded: BoolArray = array("instant", "view", about="true self-occlusion of the face")
     pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
-    goal_pose: FloatArray = array(
-        "row", "coordinate", units="m", about="true pose at the goal, NaN if unknown"
-    )
+    goal_pose: FloatArray = array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
     center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
 
 

@@ -246,3 +246,15 @@ def dual_pencil(A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
     e = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0, 1.0 if k == 3 else 0.0)
     w = unit(axpy(-u[k], u, axpy(-v[k], v, e)))
     return w, meet(u, v, w)
+
+
+def as_vec(A: FloatArray) -> Vec4:
+    """(4,) array as the tuple of four floats the kernels take.
+
+    Raises
+    ------
+    ValueError
+        If the array has another shape.
+    """
+    x, y, z, w = (float(v) for v in A)
+    return (x, y, z, w)

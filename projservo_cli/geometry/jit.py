@@ -52,9 +52,12 @@ def cache_folder(root: Path) -> Path | None:
     return folder
 
 
-CACHE_FOLDER = None if numba.config.DISABLE_JIT else cache_folder(Path(__file__).parents[1])
+# The compiler's settings are attributes made at run time, which its types do not list.
+SETTINGS: Any = numba.config
+COMPILED = not SETTINGS.DISABLE_JIT
+CACHE_FOLDER = cache_folder(Path(__file__).parents[1]) if COMPILED else None
 if CACHE_FOLDER is not None:
-    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+    SETTINGS.CACHE_DIR = str(CACHE_FOLDER)
 
 
 def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:

@@ -14,6 +14,7 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     apply_transposed,
+    as_vec,
     dual_pencil,
     inner,
     mat,
@@ -161,14 +162,12 @@ def _mechanism(kind: str, H_hat: FloatArray, first: FloatArray, second: FloatArr
     work = workspace(n, 8)
     work.H_hat[:] = H_hat
     q_hat = np.zeros(n)
-    u = tuple(float(x) for x in first)
-    v = tuple(float(x) for x in second)
     compiled = {
         "translation": translation_mechanism,
         "rotation": rotation_mechanism,
         "planar rotation": planar_mechanism,
     }[kind]
-    found, H = compiled(work, u, v, q_hat)  # type: ignore[operator]
+    found, H = compiled(work, as_vec(first), as_vec(second), q_hat)
     if not found:
         raise WorkFailed(
             f"the robot has no unique {kind} of this kind here: its operators are near a singularity"

@@ -140,7 +140,7 @@ def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
     """Whether the image error fell by less than 1 % over the last ``window`` steps."""
     if k < window:
         return False
-    return errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window]
+    return bool(errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window])
 
 
 @njit

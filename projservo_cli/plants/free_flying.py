@@ -15,7 +15,7 @@ from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
 def rig_twists() -> FloatArray:
     """Operators (6, 4, 4) of the face in the rig's frame for the rig's velocities v (m/s), ω (rad/s)."""
-    unit = np.eye(3)
+    unit = np.eye(3).tolist()
     moving = [twist((0, 0, 0), v) for v in unit] + [twist(w, (0, 0, 0)) for w in unit]
     return -np.array(moving)
 
