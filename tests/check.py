@@ -1,0 +1,49 @@
+"""Every check of the project: `python -m tests.check [NAME ...]`."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PYTHON = sys.executable
+BIN = Path(PYTHON).parent
+PYTEST = [PYTHON, "-m", "pytest", "-q"]
+INTERPRETED = ["--cov=projservo_cli", "--cov-report=term", "--cov-fail-under=90", "--benchmark-disable"]
+
+CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
+    "lint": ([BIN / "ruff", "check", "."], {}),
+    "format": ([BIN / "ruff", "format", "--check", "."], {}),
+    "types": ([BIN / "mypy"], {}),
+    "imports": ([BIN / "lint-imports"], {}),
+    "interpreted tests and coverage": ([*PYTEST, *INTERPRETED], {"NUMBA_DISABLE_JIT": "1"}),
+    "compiled tests": ([*PYTEST], {}),
+}
+
+
+def main(names: Sequence[str]) -> int:
+    """Run the named checks, or all, and return how many failed."""
+    unknown = [name for name in names if name not in CHECKS]
+    if unknown:
+        print(f"unknown check {unknown[0]!r}: choose among {', '.join(CHECKS)}", file=sys.stderr)
+        return 2
+    failed = []
+    for name, (command, environment) in CHECKS.items():
+        if names and name not in names:
+            continue
+        print(f"── {name}: {' '.join(str(Path(part).name) for part in command)}", flush=True)
+        start = time.monotonic()
+        code = subprocess.run(
+            command, cwd=ROOT, env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **environment}, check=False
+        ).returncode
+        print(f"── {name}: {'passed' if code == 0 else 'FAILED'} in {time.monotonic() - start:.0f} s\n", flush=True)
+        if code != 0:
+            failed.append(name)
+    print("all checks passed" if not failed else f"failed: {', '.join(failed)}")
+    return len(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
