@@ -5,6 +5,7 @@ Only click is imported here; a command imports what it needs when it runs.
 
 import difflib
 import importlib
+import io
 import os
 import sys
 import traceback
@@ -37,6 +38,9 @@ main = _Projservo(
 
 def run(arguments: Sequence[str]) -> int:
     """Run the command line; the exit code is 0, 1, 2 or 130 (see the module's constants)."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without Greek letters is no reason to fail
+            stream.reconfigure(errors="replace")
     try:
         code = _dispatch(list(arguments))
         sys.stdout.flush()

@@ -21,7 +21,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return str(value)
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain(np.asarray(value).tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -30,7 +30,7 @@ def plain(value: Any) -> Any:
 def print_json(value: Any) -> None:
     """Print one object of strict JSON in UTF-8, whatever the locale."""
     text = json.dumps(plain(value), ensure_ascii=False, allow_nan=False, indent=2)
-    click.get_binary_stream("stdout").write(f"{text}\n".encode())
+    sys.stdout.buffer.write(f"{text}\n".encode())
 
 
 class Console:

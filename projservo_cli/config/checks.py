@@ -199,14 +199,16 @@ def _joint_vectors(config: Any) -> Iterator[Finding]:
 
 
 def _within(path: Path, values: tuple[float, ...], robot: Any) -> Iterator[Finding]:
-    for i, (value, (low, high), kind) in enumerate(zip(values, robot.limits, robot.joint_types, strict=True)):
-        if not low <= value <= high:
-            turn, unit = (math.degrees, "deg") if kind == "R" else (float, "m")
-            yield (
-                (*path, "joints", i),
-                f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}, "
-                f"{turn(low):.6g} to {turn(high):.6g} {unit}",
-            )
+    for i, (value, joint) in enumerate(zip(values, robot.joints, strict=True)):
+        low, high = joint.limits
+        if low <= value <= high or any(_limits((), joint)):  # limits that are wrong themselves limit nothing
+            continue
+        turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
+        yield (
+            (*path, "joints", i),
+            f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}, "
+            f"{turn(low):.6g} to {turn(high):.6g} {unit}",
+        )
 
 
 @_needs("task")

@@ -1,6 +1,7 @@
 """What pydantic finds, said in the words of the configuration."""
 
 import difflib
+import json
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -92,12 +93,8 @@ def _given(value: Any) -> str:
 
 
 def _shown(value: Any) -> str:
-    text = (
-        {None: "null", True: "true", False: "false"}.get(value)
-        if not isinstance(value, (list, dict))
-        else None
-    )
-    text = text or repr(value)
+    """A value as it would stand in YAML, shortened."""
+    text = json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
     return text if len(text) <= 40 else text[:37] + "…"
 
 

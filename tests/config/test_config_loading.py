@@ -1,0 +1,341 @@
+"""Configurations: what loads, every error at once with its place, overrides, hashing."""
+
+import math
+import typing
+from pathlib import Path
+
+import pytest
+import yaml
+
+from projservo_cli.config import Config, digest, load_config, to_yaml
+from projservo_cli.config.models import Law
+from projservo_cli.records import LAWS, InputError
+
+ROOT = Path(__file__).parents[2]
+GOOD = """\
+seed: 1
+robot:
+  dh:
+    joints:
+      - {type: R, d_m: 0.089, alpha_deg: 90, limits_deg: [-360, 360]}
+      - {type: P, limits_m: [0.2, 0.9]}
+rig:
+  image_size_px: [1280, 1024]
+  left: {focal_px: [1200, 1200], principal_point_px: [640, 512], position_m: [1, 0, 0], target_m: [0, 0, 0]}
+  right: {matrix: [[1200, 0, 640, 0], [0, 1200, 512, 0], [0, 0, 1, 1]]}
+markers:
+  positions_m: [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]
+  face: [0, 1, 2]
+noise: {calibration_px: 1e-1}
+task:
+  start: {joints: [10, 0.5], unit: deg}
+  goal: {turn_deg: 180}
+control: {joint_speed_limit_deg_s: null}
+"""
+
+
+@pytest.fixture
+def good(tmp_path):
+    path = tmp_path / "good.yaml"
+    path.write_text(GOOD, encoding="utf-8")
+    return path
+
+
+def errors(path, *overrides, text=None):
+    with pytest.raises(InputError) as caught:
+        load_config(path, overrides, text=text)
+    return str(caught.value).splitlines()
+
+
+def test_a_configuration_loads_with_defaults_and_units(good):
+    config = load_config(good)
+    assert config.name == "good"
+    assert config.joint_types == "RP"
+    assert config.task.start.values("RP") == (math.radians(10), 0.5)
+    assert config.robot.limits == ((-2 * math.pi, 2 * math.pi), (0.2, 0.9))
+    assert config.noise.calibration_px == 0.1
+    assert config.control.joint_speed_limit_deg_s is None
+    assert config.control.laws == LAWS
+    assert config.markers.known == (0, 1, 2, 3)
+    with pytest.raises(ValueError, match="frozen"):
+        config.seed = 3
+
+
+def test_the_laws_are_those_of_the_control(good):
+    assert typing.get_args(Law) == LAWS
+
+
+def test_resolved_yaml_loads_to_an_equal_configuration(good):
+    config = load_config(good)
+    again = load_config("stored.yaml", text=to_yaml(config))
+    assert again == config
+    assert digest(again, list(Config.model_fields)) == digest(config, list(Config.model_fields))
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_shipped_configurations_load(path):
+    config = load_config(path)
+    assert config.name == path.stem
+    assert load_config(path, text=to_yaml(config)) == config
+
+
+def test_all_errors_come_at_once_each_with_line_and_column(tmp_path):
+    path = tmp_path / "bad.yaml"
+    path.write_text(
+        """\
+seeed: 3
+robot:
+  dh:
+    convention: craig
+    joints:
+      - {type: R, d: 0.089, alpha_deg: true, limits_deg: [360, -360]}
+rig:
+  image_size_px: [1280.5, 1024]
+  left: {focal_px: [.inf, 1200]}
+noise: {calibration_px: "0.5"}
+control:
+  gain_t: 30
+  laws: [direct_thre]
+  period_s: -0.04
+stop: {max_steps: 0}
+plant:
+""",
+        encoding="utf-8",
+    )
+    places = {line.split(" ")[0].removeprefix(f"{path}:"): line for line in errors(path)}
+    expected = {
+        "1:1:": "seeed: unknown key; did you mean seed?",
+        "4:5:": "robot.dh.convention: 'craig' is not one of them; valid: standard, modified",
+        "6:19:": "robot.dh.joints.0.d: unknown key; did you mean d_m?",
+        "6:29:": "robot.dh.joints.0.alpha_deg: must be a number, not true",
+        "7:1:": "rig.right: is missing",
+        "8:19:": "rig.image_size_px.0: must be a whole number, not 1280.5",
+        "9:21:": "rig.left.focal_px.0: must be a finite number, not inf",
+        "10:9:": "noise.calibration_px: must be a number, not '0.5'",
+        "13:10:": "control.laws.0: 'direct_thre' is not one of them; did you mean direct_three?",
+        "14:3:": "control.period_s: must be greater than 0, not -0.04",
+        "15:8:": "stop.max_steps: must be at least 1, not 0",
+        "16:1:": "plant: must be a mapping of keys to values, not null",
+    }
+    assert {place: line.split(": ", 1)[1] for place, line in places.items()} == expected
+
+
+# what is set, the path named, part of the message
+INCONSISTENT = {
+    "gain times period": ("control.gain_t=25", "control.gain_t", "gain · period_s is 1;"),
+    "two goals": ("task.goal.joints={joints: [1, 0.3], unit: deg}", "task.goal", "exactly one of"),
+    "no goal": ("task.goal={}", "task.goal", "exactly one of"),
+    "perturbed joint goal": (
+        "task.goal={joints: {joints: [1, 0.3], unit: deg}, perturbation: {}}",
+        "task.goal.perturbation",
+        "turn_deg",
+    ),
+    "goal images": (
+        "task.goal={images: {left: [[1, 2]], right: [[1, 2], [3, 4], [5, 6]]}}",
+        "task.goal.images.left",
+        "1 pixels for the 3 markers",
+    ),
+    "missing face marker": ("markers.face=[0, 1, 9]", "markers.face.2", "there is no marker 9"),
+    "face marker twice": ("markers.face=[0, 1, 1]", "markers.face", "twice"),
+    "centre off the face": ("markers.center=3", "markers.center", "not on the face"),
+    "numbers of markers": ("markers.numbers=[0, 1, 2]", "markers.numbers", "3 numbers for 4"),
+    "markers numbered alike": ("markers.numbers=[0, 1, 2, 2]", "markers.numbers", "twice"),
+    "joints of the start": ("task.start.joints=[1, 0.3, 2]", "task.start.joints", "3 values for 2 joints"),
+    "start beyond limits": ("task.start.joints=[1, 1.3]", "task.start.joints.1", "1.3 m is outside"),
+    "reference beyond limits": (
+        "calibration.reference={joints: [361, 0.3], unit: deg}",
+        "calibration.reference.joints.0",
+        "361 deg is outside the limits of joint 1, -360 to 360 deg",
+    ),
+    "limits upside down": ("robot.dh.joints.1.limits_m=[2, 1]", "robot.dh.joints.1.limits_m", "below"),
+    "unit of limits": (
+        "robot.dh.joints.1={type: P, limits_deg: [0, 1]}",
+        "robot.dh.joints.1.limits_deg",
+        "takes limits_m",
+    ),
+    "two limits": ("robot.dh.joints.0.limits_rad=[0, 1]", "robot.dh.joints.0.limits_rad", "keep one"),
+    "two robots": (
+        "robot.screws={reference: {joints: [0, 0], unit: rad}, "
+        "joints: [{type: R, w: [0, 0, 1], v: [0, 0, 0]}], "
+        "base_tool: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}",
+        "robot",
+        "exactly one of dh and screws",
+    ),
+    "no robot": ("robot=null", "robot", "a simulated run needs it"),
+    "no markers": ("markers.positions_m=null", "markers.positions_m", "a simulated run needs it"),
+    "no rotation": (
+        "robot.dh.tool=[[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]",
+        "robot.dh.tool",
+        "must be a rotation",
+    ),
+    "a mirror": (
+        "robot.dh.tool=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
+        "robot.dh.tool",
+        "must be a rotation",
+    ),
+    "last row": (
+        "robot.dh.tool=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 2]]",
+        "robot.dh.tool",
+        "last row",
+    ),
+    "two cameras": ("rig.left.matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "rig.left.focal_px", "matrix"),
+    "half a camera": ("rig.left.target_m=null", "rig.left", "missing: target_m"),
+    "camera at its target": ("rig.left.target_m=[1, 0, 0]", "rig.left.target_m", "must look somewhere"),
+    "camera upright": ("rig.left.up=[1, 0, 0]", "rig.left.up", "line of sight"),
+    "singular": ("rig.right.matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]", "rig.right.matrix", "singular"),
+    "empty image": ("rig.image_size_px=[0, 10]", "rig.image_size_px", "greater than 0"),
+    "another robot": ("data={table: t.csv, joints: RR}", "data.joints", "not the joints of the robot, RP"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", INCONSISTENT)
+def test_inconsistencies_are_refused_with_path_and_flag(good, case):
+    override, path, message = INCONSISTENT[case]
+    found = errors(good, override)
+    assert len(found) == 1, found
+    assert found[0].startswith((f"--set {override}: {path}: ", f"{good}:")), found
+    assert f" {path}: " in found[0]
+    assert message in found[0]
+
+
+def test_screws_are_checked(good):
+    screws = {
+        "reference": {"joints": [0.1], "unit": "rad"},
+        "base_tool": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+        "joints": [
+            {"type": "R", "w": [0, 0, 2], "v": [0, 0, 0]},
+            {"type": "R", "w": [0, 0, 1], "v": [0, 0, 1]},
+            {"type": "P", "w": [0, 0, 1], "v": [0, 0.5, 0]},
+        ],
+    }
+    found = errors(good, f"robot={yaml.safe_dump({'screws': screws}, default_flow_style=True)}", "task=null")
+    text = "\n".join(found)
+    for part in (
+        "screws.joints.0.w: must be of unit length",
+        "screws.joints.1.v: must be orthogonal to w",
+        "screws.joints.2.v: must be of unit length",
+        "screws.joints.2.w: must be zero",
+        "screws.reference.joints: 1 values for 3 joints",
+        "task: is missing",
+    ):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("control.gain_t", "expected KEY=VALUE"),
+        ("=3", "expected KEY=VALUE"),
+        ("control..gain=3", "expected KEY=VALUE"),
+        ("control.gain_t=[1", "not valid YAML"),
+        ("control.gain_t=-1", "control.gain_t: must be greater than 0, not -1"),
+        ("control.gain_t=true", "control.gain_t: must be a number, not true"),
+        ("control.gain_t=.nan", "control.gain_t: must be a finite number, not nan"),
+        ("control.gain_x=3", "control.gain_x: unknown key; did you mean gain_"),
+        ("controls.gain=3", "controls: unknown key; did you mean control?"),
+        ("robot.dh.joints.5.d_m=1", "robot.dh.joints.5: expected a list position from 0 to 1"),
+        ("seed.x=1", "seed.x: there is a plain value"),
+        ("name=a/b", "name: must be usable as the name of a folder"),
+        ("seed=-1", "seed: must be at least 0"),
+        ("control=3", "control: must be a mapping"),
+    ],
+)
+def test_errors_in_overrides_name_the_flag(good, override, message):
+    found = errors(good, override)
+    assert len(found) == 1, found
+    assert found[0].startswith(f"--set {override}: ")
+    assert message in found[0]
+
+
+def test_overrides_reach_lists_and_make_sections(good):
+    config = load_config(
+        good,
+        [
+            "robot.dh.joints.1.limits_m=[0.1, 0.6]",
+            "calibration.reference.unit=deg",
+            "calibration.reference.joints=[1, 0.2]",
+            "control.gain=1",
+            "control.gain=2",
+        ],
+    )
+    assert config.robot.limits[1] == (0.1, 0.6)
+    assert config.calibration.reference.values("RP") == (math.radians(1), 0.2)
+    assert config.control.gain == 2
+
+
+def test_a_blank_recorded_configuration_needs_only_a_table(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = load_config(None, ["data.table=a/trial.csv", "data.joints=rrp"])
+    assert (config.name, config.recorded, config.joint_types) == ("trial", True, "RRP")
+    assert config.data.table == str(tmp_path / "a/trial.csv")
+
+
+def test_a_table_is_sought_beside_the_configuration(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub/c.yaml").write_text("data: {table: t.csv}", encoding="utf-8")
+    config = load_config("sub/c.yaml")
+    assert config.data.table == str(tmp_path / "sub/t.csv")
+    assert load_config("elsewhere.yaml", text=to_yaml(config)).data.table == config.data.table
+
+
+UNREADABLE = {
+    "nothing": "",
+    "a comment": "# nothing",
+    "a list": "- 1",
+    "no yaml": "name: [1",
+    "a tab": "robot:\n\t- 1",
+    "two documents": "name: a\n---\nname: b",
+    "a tag": "name: !!python/object/apply:os.getcwd []",
+    "deep nesting": "[" * 3000,
+    "an endless alias": "name: &x [*x]",
+    "an alias bomb": "a: &a [1,1,1,1,1,1,1,1,1,1]\n"
+    + "".join(
+        f"{new}: &{new} [{','.join([f'*{old}'] * 10)}]\n" for old, new in zip("abcdef", "bcdefg", strict=True)
+    ),
+    "too large": "name: " + "x" * 1_000_001,
+}
+
+
+@pytest.mark.parametrize("case", UNREADABLE)
+def test_unreadable_text_is_refused(tmp_path, case):
+    path = tmp_path / "c.yaml"
+    path.write_text(UNREADABLE[case], encoding="utf-8")
+    assert all(line.startswith(str(path)) for line in errors(path))
+
+
+def test_duplicate_keys_are_refused_with_both_places(good):
+    (line,) = errors(good, text=GOOD.replace("  face:", "  face: [0, 1, 3]\n  face:"))
+    assert line == f"{good}:14:3: markers.face: the key stands here a second time (first at 13:3); keep one"
+
+
+def test_files_that_are_none(tmp_path):
+    assert "cannot be read" in errors(tmp_path / "none.yaml")[0]
+    assert "cannot be read" in errors(tmp_path)[0]
+    (tmp_path / "c.yaml").write_bytes(b"name: \xff")
+    assert "not UTF-8" in errors(tmp_path / "c.yaml")[0]
+
+
+def test_a_hash_depends_on_the_parts_named_and_on_nothing_else(good):
+    plain = load_config(good)
+    faster = load_config(good, ["control.gain_t=3"])
+    fewer = load_config(good, ["control.laws=[stacked]"])
+    keys = ("seed", "control", "noise.servo_px", "data", "task.start")
+    assert digest(plain, keys) == digest(load_config(good, ["control.gain_t=2.50"]), keys)
+    assert digest(plain, keys) == digest(plain, keys[::-1])
+    assert digest(plain, keys) == digest(load_config(good, ["noise.calibration_px=3"]), keys)
+    assert digest(plain, keys) != digest(load_config(good, ["noise.servo_px=3"]), keys)
+    assert digest(plain, keys) != digest(faster, keys)
+    assert digest(plain, keys) != digest(fewer, keys)
+    assert digest(plain, keys, without=("control.laws",)) == digest(fewer, keys, without=("control.laws",))
+    assert digest(plain, keys, extra={"before": "x"}) != digest(plain, keys)
+    assert digest(plain, ("data.table",)) == digest(plain, ("data.table",), without=("data.table",))
+    with pytest.raises(KeyError):
+        digest(plain, ("contrl",))
+
+
+def test_a_configuration_made_in_python_is_checked_as_well(good):
+    values = yaml.safe_load(to_yaml(load_config(good)))
+    values["control"]["gain_t"] = 25.0
+    with pytest.raises(ValueError, match="gain_t"):
+        Config.model_validate(values)

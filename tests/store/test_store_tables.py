@@ -1,0 +1,117 @@
+"""Observation tables: what is read, what is refused and where, and round trips."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from projservo_cli.records import InputError, Observation
+from projservo_cli.tables import read_table, write_table
+
+HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
+ROWS = ["0,1,0.5,-1,10,20,30,40", "0,0,0.5,-1,11,21,31,41", "7,1,0.25,2e-1,12.5,22,,"]
+
+
+def written(tmp_path, *lines, end="\n", prefix=b""):
+    path = tmp_path / "table.csv"
+    path.write_bytes(prefix + end.join(lines).encode())
+    return path
+
+
+def test_rows_become_arrays(tmp_path):
+    table = read_table(written(tmp_path, HEADER, *ROWS))
+    assert table.pose.tolist() == [0, 7]
+    assert table.marker.tolist() == [0, 1]
+    assert table.q.tolist() == [[0.5, -1.0], [0.25, 0.2]]
+    assert table.images[0].tolist() == [[[11, 21], [10, 20]], [[31, 41], [30, 40]]]
+    assert np.isnan(table.images[1, :, 0]).all()  # no row for marker 0 at pose 7
+    assert table.images[1, 0, 1].tolist() == [12.5, 22]
+    assert np.isnan(table.images[1, 1, 1]).all()  # empty cells
+
+
+def test_order_of_columns_extra_columns_line_ends_and_mark_do_not_matter(tmp_path):
+    plain = read_table(written(tmp_path, HEADER, *ROWS))
+    columns = HEADER.split(",")
+    order = [7, 2, 0, 5, 3, 1, 4, 6]
+    lines = [",".join(["note", *(columns[i] for i in order)])]
+    for row in ROWS:
+        cells = row.split(",")
+        lines.append(",".join(['"a,b"', *(f" {cells[i]} " for i in order)]))
+    odd = read_table(written(tmp_path, *lines, "", "", end="\r\n", prefix=b"\xef\xbb\xbf"))
+    for name in ("pose", "marker", "q", "images"):
+        np.testing.assert_array_equal(getattr(plain, name), getattr(odd, name))
+
+
+BAD = {
+    "empty file": ([""], "the table is empty"),
+    "header only": ([HEADER], "no rows"),
+    "no marker column": ([HEADER.replace("marker,", ""), "0,1,2,3,4,5,6"], ":1: .*lacks.*marker"),
+    "no joints": (["pose,marker,u_left,v_left,u_right,v_right", "0,0,1,2,3,4"], ":1: .*lacks.*q1"),
+    "gap in joints": ([HEADER.replace("q2", "q3"), ROWS[0]], ":1: joint column q2 is missing"),
+    "column twice": ([HEADER.replace("q2", "q1"), ROWS[0]], ":1: .*q1 more than once"),
+    "semicolons": ([HEADER.replace(",", ";"), ROWS[0].replace(",", ";")], ":1: .*semicolons"),
+    "row cut short": ([HEADER, ROWS[0], "0,0,0.5,-1,11,2"], ":3: 6 cells where the header has 8"),
+    "row too long": ([HEADER, ROWS[0] + ",1"], ":2: 9 cells"),
+    "text for a number": ([HEADER, ROWS[0].replace("10", "ten")], ":2: u_left is 'ten'"),
+    "nan": ([HEADER, ROWS[0].replace("10", "nan")], ":2: u_left is 'nan'; expected a finite"),
+    "infinite": ([HEADER, ROWS[0].replace("10", "1e999")], ":2: u_left is '1e999'"),
+    "underscores": ([HEADER, ROWS[0].replace("10", "1_0")], ":2: u_left"),
+    "empty joint": ([HEADER, "0,1,,-1,10,20,30,40"], ":2: q1 is ''"),
+    "half a pixel": ([HEADER, "0,1,1,-1,10,,30,40"], ":2: one of u_left, v_left is empty"),
+    "fractional pose": ([HEADER, "0.5,1,1,-1,10,20,30,40"], ":2: pose is '0.5'; expected an integer"),
+    "same marker twice": ([HEADER, ROWS[0], ROWS[0]], ":3: marker 1 at pose 0 is already in line 2"),
+    "two readings": ([HEADER, ROWS[0], "0,0,0.5,-2,1,2,3,4"], ":3: q2 of pose 0 is -2.0, but -1.0 in line 2"),
+    "open quote": ([HEADER, ROWS[0], '"0,1'], ":3: "),
+    "nul byte": ([HEADER, "0,\0,1"], ":2: not a text file"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_tables_are_refused_with_the_line(tmp_path, case):
+    lines, message = BAD[case]
+    path = written(tmp_path, *lines)
+    with pytest.raises(InputError, match=message) as caught:
+        read_table(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_bytes_that_are_no_text_a_folder_and_nothing_are_refused(tmp_path):
+    path = written(tmp_path, HEADER)
+    path.write_bytes(HEADER.encode() + b"\n0,1,\xff\xfe")
+    with pytest.raises(InputError, match=":2: not UTF-8"):
+        read_table(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_table(tmp_path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_table(tmp_path / "none.csv")
+
+
+def test_a_joint_string_must_fit_the_columns(tmp_path):
+    path = written(tmp_path, HEADER, *ROWS)
+    assert read_table(path, "RP").q.shape == (2, 2)
+    with pytest.raises(InputError, match=r"2 joint columns.*'RRP' has 3 letters"):
+        read_table(path, "RRP")
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.data())
+def test_writing_and_reading_is_exact(tmp_path_factory, data):
+    poses = data.draw(st.lists(st.integers(-(10**9), 10**9), min_size=1, max_size=4, unique=True))
+    markers = sorted(data.draw(st.sets(st.integers(0, 10**6), min_size=1, max_size=3)))
+    n = data.draw(st.integers(1, 3))
+    q = np.array([[data.draw(finite) for _ in range(n)] for _ in poses])
+    images = np.array([data.draw(finite) for _ in range(len(poses) * len(markers) * 4)])
+    images = images.reshape(len(poses), 2, len(markers), 2)
+    for k, view, j in np.ndindex(images.shape[:3]):
+        if data.draw(st.booleans()):
+            images[k, view, j] = np.nan
+    table = Observation(np.array(poses), np.array(markers), q, images)
+    path = tmp_path_factory.mktemp("tables") / "table.csv"
+    write_table(table, path)
+    back = read_table(path)
+    for name in ("pose", "marker", "q", "images"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
