@@ -99,9 +99,9 @@ def _plan_words(value: dict[str, Any]) -> list[str]:
 
 
 def _servo_words(value: dict[str, Any]) -> list[str]:
-    head = f"  {'law':<17}{'verdict':<14}{'steps':>6}{'mm':>10}{'deg':>10}{'occluded':>11}{'drift mm':>11}"
+    head = f"  {'law':<17}{'verdict':<13}{'steps':>6}{'mm':>10}{'deg':>10}{'occluded':>11}{'drift mm':>11}"
     rows = [
-        f"  {trace['law']:<17}{trace['verdict']:<14}{trace['steps']:>6}"
+        f"  {trace['law']:<17}{trace['verdict']:<13}{trace['steps']:>6}"
         f"{_number(trace['position_error_mm']):>10}"
         f"{_number(trace['rotation_error_deg']):>10}"
         f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}"
@@ -112,7 +112,11 @@ def _servo_words(value: dict[str, Any]) -> list[str]:
 
 
 def _other_words(value: dict[str, Any]) -> list[str]:
-    return [wrapped(f"{name.replace('_', ' ')}: {content}", "  ") for name, content in value.items()]
+    rest = {name: content for name, content in value.items() if name != "run"}
+    return [
+        "report:",
+        *(wrapped(f"{name.replace('_', ' ')}: {content}", "  ") for name, content in rest.items()),
+    ]
 
 
 def _number(value: float | None) -> str:
