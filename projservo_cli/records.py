@@ -148,6 +148,11 @@ class Plan:
         "solution", "view", about="least margin along each sense, 1 at the start"
     )
 
+    def rotation_sense(self) -> FloatArray:
+        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
+        signs = np.where(np.array([self.theta_r, self.theta_p]) >= 0.0, 1.0, -1.0)
+        return np.asarray(signs[:, None] * self.q_hat[1:3])
+
 
 @dataclass(frozen=True, eq=False)
 class Trace:

@@ -119,6 +119,8 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
     """Measure and partition the remaining task; the errors are written to the state."""
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] = 0.0
+    for i in range(state.errors.shape[0]):
+        state.errors[i] = math.nan
     if not measure(model, task, s, q, state):
         return LOST, no_parts()
     parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)

@@ -1,4 +1,4 @@
-"""The closed loop in Python: any law, any plant, the same limits, counting and verdicts."""
+"""The closed loop in Python: any law on the simulated plant, the same limits, counting and verdicts."""
 
 from typing import Protocol
 

@@ -83,6 +83,7 @@ def run(
         gains_of(config),
         limits_of(config, truth),
         noise,
+        plan.rotation_sense(),
     )
 
 
@@ -103,6 +104,7 @@ def drive(
     gains: Gains,
     limits: Limits,
     noise: FloatArray,
+    sense: FloatArray | None = None,
 ) -> Trace:
     """Run one law with one model on the simulated robot.
 
@@ -111,10 +113,13 @@ def drive(
     law : name of the law.
     model : what the law believes.
     noise : (≥ max_steps + 1, 2, m, 2) px.
+    sense : (2, n) joint motions of the planned rotations r and p, which decide the sense of a half turn.
     """
     n, m = len(reach.q_start), len(truth.face)
     task = task_from_images(model, reach.s_start, reach.s_star, truth.center)
     state = new_state(n, m)
+    if sense is not None:
+        state.memory.rotation[:] = sense
     log = new_log(n, m, limits.max_steps, len(ERRORS))
     code, steps = run_loop(
         CODES[law], model, task, gains, limits, plant, noise, reach.q_start.copy(), state, log

@@ -150,7 +150,12 @@ def robot_of(config: "Config") -> Robot:
 def camera_of(camera: "Camera") -> FloatArray:
     """Camera (3, 4) to px of its matrix or its look-at description."""
     if camera.matrix is not None:
-        return np.array(camera.matrix)
+        P = np.array(camera.matrix)
+        # A camera is given up to scale; the loop needs the scale that makes depths positive metres.
+        scale = float(np.sign(np.linalg.det(P[:, :3])) * np.linalg.norm(P[2, :3]))
+        if scale == 0.0:
+            raise InputError("rig: a camera matrix needs an invertible left 3×3 block: a finite camera")
+        return P / scale if abs(scale - 1.0) > 1e-12 else P
     assert camera.focal_px is not None
     assert camera.principal_point_px is not None
     assert camera.position_m is not None
@@ -192,6 +197,7 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
         raise InputError("this stage needs a task: set task.start and task.goal")
     types = config.robot.joint_types if config.robot is not None else ""
     q_start = np.array(config.task.start.values(types))
+    _require_limits(truth.robot, q_start, "task.start")
     rng = generator(config, TARGET_NOISE)
     clean = truth.images(q_start, truth.M_face)
     sigma = config.noise.servo_px
@@ -232,7 +238,7 @@ def _require_limits(robot: Robot, q: FloatArray, where: str) -> None:
         if not robot.lower[i] <= value <= robot.upper[i]:
             raise WorkFailed(
                 f"{where}: joint {i + 1} would be at {value:.4g}, outside its limits "
-                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose another goal or wider limits"
+                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose other joints or wider limits"
             )
 
 
