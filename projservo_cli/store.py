@@ -138,7 +138,9 @@ def load(target: Path | str) -> Run:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         what = " ".join(str(error).split())
-        raise InputError(f"{path}: cut short, damaged or not a run file ({what}); make it again") from error
+        raise InputError(
+            f"{path}: cut short, damaged or not a run file ({what}); delete it or use another"
+        ) from error
 
 
 def _check_schema(path: Path, file: h5py.File) -> None:
@@ -147,7 +149,7 @@ def _check_schema(path: Path, file: h5py.File) -> None:
     version = int(file.attrs.get("schema_version", 0))
     if version != SCHEMA_VERSION:
         raise InputError(
-            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}; make it again"
+            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}; delete it or use another"
         )
 
 
@@ -227,13 +229,15 @@ def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> No
 def _load_record(path: Path, group: h5py.Group) -> Any:
     kind = getattr(record_types, _text(group, "record"), None)
     if not dataclasses.is_dataclass(kind):
-        raise InputError(f"{path}: {group.name} holds a record this version does not know; make it again")
+        raise InputError(f"{path}: {group.name} holds a record this version does not know; use another run")
     hints = typing.get_type_hints(kind)
     values: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
         present = field.name in (group if "dims" in field.metadata else group.attrs)
         if not present and not _optional(hints[field.name]):
-            raise InputError(f"{path}: {group.name} lacks {field.name}; it was made by another version")
+            raise InputError(
+                f"{path}: {group.name} lacks {field.name}, as made by another version; delete it or use another"
+            )
         if not present:
             values[field.name] = None
         elif "dims" in field.metadata:
@@ -245,9 +249,7 @@ def _load_record(path: Path, group: h5py.Group) -> Any:
 
 def _load_array(path: Path, data: h5py.Dataset, dims: tuple[str, ...]) -> Any:
     if data.ndim != len(dims):
-        raise InputError(
-            f"{path}: {data.name} has {data.ndim} dimensions instead of {len(dims)}; make it again"
-        )
+        raise InputError(f"{path}: {data.name} has {data.ndim} dimensions instead of {len(dims)}")
     value = data[()]
     return value.astype(np.bool_) if data.attrs.get("dtype") == "bool" else value
 

@@ -19,10 +19,14 @@ from projservo_cli.stages import Progress
 from projservo_cli.store import SERVO, Result, Run, save
 
 STAGES = ("calibrate", "plan", "servo", "report")
-# which laws are run, and which of them must converge, does not change the run of any of them
-NOT_OF_A_TRACE = ("control.laws", "control.must_converge")
-# where a table lies does not matter, only what it says
-NOT_OF_A_CALIBRATION = ("data.table",)
+# Where a table lies does not matter, only what it says. Which laws are run, and which of them must
+# converge, changes the run of none of them.
+NOT_HASHED: dict[str, tuple[str, ...]] = {
+    "calibrate": ("data.table",),
+    "plan": ("data.table",),
+    "servo": ("data.table", "control.laws", "control.must_converge"),
+    "report": ("data.table",),
+}
 
 
 @dataclass(frozen=True)
@@ -78,11 +82,9 @@ def steps_for(
         When the table cannot be read, or a recorded calibration would be replaced by a simulated
         one without ``force``.
     """
-    last = max(STAGES.index(stage) for stage in named)
+    last = max(named, key=STAGES.index)
     steps: list[Step] = []
-    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws):
-        if STAGES.index(stage) > last:
-            break
+    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, last):
         step = Step(stage, law, key, "", inputs)
         remade = any(before.why for before in steps if before.stage != stage)
         steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
@@ -91,22 +93,19 @@ def steps_for(
     return steps
 
 
-def _keys(config: Config, run: Run, laws: Sequence[str]) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, law, key and input hashes of every result, each key made from the one before it."""
+def _keys(
+    config: Config, run: Run, laws: Sequence[str], last: str
+) -> Iterator[tuple[str, str, str, dict[str, str]]]:
+    """Stage, law, key and input hashes of every result to ``last``, each key made from those before."""
     inputs = _table_hash(config, run)
-    read = {"table": inputs.get("table_sha256")}
-    key = digest(config, _depends_on("calibrate"), without=NOT_OF_A_CALIBRATION, extra=read)
-    yield "calibrate", "", key, inputs
-    key = digest(config, _depends_on("plan"), without=NOT_OF_A_CALIBRATION, extra={"before": key})
-    yield "plan", "", key, {}
-    traces = []
-    for law in dict.fromkeys(laws):
-        without = NOT_OF_A_TRACE + NOT_OF_A_CALIBRATION
-        before = {"before": key, "law": law}
-        traces.append(digest(config, _depends_on("servo"), without=without, extra=before))
-        yield "servo", law, traces[-1], {}
-    before_report = {"before": [key, *traces]}
-    yield "report", "", digest(config, _depends_on("report"), extra=before_report), {}
+    before: list[str | None] = [inputs.get("table_sha256")]
+    for stage in STAGES[: STAGES.index(last) + 1]:
+        keys = []
+        for law in dict.fromkeys(laws) if stage == "servo" else [""]:
+            extra = {"before": before, "law": law}
+            keys.append(digest(config, _depends_on(stage), without=NOT_HASHED[stage], extra=extra))
+            yield stage, law, keys[-1], inputs if stage == "calibrate" else {}
+        before = [*keys]
 
 
 def _depends_on(stage: str) -> tuple[str, ...]:

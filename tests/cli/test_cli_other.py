@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 from pathlib import Path
 
 import pytest
@@ -77,3 +78,16 @@ def test_every_function_and_test_of_the_register_exists(entry):
         file, name = test.split("::")
         tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
         assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}, test
+
+
+@pytest.mark.parametrize("entry", REGISTER, ids=lambda entry: entry.number)
+def test_registered_functions_say_so_in_their_words(entry):
+    number = entry.number.removeprefix("§")
+    for dotted in entry.functions:
+        module, name = dotted.rsplit(".", 1)
+        words = getattr(importlib.import_module(module), name).__doc__
+        numbers = set(re.findall(r"\(([0-9]+)\)|section ([0-9.]+[0-9])", words))
+        ranges = re.findall(r"\(([0-9]+)\)–\(([0-9]+)\)", words)
+        named = {number for pair in numbers for number in pair}
+        named |= {str(i) for first, last in ranges for i in range(int(first), int(last) + 1)}
+        assert number in named, (dotted, named)
