@@ -140,6 +140,9 @@ def onto_plane_part(
     """
     same = dot(a, a_t)
     D = sub(a_t, a) if same >= 0.0 else add(a_t, a)
+    # Both planes hold the centre; what round-off leaves of its distance must not carry the axis away
+    # from it where the planes nearly agree.
+    D = axpy(-dot(D, A_c) / dot(A_c, A_c), A_c, D)
     if dot(D, D) <= COINCIDENT * COINCIDENT:
         if same >= 0.0:
             clear(q_hat)
