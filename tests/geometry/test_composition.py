@@ -44,9 +44,8 @@ def test_solutions_are_all_zeros_of_the_equation(p_0, p_s, p_c):
         return
     for theta in (plus, minus):
         assert -math.pi < theta <= math.pi
-        assert (
-            abs(p_0 + p_s * math.sin(theta) + p_c * math.cos(theta)) < 1e-14 * (1 + abs(p_0) + amplitude) * 8
-        )
+        rest = p_0 + p_s * math.sin(theta) + p_c * math.cos(theta)
+        assert abs(rest) < 8e-14 * (1 + abs(p_0) + amplitude)
     # Two different zeros, as many as a cosine has in one turn: none is missed.
     if abs(p_0) < 0.999 * amplitude:
         assert abs(wrap(plus - minus)) > 1e-3

@@ -124,3 +124,11 @@ def test_a_gantry_cannot_rotate():
     H_hat = np.array([prismatic(axis) for axis in np.eye(3)])
     with pytest.raises(WorkFailed):
         rotation_about(H_hat, face()[0], face()[1])
+
+
+def test_two_joints_on_one_axis_are_a_singularity():
+    model = arm()
+    H_hat = model.H_hat_0.copy()
+    H_hat[4] = -H_hat[2]
+    with pytest.raises(WorkFailed, match="singularity"):
+        translation_along(H_hat, face()[0], face()[1])

@@ -13,7 +13,7 @@ from projservo_cli.geometry.stereo import (
     triangulate_points,
 )
 from projservo_cli.records import WorkFailed
-from tests.samples import frame, pixels, rig
+from tests.samples import frame, hat, pixels, rig
 
 METRIC = np.array([0.0, 0, 0, 1])
 PARALLEL = np.array([np.c_[np.eye(3), [side * 0.15, 0, 0]] for side in (1, -1)])
@@ -169,3 +169,13 @@ def test_the_marker_at_fault_is_named():
     s[1, 1] = s[0, 1]
     with pytest.raises(WorkFailed, match="marker 1 of the face"):
         triangulate_points(PARALLEL, METRIC, s)
+
+
+def test_pixels_at_the_epipoles_are_refused():
+    """On the baseline every plane through it is seen as the same line: no point is determined."""
+    turn = hat([0, 0.4, 0], [0, 0, 0])[:3, :3] + np.eye(3)
+    P = np.array([np.c_[turn, turn @ [0.15, 0, 0]], np.c_[np.eye(3), [-0.15, 0, 0.1]]])
+    O = optical_centers(P, METRIC)
+    left, right = P[0] @ O[1], P[1] @ O[0]
+    found, _ = one(P, METRIC, left[:2] / left[2], right[:2] / right[2])
+    assert not found
