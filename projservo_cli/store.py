@@ -149,7 +149,7 @@ def _check_schema(path: Path, file: h5py.File) -> None:
     version = int(file.attrs.get("schema_version", 0))
     if version != SCHEMA_VERSION:
         raise InputError(
-            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}; delete it or use another"
+            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}; use another run"
         )
 
 
@@ -185,7 +185,7 @@ def _save_record(group: h5py.Group, record: Any) -> None:
             group.attrs[field.name] = _encoded(value)
     for name, (field, value) in arrays.items():
         _save_array(group, name, value, field.metadata)
-    _attach_scales(group, {name: field.metadata["dims"] for name, (field, _) in arrays.items()})
+    _attach_scales(group, _distinct({name: field.metadata["dims"] for name, (field, _) in arrays.items()}))
 
 
 def _encoded(value: Any) -> Any:
@@ -208,6 +208,12 @@ def _save_array(group: h5py.Group, name: str, value: Any, metadata: Mapping[str,
     data.attrs["long_name"] = metadata["about"]
 
 
+def _distinct(dims: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Dimension names that no array over other dimensions bears, since both are datasets of a group."""
+    taken = {name for name, own in dims.items() if own != (name,)}
+    return {name: tuple(f"{dim}_index" if dim in taken else dim for dim in own) for name, own in dims.items()}
+
+
 def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> None:
     """Name the dimensions of all arrays; an array named as its only dimension is its coordinate."""
     for name, own in dims.items():
@@ -216,9 +222,7 @@ def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> No
             if dim not in group:
                 scale = group.create_dataset(dim, data=np.zeros(size, dtype=np.float32))
                 scale.make_scale(_NO_VARIABLE.format(size))
-            elif dim in dims and not group[dim].is_scale:
-                if dims[dim] != (dim,):
-                    raise ValueError(f"{group.name}: {dim} names both a dimension and an array over others")
+            elif not group[dim].is_scale:
                 group[dim].make_scale(dim)
             if group[dim].shape != (size,):
                 raise ValueError(f"{group.name}/{name}: dimension {dim} has {size} entries, elsewhere others")
@@ -236,7 +240,7 @@ def _load_record(path: Path, group: h5py.Group) -> Any:
         present = field.name in (group if "dims" in field.metadata else group.attrs)
         if not present and not _optional(hints[field.name]):
             raise InputError(
-                f"{path}: {group.name} lacks {field.name}, as made by another version; delete it or use another"
+                f"{path}: {group.name} lacks {field.name}; another version made it; use another run"
             )
         if not present:
             values[field.name] = None

@@ -9,8 +9,8 @@ from projservo_cli.cli.options import wrapped
 from projservo_cli.config import Config
 from projservo_cli.store import Run
 
-# reports on single observations that a calibration may hold besides its numbers
-FINDINGS = ("outliers", "suspect_joint_readings", "swapped", "merged_poses", "merged_markers")
+LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
+COUNTS = ("merged_poses", "merged_markers")
 NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
 
 
@@ -30,9 +30,8 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
     """The JSON object of a stage that could not be made, or lacks what it needs."""
     result: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
     if stage == "calibrate":
-        numbers = dict.fromkeys(NUMBERS)
-        findings: dict[str, list[Any]] = {name: [] for name in FINDINGS}
-        return result | {"usable": False, "advice": [], **numbers, "joints": [], **findings}
+        lists: dict[str, list[Any]] = {name: [] for name in ("advice", "joints", *LISTS)}
+        return result | {"usable": False} | dict.fromkeys(NUMBERS) | dict.fromkeys(COUNTS, 0) | lists
     if stage == "plan":
         return result | {"feasible": False}
     if stage == "servo":
@@ -47,6 +46,8 @@ def _scalars(record: Any) -> dict[str, Any]:
 
 
 def _calibration(run: Run, config: Config) -> dict[str, Any]:
+    from projservo_cli.calibration import findings  # heavy; only this object needs it
+
     calibration = run.calibration
     given = config.robot.joints if config.robot is not None else ()
     joints = [
@@ -58,7 +59,7 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
         }
         for i, letter in enumerate(calibration.joint_types)
     ]
-    return dict.fromkeys(FINDINGS, ()) | _scalars(calibration) | {"joints": joints}
+    return _scalars(calibration) | {"joints": joints} | findings(calibration)
 
 
 def _plan(run: Run) -> dict[str, Any]:
@@ -79,7 +80,7 @@ def summary(stage: str, value: dict[str, Any]) -> str:
 
 def _calibrate_words(value: dict[str, Any]) -> list[str]:
     weak = [joint["name"] for joint in value["joints"] if joint["weak"]]
-    found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in FINDINGS[:3] if value[name]]
+    found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in LISTS if value[name]]
     return [
         wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}"),
         f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "

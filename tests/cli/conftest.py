@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from projservo_cli import cli
@@ -67,6 +68,7 @@ class Stages:
         n = observation.q.shape[1]
         types = config.joint_types or "R" * n
         given = {"source": source, "joint_types": types, "chi2_per_dof": float("nan"), "advice": ("more",)}
+        given |= {"outlier": np.array([[3, 1, 0], [4, 2, 2]]), "suspect": np.zeros((0, 2), dtype=np.int64)}
         return observation, fake(Calibration, config.seed, {"joint": n}, **given)
 
     def plan(self, config: Any, calibration: Any) -> Any:

@@ -146,7 +146,12 @@ def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
     assert calibrate["usable"] is True
     assert calibrate["advice"] == ["more"]
     assert calibrate["chi2_per_dof"] is None  # not a number
-    assert calibrate["outliers"] == []
+    assert calibrate["outliers"] == [
+        {"pose": 3, "marker": 1, "view": "left"},
+        {"pose": 4, "marker": 2, "view": "both"},
+    ]
+    assert calibrate["suspect_joint_readings"] == []
+    assert calibrate["merged_poses"] == 3
     names = [(joint["name"], joint["type"]) for joint in calibrate["joints"]]
     assert names == [("q1", "R"), ("elbow", "R")]
     assert set(calibrate["joints"][0]) == {"name", "type", "excitation", "weak"}
