@@ -39,7 +39,7 @@ def factorize(B: FloatArray, m: int, n: int, pivot: IntArray, rhs: FloatArray) -
     before_last = 0.0
     for k in range(min(m, n)):
         best = k
-        most = -1.0
+        most = 0.0
         for j in range(k, n):
             size = 0.0
             for i in range(k, m):
@@ -112,7 +112,7 @@ def kernel_vector(
             x[j] = 0.0
         return False
     last = abs(B[n - 1, n - 1]) if m >= n else 0.0
-    if last > KERNEL_TOLERANCE * abs(B[0, 0]):
+    if not last <= KERNEL_TOLERANCE * abs(B[0, 0]):
         for j in range(n):
             x[j] = 0.0
         return False

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 DEPENDS_ON = ("seed", "robot", "rig", "markers", "noise.servo_px", "task", "trajectory")
 VIEWS = ("left", "right")
+TASK_DIMENSION = 6
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
 HALF_TURN_BAND = math.radians(2.0)
 REHEARSAL_STEPS = 300
@@ -99,6 +100,11 @@ def plan_task(
     WorkFailed
         If a marker cannot be triangulated or a motion is not unique.
     """
+    if len(q_start) != TASK_DIMENSION:
+        raise WorkFailed(
+            f"the partition of a task needs a robot of six joints, this one has {len(q_start)}: "
+            "its motions are then no unique kernels"
+        )
     task = task_from_images(model, s_start, s_star, center)
     state = new_state(len(q_start), s_start.shape[1])
     if not measure(model, task, np.ascontiguousarray(s_start), q_start, state):
