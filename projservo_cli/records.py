@@ -98,6 +98,20 @@ class Calibration:
     operator_defect: FloatArray = array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
     trace_defect: FloatArray = array("joint", about="absolute trace of Ĥ")
     plane_defect: FloatArray = array("joint", about="norm of a_inf @ Ĥ, a_inf of unit norm")
+    prediction_noise: FloatArray = array(
+        "joint", about="noise of predicted images 0.5 rad or 0.15 m from the reference, over the pixel noise"
+    )
+    merged_poses: int = scalar(about="poses that the fit uses")
+    merged_markers: int = scalar(about="markers that the fit uses")
+    outlier: IntArray = array(
+        "outlier_row", "outlier_column", about="readings left out: pose, marker, view (0 left, 1 right, 2 both)"
+    )
+    suspect: IntArray = array(
+        "suspect_row", "suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
+    )
+    swapped: IntArray = array(
+        "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
+    )
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""

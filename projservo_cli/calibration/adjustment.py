@@ -6,6 +6,7 @@ Both cameras are general 3×4 matrices. The frame is a means of writing the cons
 claim to truth: how it sits in the world is left to the images as far as they determine it.
 """
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,14 +57,12 @@ def layout(readings: Readings) -> Layout:
     joint = 2 * CAMERA + np.concatenate([[0], np.cumsum(np.where(readings.prismatic, 2, 4))])
     m = readings.marker.size
     edges = np.searchsorted(readings.marker_of, np.arange(m + 1))
-    groups = tuple(slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    groups = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
     joints = np.arange(joint[0], joint[-1])
     columns = np.array(
         [
             [
-                np.concatenate(
-                    [v * CAMERA + np.arange(CAMERA), joints, joint[-1] + 3 * j + np.arange(3)]
-                )
+                np.concatenate([v * CAMERA + np.arange(CAMERA), joints, joint[-1] + 3 * j + np.arange(3)])
                 for j in range(m)
             ]
             for v in (0, 1)
@@ -210,9 +209,7 @@ def _clean(H_hat: FloatArray, before: FloatArray, slides: bool) -> FloatArray:
         speed = np.linalg.norm(before[:3, 3]) / np.linalg.norm(H_hat[:3, 3])
         result[:3, 3] = H_hat[:3, 3] * speed
         return result
-    w = 0.5 * np.array(
-        [H_hat[2, 1] - H_hat[1, 2], H_hat[0, 2] - H_hat[2, 0], H_hat[1, 0] - H_hat[0, 1]]
-    )
+    w = 0.5 * np.array([H_hat[2, 1] - H_hat[1, 2], H_hat[0, 2] - H_hat[2, 0], H_hat[1, 0] - H_hat[0, 1]])
     w /= np.linalg.norm(w)
     result[:3, :3] = _cross(w)
     result[:3, 3] = H_hat[:3, 3] - w * (w @ H_hat[:3, 3])
@@ -245,4 +242,5 @@ def gauge(scene: Scene, readings: Readings, place: Layout) -> FloatArray:
         result[place.joint[-1] :, k] = (scene.M @ Z.T)[:, :3].ravel()
     for v in (0, 1):
         result[v * CAMERA : (v + 1) * CAMERA, len(motions) + v] = scene.P[v].ravel()
-    return result / np.linalg.norm(result, axis=0)
+    directions: FloatArray = result / np.linalg.norm(result, axis=0)
+    return directions

@@ -80,7 +80,7 @@ def merge(points: FloatArray, seen: BoolArray) -> Alignment:
     points : (K, m, 3) guessed metric reconstruction, any value where not seen.
     seen : (K, m) what was reconstructed.
     """
-    K, m = seen.shape
+    K = len(seen)
     points = np.where(seen[..., None], points, 0.0)
     R, t = np.tile(np.eye(3), (K, 1, 1)), np.zeros((K, 3))
     seed = _seed(points, seen)
@@ -93,7 +93,8 @@ def merge(points: FloatArray, seen: BoolArray) -> Alignment:
             rows = usable.sum(axis=1) >= min(shared, int(known.sum()))
             rows &= usable.sum(axis=1) >= LEAST
             if rows.any():
-                R[rows], t[rows] = robust_align(np.where(known[:, None], body, 0.0), points[rows], usable[rows])
+                filled = np.where(known[:, None], body, 0.0)
+                R[rows], t[rows] = robust_align(filled, points[rows], usable[rows])
             grown = bool((rows & ~merged).any())
             merged |= rows
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])

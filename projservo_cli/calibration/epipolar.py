@@ -52,6 +52,19 @@ def normalization(pixels: FloatArray) -> FloatArray:
     return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
 
 
+def incidence_and_slope(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residual rightᵀ F left of correspondences and the length of its gradient by all four pixels.
+
+    Parameters are those of ``sampson``; so are the shapes of both results.
+    """
+    lines_right = left @ np.swapaxes(F, -1, -2)
+    lines_left = right @ F
+    incidence: FloatArray = (lines_right * right).sum(axis=-1)
+    square = (lines_right[..., :2] ** 2).sum(axis=-1) + (lines_left[..., :2] ** 2).sum(axis=-1)
+    slope: FloatArray = np.sqrt(np.maximum(square, np.finfo(float).tiny))
+    return incidence, slope
+
+
 def sampson(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
     """Signed first-order distance of correspondences to the epipolar variety.
 
@@ -66,12 +79,8 @@ def sampson(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
     -------
     (..., N) distances in the joint image plane, in the unit of the pixels.
     """
-    lines_right = left @ np.swapaxes(F, -1, -2)
-    lines_left = right @ F
-    incidence = (lines_right * right).sum(axis=-1)
-    slope = (lines_right[..., :2] ** 2).sum(axis=-1) + (lines_left[..., :2] ** 2).sum(axis=-1)
-    result: FloatArray = incidence / np.sqrt(np.maximum(slope, np.finfo(float).tiny))
-    return result
+    incidence, slope = incidence_and_slope(F, left, right)
+    return incidence / slope
 
 
 def eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None = None) -> FloatArray:
@@ -144,11 +153,9 @@ def _sampson_gradient(F: FloatArray, left: FloatArray, right: FloatArray) -> Flo
     """Derivative of each Sampson distance by the entries of F, (N, 3, 3)."""
     flat = np.array([1.0, 1.0, 0.0])
     lines_right, lines_left = (left @ F.T) * flat, (right @ F) * flat
-    slope = (lines_right**2).sum(axis=1) + (lines_left**2).sum(axis=1)
-    slope = np.maximum(slope, np.finfo(float).tiny)[:, None, None]
-    incidence = ((left @ F.T) * right).sum(axis=1)[:, None, None]
+    incidence, slope = (part[:, None, None] for part in incidence_and_slope(F, left, right))
     turn = lines_right[:, :, None] * left[:, None, :] + right[:, :, None] * lines_left[:, None, :]
-    result: FloatArray = (right[:, :, None] * left[:, None, :] - incidence / slope * turn) / np.sqrt(slope)
+    result: FloatArray = (right[:, :, None] * left[:, None, :] - incidence / slope**2 * turn) / slope
     return result
 
 
@@ -200,19 +207,18 @@ def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> E
     medians = np.median(np.abs(sampson(candidates, a, b)), axis=1)
     F = candidates[np.argmin(medians)]
     for _ in range(10):
-        r = sampson(F, a, b)
+        incidence, slope = incidence_and_slope(F, a, b)
+        r = incidence / slope
         scale = max(float(np.median(np.abs(r))) / MAD, 1e-12)
-        slope = np.abs(((a @ F.T) * b).sum(axis=1)) / np.maximum(np.abs(r), 1e-15)
         F = eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * scale)) ** 2)))
     r = sampson(F, a, b)
     F = refine(F, a, b, 2.0 * max(float(np.median(np.abs(r))) / MAD, 1e-12))
-    F = T_.T @ F @ T
-    F /= np.linalg.norm(F)
-    residual = sampson(F, homogeneous(left), homogeneous(right))
+    in_pixels: FloatArray = T_.T @ F @ T
+    in_pixels = np.asarray(in_pixels / np.linalg.norm(in_pixels))
+    residual = sampson(in_pixels, homogeneous(left), homogeneous(right))
     scale = max(float(np.median(np.abs(residual))) / MAD, 1e-9)
     inlier = np.abs(residual) <= OUTLIER * scale
     if inlier.sum() <= 7:
         raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
     sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - 7)))
-    return Epipolar(F, sigma, inlier)
-
+    return Epipolar(in_pixels, sigma, inlier)

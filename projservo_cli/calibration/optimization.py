@@ -46,10 +46,11 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """Images to explain: the readings, joint values from the reference and where parameters stand."""
+    """Images to explain: the readings, joint values (K, n) from the reference (n,), layout."""
 
     readings: Readings
     q: FloatArray
+    q_reference: FloatArray
     place: Layout
 
     def residual(self, scene: Scene) -> FloatArray:
@@ -85,10 +86,20 @@ class Problem:
                 result[v, rows] = J[v, rows] @ x[self.place.columns[v, j]]
         return result
 
+    def dense(self, J: FloatArray, weight: FloatArray) -> FloatArray:
+        """The whole derivative (4 N, size) in units of noise, for what needs more than JᵀJ."""
+        result = np.zeros((*J.shape[:3], self.place.size))
+        for v in (0, 1):
+            for j, rows in enumerate(self.place.groups):
+                result[v, rows, :, self.place.columns[v, j]] = np.moveaxis(
+                    J[v, rows] * np.sqrt(weight[v, rows])[:, None, None], 2, 0
+                )
+        return result.reshape(-1, self.place.size)
+
 
 def prepare(readings: Readings, q_reference: FloatArray) -> Problem:
     """Problem of explaining the readings about the reference joints (n,), rad or m."""
-    return Problem(readings, readings.q - q_reference, adjustment.layout(readings))
+    return Problem(readings, readings.q - q_reference, q_reference, adjustment.layout(readings))
 
 
 def fixed(weight: FloatArray) -> Weighting:
@@ -116,8 +127,9 @@ def minimize(
     damping, scale = 1e-3, np.zeros(int(free.sum()))
     settled = False
     fresh = True
-    step = 0
-    for step in range(1, most + 1):
+    steps = 0
+    while steps < most and not settled and damping <= MOST_DAMPING:
+        steps += 1
         if fresh:
             _, J = adjustment.derivative(scene, readings, problem.q)
             A, g, scale, G = _scaled_normal(problem, scene, J, weight, residual, free, scale)
@@ -135,10 +147,8 @@ def minimize(
             damping = max(0.1 * damping, LEAST_DAMPING)
         else:
             damping *= 10.0
-        if settled or damping > MOST_DAMPING:
-            break
     cost = float((weight[..., None] * residual**2).sum())
-    return Fit(scene, residual, weight, cost, step, settled)
+    return Fit(scene, residual, weight, cost, steps, settled)
 
 
 def _scaled_normal(

@@ -18,6 +18,7 @@ class Readings:
     ----------
     q : (K, n) joint readings, rad or m.
     prismatic : (n,) whether the joint is prismatic.
+    pose : (K,) numbers of the poses.
     marker : (m,) numbers of the markers.
     pose_of : (N,) row of ``q``.
     marker_of : (N,) position in ``marker``, never falling.
@@ -27,6 +28,7 @@ class Readings:
 
     q: FloatArray
     prismatic: BoolArray
+    pose: IntArray
     marker: IntArray
     pose_of: IntArray
     marker_of: IntArray
@@ -36,7 +38,7 @@ class Readings:
     @property
     def both(self) -> BoolArray:
         """(N,) whether both views saw the marker."""
-        result: BoolArray = self.seen.all(axis=0)
+        result: BoolArray = np.logical_and(self.seen[0], self.seen[1])
         return result
 
 
@@ -59,7 +61,7 @@ def gather(observation: Observation, joint_types: str) -> Readings:
         raise InputError(f"joint types {joint_types!r}: expected {n} letters R or P, one a joint")
     if not np.isfinite(observation.q).all():
         raise InputError("joint readings must be finite numbers")
-    finite = np.isfinite(observation.images).all(axis=3)
+    finite = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
     if np.isinf(observation.images).any():
         raise InputError("pixels must be finite numbers, or missing where a marker was not seen")
     marker_of, pose_of = np.nonzero(finite.any(axis=1).T)
@@ -69,6 +71,7 @@ def gather(observation: Observation, joint_types: str) -> Readings:
     return Readings(
         q=np.array(observation.q, dtype=np.float64),
         prismatic=np.array([letter == "P" for letter in letters]),
+        pose=observation.pose,
         marker=observation.marker[present],
         pose_of=pose_of,
         marker_of=np.searchsorted(present, marker_of),

@@ -4,6 +4,7 @@ Everything guessed here (focal length, principal point, square pixels) is free i
 whose result is projective.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +102,8 @@ def relative_pose(F: FloatArray, K: FloatArray, left: FloatArray, right: FloatAr
     scale = float(np.median(np.abs(depth))) or 1.0
     left_camera = np.hstack([np.eye(3), np.zeros((3, 1))])
     right_camera = np.hstack([R, t[:, None] / scale])
-    return Guess(np.stack([K[0] @ left_camera, K[1] @ right_camera]), x * (depth / scale)[:, None], np.inf, 0.0)
+    P = np.stack([K[0] @ left_camera, K[1] @ right_camera])
+    return Guess(P, x * (depth / scale)[:, None], np.inf, 0.0)
 
 
 def ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -184,11 +186,13 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: Frame, keep: int) -
     padded = np.concatenate([[np.inf], spread, [np.inf]])
     minima = np.flatnonzero((spread <= padded[:-2]) & (spread < padded[2:]))
     minima = minima[np.argsort(spread[minima])][:keep]
+    # A minimum at which the body changes its shape a lot more than at the best is none to start from.
+    minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
     return [_golden(guess, grid[i] - step, grid[i] + step, scan[i]) for i in minima]
 
 
-def _golden(guess, low: float, high: float, best: Guess) -> Guess:
+def _golden(guess: Callable[[float], Guess], low: float, high: float, best: Guess) -> Guess:
     """Golden section search for the least spread between two logarithms of the focal length."""
     for _ in range(12):
         width = GOLDEN * (high - low)

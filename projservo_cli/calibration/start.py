@@ -71,18 +71,18 @@ def rotation_vector(R: FloatArray) -> FloatArray:
     )
     sine = np.linalg.norm(quaternion[..., 1:], axis=-1)
     angle = 2.0 * np.arctan2(sine, quaternion[..., 0])
-    result: FloatArray = quaternion[..., 1:] * np.where(
-        sine > 1e-9, angle / np.maximum(sine, 1e-300), 2.0
-    )[..., None]
+    result: FloatArray = (
+        quaternion[..., 1:] * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-300), 2.0)[..., None]
+    )
     return result
 
 
-def mean_rotation(R: FloatArray, weight: FloatArray) -> FloatArray:
+def mean_rotation(R: FloatArray) -> FloatArray:
     """Chordal mean (S, 3, 3) of rotations (S, K, 3, 3).
 
     Source: R. Hartley et al., "Rotation averaging", IJCV 103, 2013, section 5.3.
     """
-    U, _, Vt = np.linalg.svd(np.einsum("sk,skij->sij", weight, R))
+    U, _, Vt = np.linalg.svd(R.sum(axis=1))
     U[..., 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[:, None]
     return np.asarray(U @ Vt)
 
@@ -103,7 +103,8 @@ def chain_rotations(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> Float
         if prismatic[i]:
             result[..., i + 1, :, :, :] = result[..., i, :, :, :]
         else:
-            result[..., i + 1, :, :, :] = result[..., i, :, :, :] @ rotation_about(w[..., i, None, :], q[:, i])
+            turn = rotation_about(w[..., i, None, :], q[:, i])
+            result[..., i + 1, :, :, :] = result[..., i, :, :, :] @ turn
     return result
 
 
@@ -174,7 +175,8 @@ def _fit_axes(
 ) -> tuple[FloatArray, FloatArray]:
     """Levenberg–Marquardt for all starts at once: axes (S, n, 3) and losses (S,)."""
     S, n = w.shape[:2]
-    base = mean_rotation(np.swapaxes(chain_rotations(w, q, prismatic)[:, n], -1, -2) @ R, np.ones((S, len(R))))
+    chain = chain_rotations(w, q, prismatic)[:, n]
+    base = mean_rotation(np.swapaxes(chain, -1, -2) @ R)
     damping = np.full(S, 1e-2)
     residual, J = _axis_residuals(w, base, R, q, prismatic)
     loss, weight = _cauchy(residual)
@@ -210,7 +212,7 @@ def _exponential(v: FloatArray) -> FloatArray:
 def _axis_residuals(
     w: FloatArray, base: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals log(R_predᵀ-free) (S, K, 3) and their derivative (S, K, 3, 3 (n + 1)) by turns of axes and base.
+    """Residuals log(R R_predᵀ) (S, K, 3) and derivative (S, K, 3, 3 (n + 1)) by turns of axes and base.
 
     A turn δ of axis i turns the prediction by (R̄_i−1 − R̄_i) δ, a turn of the base by R̄_n δ; the
     logarithm is taken to first order, which vanishes with the residual.
@@ -226,7 +228,7 @@ def _axis_residuals(
 
 
 def _cauchy(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cauchy loss (S,) of residual rotations (S, K, 3) at a fixed width of 0.05 rad, and the weights (S, K)."""
+    """Cauchy loss (S,) of rotations (S, K, 3) at a width of 0.05 rad, and the weights (S, K)."""
     square = (residual**2).sum(axis=2) / 0.05**2
     return np.log1p(square).sum(axis=1), 1.0 / (1.0 + square)
 
