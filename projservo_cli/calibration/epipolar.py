@@ -214,7 +214,8 @@ def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> E
     r = sampson(F, a, b)
     F = refine(F, a, b, 2.0 * max(float(np.median(np.abs(r))) / MAD, 1e-12))
     in_pixels: FloatArray = T_.T @ F @ T
-    in_pixels = np.asarray(in_pixels / np.linalg.norm(in_pixels))
+    product = T_.T @ F @ T
+    in_pixels: FloatArray = product / float(np.linalg.norm(product))
     residual = sampson(in_pixels, homogeneous(left), homogeneous(right))
     scale = max(float(np.median(np.abs(residual))) / MAD, 1e-9)
     inlier = np.abs(residual) <= OUTLIER * scale
