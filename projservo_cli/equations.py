@@ -48,7 +48,7 @@ REGISTER = (
         "2",
         "Projective displacement, conjugate to a rigid motion, of unit determinant",
         "geometry.displacement.normalize_displacement",
-        "geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
+        " geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
         "det = 1 leaves ±H in dimension 4 (the trace is 0 at 180°): choose the sign that keeps the sign "
         "of a_inf·M.",
     ),
@@ -113,13 +113,14 @@ REGISTER = (
         "11",
         "Amplitude of the translation of the centre",
         "task.partition.translation_part",
-        "",
+        "task/test_partition.py::test_amplitudes_are_the_metric_ones",
     ),
     _entry(
         "12",
         "Target less the translation",
         "task.partition.partition",
-        "",
+        "task/test_partition.py::test_any_displacement "
+        "task/test_partition.py::test_partition_does_not_depend_on_the_frame",
     ),
     _entry(
         "13",
@@ -133,7 +134,7 @@ REGISTER = (
         "14",
         "Its trigonometric equation",
         "geometry.composition.incidence_coefficients task.visibility.margin_coefficients",
-        "geometry/test_composition.py::test_points_are_turned_onto_the_plane",
+        "task/test_visibility.py::test_margin_coefficients_describe_the_carried_plane",
     ),
     _entry(
         "15",
@@ -147,19 +148,19 @@ REGISTER = (
         "16",
         "Target less the translation and the rotation onto the plane",
         "task.partition.partition",
-        "",
+        "task/test_partition.py::test_any_displacement task/test_partition.py::test_square_face",
     ),
     _entry(
         "17",
         "Displacement along the planned trajectory",
         "task.trajectory.trajectory_displacement",
-        "",
+        "task/test_trajectory.py::test_planned_displacement_is_the_product_in_the_order_of_the_paper",
     ),
     _entry(
         "18",
         "Shares of translation and rotations along the trajectory",
         "task.trajectory.profile_shares",
-        "",
+        "task/test_trajectory.py::test_shares_grow_from_nothing_to_all",
         "μ_d is μ_t.",
     ),
     _entry(
@@ -174,7 +175,7 @@ REGISTER = (
         "20",
         "Direct control directTHREE",
         "control.direct_three.direct_three",
-        "",
+        "control/test_direct.py::test_each_error_decays_at_its_own_rate",
         "−ė = λe with q̇ = […] ė leads away from the goal; the motion that reaches it is q̇ = λ_t τ "
         "q̂_t + λ_r θ_r q̂_r + λ_p θ_p q̂_p.",
     ),
@@ -182,14 +183,14 @@ REGISTER = (
         "21",
         "Displacement that directTHREE integrates to",
         "control.direct_three.direct_three",
-        "",
+        "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit",
         "λ_r θ_r is printed twice; the second is λ_p θ_p.",
     ),
     _entry(
         "22",
         "Translation and rotation at once",
         "control.direct_two.direct_two",
-        "",
+        "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "
         "parallel to the axis; with Ĥ_s carried along with the moving centre the flow integrates to the "
         "product.",
@@ -198,7 +199,8 @@ REGISTER = (
         "23",
         "Direct control directTWO",
         "control.direct_two.direct_two control.direct_two.rotation_about_center",
-        "",
+        "control/test_direct.py::test_one_rotation_decays_at_the_rate_of_its_gain "
+        "control/test_direct.py::test_any_ratio_converges",
         "Sign as in (20): q̇ = λ_t τ q̂_t + λ_s θ_s q̂_s.",
     ),
     _entry(
@@ -206,7 +208,8 @@ REGISTER = (
         "One rotation for both rotations",
         "geometry.composition.compose_rotations",
         "geometry/test_composition.py::test_one_rotation_equals_two "
-        "geometry/test_composition.py::test_operator_is_the_matrix_logarithm_of_the_product",
+        "geometry/test_composition.py::test_operator_is_the_matrix_logarithm_of_the_product "
+        "control/test_direct.py::test_error_of_both_rotations_is_the_true_angle",
     ),
     _entry(
         "25",
@@ -221,7 +224,12 @@ REGISTER = (
         "task.visibility.margin task.visibility.visibility_translation "
         "task.visibility.visibility_angles task.visibility.choose_sense "
         "task.visibility.limited_translation",
-        "",
+        "task/test_visibility.py::test_neutral_along_the_ray_of_a_point_of_the_face "
+        "task/test_visibility.py::test_neutral_parallel_to_the_face "
+        "task/test_visibility.py::test_neutral_about_any_axis_through_the_optical_center "
+        "task/test_visibility.py::test_neutral_within_the_plane_of_the_face "
+        "task/test_visibility.py::test_the_optical_axis_itself_is_not_neutral "
+        "task/test_visibility.py::test_two_cameras_that_want_different_senses",
         "Translation along the optical axis changes visibility unless the ray passes through the face's "
         "point. Neutral, for one camera each: translation along that ray in front of the camera or "
         "parallel to the face, any rotation about an axis through the optical centre, and Ĥ_p.",
@@ -230,7 +238,8 @@ REGISTER = (
         "§4.3",
         "Profiles of the trajectory",
         "task.trajectory.profile_shares",
-        "",
+        "task/test_trajectory.py::test_linear_and_exponential "
+        "task/test_trajectory.py::test_what_comes_first_is_done_before_the_rest_begins",
         "1 − exp(−σ/t_*) reaches 0.632 at σ = t_* and is normalised to reach 1. H_r(θ_P(σ)) is "
         "H_r(θ_r(σ)); “μ_t < τ_0” compares τ(σ) with τ_0, likewise θ_r; τ(σ − 1) means τ (μ_t(σ) − 1).",
     ),
