@@ -177,8 +177,7 @@ def _cross(w: FloatArray) -> FloatArray:
 def _turn(w: FloatArray) -> FloatArray:
     """Rotation near the identity by the Cayley map, (3, 3) from three numbers."""
     S = 0.5 * _cross(w)
-    result: FloatArray = np.linalg.solve(np.eye(3) - S, np.eye(3) + S)
-    return result
+    return np.asarray(np.linalg.solve(np.eye(3) - S, np.eye(3) + S), dtype=np.float64)
 
 
 def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> Epipolar:
@@ -213,7 +212,6 @@ def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> E
         F = eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * scale)) ** 2)))
     r = sampson(F, a, b)
     F = refine(F, a, b, 2.0 * max(float(np.median(np.abs(r))) / MAD, 1e-12))
-    in_pixels: FloatArray = T_.T @ F @ T
     product = T_.T @ F @ T
     in_pixels: FloatArray = product / float(np.linalg.norm(product))
     residual = sampson(in_pixels, homogeneous(left), homogeneous(right))
