@@ -9,6 +9,8 @@ from scipy.linalg import expm
 
 from projservo_cli.records import PRISMATIC, REVOLUTE, Model
 
+METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+
 
 def hat(w, v):
     """Twist 4×4 of an angular velocity and a velocity of the origin."""
@@ -37,14 +39,17 @@ def rig(baseline=0.3, focal=1000.0):
 
 
 def arm(types="RRRRRR"):
-    """Metric model of an arm with axes in general position, seen by ``rig``; q_reference is not zero."""
+    """Metric model of an arm with axes in general position, seen by ``rig``; q_reference is not zero.
+
+    Six joints, all revolute or the third prismatic, stay away from singularities within ±0.4 of it.
+    """
     axes = [
-        ([0.1, 0.5, 2.1], [0.1, 1.0, 0.2]),
-        ([0.0, 0.4, 2.0], [1.0, 0.1, -0.2]),
-        ([-0.1, 0.1, 2.1], [0.9, -0.2, 0.3]),
-        ([0.05, 0.0, 1.9], [0.1, 0.3, 1.0]),
-        ([0.1, -0.1, 1.7], [-0.2, 1.0, 0.1]),
-        ([0.0, 0.05, 1.6], [0.2, -0.3, 1.0]),
+        ([-0.16, 0.09, 2.16], [0.1, 1.0, 0.3]),
+        ([0.26, 0.41, 2.19], [1.4, 0.9, 0.3]),
+        ([0.14, -0.36, 2.04], [0.5, 0.5, -0.6]),
+        ([-0.08, 0.21, 1.54], [-0.8, 0.1, 0.5]),
+        ([-0.02, 0.0, 1.42], [0.8, 0.7, 0.8]),
+        ([0.09, -0.05, 1.41], [0.2, 1.3, 0.2]),
         ([0.2, 0.1, 1.8], [1.0, 1.0, 0.3]),
     ]
     twists = [
@@ -56,7 +61,7 @@ def arm(types="RRRRRR"):
         np.array(twists),
         np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in types], dtype=np.int64),
         np.linspace(-0.4, 0.5, len(types)),
-        np.array([0.0, 0.0, 0.0, 1.0]),
+        METRIC_A_INF.copy(),
     )
 
 
