@@ -10,12 +10,13 @@ from projservo_cli.figures.measures import along_line, center_path
 from projservo_cli.records import FloatArray
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Deviations below this, mm, are drawn at the lower border.
-LEAST_MM = 0.01
+# Share of the largest deviation of the best run below which nothing is drawn.
+LEAST_SHARE = 0.05
 PATH_POINTS = 400
+# Runs with a longer joint step, rad or m, wind the arm up: their path is drawn at the instants only.
+WHIRL = np.pi
 
 
 def table(studies: Studies, *, at_samples: bool = False) -> FloatArray:
@@ -53,9 +54,11 @@ def data(material: Material) -> Data:
         cases = [(gain, False) for gain in studies.gains] + [(max(studies.gains), True)]
         for i, (gain, limited) in enumerate(cases):
             trace = studies.sweep[law, "calibrated", limited, gain]
-            points = center_path(material, trace)
+            whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > WHIRL
+            points = trace.center if whirls else center_path(material, trace)
             way, off = along_line(points, trace.center[0], material.goal_center(trace))
             used = np.unique(np.linspace(0, len(points) - 1, PATH_POINTS).round().astype(int))
+            result[f"whirls_{law}_{i}"] = np.array(whirls)
             result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([way, off], axis=1)[used]
     return result
 
@@ -65,19 +68,22 @@ def draw(data: Data, figure: "Figure") -> None:
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
     for row, law in enumerate(DIRECT):
-        for i in range(len(gains) + 1):
-            way, off = data[f"path_mm_{law}_{i}"].T
-            axes[row, 0].plot(way, np.maximum(off, LEAST_MM), **_path_look(i, len(gains)))
+        paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
+        least = max(LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
+        for i, path in enumerate(paths):
+            way, off = path.T
+            axes[row, 0].plot(way, np.maximum(off, least), **_path_look(i, len(gains)))
         axes[row, 0].set_title(f"{TITLES[law]}: path of the centre, calibrated operators")
         axes[row, 0].set_xlabel("way along the straight line (mm)")
         axes[row, 0].set_ylabel("distance from it (mm)")
-        _decades(axes[row, 0])
+        axes[row, 0].set_yscale("log")
+        axes[row, 0].set_ylim(bottom=least)
         for operators, color in enumerate((style.BLACK, style.VERMILION)):
             for limited, line in enumerate(("-", (0, (4, 1.5)))):
                 marker = "os"[operators] if not limited else "^v"[operators]
                 axes[row, 1].plot(
                     gains,
-                    np.maximum(data["drift_mm"][row, operators, limited], LEAST_MM),
+                    data["drift_mm"][row, operators, limited],
                     color=color,
                     linestyle=line,
                     marker=marker,
@@ -87,11 +93,14 @@ def draw(data: Data, figure: "Figure") -> None:
         axes[row, 1].set_xscale("log")
         axes[row, 1].set_xticks(gains, [f"{gain:g}" for gain in gains])
         axes[row, 1].minorticks_off()
-        _decades(axes[row, 1])
+        axes[row, 1].set_yscale("log")
         axes[row, 1].set_title(f"{TITLES[law]}: largest distance")
         axes[row, 1].set_xlabel("gain per step (1)")
         axes[row, 1].set_ylabel("largest distance (mm)")
-    style.legend_below(figure, _handles(gains, float(data["step_limit_deg"])), 4)
+    handles = _handles(gains, float(data["step_limit_deg"]))
+    if any(data[f"whirls_{law}_{i}"] for law in DIRECT for i in range(len(gains) + 1)):
+        handles.append(style.line_handle("chords: steps over 180°", color=style.BLACK, linewidth=0))
+    style.legend_below(figure, handles, 4)
 
 
 def _path_look(i: int, gains: int) -> dict[str, Any]:
@@ -100,15 +109,8 @@ def _path_look(i: int, gains: int) -> dict[str, Any]:
     return style.curve(i)
 
 
-def _decades(axes: "Axes") -> None:
-    axes.set_yscale("log")
-    axes.set_ylim(bottom=LEAST_MM)
-
-
 def _handles(gains: FloatArray, limit: float) -> list[Any]:
-    paths = [
-        style.line_handle(f"gain {gain:g} per step", **style.curve(i)) for i, gain in enumerate(gains)
-    ]
+    paths = [style.line_handle(f"gain {gain:g} per step", **style.curve(i)) for i, gain in enumerate(gains)]
     paths.append(
         style.line_handle(f"{gains.max():g} and {limit:g}° per step", **_path_look(len(gains), len(gains)))
     )

@@ -19,7 +19,7 @@ DECADES = 1e-5
 
 def percent(values: FloatArray) -> FloatArray:
     """Values normalised to 100 at their start; NaN throughout where they start at 0."""
-    return 100.0 * values / values[0] if values[0] != 0 else np.full_like(values, np.nan)
+    return np.asarray(100.0 * values / values[0]) if values[0] != 0 else np.full_like(values, np.nan)
 
 
 def data_two(material: Material) -> Data:
@@ -45,7 +45,7 @@ def _time(trace: Trace) -> FloatArray:
 def draw_two(data: Data, figure: "Figure") -> None:
     """Above τ, below θ_s; left as in the paper, right on a logarithmic scale."""
     axes = figure.subplots(2, 2, sharex=True)
-    looks = {
+    looks: dict[str, style.Look] = {
         "free": {"color": style.BLACK, "linestyle": "-"},
         "limited": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
     }
@@ -62,7 +62,7 @@ def draw_two(data: Data, figure: "Figure") -> None:
         axes[0, column].set_ylabel(r"$\tau$ (% of its start)")
         axes[1, column].set_ylabel(r"$\theta_s$ (deg)")
         axes[1, column].set_xlabel("time (s)")
-    faint = {"linewidth": 0.8, "alpha": 0.55}
+    faint: style.Look = {"linewidth": 0.8, "alpha": 0.55}
     handles = [
         style.line_handle("no limit", **looks["free"]),
         style.line_handle(f"{data['step_limit_deg']:g}° per step", **looks["limited"]),
@@ -152,9 +152,13 @@ def draw_three(data: Data, figure: "Figure") -> None:
         style.line_handle(r"$\theta_r$, projective model", color=style.BLACK),
         style.line_handle(r"$\theta_p$, projective model", color=style.VERMILION),
         style.line_handle(
-            r"$\theta_r$, $\theta_p$, Euclidean", color=style.BLACK, marker="o", linestyle="none", fillstyle="none"
+            r"$\theta_r$, $\theta_p$, Euclidean",
+            color=style.BLACK,
+            marker="o",
+            linestyle="none",
+            fillstyle="none",
         ),
-        style.line_handle("difference, true operators", color=style.BLACK, linestyle=(0, (1, 1.2))),
+        style.line_handle("dotted difference: true operators", color=style.BLACK, linestyle=(0, (1, 1.2))),
     ]
     style.legend_below(figure, handles, 2)
 

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 # How far outside an image, as a share of its size, a path is still drawn.
 OUTSIDE = 0.15
+BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
 PLATEAU_WINDOW = 20
+PANEL_WIDTH = 2.9  # inches, of one of two panels beside one another
 
 
 def data_classical(material: Material) -> Data:
@@ -42,19 +44,31 @@ def _paths(material: Material, trace: Trace) -> Data:
 def draw_classical(data: Data, figure: "Figure") -> None:
     """One row a law, one column a camera."""
     laws = [law for law in CLASSICAL if f"s_{law}" in data]
-    axes = figure.subplots(len(laws), 2, squeeze=False)
+    shown = [
+        np.concatenate([data[f"s_{law}"].reshape(-1, 2), data[f"s_star_{law}"].reshape(-1, 2)])
+        for law in laws
+    ]
+    heights = [PANEL_WIDTH * style.aspect(_near(pixels, data["image_size"])) for pixels in shown]
+    figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
+    axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
     for row, law in enumerate(laws):
         for view, name in enumerate(VIEWS):
             panel = axes[row, view]
             s, hidden = data[f"s_{law}"][:, view], data[f"hidden_{law}"][:, view]
             _draw_paths(panel, s, hidden, data[f"plateau_{law}"])
-            style.face(panel, s[0], fill=style.PALE, color=style.BLACK, linewidth=1.4)
+            panel.plot(*s[-1].T, "x", color=style.BLACK, markersize=4)
+            style.face(panel, s[0], style.START, fill=True)
             goal = data[f"s_star_{law}"][view]
-            style.face(panel, goal, color=style.BLUE, linestyle=(0, (5, 1.5)))
+            style.face(panel, goal, style.GOAL)
             title = f"{name} camera" if view else f"{TITLES[law]}: {data[f'verdict_{law}']}"
             style.image_axes(panel, title)
             _frame(panel, np.concatenate([s.reshape(-1, 2), goal]), data["image_size"])
-    style.legend_below(figure, _classical_handles(), 3)
+    handles = _classical_handles()
+    handles += [style.line_handle("end of the run", color=style.BLACK, marker="x", linestyle="none")]
+    every = _near(np.concatenate(shown), data["image_size"]) / data["image_size"]
+    if (np.abs(every - 0.5) > 0.5 - BORDER_SHOWN).any():
+        handles += [style.line_handle("border of the image", color=style.GREY, linewidth=0.8)]
+    style.legend_below(figure, handles, 4)
 
 
 def _draw_paths(axes: "Axes", s: FloatArray, hidden: FloatArray, plateau: FloatArray) -> None:
@@ -70,9 +84,7 @@ def _draw_paths(axes: "Axes", s: FloatArray, hidden: FloatArray, plateau: FloatA
 
 def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
     """Show the paths as far as they stay near the image, and the image border where it is near."""
-    low, high = -OUTSIDE * size, (1.0 + OUTSIDE) * size
-    near = pixels[np.isfinite(pixels).all(axis=1)]
-    style.frame_pixels(axes, np.clip(near, low, high))
+    style.frame_pixels(axes, _near(pixels, size))
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
     limits = axes.get_xlim(), axes.get_ylim()
     axes.plot(*style.closed(border).T, color=style.GREY, linewidth=0.8)
@@ -80,14 +92,19 @@ def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
     axes.set_ylim(limits[1])
 
 
+def _near(pixels: FloatArray, size: FloatArray) -> FloatArray:
+    """Pixels (k, 2) that were measured, none farther outside the image than is drawn."""
+    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    return np.clip(seen, -OUTSIDE * size, (1.0 + OUTSIDE) * size)
+
+
 def _classical_handles() -> list[object]:
     return [
-        style.line_handle("start", color=style.BLACK, linewidth=1.4),
-        style.line_handle("goal", color=style.BLUE, linestyle=(0, (5, 1.5))),
+        style.line_handle("start", **style.START),
+        style.line_handle("goal", **style.GOAL),
         style.line_handle("path of a marker", color=style.BLACK, linewidth=0.9),
         style.line_handle("face hidden from this camera", color=style.ORANGE, linewidth=4, alpha=0.6),
         style.line_handle("plateau of the image error", color=style.VERMILION, linewidth=2, marker="s"),
-        style.line_handle("border of the image", color=style.GREY, linewidth=0.8),
     ]
 
 
@@ -101,6 +118,8 @@ def data_direct(material: Material) -> Data:
 
 def draw_direct(data: Data, figure: "Figure") -> None:
     """Both laws over one another, one panel a camera."""
+    every = np.concatenate([data[f"s_{law}"].reshape(-1, 2) for law in DIRECT])
+    figure.set_figheight(PANEL_WIDTH * style.aspect(every) + 1.05)
     axes = figure.subplots(1, 2)
     looks = (
         {"color": style.BLACK, "linewidth": 1.1},
@@ -113,8 +132,8 @@ def draw_direct(data: Data, figure: "Figure") -> None:
             shown.append(s.reshape(-1, 2))
             for k in range(s.shape[1]):
                 axes[view].plot(*s[:, k].T, **look)
-        style.face(axes[view], data[f"s_{DIRECT[0]}"][0, view], fill=style.PALE, color=style.BLACK)
-        style.face(axes[view], data["s_star"][view], color=style.BLUE, linestyle=(0, (5, 1.5)))
+        style.face(axes[view], data[f"s_{DIRECT[0]}"][0, view], style.START, fill=True)
+        style.face(axes[view], data["s_star"][view], style.GOAL)
         style.frame_pixels(axes[view], np.concatenate(shown))
         style.image_axes(axes[view], f"{name} camera")
     handles = [style.line_handle(TITLES[law], **look) for law, look in zip(DIRECT, looks, strict=True)]

@@ -34,7 +34,10 @@ def draw(data: Data, figure: "Figure") -> None:
     prismatic = data["prismatic"]
     kinds = [
         (chosen, unit)
-        for chosen, unit in ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))
+        for chosen, unit in (
+            (np.flatnonzero(~prismatic).tolist(), "deg"),
+            (np.flatnonzero(prismatic).tolist(), "mm"),
+        )
         if len(chosen)
     ]
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)

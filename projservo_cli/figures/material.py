@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.control.law import Gains
 from projservo_cli.plants.plant import Plant
 from projservo_cli.plants.robot import Robot
 from projservo_cli.records import FloatArray, Model, Plan, Trace
@@ -36,6 +37,7 @@ class Studies:
     ----------
     gains : gains per step that are swept.
     periods : periods, s, that are swept at the configured gains.
+    gains_of_laws : the configured gains.
     step_limit_deg : joint motion per step of the limited runs, deg.
     sweep : runs by (law, operators, limited, gain per step).
     own : runs with the configured gains by (law, operators, limited).
@@ -44,6 +46,7 @@ class Studies:
 
     gains: tuple[float, ...]
     periods: tuple[float, ...]
+    gains_of_laws: Gains
     step_limit_deg: float
     sweep: Mapping[tuple[str, str, bool, float], Trace]
     own: Mapping[tuple[str, str, bool], Trace]
@@ -78,7 +81,7 @@ class Material:
     def middle(self) -> FloatArray:
         """Centre of the face (4,) at the robot's reference, m."""
         M = self.plant.M
-        return M.mean(axis=0) if self.plant.center < 0 else M[self.plant.center]
+        return np.asarray(M.mean(axis=0) if self.plant.center < 0 else M[self.plant.center])
 
     def goal_center(self, trace: Trace) -> FloatArray:
         """True centre (3,) of the face at the goal, m; NaN where the goal pose is unknown."""

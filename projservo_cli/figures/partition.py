@@ -12,6 +12,7 @@ from projservo_cli.records import FloatArray
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ARC_POINTS = 61
@@ -61,53 +62,57 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
     return np.stack([A_c - 1.4 * reach / size * longest, A_c + 1.4 * reach / size * longest])
 
 
+SHIFTED: style.Look = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
+TURNED: style.Look = {"color": style.GREEN, "linestyle": (0, (5, 1.5, 1, 1.5))}
+PATH: style.Look = {"color": style.GREY, "linewidth": 0.7}
+AXIS: style.Look = {"color": style.BLACK, "linewidth": 0.8, "linestyle": (0, (8, 3, 1, 3))}
+
+
 def draw(data: Data, figure: "Figure") -> None:
     """Three panels, one a part."""
-    axes = figure.subplots(1, 3, width_ratios=[1.25, 1, 1])
-    start = {"color": style.BLACK, "linewidth": 1.4}
-    goal = {"color": style.BLUE, "linestyle": (0, (5, 1.5))}
-    shifted = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
-    turned = {"color": style.GREEN, "linestyle": (0, (5, 1.5, 1, 1.5))}
-    path = {"color": style.GREY, "linewidth": 0.7}
-    theta_r, theta_p = data["angles_deg"]
-
-    for k in range(len(data["A"])):
-        ends = np.stack([data["A_t"][k], data["A_star"][k]])
-        axes[0].plot(ends[:, 0], ends[:, 1], **path)
-    axes[0].annotate(
-        "", data["center"][1], data["center"][0], arrowprops={"arrowstyle": "->", "linewidth": 0.9}
-    )
-    style.face(axes[0], data["A"], fill=style.PALE, **start)
-    style.face(axes[0], data["A_t"], **shifted)
-    style.face(axes[0], data["A_star"], **goal)
-    style.frame_pixels(axes[0], np.concatenate([data["A"], data["A_t"], data["A_star"]]))
-
-    axes[1].plot(*data["axis"].T, color=style.BLACK, linewidth=0.8, linestyle=(0, (8, 3, 1, 3)))
-    for k in range(len(data["A"])):
-        axes[1].plot(*data["onto_plane"][:, k].T, **path)
-    style.face(axes[1], data["A"], fill=style.PALE, **start)
-    style.face(axes[1], data["A_r"], **turned)
-    style.face(axes[1], data["A_t"], **shifted)
-    around = [data["onto_plane"].reshape(-1, 2), data["axis"], data["A"], data["A_t"]]
-    style.frame_pixels(axes[1], np.concatenate(around))
-
-    for k in range(len(data["A"])):
-        axes[2].plot(*data["within_plane"][:, k].T, **path)
-    style.face(axes[2], data["A"], fill=style.PALE, **start)
-    style.face(axes[2], data["A_r"], **turned)
-    style.frame_pixels(axes[2], np.concatenate([data["within_plane"].reshape(-1, 2), data["A_r"]]))
-
-    style.image_axes(axes[0], "translation of the centre")
-    style.image_axes(axes[1], rf"onto the plane, $\theta_r$ = {theta_r:.1f}°")
-    style.image_axes(axes[2], rf"within the plane, $\theta_p$ = {theta_p:.1f}°")
+    axes = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
+    _translation(axes[0], data)
+    _onto_plane(axes[1], data)
+    _within_plane(axes[2], data)
     handles = [
-        style.line_handle("start $A$", **start),
-        style.line_handle("goal $A_*$", **goal),
-        style.line_handle("goal less translation $A_t$", **shifted),
-        style.line_handle("less rotation onto the plane $A_r$", **turned),
-        style.line_handle("paths of the markers", **path),
-        style.line_handle(
-            r"axis of $\hat H_r$", color=style.BLACK, linewidth=0.8, linestyle=(0, (8, 3, 1, 3))
-        ),
+        style.line_handle("start $A$", **style.START),
+        style.line_handle("goal $A_*$", **style.GOAL),
+        style.line_handle("goal less translation $A_t$", **SHIFTED),
+        style.line_handle("less rotation onto the plane $A_r$", **TURNED),
+        style.line_handle("paths of the markers", **PATH),
+        style.line_handle(r"axis of $\hat H_r$", **AXIS),
     ]
     style.legend_below(figure, handles, 3)
+
+
+def _translation(axes: "Axes", data: Data) -> None:
+    for k in range(len(data["A"])):
+        axes.plot(*np.stack([data["A_t"][k], data["A_star"][k]]).T, **PATH)
+    arrow = {"arrowstyle": "->", "linewidth": 0.9}
+    axes.annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
+    style.face(axes, data["A"], style.START, fill=True)
+    style.face(axes, data["A_t"], SHIFTED)
+    style.face(axes, data["A_star"], style.GOAL)
+    style.frame_pixels(axes, np.concatenate([data["A"], data["A_t"], data["A_star"]]))
+    style.image_axes(axes, "translation of the centre")
+
+
+def _onto_plane(axes: "Axes", data: Data) -> None:
+    axes.plot(*data["axis"].T, **AXIS)
+    for k in range(len(data["A"])):
+        axes.plot(*data["onto_plane"][:, k].T, **PATH)
+    style.face(axes, data["A"], style.START, fill=True)
+    style.face(axes, data["A_r"], TURNED)
+    style.face(axes, data["A_t"], SHIFTED)
+    around = [data["onto_plane"].reshape(-1, 2), data["axis"], data["A"], data["A_t"]]
+    style.frame_pixels(axes, np.concatenate(around))
+    style.image_axes(axes, rf"onto plane, $\theta_r$ = {style.signed(data['angles_deg'][0])}°")
+
+
+def _within_plane(axes: "Axes", data: Data) -> None:
+    for k in range(len(data["A"])):
+        axes.plot(*data["within_plane"][:, k].T, **PATH)
+    style.face(axes, data["A"], style.START, fill=True)
+    style.face(axes, data["A_r"], TURNED)
+    style.frame_pixels(axes, np.concatenate([data["within_plane"].reshape(-1, 2), data["A_r"]]))
+    style.image_axes(axes, rf"within plane, $\theta_p$ = {style.signed(data['angles_deg'][1])}°")

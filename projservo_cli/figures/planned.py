@@ -90,6 +90,7 @@ def draw(data: Data, figure: "Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
     from matplotlib import colormaps
 
+    figure.set_figheight(max(4.2 * style.aspect(data["faces"]) + 1.0, 3.0))
     grid = figure.add_gridspec(2, 2, width_ratios=[1.7, 1])
     image, shares = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     margins = figure.add_subplot(grid[1, 1], sharex=shares)
@@ -100,13 +101,19 @@ def draw(data: Data, figure: "Figure") -> None:
     for j in shown:
         color = colormaps["cividis"](0.92 * sigma[j])
         ends = j in (shown[0], shown[-1])
-        style.face(image, faces[j], color=color, linewidth=1.8 if ends else 1.0)
+        style.face(image, faces[j], {"color": color, "linewidth": 1.8 if ends else 1.0})
     style.frame_pixels(image, faces)
     style.image_axes(image, f"from the rig's centre, {data['profile']}")
     for j, label in ((0, "start"), (-1, "goal")):
         corner = faces[j][np.argmin(faces[j][:, 1])]
         image.annotate(
-            label, corner, xytext=(0, 5), textcoords="offset points", ha="center", va="bottom"
+            label,
+            corner,
+            xytext=(0, 5),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8},
         )
     for i, (label, look) in enumerate(_looks()):
         shares.plot(sigma, data["mu"][:, i], label=label, **look)
@@ -118,11 +125,13 @@ def draw(data: Data, figure: "Figure") -> None:
     margins.set_xlabel(r"path parameter $\sigma$ (1)")
     margins.set_ylabel("margin $a\\cdot O$\n(start = 1)")
     handles = shares.get_legend_handles_labels()[0] + margins.get_legend_handles_labels()[0]
-    handles.append(style.line_handle("first marker of the face", color=style.BLACK, marker="o", linestyle="none"))
+    handles.append(
+        style.line_handle("first marker of the face", color=style.BLACK, marker="o", linestyle="none")
+    )
     style.legend_below(figure, handles, 6)
 
 
-def _looks() -> list[tuple[str, dict[str, object]]]:
+def _looks() -> list[tuple[str, style.Look]]:
     names = (r"$\mu_t$", r"$\mu_r$", r"$\mu_p$")
     widths = (3.0, 1.8, 1.0)  # equal shares lie on one another: the wider shows beneath
     colors = (style.SKY, style.BLACK, style.VERMILION)

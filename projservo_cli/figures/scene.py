@@ -85,7 +85,8 @@ def pyramid(P: FloatArray, image_size: FloatArray, depth: float) -> FloatArray:
 
 def draw(data: Data, figure: "Figure") -> None:
     """One view in perspective with equal scales."""
-    axes: Any = figure.add_subplot(projection="3d", proj_type="persp", focal_length=0.9)
+    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
+    axes.patch.set_visible(False)
     axes.computed_zorder = False
     axes.plot(*data["robot"].T, "o-", color=style.BLACK, linewidth=2.0, markersize=4)
     for i, color in enumerate((style.BLUE, style.ORANGE)):
@@ -109,22 +110,48 @@ def draw(data: Data, figure: "Figure") -> None:
         handles.insert(2, style.line_handle("face at the goal", **goal))
         handles.insert(3, style.line_handle("straight line of the centre", **line))
         shown.append(data["face_goal"])
-    _frame(axes, np.concatenate(shown), data["cameras"].mean(axis=0))
-    style.legend_below(figure, handles, 3)
+    extent = _frame(axes, np.concatenate(shown), data["cameras"].mean(axis=0))
+    figure.set_layout_engine("none")
+    figure.legend(handles=handles, loc="lower center", ncols=3)
+    _fit(axes, figure, extent)
 
 
-def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> None:
-    """Equal scales on all axes, seen from the side of the rig."""
+def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
+    """Equal scales on all axes, seen from the side of the rig; returns the extent (3, 2) shown, m."""
     low, high = points.min(axis=0), points.max(axis=0)
     pad = 0.05 * (high - low).max()
-    for name, a, b in zip("xyz", low - pad, high + pad, strict=True):
+    extent = np.stack([low - pad, high + pad], axis=1)
+    for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
-        getattr(axes, f"set_{name}label")(f"{name} (m)")
-    axes.set_box_aspect(high - low + 2 * pad, zoom=1.0)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.set_major_locator(_locator(0.5))
+        getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 6)
+        getattr(axes, f"{name}axis").set_major_locator(_locator(0.25 if b - a < 0.75 else 0.5))
+    axes.tick_params(pad=0)
     towards = rig - points.mean(axis=0)
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
+    return extent
+
+
+def _fit(axes: Any, figure: "Figure", extent: FloatArray) -> None:
+    """Show the scene as large as its labels and the room above the legend allow."""
+    corners = np.array([*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)])
+    size = np.ptp(extent, axis=1)
+    side = np.array([1.0, figure.get_figwidth() / figure.get_figheight()])  # a square
+    zoom, middle = 1.0, np.array([0.5, 0.5])
+    for _ in range(2):
+        axes.set_position((*(middle - 0.5 * side), *side))
+        axes.set_box_aspect(size, zoom=zoom)
+        figure.draw_without_rendering()
+        m = axes.get_proj() @ corners
+        shown = axes.transData.transform((m[:2] / m[3]).T)
+        labels = [axis.get_tightbbox().get_points() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+        taken = np.concatenate([shown, *labels])
+        low = np.array([0.0, figure.legends[0].get_window_extent().y1])
+        room = figure.bbox.get_points()[1] - low
+        zoom *= 0.95 * float((room / np.ptp(taken, axis=0)).min())
+        off = low + 0.5 * room - 0.5 * (taken.min(axis=0) + taken.max(axis=0))
+        middle += off / figure.bbox.size
+    axes.set_box_aspect(size, zoom=zoom)
+    axes.set_position((*(middle - 0.5 * side), *side))
 
 
 def _locator(step: float) -> Any:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
 PNG_DPI = 200
+Look = dict[str, Any]
+IMAGE = "image"  # label of axes that show pixels
 
 # M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
 BLACK, ORANGE, BLUE, SKY, VERMILION, GREEN, PURPLE = (
@@ -43,7 +45,11 @@ CURVES: tuple[tuple[str, Any, str], ...] = (
     (PURPLE, (0, (3, 1, 1, 1, 1, 1)), "P"),
 )
 
-RC: dict[str, Any] = {
+# How the face at the start and at the goal look in every figure.
+START: Look = {"color": BLACK, "linewidth": 1.4}
+GOAL: Look = {"color": BLUE, "linestyle": (0, (5, 1.5))}
+
+RC: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 8.0,
     "axes.titlesize": 8.5,
@@ -100,7 +106,25 @@ def new_figure(height: float, width: float = WIDTH) -> "Figure":
 def arrange(figure: "Figure") -> None:
     """Arrange the parts of a figure once, so that every format shows the same."""
     figure.draw_without_rendering()
+    images = [axes for axes in figure.axes if axes.get_label() == IMAGE]
+    for axes in images:
+        _equal_scales(axes)
+    if images:  # other limits may have brought other tick labels, and with them another arrangement
+        figure.draw_without_rendering()
+        for axes in images:
+            _equal_scales(axes)
     figure.set_layout_engine("none")
+
+
+def _equal_scales(axes: "Axes") -> None:
+    """Widen what axes show until a pixel is as wide as it is high in the panel as it is."""
+    box = axes.get_window_extent()
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    scale = max(abs(right - left) / box.width, abs(top - bottom) / box.height)
+    half = 0.5 * scale * np.array([box.width, box.height]) * np.sign([right - left, top - bottom])
+    u, v = 0.5 * (left + right), 0.5 * (bottom + top)
+    axes.set_xlim(u - half[0], u + half[0])
+    axes.set_ylim(v - half[1], v + half[1])
 
 
 def save(figure: "Figure", path: Path, kind: str) -> None:
@@ -120,7 +144,7 @@ def line_handle(label: str, **look: Any) -> Any:
     return Line2D([], [], label=label, **look)
 
 
-def curve(index: int, *, marker: bool = False) -> dict[str, Any]:
+def curve(index: int, *, marker: bool = False) -> Look:
     """Look of the curve of a number: colour, line style and, if asked for, marker."""
     color, style, symbol = CURVES[index % len(CURVES)]
     look = {"color": color, "linestyle": style}
@@ -128,11 +152,11 @@ def curve(index: int, *, marker: bool = False) -> dict[str, Any]:
 
 
 def image_axes(axes: "Axes", title: str) -> None:
-    """Axes in pixels of an image: v points down, both scales are equal."""
+    """Axes in pixels of an image with equal scales; the view widens to fill its panel."""
     axes.set_title(title)
     axes.set_xlabel("u (px)")
     axes.set_ylabel("v (px)")
-    axes.set_aspect("equal", adjustable="box")
+    axes.set_label(IMAGE)
 
 
 def frame_pixels(axes: "Axes", pixels: FloatArray, margin: float = 0.06) -> None:
@@ -145,16 +169,27 @@ def frame_pixels(axes: "Axes", pixels: FloatArray, margin: float = 0.06) -> None
     axes.set_ylim(high[1] + pad, low[1] - pad)
 
 
+def aspect(pixels: FloatArray, least: float = 0.3, most: float = 1.1) -> float:
+    """Height over width of what a panel shows of pixels (…, 2), within bounds fit for print."""
+    points = pixels.reshape(-1, 2)
+    size = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
+    return float(np.clip(size[1] / max(size[0], 1.0), least, most))
+
+
+def signed(value: float) -> str:
+    """Angle with one decimal and a typographic minus."""
+    return f"{value:.1f}".replace("-", "\N{MINUS SIGN}")
+
+
 def closed(polygon: FloatArray) -> FloatArray:
     """Corners (k, 2) with the first one repeated at the end."""
     return np.concatenate([polygon, polygon[:1]])
 
 
-def face(axes: "Axes", corners: FloatArray, *, fill: str | None = None, **look: Any) -> None:
+def face(axes: "Axes", corners: FloatArray, look: Look, *, fill: bool = False) -> None:
     """Draw a face from its corners (k, 2) in cyclic order; a dot marks the first."""
     loop = closed(corners)
-    if fill is not None:
-        axes.fill(loop[:, 0], loop[:, 1], color=fill, alpha=0.35, linewidth=0)
+    if fill:
+        axes.fill(loop[:, 0], loop[:, 1], color=PALE, alpha=0.35, linewidth=0)
     axes.plot(loop[:, 0], loop[:, 1], **look)
-    color = look.get("color", BLACK)
-    axes.plot(corners[:1, 0], corners[:1, 1], marker="o", color=color, linestyle="none", markersize=3)
+    axes.plot(corners[:1, 0], corners[:1, 1], "o", color=look["color"], markersize=3)

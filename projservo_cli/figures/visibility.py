@@ -1,6 +1,6 @@
 """Fig. 2 of [RH00]: where the face changes visibility, seen from both cameras."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -55,7 +55,7 @@ def _margins(a: FloatArray, H_hat: FloatArray, O: FloatArray, theta: FloatArray)
     return np.array(values).reshape(*theta.shape, 2)
 
 
-SENSES: tuple[dict[str, Any], ...] = (
+SENSES: tuple[style.Look, ...] = (
     {"color": style.BLUE, "linestyle": "-"},
     {"color": style.VERMILION, "linestyle": (0, (5, 1.5))},
 )
@@ -71,9 +71,9 @@ def draw(data: Data, figure: "Figure") -> None:
         _translation(axes[2, view], data, view)
     senses = data["theta_deg"][:, -1]
     handles = [
-        style.line_handle("face at the start", color=style.BLACK, linewidth=1.4),
+        style.line_handle("face at the start", **style.START),
         *(
-            style.line_handle(rf"sense $\theta_r$ = {angle:.1f}°", **look)
+            style.line_handle(rf"sense $\theta_r$ = {style.signed(angle)}°", **look)
             for angle, look in zip(senses, SENSES, strict=True)
         ),
         style.line_handle("hidden from this camera", color=style.GREY, linewidth=4, alpha=0.5),
@@ -94,8 +94,8 @@ def _images(axes: "Axes", data: Data, view: int) -> None:
             hidden = np.where(seen[:, None], np.nan, path)
             axes.plot(*hidden.T, color=style.GREY, linewidth=4, alpha=0.5, solid_capstyle="butt")
             axes.plot(*path.T, linewidth=0.9, **look)
-        style.face(axes, images[i, -1], linewidth=1.2, **look)
-    style.face(axes, images[0, 0], fill=style.PALE, color=style.BLACK, linewidth=1.4)
+        style.face(axes, images[i, -1], look)
+    style.face(axes, images[0, 0], style.START, fill=True)
     style.frame_pixels(axes, images)
 
 

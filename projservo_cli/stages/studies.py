@@ -10,7 +10,13 @@ import numpy as np
 from projservo_cli.control.law import Gains
 from projservo_cli.figures.material import DIRECT, Studies
 from projservo_cli.geometry.composition import compose_rotations
-from projservo_cli.geometry.displacement import as_array, as_mat, exp_rotation, exp_translation, twist_exponential
+from projservo_cli.geometry.displacement import (
+    as_array,
+    as_mat,
+    exp_rotation,
+    exp_translation,
+    twist_exponential,
+)
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.loop.step import Limits
 from projservo_cli.plants.plant import Plant
@@ -152,7 +158,7 @@ def run_studies(
         progress("studies", done, total)
         rate[law, period] = bench.run(law, "true", own._replace(period=period), limited=False)
     progress("studies", total, total)
-    return Studies(tuple(gains), tuple(periods), STEP_LIMIT_DEG, sweep, by_model, rate)
+    return Studies(tuple(gains), tuple(periods), own, STEP_LIMIT_DEG, sweep, by_model, rate)
 
 
 def metric_plan(bench: Bench, delta: float) -> Plan:
