@@ -74,8 +74,13 @@ def summary(stage: str, value: dict[str, Any]) -> str:
     """A stage's object in words, at most 80 columns wide."""
     if "failed" in value:
         return wrapped(f"{stage}: failed at {value['failed']}: {value['reason']}")
-    lines = {"calibrate": _calibrate_words, "plan": _plan_words, "servo": _servo_words}
-    return "\n".join(lines.get(stage, _other_words)(value))
+    words = {
+        "calibrate": _calibrate_words,
+        "plan": _plan_words,
+        "servo": _servo_words,
+        "report": _report_words,
+    }
+    return "\n".join(words[stage](value))
 
 
 def _calibrate_words(value: dict[str, Any]) -> list[str]:
@@ -112,11 +117,13 @@ def _servo_words(value: dict[str, Any]) -> list[str]:
     return ["servo: true errors at the end, self-occluded steps left/right", head, *rows]
 
 
-def _other_words(value: dict[str, Any]) -> list[str]:
-    rest = {name: content for name, content in value.items() if name != "run"}
+def _report_words(value: dict[str, Any]) -> list[str]:
+    words = {True: "holds", False: "fails", None: "not measured"}
+    claims = [f"{words[row['holds']]}: {row['claim']}: {row['measured']}" for row in value["claims"]]
+    left_out = [f"left out: {row['what']}: {row['reason']}" for row in value["left_out"]]
     return [
-        "report:",
-        *(wrapped(f"{name.replace('_', ' ')}: {content}", "  ") for name, content in rest.items()),
+        f"report: {len(value['figures'])} files of figures, {len(claims)} claims",
+        *(wrapped(text, "  ") for text in (*claims, *left_out)),
     ]
 
 

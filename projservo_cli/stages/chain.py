@@ -148,8 +148,16 @@ def _keep_recorded(config: Config, run: Run) -> None:
     )
 
 
-def make(step: Step, config: Config, run: Run, progress: Progress) -> tuple[Run, list[str]]:
+def make(
+    step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress
+) -> tuple[Run, list[str]]:
     """Make one result and put it into the run file.
+
+    Parameters
+    ----------
+    step, config, run : what to make, from what.
+    laws : laws whose traces a report is about; others may be stored, of other settings perhaps.
+    progress : told how far the stage is.
 
     Returns
     -------
@@ -161,12 +169,12 @@ def make(step: Step, config: Config, run: Run, progress: Progress) -> tuple[Run,
     InputError, WorkFailed
         What the stage raises; the run file is then as it was.
     """
-    records = _records(step, config, run, progress)
-    made_with = provenance.collect(seed=config.seed)
-    result = Result(step.key, to_yaml(config), made_with, step.inputs, records)
+    run = replace(run, configuration=to_yaml(config))
+    records = _records(step, config, run, laws, progress)
+    result = Result(step.key, run.configuration, provenance.collect(seed=config.seed), step.inputs, records)
     after = [name for name in run.results if _stage_of(name) > STAGES.index(step.stage)]
     results = {name: stored for name, stored in run.results.items() if name not in after}
-    run = replace(run, configuration=to_yaml(config), results={**results, step.name: result})
+    run = replace(run, results={**results, step.name: result})
     save(run)
     return run, after
 
@@ -175,7 +183,7 @@ def _stage_of(name: str) -> int:
     return STAGES.index(name.split("/")[0])
 
 
-def _records(step: Step, config: Config, run: Run, progress: Progress) -> dict[str, Any]:
+def _records(step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress) -> dict[str, Any]:
     module = stage_module(step.stage)
     if step.stage == "calibrate":
         observation, calibration = module.run(config, progress=progress)
@@ -184,4 +192,6 @@ def _records(step: Step, config: Config, run: Run, progress: Progress) -> dict[s
         return {"": module.run(config, run.calibration)}
     if step.stage == "servo":
         return {"": module.run(config, run.calibration, run.plan, step.law, progress=progress)}
-    return {"": module.run(run, run.path.parent, progress=progress)}
+    names = ["calibrate", "plan", *(SERVO + law for law in laws)]
+    reported = replace(run, results={name: run.results[name] for name in names})
+    return {"": module.run(reported, run.path.parent, progress=progress)}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from projservo_cli import cli
-from projservo_cli.records import Calibration, Observation, Plan, Trace, WorkFailed
+from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import chain
 from projservo_cli.tables import read_table
 from tests.fake_records import fake
@@ -43,6 +43,7 @@ class Stages:
     made: list[str] = field(default_factory=list)
     fails: dict[str, Exception] = field(default_factory=dict)
     verdicts: dict[str, str] = field(default_factory=dict)
+    reported: list[tuple[list[str], str]] = field(default_factory=list)
 
     def module(self, stage: str) -> Any:
         depends = {
@@ -81,8 +82,10 @@ class Stages:
 
     def report(self, run: Any, directory: Any, *, progress: Any) -> Any:
         self._make("report")
-        assert run.traces
-        return fake(Plan, 9)
+        self.reported.append((list(run.traces), run.configuration))
+        claim = {"claim": "c", "source": "s", "measured": "3 mm", "criterion": "< 4 mm", "holds": True}
+        left_out = {"what": "fig_9", "reason": "no run"}
+        return fake(Report, 9, figures=("figures/fig_1.svg",), claims=(claim,), left_out=(left_out,))
 
 
 @dataclass

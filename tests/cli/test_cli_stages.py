@@ -126,6 +126,20 @@ def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, stag
     assert list(load("out").traces) == ["direct_three", "stacked", "blockwise"]
 
 
+def test_a_report_is_about_the_laws_and_the_configuration_of_its_call(projservo, stages):
+    projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", "blockwise")
+    answer = projservo("report", "-o", "out")
+    assert "holds: c: 3 mm" in answer.out
+    assert "left out: fig_9: no run" in answer.out
+    projservo("report", "-o", "out", "--set", "report.formats=[png]")
+    (first, _), (second, configuration) = stages.reported
+    assert first == second == ["direct_three", "stacked"]
+    assert "formats: [png]" in configuration
+    value = projservo("report", "-o", "out", "--json").json
+    assert value["figures"] == ["figures/fig_1.svg"]
+    assert value["claims"][0]["holds"] is True
+
+
 CALIBRATE_KEYS = {
     *("run", "usable", "reason", "advice", "rms_px", "sigma_px", "chi2_per_dof", "seconds", "joints"),
     *("outliers", "suspect_joint_readings", "swapped", "merged_poses", "merged_markers"),
