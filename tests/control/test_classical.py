@@ -127,7 +127,7 @@ def test_at_the_goal_nothing_moves(law):
 
 def test_in_frame_keeps_the_robot():
     """The check of frames above is one: the transformed model draws the same pixels."""
-    sc, q, s, M = instant("RRRRRR", 4, 5)
+    sc, _q, s, M = instant("RRRRRR", 4, 5)
     G = frame(1)
     there = in_frame(sc.model, G)
     m = (M @ G.T) @ np.swapaxes(there.P, 1, 2)

@@ -134,3 +134,12 @@ def test_least_squares_refuses_dependent_columns_and_too_few_rows(rng):
     found, x = solve(rng.normal(size=(5, 6)), np.ones(5))
     assert not found
     assert not x.any()
+
+
+def test_matrices_with_nan_are_refused(rng):
+    for place in [(0, 0), (7, 5), (3, 2)]:
+        A = rng.normal(size=(8, 6))
+        A[place] = np.nan
+        for found, x in (kernel(A), solve(A, np.ones(8))):
+            assert not found
+            assert not x.any()
