@@ -53,6 +53,7 @@ def assemble(
     model = Model(scene.P, scene.H_hat_0, types, q_reference, scene.a_inf)
     span = quality.require_motion(readings)
     size = 24 + 16 * len(types) + 4 * len(scene.M)
+    # NaN, not zero: a method without covariance does not claim certainty.
     noise, covariance = np.full(len(types), np.nan), np.full((size, size), np.nan)
     if factor is not None:
         noise = reach_noise(model, scene.M, factor, _surroundings(readings))

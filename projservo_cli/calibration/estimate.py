@@ -6,15 +6,24 @@ import time
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from projservo_cli.calibration import adjustment, quality
+from projservo_cli.calibration import adjustment, closed_form, linear, quality
+from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.assembly import assemble
+from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
-from projservo_cli.calibration.frame import isotropic, output_derivative, output_gauge, spread_factor
-from projservo_cli.calibration.quality import Expected
-from projservo_cli.calibration.readings import gather, reference_joints
-from projservo_cli.calibration.reconstruction import image_frame
-from projservo_cli.calibration.refined import Solution, solve
-from projservo_cli.records import Calibration, InputError, Observation, WorkFailed
+from projservo_cli.calibration.frame import (
+    ProjectiveScene,
+    isotropic,
+    output_derivative,
+    output_gauge,
+    spread_factor,
+)
+from projservo_cli.calibration.optimization import Problem, prepare
+from projservo_cli.calibration.quality import Agreement, Expected
+from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
+from projservo_cli.calibration.reconstruction import Frame, image_frame
+from projservo_cli.calibration.refined import solve
+from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 
 METHODS = ("refined", "linear", "closed_form")
 A_INF = np.array([0.0, 0.0, 0.0, 1.0])
@@ -64,26 +73,61 @@ def calibrate(
         both = readings.both
         epipolar = epipolar_geometry(readings.pixels[0][both], readings.pixels[1][both], rng)
         expected = quality.expected_noise(epipolar.sigma_px, sigma_px, source)
-        frame = image_frame(readings, image_size)
-        solution = solve(readings, reference_joints(readings.q), epipolar, frame, rng, expected.agrees)
-        refusal = expected.refusal(solution.agreement)
-        if refusal is not None:
-            raise WorkFailed(refusal)
-        result = _of_solution(solution, expected)
+        if method == "refined":
+            result = _refined(readings, epipolar, image_frame(readings, image_size), rng, expected)
+        elif method == "linear":
+            result = _linear(readings, epipolar, expected)
+        else:
+            result = _closed_form(readings, epipolar, expected)
     return dataclasses.replace(result, source=source, seconds=time.perf_counter() - begin)
 
 
-def _of_solution(solution: Solution, expected: Expected) -> Calibration:
-    """Calibration from a fit, in its projective frame, with its covariance."""
+def _refined(
+    readings: Readings, epipolar: Epipolar, frame: Frame, rng: np.random.Generator, expected: Expected
+) -> Calibration:
+    """Calibration by maximum likelihood, in its projective frame, with its covariance."""
+    solution = solve(readings, reference_joints(readings.q), epipolar, frame, rng, expected.agrees)
+    refusal = expected.refusal(solution.agreement)
+    if refusal is not None:
+        raise WorkFailed(refusal)
     problem, scene = solution.problem, solution.scene
-    readings, place = problem.readings, problem.place
-    E = adjustment.displacements(scene.H_hat, readings.prismatic, problem.q)
-    moved = adjustment.moved_points(E, scene.M, readings)[0]
-    result = isotropic(scene.P, scene.H_hat, scene.M, A_INF, moved)
+    result = _projective(problem, scene)
     _, J = adjustment.derivative(scene, readings, problem.q)
     used = solution.agreement.used.astype(np.float64)
-    factor = spread_factor(problem.dense(J, used), adjustment.gauge(scene, readings, place))
-    factor = output_derivative(scene, readings, place, result) @ factor
+    factor = spread_factor(problem.dense(J, used), adjustment.gauge(scene, readings, problem.place))
+    factor = output_derivative(scene, readings, problem.place, result) @ factor
     gauge = output_gauge(result)
     factor -= gauge @ (gauge.T @ factor)
     return assemble("refined", result, readings, problem.q_reference, solution.agreement, expected, factor)
+
+
+def _projective(problem: Problem, scene: Scene) -> ProjectiveScene:
+    """The scene in the isotropic projective frame of the points seen."""
+    E = adjustment.displacements(scene.H_hat, problem.readings.prismatic, problem.q)
+    moved = adjustment.moved_points(E, scene.M, problem.readings)[0]
+    return isotropic(scene.P, scene.H_hat, scene.M, A_INF, moved)
+
+
+def _linear(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:
+    """Calibration by the linear multi-frame method, without covariance."""
+    scene, q_reference, known = linear.operators(readings, epipolar.F)
+    readings = restrict(readings, known)
+    result = _projective(prepare(readings, q_reference), scene)
+    return _unrefined("linear", result, readings, q_reference, expected)
+
+
+def _closed_form(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:
+    """Calibration by the closed forms [RH00] eqs. (4), (5), without covariance."""
+    result, q_reference, known = closed_form.operators(readings, epipolar.F, epipolar.sigma_px)
+    return _unrefined("closed_form", result, restrict(readings, known), q_reference, expected)
+
+
+def _unrefined(
+    method: str, result: ProjectiveScene, readings: Readings, q_reference: FloatArray, expected: Expected
+) -> Calibration:
+    """Record of a method that minimises no image error: all readings count, whatever they show."""
+    problem = prepare(readings, q_reference)
+    residual = problem.residual(Scene(result.P, result.H_hat_0, result.M))
+    dof = 2 * int(np.count_nonzero(readings.seen)) - problem.place.size
+    agreement = Agreement(residual, readings.seen, dof)
+    return assemble(method, result, readings, q_reference, agreement, expected, None)

@@ -217,8 +217,9 @@ def shortfall(method: str, agreement: Agreement, expected: Expected) -> str | No
     """Why a fit that was not refused cannot be used, or None where it can.
 
     The methods without refinement are kept for comparison: they return what they find, marked so.
+    Theirs is no least-squares fit, so that residuals above the noise are their own doing.
     """
-    if expected.ratio(agreement) <= REFUSE_RATIO:
+    if method == "refined" or expected.ratio(agreement) <= WARN_RATIO:
         return None
     return (
         f"the {method} method explains the images only to {agreement.sigma_px:.3g} px a coordinate, "

@@ -1,5 +1,6 @@
 """What a calibration works on: joint readings and the marker pairs seen in them, as flat lists."""
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,6 +78,25 @@ def gather(observation: Observation, joint_types: str) -> Readings:
         marker_of=np.searchsorted(present, marker_of),
         pixels=pixels,
         seen=seen,
+    )
+
+
+def restrict(readings: Readings, keep: BoolArray) -> Readings:
+    """Readings of some of the markers.
+
+    Parameters
+    ----------
+    readings : what was seen.
+    keep : (m,) markers that stay.
+    """
+    rows = keep[readings.marker_of]
+    return dataclasses.replace(
+        readings,
+        marker=readings.marker[keep],
+        pose_of=readings.pose_of[rows],
+        marker_of=(np.cumsum(keep) - 1)[readings.marker_of[rows]],
+        pixels=readings.pixels[:, rows],
+        seen=readings.seen[:, rows],
     )
 
 
