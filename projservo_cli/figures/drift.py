@@ -76,7 +76,7 @@ def draw(data: Data, figure: "Figure") -> None:
         axes[row, 0].set_title(f"{TITLES[law]}: path of the centre, calibrated operators")
         axes[row, 0].set_xlabel("way along the straight line (mm)")
         axes[row, 0].set_ylabel("distance from it (mm)")
-        axes[row, 0].set_yscale("log")
+        style.log_scale(axes[row, 0])
         axes[row, 0].set_ylim(bottom=least)
         for operators, color in enumerate((style.BLACK, style.VERMILION)):
             for limited, line in enumerate(("-", (0, (4, 1.5)))):
@@ -93,7 +93,7 @@ def draw(data: Data, figure: "Figure") -> None:
         axes[row, 1].set_xscale("log")
         axes[row, 1].set_xticks(gains, [f"{gain:g}" for gain in gains])
         axes[row, 1].minorticks_off()
-        axes[row, 1].set_yscale("log")
+        style.log_scale(axes[row, 1])
         axes[row, 1].set_title(f"{TITLES[law]}: largest distance")
         axes[row, 1].set_xlabel("gain per step (1)")
         axes[row, 1].set_ylabel("largest distance (mm)")

@@ -39,7 +39,7 @@ def data_two(material: Material) -> Data:
 
 
 def _time(trace: Trace) -> FloatArray:
-    return trace.period * np.arange(len(trace.tau))
+    return np.asarray(trace.period * np.arange(len(trace.tau)))
 
 
 def draw_two(data: Data, figure: "Figure") -> None:
@@ -72,7 +72,7 @@ def draw_two(data: Data, figure: "Figure") -> None:
 
 
 def _log(axes: "Axes", start: float) -> None:
-    axes.set_yscale("log")
+    style.log_scale(axes)
     axes.set_ylim(max(start, 1e-3) * DECADES, max(start, 1e-3) * 3.0)
 
 
@@ -164,7 +164,7 @@ def draw_three(data: Data, figure: "Figure") -> None:
 
 
 def _floor(axes: "Axes", least: float) -> None:
-    axes.set_yscale("log", nonpositive="clip")
+    style.log_scale(axes)
     axes.set_ylim(bottom=least)
 
 

@@ -111,7 +111,7 @@ def draw(data: Data, figure: "Figure") -> None:
         handles.insert(3, style.line_handle("straight line of the centre", **line))
         shown.append(data["face_goal"])
     extent = _frame(axes, np.concatenate(shown), data["cameras"].mean(axis=0))
-    figure.set_layout_engine("none")
+    figure.set_layout_engine()
     figure.legend(handles=handles, loc="lower center", ncols=3)
     _fit(axes, figure, extent)
 

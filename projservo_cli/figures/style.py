@@ -21,6 +21,7 @@ FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
 PNG_DPI = 200
 Look = dict[str, Any]
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMAGE = "image"  # label of axes that show pixels
 
 # M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
@@ -69,11 +70,10 @@ RC: Any = {
     "lines.markersize": 3.5,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    "axes.formatter.use_mathtext": True,
     "axes.unicode_minus": True,
     "svg.hashsalt": "projservo",
     "svg.fonttype": "path",
-    "pdf.fonttype": 42,
+    "pdf.fonttype": 3,
     "image.cmap": "cividis",
     "savefig.facecolor": "white",
 }
@@ -113,7 +113,7 @@ def arrange(figure: "Figure") -> None:
         figure.draw_without_rendering()
         for axes in images:
             _equal_scales(axes)
-    figure.set_layout_engine("none")
+    figure.set_layout_engine()  # none any more
 
 
 def _equal_scales(axes: "Axes") -> None:
@@ -174,6 +174,23 @@ def aspect(pixels: FloatArray, least: float = 0.3, most: float = 1.1) -> float:
     points = pixels.reshape(-1, 2)
     size = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
     return float(np.clip(size[1] / max(size[0], 1.0), least, most))
+
+
+def log_scale(axes: "Axes") -> None:
+    """Logarithmic vertical scale with plain powers of ten as labels, about five of them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_yscale("log", nonpositive="clip")
+    axis = axes.yaxis
+    axis.set_major_locator(LogLocator(numticks=5))
+    axis.set_major_formatter(FuncFormatter(_power))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _power(value: float, position: int | None = None) -> str:
+    del position
+    exponent = round(float(np.log10(value))) if value > 0 else 0
+    return "10" + str(exponent).translate(SUPERSCRIPTS)
 
 
 def signed(value: float) -> str:
