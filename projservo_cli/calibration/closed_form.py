@@ -116,8 +116,8 @@ def operators(
     known = np.isfinite(M[..., 0])
     if int(known[home].sum()) < LEAST_MARKERS:
         raise WorkFailed(
-            f"closed_form needs {LEAST_MARKERS} markers seen by both cameras at the reference pose, and there "
-            f"are {int(known[home].sum())}: use refined"
+            f"closed_form needs {LEAST_MARKERS} markers in both images of the reference pose, and there are "
+            f"{int(known[home].sum())}: use refined"
         )
     require_space(view.P, M[home, known[home]], sigma_px)
     # The depth in the left camera is positive for all points: it orients them as a_inf would.
