@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projservo_cli import cli
+from projservo_cli import cli, files
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import chain
 from projservo_cli.tables import read_table
@@ -106,6 +106,7 @@ class Answer:
 def stages(monkeypatch, tmp_path):
     pretended = Stages()
     monkeypatch.setattr(chain, "stage_module", pretended.module)
+    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
     monkeypatch.chdir(tmp_path)
     (tmp_path / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")
     (tmp_path / "t.csv").write_text(TABLE, encoding="utf-8")
