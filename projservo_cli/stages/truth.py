@@ -43,7 +43,7 @@ class Truth:
     P : (2, 3, 4) true cameras, px.
     M : (m, 4) all markers at the robot's reference, m.
     number : (m,) their numbers.
-    face : indices of the face markers.
+    face : indices of the face markers; none where the configuration has no face.
     center : position of the centre marker within the face, or ``MIDPOINT``.
     image_size : (2,) px.
     """
@@ -116,8 +116,8 @@ def truth_of(config: "Config") -> Truth:
         np.array([camera_of(config.rig.left), camera_of(config.rig.right)]),
         points @ robot.base_tool.T,
         numbers,
-        tuple(numbers.index(number) for number in face_numbers(config)),
-        center_index(config),
+        tuple(numbers.index(number) for number in config.markers.face or ()),
+        center_index(config) if config.markers.face else MIDPOINT,
         np.array(config.rig.image_size_px, dtype=np.float64),
     )
 
@@ -195,6 +195,7 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     """
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
+    face_numbers(config)
     types = config.robot.joint_types if config.robot is not None else ""
     q_start = np.array(config.task.start.values(types))
     _require_limits(truth.robot, q_start, "task.start")
