@@ -11,6 +11,8 @@ SAMPLES = 500
 MAD = 0.6744897501960817
 # Correspondences farther than this many standard deviations do not count in the noise.
 OUTLIER = 5.0
+# Least median distance of the right view from a homography of the left one, in units of the noise.
+LEAST_PARALLAX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +151,20 @@ def refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) -> 
     return result
 
 
+def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Distance (N,) of the right points from a homography of the left ones, in normalised units.
+
+    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 4.1.
+    """
+    zero = np.zeros_like(left)
+    first = np.concatenate([left, zero, -right[:, :1] * left], axis=1)
+    second = np.concatenate([zero, left, -right[:, 1:2] * left], axis=1)
+    H = np.linalg.svd(np.concatenate([first, second]))[2][8].reshape(3, 3)
+    moved = left @ H.T
+    distance: FloatArray = np.linalg.norm(moved[:, :2] / moved[:, 2:] - right[:, :2], axis=1)
+    return distance
+
+
 def _sampson_gradient(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
     """Derivative of each Sampson distance by the entries of F, (N, 3, 3)."""
     flat = np.array([1.0, 1.0, 0.0])
@@ -220,4 +236,10 @@ def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> E
     if inlier.sum() <= 7:
         raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
     sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - 7)))
+    parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
+    if float(np.median(parallax)) < LEAST_PARALLAX * sigma:
+        raise WorkFailed(
+            "both cameras see the same up to a change of image coordinates: without a baseline, or with all "
+            "markers always in one plane, there is no depth; move the cameras apart, or the markers in depth"
+        )
     return Epipolar(in_pixels, sigma, inlier)

@@ -10,6 +10,9 @@ from projservo_cli.calibration.readings import Readings
 from projservo_cli.records import FloatArray
 
 
+OPEN_DIRECTION = 1e-10
+
+
 @dataclass(frozen=True, eq=False)
 class ProjectiveScene:
     """Projective kinematics: what [RH00] section 2 calls P, Ĥ, M and the plane at infinity.
@@ -148,6 +151,8 @@ def spread_factor(J: FloatArray, gauge: FloatArray) -> FloatArray:
     G = np.linalg.qr(scale[:, None] * gauge)[0]
     free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
     _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
-    floor = np.finfo(float).eps * s[0]
+    # Robots of one or two joints leave more directions open than the gauge, none of which matters
+    # to an image: they must come out as zero after the product with its derivative.
+    floor = OPEN_DIRECTION * s[0]
     result: FloatArray = (free @ (Vt.T / np.maximum(s, floor))) / scale[:, None]
     return result

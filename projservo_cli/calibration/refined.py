@@ -96,7 +96,8 @@ def starts(problem: Problem, epipolar: Epipolar, frame: Frame, rng: np.random.Ge
         for w in rotation_axes(alignment, problem.q, readings.prismatic, rng, AXIS_MINIMA):
             screws = place(w, guess.points, readings, problem.q)
             M = np.hstack([screws.body, np.ones((len(screws.body), 1))])
-            yield Scene(guess.P, screws.H_hat, M)
+            if np.isfinite(screws.H_hat).all() and np.isfinite(M).all():
+                yield Scene(guess.P, screws.H_hat, M)
 
 
 def _merged(guess: Guess, readings: Readings) -> Alignment:
