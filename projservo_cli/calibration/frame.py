@@ -9,7 +9,6 @@ from projservo_cli.calibration.adjustment import CAMERA, Layout, Scene
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.records import FloatArray
 
-
 OPEN_DIRECTION = 1e-10
 
 
