@@ -124,15 +124,15 @@ def plan_task(
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     amplitudes = (parts.tau, parts.theta_r, parts.theta_p)
     sigma = np.linspace(0.0, 1.0, samples)
-    mu = profile_shares(profile, sigma)
+    tau_0, theta_0 = _changes(np.array(parts.a), H_hat, task)
+    tau_limit = min((delta * t for t in tau_0 if t > 0.0), default=math.inf)
+    mu = profile_shares(profile, sigma, tau_limit / parts.tau if parts.tau > 0.0 else 1.0)
     H_d = np.array([trajectory_displacement(H_hat, amplitudes, row) for row in mu])
     images = np.array([project(model.P, state.A @ H.T) for H in H_d])
     a = np.array(parts.a)
     carried = np.array([np.linalg.solve(H.T, a) for H in H_d])
     margins = margin(carried, task.O, task.visible)
     margins = margins / margins[0]
-    tau_0, theta_0 = _changes(a, H_hat, task)
-    limits = [delta * t for t in tau_0 if t > 0.0]
     sense, sense_margin = _senses(parts, task)
     feasible, reason = _verdict(profile, sigma, margins)
     return Plan(
@@ -143,7 +143,7 @@ def plan_task(
         theta_r=parts.theta_r,
         theta_p=parts.theta_p,
         theta_s=composed_angle(parts.theta_r, parts.theta_p)[0],
-        tau_limit=min(limits, default=math.inf),
+        tau_limit=tau_limit,
         sigma=sigma,
         mu=mu,
         H_d=H_d,
