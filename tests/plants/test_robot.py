@@ -100,7 +100,7 @@ def test_a_camera_looks_at_its_target():
         return pixels(np.array([P, P]), np.append(point, 1.0)[None])[0, 0]
 
     assert seen(target) == pytest.approx([640, 500], abs=1e-9)
-    assert seen(target + [0, 0, 0.1])[1] < 500  # up is towards smaller v
+    assert seen(target + np.array([0, 0, 0.1]))[1] < 500  # up is towards smaller v
     left = np.cross([0, 0, 1.0], target - position)
     assert seen(target + 0.1 * left)[0] < 640
     assert P[2] @ [*target, 1] == pytest.approx(np.linalg.norm(target - position))
