@@ -17,7 +17,7 @@ def drawn(spec, material):
     return figure
 
 
-@pytest.fixture(scope="module", params=["paper", "ur5", "stanford"])
+@pytest.fixture(scope="module", params=["paper", "stanford", pytest.param("ur5", marks=pytest.mark.volume)])
 def figures(request):
     material = case(request.param)[2]
     return {spec.name: drawn(spec, material) for spec in FIGURES}
