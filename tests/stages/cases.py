@@ -22,6 +22,7 @@ class Case:
         self.gains = gains_of(self.config)
         self.limits = limits_of(self.config, self.truth)
         self.plan = self.planned(self.truth.model)
+        self.traces = {}
 
     def planned(self, model, profile="linear", samples=11):
         bounds = (self.truth.robot.lower, self.truth.robot.upper)
@@ -38,6 +39,12 @@ class Case:
             self.gains if gains is None else gains, self.limits._replace(**limits),
             np.zeros((most + 1, 2, len(self.truth.face), 2)), self.plan.rotation_sense(),
         )  # fmt: skip
+
+    def trace(self, law):
+        """Trace of one law as configured, with the true metric model; made once."""
+        if law not in self.traces:
+            self.traces[law] = self.servo(law)
+        return self.traces[law]
 
     @property
     def goal_center(self):

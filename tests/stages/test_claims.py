@@ -15,7 +15,7 @@ GAINS_A_STEP = (0.5, 0.3, 0.1, 0.05, 0.02)
 @pytest.mark.parametrize("name", ["paper", "paper_perturbed", "ur5", "stanford"])
 @pytest.mark.parametrize("law", DIRECT)
 def test_direct_laws_do_the_task_in_sight_of_both_cameras(name, law):
-    trace = case(name).servo(law)
+    trace = case(name).trace(law)
     assert trace.verdict == "converged"
     assert (trace.self_occluded_steps_left, trace.self_occluded_steps_right) == (0, 0)
     assert trace.position_error_mm < 0.1
@@ -29,7 +29,7 @@ def test_direct_laws_do_the_task_in_sight_of_both_cameras(name, law):
 def test_errors_decay_exponentially(name, law):
     """Within 1 % of 1 − gain·period a step, from 20 steps after the last saturated one to 0.1 mm or 0.05°."""
     example = case(name)
-    trace = example.servo(law)
+    trace = example.trace(law)
     wanted = 1.0 - example.config.control.gain_t * trace.period
     distance = np.linalg.norm(trace.center - example.goal_center, axis=1)
     saturated = np.flatnonzero(trace.speed_factor < 1.0)
@@ -89,18 +89,18 @@ def test_drift_falls_with_the_gain_and_with_the_limit(name, law):
 
 @pytest.mark.parametrize("law", ["stacked", "euclidean_points"])
 def test_classical_laws_turn_the_face_through_occlusion(law):
-    trace = case("paper").servo(law)
+    trace = case("paper").trace(law)
     assert trace.self_occluded_steps_left > 0
     assert trace.self_occluded_steps_right > 0
 
 
 def test_blockwise_does_not_converge():
-    assert case("paper").servo("blockwise", max_steps=300).verdict != "converged"
+    assert case("paper").servo("blockwise", max_steps=150).verdict != "converged"
 
 
 def test_image_error_is_neither_exponential_nor_monotone():
     """Some coordinate moves away from its goal for a while, and no single factor describes the decay."""
-    trace = case("paper").servo("direct_three")
+    trace = case("paper").trace("direct_three")
     errors = np.abs(trace.s - trace.s_star).reshape(len(trace.s), -1)
     assert (np.diff(errors, axis=0).max(axis=0) > 1.0).any()  # px in one step
     factors = trace.image_error[1:] / trace.image_error[:-1]

@@ -117,3 +117,20 @@ def test_a_start_that_is_the_goal_is_a_plan_without_motion():
     assert np.abs(plan.H_d - np.eye(4)).max() < 1e-9
     assert plan.tau_limit == math.inf
     assert np.isnan(plan.tau_0).all()
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5"])
+def test_the_planned_half_turn_does_not_depend_on_frame_or_scale(name):
+    """Exactly 180°: the rehearsed sense is one of the robot, whatever the sign of its cameras."""
+    example = case(name)
+    model = example.truth.model
+    wanted = example.plan.rotation_sense()[1]
+    negative = model._replace(P=-model.P)
+    one_negative = model._replace(P=model.P * np.array([1.0, -1.0])[:, None, None])
+    for there in (
+        in_frame(model, frame(1)),
+        negative,
+        one_negative,
+        in_frame(negative, frame(2, mirrored=True)),
+    ):
+        assert example.planned(there).rotation_sense()[1] == pytest.approx(wanted, abs=1e-6)

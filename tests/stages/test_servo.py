@@ -12,7 +12,7 @@ from tests.stages.cases import Case, case
 
 def test_trace_is_the_run_as_it_was():
     example = case("ur5")
-    trace = example.servo("direct_three")
+    trace = example.trace("direct_three")
     k = trace.steps
     assert len(trace.q) == len(trace.s) == len(trace.theta_r) == k + 1
     assert len(trace.q_dot) == len(trace.speed_factor) == k
@@ -32,7 +32,7 @@ def test_trace_is_the_run_as_it_was():
 
 
 def test_deviation_is_that_from_the_line_between_true_start_and_goal():
-    trace, goal = case("ur5").servo("direct_two"), case("ur5").goal_center
+    trace, goal = case("ur5").trace("direct_two"), case("ur5").goal_center
     way = (goal - trace.center[0]) / np.linalg.norm(goal - trace.center[0])
     off = trace.center - trace.center[0]
     at_samples = 1e3 * np.linalg.norm(off - np.outer(off @ way, way), axis=1).max()
@@ -49,7 +49,7 @@ def test_two_runs_are_identical_to_the_bit():
 
 def test_opaque_face_loses_its_markers():
     example = Case("paper", ["plant.self_occlusion=opaque"])
-    trace = example.servo("stacked")
+    trace = example.trace("stacked")
     assert trace.verdict == "markers lost"
     assert trace.self_occluded[-1].any()
     assert not trace.self_occluded[:-1].any()
@@ -58,10 +58,10 @@ def test_opaque_face_loses_its_markers():
 
 def test_joint_limit_stops_where_it_is_told_to():
     """The stacked law passes a joint limit on this task; told to stop it ends the step before."""
-    passed = case("paper").servo("stacked")
+    passed = case("paper").trace("stacked")
     assert passed.first_beyond_limit > 0
     example = Case("paper", ["plant.joint_limits=stop"])
-    trace = example.servo("stacked")
+    trace = example.trace("stacked")
     assert trace.verdict == "joint limit"
     assert trace.steps == passed.first_beyond_limit - 1
     assert trace.limit_joint == passed.limit_joint
