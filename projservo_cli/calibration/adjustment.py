@@ -165,12 +165,7 @@ def derivative(scene: Scene, readings: Readings, q: FloatArray) -> tuple[FloatAr
     """
     E = displacements(scene.H_hat, readings.prismatic, q)
     Y = moved_points(E, scene.M, readings)
-    m = Y[0] @ np.swapaxes(scene.P, 1, 2)
-    pixels = pixels_of(m)
-    # [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3.
-    G = np.zeros((*m.shape[:2], 2, 3))
-    G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
-    G[..., 2] = -pixels / m[..., 2:]
+    pixels, G = projection_derivative(scene.P, Y[0])
     blocks = [(G[..., None] * Y[0][:, None, None, :]).reshape(*G.shape[:3], CAMERA)]
     D = G @ scene.P[:, None]
     for i, B in enumerate(generators(scene, readings.prismatic)):
@@ -179,6 +174,40 @@ def derivative(scene: Scene, readings: Readings, q: FloatArray) -> tuple[FloatAr
         blocks.append(before - D @ np.einsum("bij,Nj->Nib", B, Y[i + 1]))
     blocks.append(D[..., :3])
     return pixels, np.concatenate(blocks, axis=3)
+
+
+def projection_derivative(P: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (2, N, 2) of points and their derivative (2, N, 2, 3) by the image points.
+
+    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3.
+
+    Parameters
+    ----------
+    P : (2, 3, 4) cameras.
+    points : (N, 4) points.
+    """
+    m = points @ np.swapaxes(P, 1, 2)
+    pixels = pixels_of(m)
+    G = np.zeros((*m.shape[:2], 2, 3))
+    G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
+    G[..., 2] = -pixels / m[..., 2:]
+    return pixels, G
+
+
+def joint_derivative(scene: Scene, readings: Readings, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values, [RH00] eqs. (7), (19).
+
+    Parameters are those of ``predict_pixels``.
+    """
+    E = displacements(scene.H_hat, readings.prismatic, q)
+    Y = moved_points(E, scene.M, readings)
+    pixels, G = projection_derivative(scene.P, Y[0])
+    D = G @ scene.P[:, None]
+    J = np.empty((*pixels.shape, len(E)))
+    for i in range(len(E)):
+        J[..., i] = np.einsum("vNrc,Nc->vNr", D, Y[i] @ scene.H_hat[i].T)
+        D = D @ E[i][readings.pose_of]
+    return pixels, J
 
 
 def retract(scene: Scene, readings: Readings, place: Layout, x: FloatArray) -> Scene:

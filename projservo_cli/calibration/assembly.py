@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.calibration import quality
+from projservo_cli.calibration.culprits import Culprits
 from projservo_cli.calibration.frame import ProjectiveScene
 from projservo_cli.calibration.prediction import image_points, prediction_derivative
 from projservo_cli.calibration.quality import Agreement, Expected
@@ -31,6 +32,7 @@ def assemble(
     agreement: Agreement,
     expected: Expected,
     factor: FloatArray | None,
+    found: Culprits | None = None,
 ) -> Calibration:
     """Record of a fit in its projective frame.
 
@@ -43,6 +45,7 @@ def assemble(
     agreement, expected : what the fit leaves of the images, and what it should.
     factor : (24 + 16 n + 4 m, r) factor of the covariance of P, H_hat_0, M at a noise of one pixel,
         None for a method that has none.
+    found : what explains readings left out.
 
     Raises
     ------
@@ -61,8 +64,13 @@ def assemble(
         motion = image_motion(model, scene.M, span)
         quality.require_determined(noise, motion, sigma, span, readings.prismatic)
         covariance = sigma**2 * (factor @ factor.T)
-    outlier = outlier_list(readings, agreement.used)
-    reason, advice = quality.verdict(agreement, expected, noise, span, readings.prismatic, len(outlier))
+    if found is None:
+        found = Culprits(
+            np.zeros((0, 2), dtype=np.int64), np.zeros((0, 3), dtype=np.int64), np.zeros_like(readings.seen)
+        )
+    outlier = outlier_list(readings, agreement.used | found.explained)
+    counts = (len(outlier), len(found.suspect), len(found.swapped))
+    reason, advice = quality.verdict(agreement, expected, noise, span, readings.prismatic, counts)
     shortfall = quality.shortfall(method, agreement, expected)
     used_rows = agreement.used.any(axis=0)
     return Calibration(
@@ -92,8 +100,10 @@ def assemble(
         merged_poses=int(np.unique(readings.pose_of[used_rows]).size),
         merged_markers=int(np.unique(readings.marker_of[used_rows]).size),
         outlier=outlier,
-        suspect=np.zeros((0, 2), dtype=np.int64),
-        swapped=np.zeros((0, 3), dtype=np.int64),
+        suspect=np.stack([readings.pose[found.suspect[:, 0]], found.suspect[:, 1] + 1], axis=1),
+        swapped=np.concatenate(
+            [readings.pose[found.swapped[:, :1]], readings.marker[found.swapped[:, 1:]]], axis=1
+        ),
     )
 
 

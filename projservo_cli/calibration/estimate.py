@@ -6,7 +6,7 @@ import time
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from projservo_cli.calibration import adjustment, closed_form, linear, quality
+from projservo_cli.calibration import adjustment, closed_form, culprits, linear, quality
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.assembly import assemble
 from projservo_cli.calibration.epipolar import Epipolar
@@ -90,15 +90,21 @@ def _refined(
     refusal = expected.refusal(solution.agreement)
     if refusal is not None:
         raise WorkFailed(refusal)
-    problem, scene = solution.problem, solution.scene
+    problem, scene, agreement = solution.problem, solution.scene, solution.agreement
+    found = culprits.find(problem, scene, agreement.used, agreement.sigma_px)
+    quality.require_explained(
+        *culprits.unexplained(readings, agreement.used, found.explained, epipolar),
+        len(np.unique(found.suspect[:, 0])),
+        len(readings.q),
+    )
     result = _projective(problem, scene)
     _, J = adjustment.derivative(scene, readings, problem.q)
-    used = solution.agreement.used.astype(np.float64)
+    used = agreement.used.astype(np.float64)
     factor = spread_factor(problem.dense(J, used), adjustment.gauge(scene, readings, problem.place))
     factor = output_derivative(scene, readings, problem.place, result) @ factor
     gauge = output_gauge(result)
     factor -= gauge @ (gauge.T @ factor)
-    return assemble("refined", result, readings, problem.q_reference, solution.agreement, expected, factor)
+    return assemble("refined", result, readings, problem.q_reference, agreement, expected, factor, found)
 
 
 def _projective(problem: Problem, scene: Scene) -> ProjectiveScene:

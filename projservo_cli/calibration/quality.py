@@ -11,6 +11,8 @@ from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 # Fitted noise over the noise expected: above the first more than pixel noise is left, above the
 # second the model does not describe the data.
 WARN_RATIO, REFUSE_RATIO = 1.15, 3.0
+# Shares of sightings both views agree on, and of poses, that may be left out of a fit.
+MOST_UNEXPLAINED, MOST_SUSPECT = 0.02, 0.4
 CHI2_TAIL = 1e-4
 LEAST_SIGMA = 1e-4
 # Second over first extent of a body that counts as a line.
@@ -213,6 +215,33 @@ def require_determined(
         )
 
 
+def require_explained(unexplained: int, sightings: int, suspect_poses: int, poses: int) -> None:
+    """Refuse a fit that leaves out too much of what both cameras agree on.
+
+    Parameters
+    ----------
+    unexplained : sightings left out although both views agree on them.
+    sightings : all sightings in both views.
+    suspect_poses : poses left out for their joint readings.
+    poses : all poses.
+
+    Raises
+    ------
+    WorkFailed
+        If the model of the robot, not single errors, is at odds with the data.
+    """
+    if unexplained > max(3.0, MOST_UNEXPLAINED * sightings):
+        raise WorkFailed(
+            f"the fit does not describe the data: in {unexplained} of {sightings} sightings both cameras "
+            "agree with each other but not with the robot; check the joint readings and types (R or P)"
+        )
+    if suspect_poses > MOST_SUSPECT * poses:
+        raise WorkFailed(
+            f"the fit does not describe the data: {suspect_poses} of {poses} poses contradict their joint "
+            "readings; check the joint readings, their units and types (R or P)"
+        )
+
+
 def shortfall(method: str, agreement: Agreement, expected: Expected) -> str | None:
     """Why a fit that was not refused cannot be used, or None where it can.
 
@@ -233,7 +262,7 @@ def verdict(
     noise: FloatArray,
     span: FloatArray,
     prismatic: BoolArray,
-    outliers: int,
+    left_out: tuple[int, int, int],
 ) -> tuple[str, tuple[str, ...]]:
     """Why a calibration is usable, what limits it, and what to do next, in words.
 
@@ -241,7 +270,7 @@ def verdict(
     ----------
     agreement, expected : what the fit leaves, and what it should.
     noise, span, prismatic : (n,) as in ``require_determined``.
-    outliers : number of readings left out.
+    left_out : number of outliers, of suspect joint readings and of exchanged markers.
     """
     sigma, ratio = agreement.sigma_px, expected.ratio(agreement)
     advice = [
@@ -257,6 +286,13 @@ def verdict(
             + wanted
         )
         advice.append("look for lens distortion and for joint readings that lag behind the images")
+    outliers, suspects, swaps = left_out
     if outliers:
-        advice.append(f"{outliers} readings were left out as outliers: check the detection of markers")
+        advice.append(f"{outliers} sightings were left out as outliers: check the detection of markers")
+    if suspects:
+        advice.append(
+            f"{suspects} joint readings disagree with the images: check how poses and images are paired"
+        )
+    if swaps:
+        advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
     return f"{reason}; limited by {limit}", tuple(advice)
