@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, Gains, new_state
+from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, new_state
 from projservo_cli.loop.compiled import Log, new_log, path_deviation
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import VERDICTS, Limits
@@ -34,21 +34,35 @@ DEPENDS_ON = (
 SUBSAMPLES = 50
 
 
-def gains_of(config: "Config") -> Gains:
+def gains_of(config: "Config", truth: Truth) -> Gains:
     """Gains and limits of the laws."""
     c = config.control
     return Gains(
-        c.gain_t, c.gain_r, c.gain_p, c.gain_s, c.ratio_rp, c.gain, c.period_s, config.trajectory.delta
+        c.gain_t,
+        c.gain_r,
+        c.gain_p,
+        c.gain_s,
+        c.ratio_rp,
+        c.gain,
+        c.period_s,
+        config.trajectory.delta,
+        speed_limits(config, truth),
+        c.substeps == "auto",
     )
+
+
+def speed_limits(config: "Config", truth: Truth) -> FloatArray:
+    """Most joint motion per second (n,), rad/s or m/s; infinite for none."""
+    c = config.control
+    revolute = math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s)
+    prismatic = math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s
+    return np.where(truth.robot.joint_types == PRISMATIC, prismatic, revolute)
 
 
 def limits_of(config: "Config", truth: Truth) -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
-    c = config.control
-    revolute = math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s)
-    prismatic = math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s
     return Limits(
-        np.where(truth.robot.joint_types == PRISMATIC, prismatic, revolute),
+        speed_limits(config, truth),
         config.stop.image_px + config.stop.noise_factor * config.noise.servo_px,
         config.stop.diverged_factor,
         config.stop.plateau_steps,
@@ -80,7 +94,7 @@ def run(
         plant_of(config, truth, reach.q_start),
         truth,
         reach,
-        gains_of(config),
+        gains_of(config, truth),
         limits_of(config, truth),
         noise,
     )
@@ -115,7 +129,7 @@ def drive(
     n, m = len(reach.q_start), len(truth.face)
     task = task_from_images(model, reach.s_start, reach.s_star, truth.center)
     state = new_state(n, m)
-    log = new_log(n, m, limits.max_steps, len(ERRORS))
+    log = new_log(n, m, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
     code, steps = run_loop(
         CODES[law], model, task, gains, limits, plant, noise, reach.q_start.copy(), state, log
     )
