@@ -8,186 +8,239 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Entry:
-    """One equation, or a statement of a section where the number starts with ``§``."""
+    """One equation, or a statement of a section where the number starts with ``§``.
+
+    Attributes
+    ----------
+    number, title : of the equation.
+    functions : dotted names of the functions that implement it.
+    tests : ``file::name`` of the tests that show it holds.
+    erratum : what is wrong in print, and what is right; empty where nothing is.
+    """
 
     number: str
     title: str
     functions: tuple[str, ...]
-    tests: tuple[str, ...] = ()
-    erratum: str = ""
+    tests: tuple[str, ...]
+    erratum: str
 
 
-_GEOMETRY = "projservo_cli.geometry."
+def _entry(number: str, title: str, functions: str, tests: str = "", erratum: str = "") -> Entry:
+    """An entry from names separated by spaces, below the package and the folder of tests."""
+    return Entry(
+        number,
+        title,
+        tuple(f"projservo_cli.{name}" for name in functions.split()),
+        tuple(f"tests/{name}" for name in tests.split()),
+        erratum,
+    )
 
-_TASK = "projservo_cli.task."
-_CONTROL = "projservo_cli.control."
 
 REGISTER = (
-    Entry(
+    _entry(
         "1",
         "Images of a projective point in both cameras, and its reconstruction",
-        (
-            _GEOMETRY + "kinematics.project",
-            _GEOMETRY + "stereo.triangulate",
-            _GEOMETRY + "stereo.triangulate_points",
-        ),
+        "geometry.kinematics.project geometry.stereo.triangulate_points calibration.prediction.predict",
+        "geometry/test_kinematics.py::test_pixels_of_points "
+        "geometry/test_stereo.py::test_clean_points_are_recovered",
     ),
-    Entry(
+    _entry(
         "2",
         "Projective displacement, conjugate to a rigid motion, of unit determinant",
-        (_GEOMETRY + "displacement.normalize_displacement",),
-        (),
-        "det = 1 leaves ±H in dimension 4 (the trace is 0 at 180°): choose the sign that keeps the sign of "
-        "a_inf·M.",
+        "geometry.displacement.normalize_displacement",
+        " geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
+        "det = 1 leaves ±H in dimension 4 (the trace is 0 at 180°): choose the sign that keeps the sign "
+        "of a_inf·M.",
     ),
-    Entry(
+    _entry(
         "3",
         "Duals: the point that three planes meet in, planes of a point or line",
-        (_GEOMETRY + "algebra.meet",),
+        "geometry.algebra.meet geometry.algebra.dual_pencil",
+        "geometry/test_algebra.py::test_meet_is_the_determinant_with_one_row_open",
     ),
-    Entry(
+    _entry(
         "4",
         "Projective rotation: algebra to group and group to algebra",
-        (
-            _GEOMETRY + "displacement.rotation",
-            _GEOMETRY + "displacement.exp_rotation",
-            _GEOMETRY + "displacement.log_rotation",
-        ),
-        (),
+        "geometry.displacement.exp_rotation geometry.displacement.log_rotation "
+        "calibration.adjustment.displacements",
+        "geometry/test_displacement.py::test_rotation_is_the_matrix_exponential "
+        "geometry/test_displacement.py::test_logarithm_inverts_the_rotation",
         "Group to algebra is undefined at 0 and ±π: such trial motions are refused.",
     ),
-    Entry(
+    _entry(
         "5",
         "Projective translation: algebra to group and group to algebra",
-        (
-            _GEOMETRY + "displacement.translation",
-            _GEOMETRY + "displacement.exp_translation",
-            _GEOMETRY + "displacement.log_translation",
-        ),
-        (),
+        "geometry.displacement.exp_translation geometry.displacement.log_translation "
+        "calibration.adjustment.displacements",
+        "geometry/test_displacement.py::test_translation_is_the_matrix_exponential "
+        "geometry/test_displacement.py::test_logarithm_inverts_the_translation",
         "Group to algebra is undefined at 0: such trial motions are refused.",
     ),
-    Entry(
+    _entry(
         "6",
         "Forward kinematics as a product of exponentials",
-        (_GEOMETRY + "kinematics.forward", _GEOMETRY + "kinematics.forward_kinematics"),
+        "geometry.kinematics.forward_kinematics calibration.adjustment.moved_points",
+        "geometry/test_kinematics.py::test_forward_kinematics_is_the_product_of_exponentials",
     ),
-    Entry(
+    _entry(
         "7",
         "Velocity of a projective point and of its image",
-        (_GEOMETRY + "kinematics.image_jacobian",),
-        (),
+        "geometry.kinematics.image_jacobian calibration.adjustment.derivative",
+        "geometry/test_kinematics.py::test_image_jacobian_is_the_derivative_of_the_pixels",
         "The second row of J_G is printed as 1/m3, 0, …; it is 0, 1/m3, −m2/m3².",
     ),
-    Entry("8", "Translation along an axis through two points", (_GEOMETRY + "mechanisms.translation_along",)),
-    Entry(
+    _entry(
+        "8",
+        "Translation along an axis through two points",
+        "geometry.mechanisms.translation_along",
+        "geometry/test_mechanisms.py::test_translation_keeps_every_plane_through_its_line",
+    ),
+    _entry(
         "9",
         "Revolution about an axis through two points",
-        (_GEOMETRY + "mechanisms.rotation_about",),
-        (),
+        "geometry.mechanisms.rotation_about",
+        "geometry/test_mechanisms.py::test_revolution_keeps_its_axis",
         "“ker” is missing: q̂_R ν = ker[…]. The text says plane-operators; they are point operators.",
     ),
-    Entry(
+    _entry(
         "10",
         "Revolution about a point in a plane",
-        (_GEOMETRY + "mechanisms.rotation_within",),
-        (),
+        "geometry.mechanisms.rotation_within",
+        "geometry/test_mechanisms.py::test_planar_revolution_keeps_its_plane_and_its_point",
         "Scrambled in typesetting: the rows are −Ĥ_iᵀ a_1 and Ĥ_i A_1.",
     ),
-    Entry("11", "Amplitude of the translation of the centre", (_TASK + "partition.partition",)),
-    Entry("12", "Target less the translation", (_TASK + "partition.partition",)),
-    Entry(
+    _entry(
+        "11",
+        "Amplitude of the translation of the centre",
+        "task.partition.translation_part",
+        "task/test_partition.py::test_amplitudes_are_the_metric_ones",
+    ),
+    _entry(
+        "12",
+        "Target less the translation",
+        "task.partition.partition",
+        "task/test_partition.py::test_any_displacement "
+        "task/test_partition.py::test_partition_does_not_depend_on_the_frame",
+    ),
+    _entry(
         "13",
         "Rotation onto the plane: the circle of a point meets the target plane",
-        (_TASK + "partition.onto_plane_part",),
-        (),
+        "task.partition.onto_plane_part geometry.composition.angles_onto_plane",
+        "geometry/test_composition.py::test_points_are_turned_onto_the_plane",
         "The axis lies in a_t, so p_0 = 0 and θ⁻ = θ⁺ ± π. For the optical centre |p_0| may exceed the "
         "amplitude: visibility then never changes, which is no error.",
     ),
-    Entry("14", "Its trigonometric equation", (_TASK + "partition.onto_plane_part",)),
-    Entry(
+    _entry(
+        "14",
+        "Its trigonometric equation",
+        "geometry.composition.incidence_coefficients task.visibility.margin_coefficients",
+        "task/test_visibility.py::test_margin_coefficients_describe_the_carried_plane",
+    ),
+    _entry(
         "15",
         "The two solutions of the trigonometric equation",
-        (_TASK + "visibility.visibility_angles",),
-        (),
+        "geometry.composition.incidence_angles geometry.composition.angles_onto_plane",
+        "geometry/test_composition.py::test_solutions_are_all_zeros_of_the_equation "
+        "geometry/test_composition.py::test_the_printed_second_solution_holds_only_without_a_cosine",
         "θ⁻ = π − θ⁺ holds only where p_c = 0; θ± = atan2(p_s, p_c) ± arccos(−p_0 / √(p_s² + p_c²)).",
     ),
-    Entry(
-        "16", "Target less the translation and the rotation onto the plane", (_TASK + "partition.partition",)
+    _entry(
+        "16",
+        "Target less the translation and the rotation onto the plane",
+        "task.partition.partition",
+        "task/test_partition.py::test_any_displacement task/test_partition.py::test_square_face",
     ),
-    Entry("17", "Displacement along the planned trajectory", (_TASK + "trajectory.trajectory_displacement",)),
-    Entry(
+    _entry(
+        "17",
+        "Displacement along the planned trajectory",
+        "task.trajectory.trajectory_displacement",
+        "task/test_trajectory.py::test_planned_displacement_is_the_product_in_the_order_of_the_paper",
+    ),
+    _entry(
         "18",
         "Shares of translation and rotations along the trajectory",
-        (_TASK + "trajectory.profile_shares",),
-        (),
+        "task.trajectory.profile_shares",
+        "task/test_trajectory.py::test_shares_grow_from_nothing_to_all",
         "μ_d is μ_t.",
     ),
-    Entry(
+    _entry(
         "19",
         "Joint operators of the moving robot",
-        (_GEOMETRY + "kinematics.operators_at", _GEOMETRY + "kinematics.joint_operators"),
-        (),
+        "geometry.kinematics.joint_operators",
+        "geometry/test_kinematics.py::test_operators_are_conjugated_by_the_joints_before "
+        "geometry/test_kinematics.py::test_operators_are_the_derivatives_of_the_forward_kinematics",
         "The operator is conjugated by the truncated product H̄_i(q_g) of (6), not by H_i⁰.",
     ),
-    Entry(
+    _entry(
         "20",
         "Direct control directTHREE",
-        (_CONTROL + "direct_three.direct_three",),
-        (),
-        "−ė = λe with q̇ = […] ė leads away from the goal; the motion that reaches it is "
-        "q̇ = λ_t τ q̂_t + λ_r θ_r q̂_r + λ_p θ_p q̂_p.",
+        "control.direct_three.direct_three",
+        "control/test_direct.py::test_each_error_decays_at_its_own_rate",
+        "−ė = λe with q̇ = […] ė leads away from the goal; the motion that reaches it is q̇ = λ_t τ "
+        "q̂_t + λ_r θ_r q̂_r + λ_p θ_p q̂_p.",
     ),
-    Entry(
+    _entry(
         "21",
         "Displacement that directTHREE integrates to",
-        (_CONTROL + "direct_three.direct_three",),
-        (),
+        "control.direct_three.direct_three",
+        "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit",
         "λ_r θ_r is printed twice; the second is λ_p θ_p.",
     ),
-    Entry(
+    _entry(
         "22",
         "Translation and rotation at once",
-        (_CONTROL + "direct_two.direct_two",),
-        (),
+        "control.direct_two.direct_two",
+        "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "
         "parallel to the axis; with Ĥ_s carried along with the moving centre the flow integrates to the "
         "product.",
     ),
-    Entry(
+    _entry(
         "23",
         "Direct control directTWO",
-        (_CONTROL + "direct_two.direct_two",),
-        (),
+        "control.direct_two.direct_two control.direct_two.rotation_about_center",
+        "control/test_direct.py::test_one_rotation_decays_at_the_rate_of_its_gain "
+        "control/test_direct.py::test_any_ratio_converges",
         "Sign as in (20): q̇ = λ_t τ q̂_t + λ_s θ_s q̂_s.",
     ),
-    Entry("24", "One rotation for both rotations", (_GEOMETRY + "composition.compose_rotations",)),
-    Entry(
+    _entry(
+        "24",
+        "One rotation for both rotations",
+        "geometry.composition.compose_rotations",
+        "geometry/test_composition.py::test_one_rotation_equals_two "
+        "geometry/test_composition.py::test_operator_is_the_matrix_logarithm_of_the_product "
+        "control/test_direct.py::test_error_of_both_rotations_is_the_true_angle",
+    ),
+    _entry(
         "25",
         "Coefficients of the composed rotation",
-        (_GEOMETRY + "composition.compose_rotations",),
-        (),
+        "geometry.composition.compose_rotations",
+        "geometry/test_composition.py::test_the_printed_factor_two_is_wrong",
         "c = sin(θ_p/2) sin(θ_r/2), without the factor 2, with [Ĥ_r, Ĥ_p] = Ĥ_r Ĥ_p − Ĥ_p Ĥ_r.",
     ),
-    Entry(
+    _entry(
         "§4.2",
         "Visibility and the motions that do not change it",
-        (
-            _TASK + "visibility.margin",
-            _TASK + "visibility.visibility_translation",
-            _TASK + "visibility.choose_sense",
-        ),
-        (),
+        "task.visibility.margin task.visibility.visibility_translation "
+        "task.visibility.visibility_angles task.visibility.choose_sense "
+        "task.visibility.limited_translation",
+        "task/test_visibility.py::test_neutral_along_the_ray_of_a_point_of_the_face "
+        "task/test_visibility.py::test_neutral_parallel_to_the_face "
+        "task/test_visibility.py::test_neutral_about_any_axis_through_the_optical_center "
+        "task/test_visibility.py::test_neutral_within_the_plane_of_the_face "
+        "task/test_visibility.py::test_the_optical_axis_itself_is_not_neutral "
+        "task/test_visibility.py::test_two_cameras_that_want_different_senses",
         "Translation along the optical axis changes visibility unless the ray passes through the face's "
-        "point. Neutral, for one camera each: translation along that ray in front of the camera or parallel "
-        "to the face, any rotation about an axis through the optical centre, and Ĥ_p.",
+        "point. Neutral, for one camera each: translation along that ray in front of the camera or "
+        "parallel to the face, any rotation about an axis through the optical centre, and Ĥ_p.",
     ),
-    Entry(
+    _entry(
         "§4.3",
         "Profiles of the trajectory",
-        (_TASK + "trajectory.profile_shares",),
-        (),
-        "1 − exp(−σ/t_*) reaches 0.632 at σ = t_* and is normalised to reach 1. H_r(θ_P(σ)) is H_r(θ_r(σ)); "
-        "“μ_t < τ_0” compares τ(σ) with τ_0, likewise θ_r; τ(σ − 1) means τ (μ_t(σ) − 1).",
+        "task.trajectory.profile_shares",
+        "task/test_trajectory.py::test_linear_and_exponential "
+        "task/test_trajectory.py::test_what_comes_first_is_done_before_the_rest_begins",
+        "1 − exp(−σ/t_*) reaches 0.632 at σ = t_* and is normalised to reach 1. H_r(θ_P(σ)) is "
+        "H_r(θ_r(σ)); “μ_t < τ_0” compares τ(σ) with τ_0, likewise θ_r; τ(σ − 1) means τ (μ_t(σ) − 1).",
     ),
 )

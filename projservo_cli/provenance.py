@@ -42,6 +42,7 @@ def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
     }
 
 
+@cache
 def _version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)

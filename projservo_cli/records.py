@@ -98,6 +98,22 @@ class Calibration:
     operator_defect: FloatArray = array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
     trace_defect: FloatArray = array("joint", about="absolute trace of Ĥ")
     plane_defect: FloatArray = array("joint", about="norm of a_inf @ Ĥ, a_inf of unit norm")
+    prediction_noise: FloatArray = array(
+        "joint", about="noise of predicted images 0.5 rad or 0.15 m from the reference, over the pixel noise"
+    )
+    merged_poses: int = scalar(about="poses that the fit uses")
+    merged_markers: int = scalar(about="markers that the fit uses")
+    outlier: IntArray = array(
+        "outlier_row",
+        "outlier_column",
+        about="readings left out: pose, marker, view (0 left, 1 right, 2 both)",
+    )
+    suspect: IntArray = array(
+        "suspect_row", "suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
+    )
+    swapped: IntArray = array(
+        "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
+    )
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""
@@ -148,6 +164,11 @@ class Plan:
         "solution", "view", about="least margin along each sense, 1 at the start"
     )
 
+    def rotation_sense(self) -> FloatArray:
+        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
+        signs = np.where(np.array([self.theta_r, self.theta_p]) >= 0.0, 1.0, -1.0)
+        return np.asarray(signs[:, None] * self.q_hat[1:3])
+
 
 @dataclass(frozen=True, eq=False)
 class Trace:
@@ -189,6 +210,38 @@ class Trace:
     pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
     goal_pose: FloatArray = array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
     center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What a report wrote, the claims of the paper against the runs, and the numbers of the extra runs.
+
+    Laws are direct_three and direct_two, operators true and calibrated, limits none and the limit
+    per step. Deviations are NaN where the goal pose is unknown.
+    """
+
+    figures: tuple[str, ...] = scalar(about="files written, relative to the folder of the run")
+    left_out: tuple[dict[str, str], ...] = scalar(about="figures and studies left out, each with the reason")
+    claims: tuple[dict[str, Any], ...] = scalar(about="claim, source, measured, criterion, holds")
+    step_limit_deg: float = scalar(units="deg", about="joint motion per step of the limited runs")
+    gain_per_step: FloatArray = array("gain_per_step", about="share of the error taken in one step")
+    drift_mm: FloatArray = array(
+        "law", "operators", "limit", "gain_per_step", units="mm", about="largest deviation of the centre"
+    )
+    drift_at_samples_mm: FloatArray = array(
+        "law", "operators", "limit", "gain_per_step", units="mm", about="the same at the sampling instants"
+    )
+    drift_converged: BoolArray = array(
+        "law", "operators", "limit", "gain_per_step", about="whether the run converged"
+    )
+    period: FloatArray = array("period", units="s", about="control period at the configured gains")
+    period_drift_mm: FloatArray = array(
+        "law", "period", units="mm", about="largest deviation of the centre, true operators, no limit"
+    )
+    share: FloatArray = array("share", about="share of the task in both sides of (22)")
+    composition_mm: FloatArray = array(
+        "share", units="mm", about="distance of the centre between both sides of (22)"
+    )
 
 
 class InputError(ValueError):

@@ -138,7 +138,9 @@ def load(target: Path | str) -> Run:
         raise
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         what = " ".join(str(error).split())
-        raise InputError(f"{path}: cut short, damaged or not a run file ({what}); make it again") from error
+        raise InputError(
+            f"{path}: cut short, damaged or not a run file ({what}); delete it or use another"
+        ) from error
 
 
 def _check_schema(path: Path, file: h5py.File) -> None:
@@ -147,7 +149,7 @@ def _check_schema(path: Path, file: h5py.File) -> None:
     version = int(file.attrs.get("schema_version", 0))
     if version != SCHEMA_VERSION:
         raise InputError(
-            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}; make it again"
+            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}; use another run"
         )
 
 
@@ -183,7 +185,7 @@ def _save_record(group: h5py.Group, record: Any) -> None:
             group.attrs[field.name] = _encoded(value)
     for name, (field, value) in arrays.items():
         _save_array(group, name, value, field.metadata)
-    _attach_scales(group, {name: field.metadata["dims"] for name, (field, _) in arrays.items()})
+    _attach_scales(group, _distinct({name: field.metadata["dims"] for name, (field, _) in arrays.items()}))
 
 
 def _encoded(value: Any) -> Any:
@@ -206,6 +208,12 @@ def _save_array(group: h5py.Group, name: str, value: Any, metadata: Mapping[str,
     data.attrs["long_name"] = metadata["about"]
 
 
+def _distinct(dims: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+    """Dimension names that no array over other dimensions bears, since both are datasets of a group."""
+    taken = {name for name, own in dims.items() if own != (name,)}
+    return {name: tuple(f"{dim}_index" if dim in taken else dim for dim in own) for name, own in dims.items()}
+
+
 def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> None:
     """Name the dimensions of all arrays; an array named as its only dimension is its coordinate."""
     for name, own in dims.items():
@@ -214,9 +222,7 @@ def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> No
             if dim not in group:
                 scale = group.create_dataset(dim, data=np.zeros(size, dtype=np.float32))
                 scale.make_scale(_NO_VARIABLE.format(size))
-            elif dim in dims and not group[dim].is_scale:
-                if dims[dim] != (dim,):
-                    raise ValueError(f"{group.name}: {dim} names both a dimension and an array over others")
+            elif not group[dim].is_scale:
                 group[dim].make_scale(dim)
             if group[dim].shape != (size,):
                 raise ValueError(f"{group.name}/{name}: dimension {dim} has {size} entries, elsewhere others")
@@ -227,13 +233,15 @@ def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> No
 def _load_record(path: Path, group: h5py.Group) -> Any:
     kind = getattr(record_types, _text(group, "record"), None)
     if not dataclasses.is_dataclass(kind):
-        raise InputError(f"{path}: {group.name} holds a record this version does not know; make it again")
+        raise InputError(f"{path}: {group.name} holds a record this version does not know; use another run")
     hints = typing.get_type_hints(kind)
     values: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
         present = field.name in (group if "dims" in field.metadata else group.attrs)
         if not present and not _optional(hints[field.name]):
-            raise InputError(f"{path}: {group.name} lacks {field.name}; it was made by another version")
+            raise InputError(
+                f"{path}: {group.name} lacks {field.name}; another version made it; use another run"
+            )
         if not present:
             values[field.name] = None
         elif "dims" in field.metadata:
@@ -245,9 +253,7 @@ def _load_record(path: Path, group: h5py.Group) -> Any:
 
 def _load_array(path: Path, data: h5py.Dataset, dims: tuple[str, ...]) -> Any:
     if data.ndim != len(dims):
-        raise InputError(
-            f"{path}: {data.name} has {data.ndim} dimensions instead of {len(dims)}; make it again"
-        )
+        raise InputError(f"{path}: {data.name} has {data.ndim} dimensions instead of {len(dims)}")
     value = data[()]
     return value.astype(np.bool_) if data.attrs.get("dtype") == "bool" else value
 

@@ -9,8 +9,8 @@ from projservo_cli.cli.options import wrapped
 from projservo_cli.config import Config
 from projservo_cli.store import Run
 
-# reports on single observations that a calibration may hold besides its numbers
-FINDINGS = ("outliers", "suspect_joint_readings", "swapped", "merged_poses", "merged_markers")
+LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
+COUNTS = ("merged_poses", "merged_markers")
 NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
 
 
@@ -30,9 +30,8 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
     """The JSON object of a stage that could not be made, or lacks what it needs."""
     result: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
     if stage == "calibrate":
-        numbers = dict.fromkeys(NUMBERS)
-        findings: dict[str, list[Any]] = {name: [] for name in FINDINGS}
-        return result | {"usable": False, "advice": [], **numbers, "joints": [], **findings}
+        lists: dict[str, list[Any]] = {name: [] for name in ("advice", "joints", *LISTS)}
+        return result | {"usable": False} | dict.fromkeys(NUMBERS) | dict.fromkeys(COUNTS, 0) | lists
     if stage == "plan":
         return result | {"feasible": False}
     if stage == "servo":
@@ -47,6 +46,8 @@ def _scalars(record: Any) -> dict[str, Any]:
 
 
 def _calibration(run: Run, config: Config) -> dict[str, Any]:
+    from projservo_cli.calibration import findings  # heavy; only this object needs it
+
     calibration = run.calibration
     given = config.robot.joints if config.robot is not None else ()
     joints = [
@@ -58,7 +59,7 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
         }
         for i, letter in enumerate(calibration.joint_types)
     ]
-    return dict.fromkeys(FINDINGS, ()) | _scalars(calibration) | {"joints": joints}
+    return _scalars(calibration) | {"joints": joints} | findings(calibration)
 
 
 def _plan(run: Run) -> dict[str, Any]:
@@ -73,13 +74,18 @@ def summary(stage: str, value: dict[str, Any]) -> str:
     """A stage's object in words, at most 80 columns wide."""
     if "failed" in value:
         return wrapped(f"{stage}: failed at {value['failed']}: {value['reason']}")
-    lines = {"calibrate": _calibrate_words, "plan": _plan_words, "servo": _servo_words}
-    return "\n".join(lines.get(stage, _other_words)(value))
+    words = {
+        "calibrate": _calibrate_words,
+        "plan": _plan_words,
+        "servo": _servo_words,
+        "report": _report_words,
+    }
+    return "\n".join(words[stage](value))
 
 
 def _calibrate_words(value: dict[str, Any]) -> list[str]:
     weak = [joint["name"] for joint in value["joints"] if joint["weak"]]
-    found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in FINDINGS[:3] if value[name]]
+    found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in LISTS if value[name]]
     return [
         wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}"),
         f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "
@@ -99,9 +105,9 @@ def _plan_words(value: dict[str, Any]) -> list[str]:
 
 
 def _servo_words(value: dict[str, Any]) -> list[str]:
-    head = f"  {'law':<17}{'verdict':<14}{'steps':>6}{'mm':>10}{'deg':>10}{'occluded':>11}{'drift mm':>11}"
+    head = f"  {'law':<17}{'verdict':<13}{'steps':>6}{'mm':>10}{'deg':>10}{'occluded':>11}{'drift mm':>11}"
     rows = [
-        f"  {trace['law']:<17}{trace['verdict']:<14}{trace['steps']:>6}"
+        f"  {trace['law']:<17}{trace['verdict']:<13}{trace['steps']:>6}"
         f"{_number(trace['position_error_mm']):>10}"
         f"{_number(trace['rotation_error_deg']):>10}"
         f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}"
@@ -111,8 +117,14 @@ def _servo_words(value: dict[str, Any]) -> list[str]:
     return ["servo: true errors at the end, self-occluded steps left/right", head, *rows]
 
 
-def _other_words(value: dict[str, Any]) -> list[str]:
-    return [wrapped(f"{name.replace('_', ' ')}: {content}", "  ") for name, content in value.items()]
+def _report_words(value: dict[str, Any]) -> list[str]:
+    words = {True: "holds", False: "fails", None: "not measured"}
+    claims = [f"{words[row['holds']]}: {row['claim']}: {row['measured']}" for row in value["claims"]]
+    left_out = [f"left out: {row['what']}: {row['reason']}" for row in value["left_out"]]
+    return [
+        f"report: {len(value['figures'])} files of figures, {len(claims)} claims",
+        *(wrapped(text, "  ") for text in (*claims, *left_out)),
+    ]
 
 
 def _number(value: float | None) -> str:

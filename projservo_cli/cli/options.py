@@ -48,7 +48,7 @@ OPTIONS: dict[str, click.Option] = {
         click.Option(
             ["-j", "--threads"],
             metavar="N",
-            type=click.IntRange(min=1),
+            type=click.IntRange(1, 256),
             help="Threads. Default: all processors.",
         ),
         click.Option(["--json"], is_flag=True, help="Print one JSON object on standard output."),

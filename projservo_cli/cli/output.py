@@ -44,6 +44,8 @@ class Console:
     def say(self, text: str) -> None:
         """A message on standard error."""
         if not self.quiet:
+            if self._bar is not None:
+                self._bar.clear()
             click.echo(wrapped(text), err=True)
 
     def detail(self, text: str) -> None:

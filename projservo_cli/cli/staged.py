@@ -67,7 +67,8 @@ def _work(call: _Call) -> None:
     from projservo_cli.stages.chain import make
 
     _announce_compilation(call)
-    for step in call.steps:
+    for done, step in enumerate(call.steps):
+        call.console.progress("results", done, len(call.steps))
         if not step.why:
             tell = call.console.say if step.stage in call.names else call.console.detail
             tell(f"{step.name}: up to date")
@@ -75,7 +76,7 @@ def _work(call: _Call) -> None:
             needed = "" if step.stage in call.names else f", needed by {call.names[-1]}"
             call.console.say(f"{step.name}: making it ({step.why}{needed})")
             try:
-                call.run, dropped = make(step, call.config, call.run, call.console.progress)
+                call.run, dropped = make(step, call.config, call.run, call.laws, call.console.progress)
             except WorkFailed as error:
                 call.failed, call.reason = step.name, " ".join(str(error).split())
                 return

@@ -5,6 +5,7 @@ import pathlib
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -141,8 +142,8 @@ def _defects(values: dict[str, Any]) -> Iterable[Problem]:
     found: list[Problem] = []
     good = SimpleNamespace()
     broken = set()
-    for name, field in Config.model_fields.items():
-        section = create_model("Part", __base__=Section, **{name: (field.annotation, field)})  # type: ignore[call-overload]
+    for name in Config.model_fields:
+        section = _alone(name)
         part = {name: values[name]} if name in values else {}
         try:
             setattr(good, name, getattr(section.model_validate(part), name))
@@ -153,6 +154,14 @@ def _defects(values: dict[str, Any]) -> Iterable[Problem]:
         if key not in Config.model_fields:
             found.append(Problem((key,), f"unknown key; {nearest(key, sorted(Config.model_fields))}"))
     return found + [Problem(path, what) for path, what in problems(good, frozenset(broken))]
+
+
+@cache
+def _alone(name: str) -> type[Section]:
+    """A model of one section by itself."""
+    field = Config.model_fields[name]
+    model: type[Section] = create_model("Part", __base__=Section, **{name: (field.annotation, field)})  # type: ignore[call-overload]
+    return model
 
 
 def _lines(document: Document, found: Sequence[Problem]) -> list[str]:

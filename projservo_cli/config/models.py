@@ -100,7 +100,7 @@ class Control(Section):
     gain: Positive = 2.5
     joint_speed_limit_deg_s: Positive | None = 125.0
     prismatic_speed_limit_m_s: Positive | None = None
-    substeps: Literal["none", "auto"] = "none"
+    substeps: Literal["none", "auto"] = "auto"
 
 
 class PlantSettings(Section):

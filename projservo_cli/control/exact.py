@@ -20,9 +20,9 @@ from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts, clear
 
 MOST_NEWTON_STEPS = 6
-# A joint step of one part of the continuation, rad or m: between its ends linear joint motion stays
-# within 0.1 mm of the path of a robot of a metre's size.
-PART_STEP = math.radians(5.0)
+# A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
+# by about 0.1 mm from the path of a robot of a metre's size.
+PART_STEP = math.radians(2.5)
 # A Newton step this short, rad or m, is the last: the next would be its square, below round-off.
 SETTLED = 1e-8
 ROUND_OFF = 1e-13
@@ -135,8 +135,8 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 
     The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before
-    any Newton step: the path itself never changes. Long steps are continued in parts of at most 5°;
-    where a part fails there are more of them, up to 64.
+    any Newton step: the path itself never changes. Long steps are continued in parts of about 2.5°;
+    where a part fails there are more of them, up to 128.
 
     Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
     """
@@ -157,12 +157,12 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     tau *= share
     theta *= share
     most = first_order(parts, tau, theta, sense, state)
-    count = max(1, math.ceil(most / PART_STEP))
-    while count <= MOST_PARTS and not continued(model, q, parts, H_s, tau, theta, count, state):
-        count *= 2
-    if count > MOST_PARTS:
-        clear(state.q_dot)
-        return SINGULAR
+    count = min(MOST_PARTS, max(1, math.ceil(most / PART_STEP)))
+    while not continued(model, q, parts, H_s, tau, theta, count, state):
+        if count == MOST_PARTS:
+            clear(state.q_dot)
+            return SINGULAR
+        count = min(MOST_PARTS, 2 * count)
     for i in range(q.shape[0]):
         state.q_dot[i] = (state.path[count, i] - q[i]) / gains.period
     state.share[0] = share

@@ -22,7 +22,10 @@ from projservo_cli.task.partition import Memory, Parts, no_parts, partition
 from projservo_cli.task.visibility import limited_translation
 
 # Parts a law may split one step into.
-MOST_PARTS = 64
+MOST_PARTS = 128
+
+# No joint-speed limit, for any number of joints a configuration may have.
+UNLIMITED = np.full(64, np.inf)
 
 OK = 0
 LOST = 1
@@ -55,8 +58,8 @@ class Gains(NamedTuple):
     gain: float
     period: float
     delta: float
-    speed: FloatArray
-    substeps: bool
+    speed: FloatArray = UNLIMITED
+    substeps: bool = False
 
 
 class State(NamedTuple):
@@ -72,7 +75,7 @@ class State(NamedTuple):
     memory : what is carried to the next step.
     limited : (1,) how often visibility limited the translation.
     newton : (n,) one Newton step.
-    path : (65, n) joints at the ends of the parts of a step, the current ones first.
+    path : (129, n) joints at the ends of the parts of a step, the current ones first.
     share : (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the
         limit to the loop.
     parts : (1,) parts of the step in ``path``; 0 where the joints go straight to the end.
@@ -139,6 +142,8 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
     """Measure and partition the remaining task; the errors are written to the state."""
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] = 0.0
+    for i in range(state.errors.shape[0]):
+        state.errors[i] = math.nan
     if not measure(model, task, s, q, state):
         return LOST, no_parts()
     parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)

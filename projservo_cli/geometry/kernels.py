@@ -11,6 +11,8 @@ from projservo_cli.records import FloatArray, IntArray
 
 # A kernel is one-dimensional when the next pivot stands above round-off by this factor of the first.
 RANK_TOLERANCE = 1e-9
+# A last pivot above this share of the first is no kernel at all: noise leaves a few per cent.
+KERNEL_TOLERANCE = 0.1
 # A last pivot below this is zero to working precision: back-substitution alone gives the kernel.
 EXACT_TOLERANCE = 1e-14
 GAIN_TOLERANCE = 1e-12
@@ -37,7 +39,7 @@ def factorize(B: FloatArray, m: int, n: int, pivot: IntArray, rhs: FloatArray) -
     before_last = 0.0
     for k in range(min(m, n)):
         best = k
-        most = -1.0
+        most = 0.0
         for j in range(k, n):
             size = 0.0
             for i in range(k, m):
@@ -101,15 +103,19 @@ def kernel_vector(
 
     Returns
     -------
-    False where the kernel is not one-dimensional; x is then zero.
+    False where there is no kernel or more than one dimension of it; x is then zero.
     """
     for i in range(m):
         rhs[i] = 0.0
-    if factorize(B, m, n, pivot, rhs) < RANK_TOLERANCE:
+    if not factorize(B, m, n, pivot, rhs) >= RANK_TOLERANCE:
         for j in range(n):
             x[j] = 0.0
         return False
     last = abs(B[n - 1, n - 1]) if m >= n else 0.0
+    if not last <= KERNEL_TOLERANCE * abs(B[0, 0]):
+        for j in range(n):
+            x[j] = 0.0
+        return False
     z[n - 1] = 1.0
     back_substitute(B, n - 1, z, B[n - 1], -1.0)
     normalize(z, n)

@@ -26,6 +26,8 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kernels import kernel_vector
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
 
+# A kernel vector whose operator is smaller than this share of its terms moves nothing.
+NULL_MOTION = 1e-9
 NO_OPERATOR: Mat4 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -110,7 +112,7 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
         put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
     if not kernel_vector(work.B, 8, n, q_hat, work.pivot, work.z, work.rhs):
         return False, NO_OPERATOR
-    return True, operator_of(work, q_hat)
+    return moving(work, q_hat)
 
 
 @njit
@@ -140,9 +142,28 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
 
 
 @njit
+def moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
+    """Operator of a kernel vector, refused where it moves nothing.
+
+    At a kinematic singularity the kernel is the null motion of the robot: joints move, the face does
+    not. Then Σ q̂_i Ĥ_i vanishes against its terms.
+    """
+    H = operator_of(work, q_hat)
+    terms = 0.0
+    for i in range(q_hat.shape[0]):
+        operator = mat(work.H_hat[i])
+        terms += q_hat[i] * q_hat[i] * inner(operator, operator)
+    if not inner(H, H) > NULL_MOTION * NULL_MOTION * terms:
+        return False, NO_OPERATOR
+    return True, H
+
+
+@njit
 def to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
-    H = operator_of(work, q_hat)
+    found, H = moving(work, q_hat)
+    if not found:
+        return False, NO_OPERATOR
     trace = 0.0
     for i in range(4):
         for k in range(4):

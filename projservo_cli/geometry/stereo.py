@@ -49,7 +49,10 @@ def triangulate(
     k1 = f10 * u + f11 * v + f12
     size = (n0 * n0 + n1 * n1) + (k0 * k0 + k1 * k1)
     nothing = (0.0, 0.0, 0.0, 0.0)
-    if not size > 0.0:
+    # At the epipoles both normals vanish; round-off leaves 1e-32 of their natural size.
+    natural = ((f00 * f00 + f01 * f01) + (f10 * f10 + f11 * f11)) * ((u * u + v * v) + (x * x + y * y))
+    natural += (f02 * f02 + f12 * f12) + (f20 * f20 + f21 * f21)
+    if not size > 1e-24 * natural:
         return False, nothing
     residual = x * k0 + y * k1 + (f20 * u + f21 * v + f22)
     a = k0 * (f00 * n0 + f01 * n1) + k1 * (f10 * n0 + f11 * n1)

@@ -1,4 +1,4 @@
-"""The closed loop in Python: any law, any plant, the same limits, counting and verdicts."""
+"""The closed loop in Python: any law on the simulated plant, the same limits, counting and verdicts."""
 
 from typing import Protocol
 
@@ -28,9 +28,14 @@ from projservo_cli.task.face import Task
 
 
 class LoopLaw(Protocol):
-    """What the Python loop asks of a law."""
+    """What the Python loop asks of a law.
+
+    ``share`` (1,) is the share of the amplitude that the law's own speed limit left, −1 where it leaves
+    the limit to the loop.
+    """
 
     errors: FloatArray
+    share: FloatArray
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity (n,), rad/s or m/s, for pixels (2, m, 2) and joints (n,)."""
@@ -51,6 +56,7 @@ class BuiltInLaw:
         self.code, self.model, self.task, self.gains = code, model, task, gains
         self.state = new_state(len(model.H_hat_0), len(task.A_star))
         self.errors = self.state.errors
+        self.share = self.state.share
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
@@ -120,7 +126,7 @@ def _run(
             return verdict, k
         if k == limits.max_steps:
             break
-        log.factor[k] = limit_speed(q_dot, limits.speed)
+        log.factor[k] = law.share[0] if law.share[0] >= 0.0 else limit_speed(q_dot, limits.speed)
         joint = beyond_limits(log.q[k] + q_dot * period, truth.lower, truth.upper)
         if joint >= 0 and log.events[1] < 0.0:
             log.events[1], log.events[2] = k + 1, joint

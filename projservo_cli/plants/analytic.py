@@ -1,6 +1,4 @@
-"""The simulated robot as an object: the contract any plant in the Python loop fulfils."""
-
-from typing import Protocol
+"""The simulated robot as an object, for the Python loop."""
 
 import numpy as np
 
@@ -8,22 +6,6 @@ from projservo_cli.geometry.displacement import as_array, as_mat
 from projservo_cli.geometry.kinematics import start_pose
 from projservo_cli.plants.plant import Plant, observe, pose_after, rig_distance
 from projservo_cli.records import FloatArray
-
-
-class LoopPlant(Protocol):
-    """What the Python loop asks of a plant."""
-
-    def joints(self) -> FloatArray:
-        """Joint readings (n,), rad or m."""
-
-    def observe(self) -> FloatArray:
-        """Pixels (2, m, 2) of the face, NaN where unseen."""
-
-    def command(self, step: FloatArray, period: float) -> None:
-        """Move by the joint step (n,), rad or m, within one period, s."""
-
-    def stop(self) -> None:
-        """Hold still; called on every way out of the loop."""
 
 
 class AnalyticPlant:

@@ -70,7 +70,7 @@ def run(config: "Config", *, progress: object = None) -> tuple[Observation, Cali
 
     if config.data is not None:
         observation = read_table(config.data.table)
-        types = config.data.joints or "R" * observation.q.shape[1]
+        types = config.joint_types or "R" * observation.q.shape[1]
         if len(types) != observation.q.shape[1]:
             raise InputError(
                 f"{config.data.table}: has {observation.q.shape[1]} joint columns, but the joint string "

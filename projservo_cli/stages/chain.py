@@ -19,10 +19,14 @@ from projservo_cli.stages import Progress
 from projservo_cli.store import SERVO, Result, Run, save
 
 STAGES = ("calibrate", "plan", "servo", "report")
-# which laws are run, and which of them must converge, does not change the run of any of them
-NOT_OF_A_TRACE = ("control.laws", "control.must_converge")
-# where a table lies does not matter, only what it says
-NOT_OF_A_CALIBRATION = ("data.table",)
+# Where a table lies does not matter, only what it says. Which laws are run, and which of them must
+# converge, changes the run of none of them.
+NOT_HASHED: dict[str, tuple[str, ...]] = {
+    "calibrate": ("data.table",),
+    "plan": ("data.table",),
+    "servo": ("data.table", "control.laws", "control.must_converge"),
+    "report": ("data.table",),
+}
 
 
 @dataclass(frozen=True)
@@ -78,11 +82,9 @@ def steps_for(
         When the table cannot be read, or a recorded calibration would be replaced by a simulated
         one without ``force``.
     """
-    last = max(STAGES.index(stage) for stage in named)
+    last = max(named, key=STAGES.index)
     steps: list[Step] = []
-    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws):
-        if STAGES.index(stage) > last:
-            break
+    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, last):
         step = Step(stage, law, key, "", inputs)
         remade = any(before.why for before in steps if before.stage != stage)
         steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
@@ -91,22 +93,19 @@ def steps_for(
     return steps
 
 
-def _keys(config: Config, run: Run, laws: Sequence[str]) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, law, key and input hashes of every result, each key made from the one before it."""
+def _keys(
+    config: Config, run: Run, laws: Sequence[str], last: str
+) -> Iterator[tuple[str, str, str, dict[str, str]]]:
+    """Stage, law, key and input hashes of every result to ``last``, each key made from those before."""
     inputs = _table_hash(config, run)
-    read = {"table": inputs.get("table_sha256")}
-    key = digest(config, _depends_on("calibrate"), without=NOT_OF_A_CALIBRATION, extra=read)
-    yield "calibrate", "", key, inputs
-    key = digest(config, _depends_on("plan"), without=NOT_OF_A_CALIBRATION, extra={"before": key})
-    yield "plan", "", key, {}
-    traces = []
-    for law in dict.fromkeys(laws):
-        without = NOT_OF_A_TRACE + NOT_OF_A_CALIBRATION
-        before = {"before": key, "law": law}
-        traces.append(digest(config, _depends_on("servo"), without=without, extra=before))
-        yield "servo", law, traces[-1], {}
-    before_report = {"before": [key, *traces]}
-    yield "report", "", digest(config, _depends_on("report"), extra=before_report), {}
+    before: list[str | None] = [inputs.get("table_sha256")]
+    for stage in STAGES[: STAGES.index(last) + 1]:
+        keys = []
+        for law in dict.fromkeys(laws) if stage == "servo" else [""]:
+            extra = {"before": before, "law": law}
+            keys.append(digest(config, _depends_on(stage), without=NOT_HASHED[stage], extra=extra))
+            yield stage, law, keys[-1], inputs if stage == "calibrate" else {}
+        before = [*keys]
 
 
 def _depends_on(stage: str) -> tuple[str, ...]:
@@ -149,8 +148,16 @@ def _keep_recorded(config: Config, run: Run) -> None:
     )
 
 
-def make(step: Step, config: Config, run: Run, progress: Progress) -> tuple[Run, list[str]]:
+def make(
+    step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress
+) -> tuple[Run, list[str]]:
     """Make one result and put it into the run file.
+
+    Parameters
+    ----------
+    step, config, run : what to make, from what.
+    laws : laws whose traces a report is about; others may be stored, of other settings perhaps.
+    progress : told how far the stage is.
 
     Returns
     -------
@@ -162,12 +169,12 @@ def make(step: Step, config: Config, run: Run, progress: Progress) -> tuple[Run,
     InputError, WorkFailed
         What the stage raises; the run file is then as it was.
     """
-    records = _records(step, config, run, progress)
-    made_with = provenance.collect(seed=config.seed)
-    result = Result(step.key, to_yaml(config), made_with, step.inputs, records)
+    run = replace(run, configuration=to_yaml(config))
+    records = _records(step, config, run, laws, progress)
+    result = Result(step.key, run.configuration, provenance.collect(seed=config.seed), step.inputs, records)
     after = [name for name in run.results if _stage_of(name) > STAGES.index(step.stage)]
     results = {name: stored for name, stored in run.results.items() if name not in after}
-    run = replace(run, configuration=to_yaml(config), results={**results, step.name: result})
+    run = replace(run, results={**results, step.name: result})
     save(run)
     return run, after
 
@@ -176,7 +183,7 @@ def _stage_of(name: str) -> int:
     return STAGES.index(name.split("/")[0])
 
 
-def _records(step: Step, config: Config, run: Run, progress: Progress) -> dict[str, Any]:
+def _records(step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress) -> dict[str, Any]:
     module = stage_module(step.stage)
     if step.stage == "calibrate":
         observation, calibration = module.run(config, progress=progress)
@@ -185,4 +192,6 @@ def _records(step: Step, config: Config, run: Run, progress: Progress) -> dict[s
         return {"": module.run(config, run.calibration)}
     if step.stage == "servo":
         return {"": module.run(config, run.calibration, run.plan, step.law, progress=progress)}
-    return {"": module.run(run, run.path.parent, progress=progress)}
+    names = ["calibrate", "plan", *(SERVO + law for law in laws)]
+    reported = replace(run, results={name: run.results[name] for name in names})
+    return {"": module.run(reported, run.path.parent, progress=progress)}

@@ -11,7 +11,7 @@ from projservo_cli.loop.compiled import Log, new_log, path_deviation
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import VERDICTS, Limits
 from projservo_cli.plants.plant import Plant
-from projservo_cli.records import METRIC_LAWS, PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
+from projservo_cli.records import METRIC_LAWS, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.stages.truth import SERVO_NOISE, Reach, Truth, generator, plant_of, reach_of, truth_of
 from projservo_cli.task.face import task_from_images
 
@@ -34,7 +34,7 @@ DEPENDS_ON = (
 SUBSAMPLES = 50
 
 
-def gains_of(config: "Config", truth: Truth) -> Gains:
+def gains_of(config: "Config") -> Gains:
     """Gains and limits of the laws."""
     c = config.control
     return Gains(
@@ -46,23 +46,24 @@ def gains_of(config: "Config", truth: Truth) -> Gains:
         c.gain,
         c.period_s,
         config.trajectory.delta,
-        speed_limits(config, truth),
+        speed_limits(config),
         c.substeps == "auto",
     )
 
 
-def speed_limits(config: "Config", truth: Truth) -> FloatArray:
+def speed_limits(config: "Config") -> FloatArray:
     """Most joint motion per second (n,), rad/s or m/s; infinite for none."""
     c = config.control
     revolute = math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s)
     prismatic = math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s
-    return np.where(truth.robot.joint_types == PRISMATIC, prismatic, revolute)
+    types = config.robot.joint_types if config.robot is not None else ""
+    return np.array([prismatic if kind == "P" else revolute for kind in types])
 
 
-def limits_of(config: "Config", truth: Truth) -> Limits:
+def limits_of(config: "Config") -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
     return Limits(
-        speed_limits(config, truth),
+        speed_limits(config),
         config.stop.image_px + config.stop.noise_factor * config.noise.servo_px,
         config.stop.diverged_factor,
         config.stop.plateau_steps,
@@ -94,9 +95,10 @@ def run(
         plant_of(config, truth, reach.q_start),
         truth,
         reach,
-        gains_of(config, truth),
-        limits_of(config, truth),
+        gains_of(config),
+        limits_of(config),
         noise,
+        plan.rotation_sense(),
     )
 
 
@@ -117,6 +119,7 @@ def drive(
     gains: Gains,
     limits: Limits,
     noise: FloatArray,
+    sense: FloatArray | None = None,
 ) -> Trace:
     """Run one law with one model on the simulated robot.
 
@@ -125,10 +128,13 @@ def drive(
     law : name of the law.
     model : what the law believes.
     noise : (≥ max_steps + 1, 2, m, 2) px.
+    sense : (2, n) joint motions of the planned rotations r and p, which decide the sense of a half turn.
     """
     n, m = len(reach.q_start), len(truth.face)
     task = task_from_images(model, reach.s_start, reach.s_star, truth.center)
     state = new_state(n, m)
+    if sense is not None:
+        state.memory.rotation[:] = sense
     log = new_log(n, m, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
     code, steps = run_loop(
         CODES[law], model, task, gains, limits, plant, noise, reach.q_start.copy(), state, log

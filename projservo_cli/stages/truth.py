@@ -43,7 +43,7 @@ class Truth:
     P : (2, 3, 4) true cameras, px.
     M : (m, 4) all markers at the robot's reference, m.
     number : (m,) their numbers.
-    face : indices of the face markers.
+    face : indices of the face markers; none where the configuration has no face.
     center : position of the centre marker within the face, or ``MIDPOINT``.
     image_size : (2,) px.
     """
@@ -116,8 +116,8 @@ def truth_of(config: "Config") -> Truth:
         np.array([camera_of(config.rig.left), camera_of(config.rig.right)]),
         points @ robot.base_tool.T,
         numbers,
-        tuple(numbers.index(number) for number in face_numbers(config)),
-        center_index(config),
+        tuple(numbers.index(number) for number in config.markers.face or ()),
+        center_index(config) if config.markers.face else MIDPOINT,
         np.array(config.rig.image_size_px, dtype=np.float64),
     )
 
@@ -150,7 +150,12 @@ def robot_of(config: "Config") -> Robot:
 def camera_of(camera: "Camera") -> FloatArray:
     """Camera (3, 4) to px of its matrix or its look-at description."""
     if camera.matrix is not None:
-        return np.array(camera.matrix)
+        P = np.array(camera.matrix)
+        # A camera is given up to scale; the loop needs the scale that makes depths positive metres.
+        scale = float(np.sign(np.linalg.det(P[:, :3])) * np.linalg.norm(P[2, :3]))
+        if scale == 0.0:
+            raise InputError("rig: a camera matrix needs an invertible left 3×3 block: a finite camera")
+        return P / scale if abs(scale - 1.0) > 1e-12 else P
     assert camera.focal_px is not None
     assert camera.principal_point_px is not None
     assert camera.position_m is not None
@@ -190,8 +195,10 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     """
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
+    face_numbers(config)
     types = config.robot.joint_types if config.robot is not None else ""
     q_start = np.array(config.task.start.values(types))
+    _require_limits(truth.robot, q_start, "task.start")
     rng = generator(config, TARGET_NOISE)
     clean = truth.images(q_start, truth.M_face)
     sigma = config.noise.servo_px
@@ -232,7 +239,7 @@ def _require_limits(robot: Robot, q: FloatArray, where: str) -> None:
         if not robot.lower[i] <= value <= robot.upper[i]:
             raise WorkFailed(
                 f"{where}: joint {i + 1} would be at {value:.4g}, outside its limits "
-                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose another goal or wider limits"
+                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose other joints or wider limits"
             )
 
 

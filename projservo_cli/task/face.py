@@ -87,6 +87,10 @@ def cyclic_order(A: FloatArray) -> IntArray:
         raise WorkFailed("the face markers lie on one line: choose markers.face that span a plane")
     x, y = axes[:2] @ offsets.T
     order = np.argsort(np.arctan2(y, x), kind="stable")
+    # The axes have arbitrary signs: begin with the first marker and go on to the lower of its neighbours.
+    order = np.roll(order, -int(np.argmin(order)))
+    if order[1] > order[-1]:
+        order = np.roll(order[::-1], 1)
     return order.astype(np.int64)
 
 

@@ -140,6 +140,9 @@ def onto_plane_part(
     """
     same = dot(a, a_t)
     D = sub(a_t, a) if same >= 0.0 else add(a_t, a)
+    # Both planes hold the centre; what round-off leaves of its distance must not carry the axis away
+    # from it where the planes nearly agree.
+    D = axpy(-dot(D, A_c) / dot(A_c, A_c), A_c, D)
     if dot(D, D) <= COINCIDENT * COINCIDENT:
         if same >= 0.0:
             clear(q_hat)
@@ -166,13 +169,18 @@ def onto_plane_part(
 
 @njit
 def oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, float]:
-    """Angle of [RH00] eq. (15), in (−π, π], that brings the front of a onto the front of a_t."""
+    """Angle of [RH00] eq. (15), in (−π, π], that brings the front of a onto the front of a_t.
+
+    A_d is the marker farthest from the axis, taken to the plane of the face: measured markers lie off
+    it, and what one of them is off must not pass for an angle between the planes.
+    """
     p_0 = 0.0
     p_s = 0.0
     p_c = 0.0
     most = -1.0
     for k in range(A.shape[0]):
         A_d = vec(A[k])
+        A_d = axpy(-dot(a, A_d), a, A_d)
         first = apply(H_r, A_d)
         second = apply(H_r, first)
         s = dot(a_t, first)

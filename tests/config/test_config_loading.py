@@ -33,6 +33,9 @@ task:
 control: {joint_speed_limit_deg_s: null}
 """
 
+FINITE = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]"
+AT_INFINITY = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]"
+
 
 @pytest.fixture
 def good(tmp_path):
@@ -178,11 +181,11 @@ INCONSISTENT = {
         "robot.dh.tool",
         "last row",
     ),
-    "two cameras": ("rig.left.matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "rig.left.focal_px", "matrix"),
+    "two cameras": (f"rig.left.matrix={FINITE}", "rig.left.focal_px", "matrix is set as well"),
     "half a camera": ("rig.left.target_m=null", "rig.left", "missing: target_m"),
     "camera at its target": ("rig.left.target_m=[1, 0, 0]", "rig.left.target_m", "must look somewhere"),
     "camera upright": ("rig.left.up=[1, 0, 0]", "rig.left.up", "line of sight"),
-    "singular": ("rig.right.matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]", "rig.right.matrix", "singular"),
+    "singular": (f"rig.right.matrix={AT_INFINITY}", "rig.right.matrix", "singular"),
     "empty image": ("rig.image_size_px=[0, 10]", "rig.image_size_px", "greater than 0"),
     "another robot": ("data={table: t.csv, joints: RR}", "data.joints", "not the joints of the robot, RP"),
 }  # fmt: skip

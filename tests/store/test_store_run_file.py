@@ -75,7 +75,7 @@ class Odd:
     counts: records.IntArray = array("thing", about="counts")  # noqa: RUF009
     yes: records.BoolArray = array("thing", "thing_", about="flags")  # noqa: RUF009
     absent: records.FloatArray | None = array("nothing", about="not there")  # noqa: RUF009
-    there: records.FloatArray | None = array("thing", units="px", about="there")  # noqa: RUF009
+    there: records.FloatArray | None = array("there", "side", units="px", about="named as a dimension")  # noqa: RUF009
     number: float | None = scalar()
     missing: str | None = scalar()
     flag: bool = scalar()
@@ -89,7 +89,7 @@ def test_optional_nested_and_special_values_come_back(tmp_path, monkeypatch):
         np.array([3, -1]),
         np.array([[True, False], [False, False]]),
         None,
-        np.array([np.nan, np.inf]),
+        np.array([[np.nan, np.inf]]),
         1.25,
         None,
         False,

@@ -1,0 +1,219 @@
+"""The calibration record of a fit: diagnostics, covariance, what was left out, verdict."""
+
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.calibration import quality
+from projservo_cli.calibration.frame import ProjectiveScene
+from projservo_cli.calibration.prediction import image_points, prediction_derivative
+from projservo_cli.calibration.quality import Agreement, Expected
+from projservo_cli.calibration.readings import Readings
+from projservo_cli.records import (
+    PRISMATIC,
+    REVOLUTE,
+    BoolArray,
+    Calibration,
+    FloatArray,
+    IntArray,
+    Model,
+)
+
+LEFT, RIGHT, BOTH = 0, 1, 2
+VIEWS = ("left", "right", "both")
+
+
+def assemble(
+    method: str,
+    scene: ProjectiveScene,
+    readings: Readings,
+    q_reference: FloatArray,
+    agreement: Agreement,
+    expected: Expected,
+    factor: FloatArray | None,
+) -> Calibration:
+    """Record of a fit in its projective frame.
+
+    Parameters
+    ----------
+    method : name of the method.
+    scene : cameras, operators, markers and plane at infinity.
+    readings : what was explained.
+    q_reference : (n,) joint readings at the reference, rad or m.
+    agreement, expected : what the fit leaves of the images, and what it should.
+    factor : (24 + 16 n + 4 m, r) factor of the covariance of P, H_hat_0, M at a noise of one pixel,
+        None for a method that has none.
+
+    Raises
+    ------
+    WorkFailed
+        If a joint is not determined.
+    """
+    types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
+    model = Model(scene.P, scene.H_hat_0, types, q_reference, scene.a_inf)
+    span = quality.require_motion(readings)
+    size = 24 + 16 * len(types) + 4 * len(scene.M)
+    # NaN, not zero: a method without covariance does not claim certainty.
+    noise, covariance = np.full(len(types), np.nan), np.full((size, size), np.nan)
+    if factor is not None:
+        noise = reach_noise(model, scene.M, factor, _surroundings(readings))
+        sigma = expected.sigma_px if expected.known else max(expected.sigma_px, agreement.sigma_px)
+        motion = image_motion(model, scene.M, span)
+        quality.require_determined(noise, motion, sigma, span, readings.prismatic)
+        covariance = sigma**2 * (factor @ factor.T)
+    outlier = outlier_list(readings, agreement.used)
+    reason, advice = quality.verdict(agreement, expected, noise, span, readings.prismatic, len(outlier))
+    shortfall = quality.shortfall(method, agreement, expected)
+    used_rows = agreement.used.any(axis=0)
+    return Calibration(
+        method=method,
+        source="",
+        joint_types="".join("P" if slides else "R" for slides in readings.prismatic),
+        usable=shortfall is None,
+        reason=shortfall or reason,
+        advice=advice,
+        rms_px=agreement.rms_px,
+        sigma_px=expected.sigma_px,
+        sigma_fitted_px=agreement.sigma_px,
+        chi2_per_dof=expected.ratio(agreement) ** 2,
+        dof=agreement.dof,
+        seconds=0.0,
+        P=scene.P,
+        H_hat_0=scene.H_hat_0,
+        q_reference=q_reference,
+        a_inf=scene.a_inf,
+        marker=readings.marker,
+        M=scene.M,
+        covariance=covariance,
+        excitation=span,
+        weak=noise > quality.WEAK_NOISE,
+        **defects(scene, readings.prismatic),
+        prediction_noise=noise,
+        merged_poses=int(np.unique(readings.pose_of[used_rows]).size),
+        merged_markers=int(np.unique(readings.marker_of[used_rows]).size),
+        outlier=outlier,
+        suspect=np.zeros((0, 2), dtype=np.int64),
+        swapped=np.zeros((0, 3), dtype=np.int64),
+    )
+
+
+def _surroundings(readings: Readings) -> FloatArray:
+    """Lower and upper corner of twice the image region in which markers were seen, (2, 2, 2) per view."""
+    corners = np.empty((2, 2, 2))
+    for v in (0, 1):
+        seen = readings.pixels[v][readings.seen[v]]
+        low, high = seen.min(axis=0), seen.max(axis=0)
+        corners[v] = np.array([low - 0.5 * (high - low), high + 0.5 * (high - low)])
+    return corners
+
+
+def reach_noise(model: Model, M: FloatArray, factor: FloatArray, surroundings: FloatArray) -> FloatArray:
+    """Noise of predicted images (n,) with each joint at its reach, in units of the pixel noise.
+
+    Images that leave the surroundings of the data do not count; where all do, the reach is halved.
+
+    Parameters
+    ----------
+    model : projective robot and rig.
+    M : (m, 4) markers at the reference.
+    factor : (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel.
+    surroundings : (2, 2, 2) lower and upper corner of the image region that counts, per view, px.
+    """
+    noise = np.zeros(len(model.joint_types))
+    for i, kind in enumerate(model.joint_types):
+        reach = quality.REACH_M if kind == PRISMATIC else quality.REACH_RAD
+        for _ in range(10):
+            q = np.tile(model.q_reference, (2, 1))
+            q[:, i] += (reach, -reach)
+            m = image_points(model, M, q)
+            pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+            counts = np.all(
+                (pixels >= surroundings[:, None, 0]) & (pixels <= surroundings[:, None, 1]), axis=-1
+            )
+            if counts.any():
+                break
+            reach *= 0.5
+        spread = prediction_derivative(model, M, q)[counts] @ factor
+        noise[i] = np.sqrt((spread**2).sum() / max(2 * int(counts.sum()), 1))
+    return noise
+
+
+def image_motion(model: Model, M: FloatArray, span: FloatArray) -> FloatArray:
+    """Mean length (n,) of the images' path over each joint's range, from their velocity at the reference, px.
+
+    Parameters
+    ----------
+    model : projective robot and rig.
+    M : (m, 4) markers at the reference.
+    span : (n,) range of each joint, rad or m.
+    """
+    # The path of [RH00] eq. (7), second row corrected: velocities of all markers for all joints.
+    velocity = np.einsum("vrc,ncd,md->nvmr", model.P, model.H_hat_0, M)
+    m = np.einsum("vrc,mc->vmr", model.P, M)
+    pixels = m[..., :2] / m[..., 2:]
+    rate = (velocity[..., :2] - pixels * velocity[..., 2:]) / m[..., 2:]
+    result: FloatArray = np.linalg.norm(rate, axis=3).mean(axis=(1, 2)) * span
+    return result
+
+
+def defects(scene: ProjectiveScene, prismatic: BoolArray) -> dict[str, Any]:
+    """How far the operators are from [RH00] section 2: Ĥ³ = −Ĥ or Ĥ² = 0, no trace, one plane at infinity.
+
+    Parameters
+    ----------
+    scene : operators and plane at infinity.
+    prismatic : (n,) types of the joints.
+
+    Returns
+    -------
+    Fields ``operator_defect``, ``trace_defect``, ``plane_defect`` of the record, (n,) each.
+    """
+    H_hat = scene.H_hat_0
+    square = H_hat @ H_hat
+    law = np.where(prismatic[:, None, None], square, square @ H_hat + H_hat)
+    return {
+        "operator_defect": np.linalg.norm(law, axis=(1, 2)) / np.linalg.norm(H_hat, axis=(1, 2)),
+        "trace_defect": np.abs(np.trace(H_hat, axis1=1, axis2=2)),
+        "plane_defect": np.linalg.norm(scene.a_inf @ H_hat, axis=1) / np.linalg.norm(scene.a_inf),
+    }
+
+
+def outlier_list(readings: Readings, used: BoolArray) -> IntArray:
+    """Readings that were seen but left out: rows of pose number, marker number, view, (L, 3).
+
+    Parameters
+    ----------
+    readings : what was seen.
+    used : (2, N) what counts.
+    """
+    out = readings.seen & ~used
+    rows = np.flatnonzero(out.any(axis=0))
+    view = np.where(out[:, rows].all(axis=0), BOTH, np.where(out[0, rows], LEFT, RIGHT))
+    listed = np.stack(
+        [readings.pose[readings.pose_of[rows]], readings.marker[readings.marker_of[rows]], view], axis=1
+    )
+    result: IntArray = listed[np.lexsort(listed.T[::-1])].astype(np.int64)
+    return result
+
+
+def findings(calibration: Calibration) -> dict[str, Any]:
+    """Single observations that do not fit, and how many do, as plain lists for people and JSON.
+
+    Parameters
+    ----------
+    calibration : the record.
+
+    Returns
+    -------
+    ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``.
+    """
+    outliers, suspects, swaps = (
+        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.swapped)
+    )
+    return {
+        "outliers": [{"pose": p, "marker": m, "view": VIEWS[v]} for p, m, v in outliers],
+        "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
+        "swapped": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
+        "merged_poses": calibration.merged_poses,
+        "merged_markers": calibration.merged_markers,
+    }

@@ -1,0 +1,133 @@
+"""``calibrate``: from an observation to projective kinematics, with its verdict."""
+
+import dataclasses
+import time
+
+import numpy as np
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
+
+from projservo_cli.calibration import adjustment, closed_form, linear, quality
+from projservo_cli.calibration.adjustment import Scene
+from projservo_cli.calibration.assembly import assemble
+from projservo_cli.calibration.epipolar import Epipolar
+from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
+from projservo_cli.calibration.frame import (
+    ProjectiveScene,
+    isotropic,
+    output_derivative,
+    output_gauge,
+    spread_factor,
+)
+from projservo_cli.calibration.optimization import Problem, prepare
+from projservo_cli.calibration.quality import Agreement, Expected
+from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
+from projservo_cli.calibration.reconstruction import Frame, image_frame
+from projservo_cli.calibration.refined import solve
+from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
+
+METHODS = ("refined", "linear", "closed_form")
+A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def calibrate(
+    observation: Observation,
+    joint_types: str,
+    *,
+    method: str = "refined",
+    sigma_px: float | None = None,
+    source: str = "simulated",
+    image_size: tuple[int, int] | None = None,
+    seed: int = 0,
+) -> Calibration:
+    """Projective kinematics [RH00] section 2 from pixels and joint readings alone.
+
+    Parameters
+    ----------
+    observation : stereo images of the markers at a sequence of poses, raw px, NaN where unseen.
+    joint_types : one letter a joint, R or P.
+    method : ``refined`` (maximum likelihood), ``linear`` (multi-frame) or ``closed_form`` (eqs. 4, 5).
+    sigma_px : noise per coordinate, px; None estimates it from the epipolar geometry.
+    source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
+    image_size : width and height, px, for the start of the search; None takes the extent of the data.
+    seed : of the random starts.
+
+    Raises
+    ------
+    InputError
+        If the arguments make no sense.
+    WorkFailed
+        If the data do not support a calibration: which joint or marker, and why.
+    """
+    if method not in METHODS:
+        raise InputError(f"calibration method {method!r}: choose one of {', '.join(METHODS)}")
+    if source not in ("simulated", "recorded"):
+        raise InputError(f"calibration source {source!r}: choose simulated or recorded")
+    if sigma_px is not None and not 0.0 < sigma_px < np.inf:
+        raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
+    begin = time.perf_counter()
+    # The matrices are small: a second thread costs more than it gives.
+    with threadpool_limits(limits=1):
+        readings = gather(observation, joint_types)
+        quality.require_motion(readings)
+        rng = np.random.default_rng(seed)
+        both = readings.both
+        epipolar = epipolar_geometry(readings.pixels[0][both], readings.pixels[1][both], rng)
+        expected = quality.expected_noise(epipolar.sigma_px, sigma_px, source)
+        if method == "refined":
+            result = _refined(readings, epipolar, image_frame(readings, image_size), rng, expected)
+        elif method == "linear":
+            result = _linear(readings, epipolar, expected)
+        else:
+            result = _closed_form(readings, epipolar, expected)
+    return dataclasses.replace(result, source=source, seconds=time.perf_counter() - begin)
+
+
+def _refined(
+    readings: Readings, epipolar: Epipolar, frame: Frame, rng: np.random.Generator, expected: Expected
+) -> Calibration:
+    """Calibration by maximum likelihood, in its projective frame, with its covariance."""
+    solution = solve(readings, reference_joints(readings.q), epipolar, frame, rng, expected.agrees)
+    refusal = expected.refusal(solution.agreement)
+    if refusal is not None:
+        raise WorkFailed(refusal)
+    problem, scene = solution.problem, solution.scene
+    result = _projective(problem, scene)
+    _, J = adjustment.derivative(scene, readings, problem.q)
+    used = solution.agreement.used.astype(np.float64)
+    factor = spread_factor(problem.dense(J, used), adjustment.gauge(scene, readings, problem.place))
+    factor = output_derivative(scene, readings, problem.place, result) @ factor
+    gauge = output_gauge(result)
+    factor -= gauge @ (gauge.T @ factor)
+    return assemble("refined", result, readings, problem.q_reference, solution.agreement, expected, factor)
+
+
+def _projective(problem: Problem, scene: Scene) -> ProjectiveScene:
+    """The scene in the isotropic projective frame of the points seen."""
+    E = adjustment.displacements(scene.H_hat, problem.readings.prismatic, problem.q)
+    moved = adjustment.moved_points(E, scene.M, problem.readings)[0]
+    return isotropic(scene.P, scene.H_hat, scene.M, A_INF, moved)
+
+
+def _linear(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:
+    """Calibration by the linear multi-frame method, without covariance."""
+    scene, q_reference, known = linear.operators(readings, epipolar.F)
+    readings = restrict(readings, known)
+    result = _projective(prepare(readings, q_reference), scene)
+    return _unrefined("linear", result, readings, q_reference, expected)
+
+
+def _closed_form(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:
+    """Calibration by the closed forms [RH00] eqs. (4), (5), without covariance."""
+    result, q_reference, known = closed_form.operators(readings, epipolar.F, epipolar.sigma_px)
+    return _unrefined("closed_form", result, restrict(readings, known), q_reference, expected)
+
+
+def _unrefined(
+    method: str, result: ProjectiveScene, readings: Readings, q_reference: FloatArray, expected: Expected
+) -> Calibration:
+    """Record of a method that minimises no image error: all readings count, whatever they show."""
+    problem = prepare(readings, q_reference)
+    residual = problem.residual(Scene(result.P, result.H_hat_0, result.M))
+    dof = 2 * int(np.count_nonzero(readings.seen)) - problem.place.size
+    agreement = Agreement(residual, readings.seen, dof)
+    return assemble(method, result, readings, q_reference, agreement, expected, None)

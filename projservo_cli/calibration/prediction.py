@@ -1,0 +1,164 @@
+"""Images that a calibration predicts, how certain they are, and how well they agree with data."""
+
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.calibration.adjustment import CAMERA, displacements
+from projservo_cli.records import PRISMATIC, Calibration, FloatArray, InputError, Model, Observation
+
+
+def image_points(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
+    """Homogeneous image points (K, 2, m, 3) of markers at joint readings, [RH00] eqs. (1), (6).
+
+    Parameters
+    ----------
+    model : robot and rig in one frame.
+    M : (m, 4) markers at the reference.
+    q : (K, n) joint readings, rad or m.
+
+    Raises
+    ------
+    InputError
+        If the readings have another number of joints.
+    """
+    q = np.asarray(q, dtype=np.float64)
+    n = len(model.H_hat_0)
+    if q.ndim != 2 or q.shape[1] != n:
+        raise InputError(f"joint readings of shape {q.shape}: expected one row of {n} a pose")
+    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, q - model.q_reference)
+    moved = np.broadcast_to(M.T, (len(q), 4, len(M)))
+    for i in range(n - 1, -1, -1):
+        moved = E[i] @ moved
+    result: FloatArray = np.swapaxes(model.P[None] @ moved[:, None], 2, 3)
+    return result
+
+
+def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
+    """Pixels of all markers in both views at joint readings, [RH00] eqs. (1), (6).
+
+    Parameters
+    ----------
+    calibration : projective kinematics.
+    q : (K, n) joint readings, rad or m.
+
+    Returns
+    -------
+    (K, 2, m, 2) pixels, markers in the order of ``calibration.marker``; NaN for a point that does
+    not lie in front of the camera.
+
+    Raises
+    ------
+    InputError
+        If the readings have another number of joints.
+    """
+    return _pixels(image_points(calibration.model(), calibration.M, q))
+
+
+def _pixels(m: FloatArray) -> FloatArray:
+    """Pixels (..., 2) of image points (..., 3), NaN where the depth is not positive."""
+    depth = np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+    result: FloatArray = m[..., :2] / depth
+    return result
+
+
+def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:
+    """How far predicted pixels are from seen ones, a distance for each marker and view.
+
+    Parameters
+    ----------
+    calibration : projective kinematics.
+    observation : stereo images of the same robot, px.
+
+    Returns
+    -------
+    ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``skipped`` with the pairs
+    of markers the calibration does not know, of points behind the camera, and not seen.
+
+    Raises
+    ------
+    InputError
+        If the readings have another number of joints.
+    """
+    known = np.isin(observation.marker, calibration.marker)
+    column = {int(number): j for j, number in enumerate(calibration.marker)}
+    order = np.array([column[int(number)] for number in observation.marker[known]], dtype=np.int64)
+    pixels = predict(calibration, observation.q)[:, :, order]
+    seen = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
+    ahead = np.isfinite(pixels[..., 0])
+    residual = (pixels - observation.images[:, :, known])[seen[:, :, known] & ahead]
+    distance = np.linalg.norm(residual, axis=1)
+    some = distance.size > 0
+    return {
+        "count": int(distance.size),
+        "rms_px": float(np.sqrt(np.mean(distance**2))) if some else None,
+        "median_px": float(np.median(distance)) if some else None,
+        "p95_px": float(np.percentile(distance, 95)) if some else None,
+        "skipped": {
+            "unknown_marker": int(seen[:, :, ~known].sum()),
+            "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
+            "missing": int((~seen).sum()),
+        },
+    }
+
+
+def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
+    """Variance of predicted pixels from the covariance of the calibration, to first order.
+
+    Parameters
+    ----------
+    calibration : projective kinematics with its covariance.
+    q : (K, n) joint readings, rad or m.
+
+    Returns
+    -------
+    (K, 2, m, 2) variances of u and v, px².
+    """
+    J = prediction_derivative(calibration.model(), calibration.M, q)
+    variance = np.einsum("...a,ab,...b->...", J, calibration.covariance, J, optimize=True)
+    result: FloatArray = np.maximum(variance, 0.0)
+    return result
+
+
+def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
+    """Derivative of predicted pixels by P, H_hat_0, M (ravelled): (K, 2, m, 2, 24 + 16 n + 4 m).
+
+    An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ).
+
+    Parameters
+    ----------
+    model : robot and rig in one frame.
+    M : (m, 4) markers at the reference.
+    q : (K, n) joint readings, rad or m.
+    """
+    H_hat, slides = model.H_hat_0, model.joint_types == PRISMATIC
+    dq = np.asarray(q, dtype=np.float64) - model.q_reference
+    K, n, m = len(dq), len(H_hat), len(M)
+    E = displacements(H_hat, slides, dq)
+    Y = np.empty((n + 1, K, m, 4))
+    Y[n] = M
+    for i in range(n - 1, -1, -1):
+        Y[i] = Y[i + 1] @ np.swapaxes(E[i], 1, 2)
+    image = Y[0][:, None] @ np.swapaxes(model.P, 1, 2)[None]
+    G = np.zeros((K, 2, m, 2, 3))
+    G[..., 0, 0] = G[..., 1, 1] = 1.0 / image[..., 2]
+    G[..., 2] = -image[..., :2] / image[..., 2:] ** 2
+    J = np.zeros((K, 2, m, 2, 2 * CAMERA + 16 * n + 4 * m))
+    for v in (0, 1):
+        camera = G[:, v, :, :, :, None] * Y[0][:, :, None, None, :]
+        J[:, v, ..., v * CAMERA : (v + 1) * CAMERA] = camera.reshape(K, m, 2, CAMERA)
+    D = G @ model.P[None, :, None]
+    for i in range(n):
+        sine = np.where(slides[i], dq[:, i], np.sin(dq[:, i]))[:, None, None, None, None]
+        versine = np.where(slides[i], 0.0, 2.0 * np.sin(0.5 * dq[:, i]) ** 2)[:, None, None, None, None]
+        point = Y[i + 1][:, None, :, None]
+        inner = sine * point + versine * (Y[i + 1] @ H_hat[i].T)[:, None, :, None]
+        block = D[..., :, None] * inner[..., None, :]
+        block = block + (versine * (D @ H_hat[i]))[..., :, None] * point[..., None, :]
+        first = 2 * CAMERA + 16 * i
+        J[..., first : first + 16] = block.reshape(K, 2, m, 2, 16)
+        D = D @ E[i][:, None, None]
+    for j in range(m):
+        first = 2 * CAMERA + 16 * n + 4 * j
+        J[:, :, j, :, first : first + 4] = D[:, :, j]
+    return J

@@ -1,0 +1,89 @@
+"""What figures are made from: the records of a run, the truth behind it, and the extra runs."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from projservo_cli.control.law import Gains
+from projservo_cli.plants.plant import Plant
+from projservo_cli.plants.robot import Robot
+from projservo_cli.records import FloatArray, Model, Plan, Trace
+
+Data = dict[str, npt.NDArray[Any]]
+"""Named arrays behind one figure."""
+
+DIRECT = ("direct_three", "direct_two")
+CLASSICAL = ("stacked", "blockwise", "euclidean_points")
+TITLES = {
+    "direct_three": "directTHREE",
+    "direct_two": "directTWO",
+    "stacked": "stacked Jacobians",
+    "blockwise": "block-wise",
+    "euclidean_points": "Euclidean points",
+}
+VIEWS = ("left", "right")
+
+
+@dataclass(frozen=True, eq=False)
+class Studies:
+    """Closed-loop runs beside those of the run file, all without noise.
+
+    Operators are ``true`` (metric), ``twin`` (the same in a projective frame) or ``calibrated``.
+
+    Attributes
+    ----------
+    gains : gains per step that are swept.
+    periods : periods, s, that are swept at the configured gains.
+    gains_of_laws : the configured gains.
+    step_limit_deg : joint motion per step of the limited runs, deg.
+    sweep : runs by (law, operators, limited, gain per step).
+    own : runs with the configured gains by (law, operators, limited).
+    rate : runs with true operators by (law, period).
+    """
+
+    gains: tuple[float, ...]
+    periods: tuple[float, ...]
+    gains_of_laws: Gains
+    step_limit_deg: float
+    sweep: Mapping[tuple[str, str, bool, float], Trace]
+    own: Mapping[tuple[str, str, bool], Trace]
+    rate: Mapping[tuple[str, float], Trace]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """All that the figures of a run may show.
+
+    Attributes
+    ----------
+    calibrated : model the laws use.
+    robot, plant : the truth.
+    plan : the plan.
+    numbers : numbers of the face markers.
+    traces : runs of the laws by name.
+    studies : extra runs; None where they could not be made.
+    no_studies : why not.
+    """
+
+    calibrated: Model
+    robot: Robot
+    plant: Plant
+    plan: Plan
+    numbers: tuple[int, ...]
+    traces: Mapping[str, Trace] = field(default_factory=dict)
+    studies: Studies | None = None
+    no_studies: str = ""
+
+    @property
+    def middle(self) -> FloatArray:
+        """Centre of the face (4,) at the robot's reference, m."""
+        M = self.plant.M
+        return np.asarray(M.mean(axis=0) if self.plant.center < 0 else M[self.plant.center])
+
+    def goal_center(self, trace: Trace) -> FloatArray:
+        """True centre (3,) of the face at the goal, m; NaN where the goal pose is unknown."""
+        goal: FloatArray = (trace.goal_pose @ np.linalg.solve(self.robot.base_tool, self.middle))[:3]
+        return goal

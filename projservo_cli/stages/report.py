@@ -1,0 +1,220 @@
+"""Stage report: figures after the paper's, and its claims against what the runs measure."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.config import load_config
+from projservo_cli.figures import FIGURES, FigureSpec, style
+from projservo_cli.figures.drift import converged, table
+from projservo_cli.figures.material import DIRECT, Material, Studies
+from projservo_cli.files import replacing
+from projservo_cli.records import Report, WorkFailed
+from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.claims import claims_of
+from projservo_cli.stages.studies import (
+    LAMBDAS,
+    STEP_LIMIT_DEG,
+    Bench,
+    bench_of,
+    composition_error,
+    metric_plan,
+    run_studies,
+)
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+    from projservo_cli.store import Run
+
+DEPENDS_ON = ("report",)
+FOLDER = "figures"
+CLAIMS_FILE = "claims.json"
+
+
+def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
+    """Make the extra runs, draw the figures and measure the claims.
+
+    Parameters
+    ----------
+    run : with calibration, plan and traces.
+    directory : folder that receives ``figures/`` and ``claims.json``.
+    progress : told how far it is.
+
+    Raises
+    ------
+    InputError
+        If the run lacks what the stage needs, or a file cannot be written.
+    """
+    config = load_config(run.path, text=run.configuration)
+    left_out: list[dict[str, str]] = []
+    bench = bench_of(config, run.calibration.model(), run.plan)
+    material = material_of(run, bench, left_out, progress)
+    written = draw_all(material, directory, config.report.formats, left_out, progress)
+    eq22 = _composition(bench, config, left_out)
+    claims = tuple(claim.row() for claim in claims_of(material, eq22))
+    record = _record(material.studies, eq22, tuple(written), tuple(left_out), claims)
+    _write_claims(record, directory / CLAIMS_FILE)
+    return record
+
+
+def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progress: Progress) -> Material:
+    """All that the figures may show; extra runs that fail are named in ``left_out``."""
+    truth, studies, reason = bench.truth, None, ""
+    try:
+        studies = run_studies(bench, progress=progress)
+    except WorkFailed as error:
+        reason = " ".join(str(error).split())
+        left_out.append({"what": "studies", "reason": reason})
+    numbers = tuple(truth.number[i] for i in truth.face)
+    calibrated = bench.models["calibrated"]
+    return Material(calibrated, truth.robot, bench.plant, run.plan, numbers, run.traces, studies, reason)
+
+
+def _composition(
+    bench: Bench, config: "Config", left_out: list[dict[str, str]]
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]] | None:
+    try:
+        distance, _ = composition_error(metric_plan(bench, config.trajectory.delta))
+    except WorkFailed as error:
+        left_out.append({"what": "equation (22)", "reason": " ".join(str(error).split())})
+        return None
+    return np.array(LAMBDAS), distance
+
+
+def draw_all(
+    material: Material,
+    directory: Path,
+    formats: tuple[str, ...],
+    left_out: list[dict[str, str]],
+    progress: Progress = silent,
+) -> list[str]:
+    """Draw every figure that the material supports, in all formats; the others are named with the reason.
+
+    Files of figures that are left out now, from an earlier report, are removed.
+
+    Returns
+    -------
+    Files written, relative to the folder.
+    """
+    written: list[str] = []
+    with style.styled():
+        for done, spec in enumerate(FIGURES):
+            progress("figures", done, len(FIGURES))
+            reason = lacking(spec, material)
+            if reason:
+                left_out.append({"what": spec.name, "reason": reason})
+            partial = partly(spec, material)
+            if partial and not reason:
+                left_out.append({"what": f"{spec.name}, in part", "reason": partial})
+            written += _draw(spec, material, directory, () if reason else formats)
+    progress("figures", len(FIGURES), len(FIGURES))
+    return written
+
+
+def lacking(spec: FigureSpec, material: Material) -> str:
+    """Why a figure cannot be drawn; empty where it can."""
+    missing = _without_run(spec, material)
+    if missing and (not spec.any_law or len(missing) == len(spec.laws)):
+        return f"no run of {', '.join(missing)} with a step to show; make it: projservo servo report"
+    if spec.studies and material.studies is None:
+        return f"the extra runs could not be made: {material.no_studies}"
+    if spec.goal and not _goal_known(material):
+        return "the pose of the goal is unknown, only its images are"
+    return ""
+
+
+def partly(spec: FigureSpec, material: Material) -> str:
+    """What a figure that can be drawn is without; empty where it is whole."""
+    missing = _without_run(spec, material)
+    return f"without {', '.join(missing)}: no run of it with a step to show" if missing else ""
+
+
+def _without_run(spec: FigureSpec, material: Material) -> list[str]:
+    return [law for law in spec.laws if law not in material.traces or material.traces[law].steps < 1]
+
+
+def _goal_known(material: Material) -> bool:
+    studies = material.studies
+    traces = [*material.traces.values(), *(studies.own.values() if studies is not None else ())]
+    return bool(traces) and all(np.isfinite(trace.goal_pose).all() for trace in traces)
+
+
+def _draw(spec: FigureSpec, material: Material, directory: Path, formats: tuple[str, ...]) -> list[str]:
+    """Write one figure in the formats asked for and remove it in all others."""
+    folder = directory / FOLDER
+    for kind in style.FORMATS:
+        if kind not in formats:
+            (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
+    if not formats:
+        return []
+    data = spec.data(material)
+    figure = style.new_figure(spec.height)
+    spec.draw(data, figure)
+    style.arrange(figure)
+    for kind in formats:
+        with replacing(folder / f"{spec.name}.{kind}") as path:
+            style.save(figure, path, kind)
+    return [f"{FOLDER}/{spec.name}.{kind}" for kind in formats]
+
+
+def _record(
+    studies: Studies | None,
+    eq22: tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]] | None,
+    figures: tuple[str, ...],
+    left_out: tuple[dict[str, str], ...],
+    claims: tuple[dict[str, Any], ...],
+) -> Report:
+    nothing = np.zeros((len(DIRECT), 2, 2, 0))
+    share, distance = eq22 if eq22 is not None else (np.zeros(0), np.zeros(0))
+    period_drift = np.zeros((len(DIRECT), 0))
+    if studies is not None:
+        rows = [
+            [studies.rate[law, period].center_deviation_mm for period in studies.periods] for law in DIRECT
+        ]
+        period_drift = np.array(rows, dtype=np.float64)
+    return Report(
+        figures=figures,
+        left_out=left_out,
+        claims=claims,
+        step_limit_deg=STEP_LIMIT_DEG,
+        gain_per_step=np.array(studies.gains if studies is not None else ()),
+        drift_mm=nothing if studies is None else table(studies),
+        drift_at_samples_mm=nothing if studies is None else table(studies, at_samples=True),
+        drift_converged=nothing.astype(np.bool_) if studies is None else converged(studies),
+        period=np.array(studies.periods if studies is not None else ()),
+        period_drift_mm=period_drift,
+        share=share,
+        composition_mm=1e3 * distance,
+    )
+
+
+def drift_rows(report: Report) -> list[dict[str, Any]]:
+    """The drift table as rows: law, operators, limit in deg per step or None, gain, mm, converged."""
+    rows = []
+    for index in np.ndindex(report.drift_mm.shape):
+        law, operators, limited, gain = index
+        values = {
+            "drift_mm": float(report.drift_mm[index]),
+            "drift_at_samples_mm": float(report.drift_at_samples_mm[index]),
+        }
+        rows.append(
+            {
+                "law": DIRECT[law],
+                "operators": ("true", "calibrated")[operators],
+                "limit_deg_per_step": report.step_limit_deg if limited else None,
+                "gain_per_step": float(report.gain_per_step[gain]),
+                **{name: value if np.isfinite(value) else None for name, value in values.items()},
+                "converged": bool(report.drift_converged[index]),
+            }
+        )
+    return rows
+
+
+def _write_claims(report: Report, path: Path) -> None:
+    """Claims and drift table as strict JSON."""
+    content = {"claims": report.claims, "drift": drift_rows(report), "left_out": report.left_out}
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
+    with replacing(path) as temporary:
+        temporary.write_text(f"{text}\n", encoding="utf-8")

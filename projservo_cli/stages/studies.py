@@ -1,0 +1,207 @@
+"""Closed-loop runs beside those of the run file: what the figures and the claims compare."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from projservo_cli.control.law import Gains
+from projservo_cli.figures.material import DIRECT, Studies
+from projservo_cli.geometry.composition import compose_rotations
+from projservo_cli.geometry.displacement import (
+    as_array,
+    as_mat,
+    exp_rotation,
+    exp_translation,
+    twist_exponential,
+)
+from projservo_cli.geometry.kinematics import project
+from projservo_cli.loop.step import Limits
+from projservo_cli.plants.plant import Plant
+from projservo_cli.records import PRISMATIC, FloatArray, Model, Plan, Trace
+from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.servo import drive, gains_of, limits_of
+from projservo_cli.stages.truth import Reach, Truth, plant_of, reach_of, truth_of
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+
+GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
+PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
+STEP_LIMIT_DEG = 5.0
+LAMBDAS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
+
+# An arbitrary frame of condition number 2.4 in which no coordinate is metric.
+H_PE = np.array([[1.1, 0.2, -0.1, 0.3], [-0.2, 0.9, 0.2, -0.1], [0.1, -0.1, 1.2, 0.2], [0.2, -0.1, 0.3, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What all extra runs share: the truth, a task without noise, the configured gains and limits.
+
+    Attributes
+    ----------
+    models : by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and
+        ``calibrated``.
+    sense : (2, n) joint motions of the planned rotations, which decide the sense of a half turn.
+    """
+
+    truth: Truth
+    plant: Plant
+    reach: Reach
+    gains: Gains
+    limits: Limits
+    models: dict[str, Model]
+    sense: FloatArray
+
+    def run(self, law: str, operators: str, gains: Gains, *, limited: bool) -> Trace:
+        """Drive a direct law without noise, with 5° per step as limit or with none.
+
+        Where there is a limit, the speed of prismatic joints is limited as configured.
+        """
+        speed = np.full(len(self.reach.q_start), math.inf)
+        if limited:
+            prismatic = self.truth.robot.joint_types == PRISMATIC
+            revolute = math.radians(STEP_LIMIT_DEG) / gains.period
+            speed = np.where(prismatic, self.limits.speed, revolute)
+        noise = np.zeros((self.limits.max_steps + 1, 2, len(self.truth.face), 2))
+        limits = self.limits._replace(speed=speed)
+        model = self.models[operators]
+        return drive(law, model, self.plant, self.truth, self.reach, gains, limits, noise, self.sense)
+
+
+def projective_twin(model: Model) -> Model:
+    """The same robot and rig in the projective frame ``H_PE``, [RH00] eqs. (1), (2)."""
+    inverse = np.linalg.inv(H_PE)
+    return Model(
+        np.ascontiguousarray(model.P @ H_PE),
+        np.ascontiguousarray(inverse @ model.H_hat_0 @ H_PE),
+        model.joint_types,
+        model.q_reference,
+        model.a_inf @ H_PE,
+    )
+
+
+def bench_of(config: "Config", calibrated: Model, plan: Plan) -> Bench:
+    """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
+
+    Raises
+    ------
+    InputError, WorkFailed
+        If the configuration describes no simulated task, or the task cannot be done.
+    """
+    truth = truth_of(config)
+    reach = reach_of(config, truth)
+    s_star = reach.s_star
+    if reach.goal_pose is not None:
+        s_star = project(truth.P, truth.M_face @ (reach.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T)
+    clean = Reach(reach.q_start, reach.goal_pose, truth.images(reach.q_start, truth.M_face), s_star)
+    limits = limits_of(config)._replace(
+        image_px=config.stop.image_px, stop_at_joint_limit=False, stop_at_border=False
+    )
+    models = {"true": truth.model, "twin": projective_twin(truth.model), "calibrated": calibrated}
+    plant, sense = plant_of(config, truth, reach.q_start), plan.rotation_sense()
+    return Bench(truth, plant, clean, gains_of(config), limits, models, sense)
+
+
+def with_gain(gains: Gains, gain_per_step: float) -> Gains:
+    """Gains of the direct laws such that each step takes one share of all errors."""
+    gain = gain_per_step / gains.period
+    return gains._replace(gain_t=gain, gain_r=gain, gain_p=gain, gain_s=gain, ratio_rp=1.0)
+
+
+def run_studies(
+    bench: Bench,
+    gains: Sequence[float] = GAINS,
+    periods: Sequence[float] = PERIODS_S,
+    progress: Progress = silent,
+) -> Studies:
+    """Make all extra runs.
+
+    Parameters
+    ----------
+    gains : gains per step to sweep.
+    periods : periods to sweep at the configured gains, s; those with a gain of 1 a step or more,
+        which no loop survives, are left out.
+    progress : told how far it is.
+
+    Raises
+    ------
+    WorkFailed
+        If the task cannot be partitioned with one of the models.
+    """
+    own = bench.gains
+    most = max(own.gain_t, own.gain_r, own.gain_p, own.gain_s)
+    periods = [period for period in periods if most * period < 1.0]
+    sweep_cases = [
+        (law, operators, limited, gain)
+        for law in DIRECT
+        for operators in ("true", "calibrated")
+        for limited in (False, True)
+        for gain in gains
+    ]
+    own_cases = [(law, kind, limited) for law in DIRECT for kind in bench.models for limited in (False, True)]
+    rate_cases = [(law, period) for law in DIRECT for period in periods]
+    total = len(sweep_cases) + len(own_cases) + len(rate_cases)
+    sweep, by_model, rate = {}, {}, {}
+    for done, (law, operators, limited, gain) in enumerate(sweep_cases):
+        progress("studies", done, total)
+        trace = bench.run(law, operators, with_gain(own, gain), limited=limited)
+        sweep[law, operators, limited, gain] = trace
+    for done, (law, operators, limited) in enumerate(own_cases, len(sweep)):
+        progress("studies", done, total)
+        by_model[law, operators, limited] = bench.run(law, operators, own, limited=limited)
+    for done, (law, period) in enumerate(rate_cases, len(sweep) + len(by_model)):
+        progress("studies", done, total)
+        rate[law, period] = bench.run(law, "true", own._replace(period=period), limited=False)
+    progress("studies", total, total)
+    return Studies(tuple(gains), tuple(periods), own, STEP_LIMIT_DEG, sweep, by_model, rate)
+
+
+def metric_plan(bench: Bench, delta: float) -> Plan:
+    """The task partitioned with the true metric model, so that its operators are in metres.
+
+    Raises
+    ------
+    WorkFailed
+        If the task cannot be partitioned.
+    """
+    reach, robot = bench.reach, bench.truth.robot
+    return plan_task(
+        bench.models["true"],
+        reach.q_start,
+        reach.s_start,
+        reach.s_star,
+        bench.truth.center,
+        "linear",
+        delta,
+        2,
+        (robot.lower, robot.upper),
+    )
+
+
+def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> tuple[FloatArray, FloatArray]:
+    """How far both sides of [RH00] eq. (22) differ when the task is taken in shares λ.
+
+    Parameters
+    ----------
+    plan : metric plan.
+    lambdas : shares of τ and θ_s.
+
+    Returns
+    -------
+    distance : (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m.
+    norm : (k,) Frobenius norm of the difference of both displacements, m and rad mixed.
+    """
+    theta_s, H_hat_s = compose_rotations(plan.H_hat[1], plan.H_hat[2], plan.theta_r, plan.theta_p)
+    distance, norm = [], []
+    for share in lambdas:
+        product = exp_translation(plan.H_hat[0], share * plan.tau) @ exp_rotation(H_hat_s, share * theta_s)
+        summed = share * (plan.tau * plan.H_hat[0] + theta_s * H_hat_s)
+        difference = product - as_array(twist_exponential(as_mat(summed)))
+        distance.append(float(np.linalg.norm(difference @ plan.A_c)))
+        norm.append(float(np.linalg.norm(difference)))
+    return np.array(distance), np.array(norm)

@@ -1,0 +1,130 @@
+"""The command line called in this process, with stages that only pretend to work."""
+
+import json
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from projservo_cli import cli, files
+from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
+from projservo_cli.stages import chain
+from projservo_cli.tables import read_table
+from tests.fake_records import fake
+
+CONFIGURATION = """\
+name: tiny
+robot:
+  dh:
+    joints:
+      - {type: R, d_m: 0.1, alpha_deg: 90}
+      - {type: R, a_m: 0.3, name: elbow}
+rig:
+  image_size_px: [640, 480]
+  left: {matrix: [[600, 0, 320, 0], [0, 600, 240, 0], [0, 0, 1, 1]]}
+  right: {matrix: [[600, 0, 320, 60], [0, 600, 240, 0], [0, 0, 1, 1]]}
+markers:
+  positions_m: [[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]
+  face: [0, 1, 2]
+task:
+  start: {joints: [0.1, 0.2], unit: rad}
+  goal: {turn_deg: 180}
+control: {laws: [direct_three, stacked]}
+"""
+TABLE = "pose,marker,q1,q2,u_left,v_left,u_right,v_right\n0,0,0.1,0.2,1,2,3,4\n1,0,0.1,0.3,1,2,3,4\n"
+
+
+@dataclass
+class Stages:
+    """What the pretended stages were called for, and how they are to end."""
+
+    made: list[str] = field(default_factory=list)
+    fails: dict[str, Exception] = field(default_factory=dict)
+    verdicts: dict[str, str] = field(default_factory=dict)
+    reported: list[tuple[list[str], str]] = field(default_factory=list)
+
+    def module(self, stage: str) -> Any:
+        depends = {
+            "calibrate": ("seed", "robot", "rig", "markers", "noise.calibration_px", "calibration", "data"),
+            "plan": ("task", "trajectory"),
+            "servo": ("seed", "control", "stop"),
+            "report": ("report",),
+        }
+        return SimpleNamespace(DEPENDS_ON=depends[stage], run=getattr(self, stage))
+
+    def _make(self, name: str) -> None:
+        if name in self.fails:
+            raise self.fails[name]
+        self.made.append(name)
+
+    def calibrate(self, config: Any, *, progress: Any) -> Any:
+        progress("trial motions", 1, 2)
+        if config.recorded:
+            source, observation = "recorded", read_table(config.data.table, config.data.joints)
+        else:
+            source, observation = "simulated", fake(Observation, 1, {"joint": len(config.joint_types)})
+        self._make("calibrate")
+        n = observation.q.shape[1]
+        types = config.joint_types or "R" * n
+        given = {"source": source, "joint_types": types, "chi2_per_dof": float("nan"), "advice": ("more",)}
+        given |= {"outlier": np.array([[3, 1, 0], [4, 2, 2]]), "suspect": np.zeros((0, 2), dtype=np.int64)}
+        return observation, fake(Calibration, config.seed, {"joint": n}, **given)
+
+    def plan(self, config: Any, calibration: Any) -> Any:
+        self._make("plan")
+        return fake(Plan, config.seed, profile=config.trajectory.profile)
+
+    def servo(self, config: Any, calibration: Any, plan: Any, law: str, *, progress: Any) -> Any:
+        self._make(law)
+        return fake(Trace, config.seed, law=law, verdict=self.verdicts.get(law, "converged"))
+
+    def report(self, run: Any, directory: Any, *, progress: Any) -> Any:
+        self._make("report")
+        self.reported.append((list(run.traces), run.configuration))
+        claim = {"claim": "c", "source": "s", "measured": "3 mm", "criterion": "< 4 mm", "holds": True}
+        left_out = {"what": "fig_9", "reason": "no run"}
+        return fake(Report, 9, figures=("figures/fig_1.svg",), claims=(claim,), left_out=(left_out,))
+
+
+@dataclass
+class Answer:
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        def refuse(constant: str) -> None:
+            raise AssertionError(f"{constant} is not strict JSON")
+
+        return json.loads(self.out, parse_constant=refuse)
+
+
+@pytest.fixture
+def stages(monkeypatch, tmp_path):
+    pretended = Stages()
+    monkeypatch.setattr(chain, "stage_module", pretended.module)
+    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")
+    (tmp_path / "t.csv").write_text(TABLE, encoding="utf-8")
+    return pretended
+
+
+@pytest.fixture
+def projservo(capsys):
+    def call(*arguments: Any) -> Answer:
+        capsys.readouterr()
+        code = cli.run([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Answer(code, captured.out, captured.err)
+
+    return call
+
+
+@pytest.fixture
+def refused():
+    """The failure of a stage whose data do not support its work."""
+    return WorkFailed("joint 3 was not moved; move it")

@@ -1,0 +1,97 @@
+"""The commands validate, show and equations."""
+
+import ast
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+import projservo_cli.calibration
+from projservo_cli.equations import REGISTER
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def statistics(monkeypatch):
+    value = {
+        "count": 2,
+        "rms_px": 0.5,
+        "median_px": 0.25,
+        "p95_px": float("nan"),
+        "skipped": {"unknown_marker": 1, "behind_camera": 0, "missing": 3},
+    }
+    monkeypatch.setattr(projservo_cli.calibration, "residual_statistics", lambda *_: value, raising=False)
+    return value
+
+
+@pytest.mark.parametrize("run", [["out"], ["out/run.h5"], ["-o", "out"], ["-o", "out/run.h5"]])
+def test_validate_prints_the_statistics_of_a_table(projservo, stages, statistics, tmp_path, run):
+    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    answer = projservo("validate", *run, "--data", "t.csv", "--json")
+    assert answer.json == {"run": str(tmp_path / "out/run.h5"), **statistics, "p95_px": None}
+    text = projservo("validate", *run, "--data", "t.csv").out
+    assert "2 marker-view pairs; skipped: 1 unknown marker, 0 behind camera, 3 missing" in text
+    assert "median 0.25" in text
+
+
+def test_validate_wants_as_many_joints_as_the_calibration_has(projservo, stages, statistics, tmp_path):
+    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    (tmp_path / "one.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,1,2,3,4,5\n")
+    answer = projservo("validate", "out", "--data", "one.csv")
+    assert answer.code == 2
+    assert "1 joint columns" in answer.err
+
+
+def test_show_tells_what_a_run_holds(projservo, stages, tmp_path):
+    projservo("report", "-c", "tiny.yaml", "-o", "results/paper")
+    value = projservo("show", "--json").json  # the default of -o
+    assert value["run"] == str(tmp_path / "results/paper/run.h5")
+    assert value["configuration"]["name"] == "tiny"
+    assert list(value["made"]) == ["calibrate", "plan", "servo/direct_three", "servo/stacked", "report"]
+    assert value["made"]["plan"]["seed"] == 0
+    known = {"projservo", "python", "numpy", "numba", "git_commit", "git_dirty", "argv", "host", "date"}
+    assert known <= set(value["made"]["plan"])
+    text = projservo("show", "results/paper/run.h5").out
+    assert "tiny, simulated" in text
+    assert [line for line in text.splitlines() if len(line) > 80] == []
+    assert "gain_t: 2.5" in projservo("show", "results/paper", "-v").out
+
+
+def test_equations_are_listed(projservo):
+    entries = projservo("equations", "--json").json["equations"]
+    assert [entry["number"] for entry in entries[:25]] == [str(i) for i in range(1, 26)]
+    assert set(entries[0]) == {"number", "title", "functions", "tests", "erratum"}
+    text = projservo("equations").out
+    assert "(25) Coefficients of the composed rotation" in text
+    assert "without the factor 2" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("entry", REGISTER, ids=lambda entry: entry.number)
+def test_every_function_and_test_of_the_register_exists(entry):
+    assert entry.functions
+    for dotted in entry.functions:
+        module, name = dotted.rsplit(".", 1)
+        assert callable(getattr(importlib.import_module(module), name)), dotted
+    for test in entry.tests:
+        file, name = test.split("::")
+        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+        assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}, test
+
+
+# statements on what the laws integrate to; no function computes them by itself
+CONSEQUENCES = {"21", "22"}
+
+
+@pytest.mark.parametrize("entry", REGISTER, ids=lambda entry: entry.number)
+def test_a_registered_function_names_its_equation(entry):
+    number = entry.number.removeprefix("§")
+    named = set()
+    for dotted in entry.functions:
+        module, name = dotted.rsplit(".", 1)
+        words = getattr(importlib.import_module(module), name).__doc__
+        named |= set(re.findall(r"\(([0-9]+)\)", words)) | set(re.findall(r"section ([0-9.]+[0-9])", words))
+        for first, last in re.findall(r"\(([0-9]+)\)–\(([0-9]+)\)", words):
+            named |= {str(i) for i in range(int(first), int(last) + 1)}
+    assert number in named or number in CONSEQUENCES

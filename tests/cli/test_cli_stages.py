@@ -1,0 +1,262 @@
+"""Chaining, what is up to date, what is made first, JSON objects and exit codes."""
+
+import sys
+
+import pytest
+
+from projservo_cli.cli.output import Console
+from projservo_cli.store import load
+
+ALL = ["calibrate", "plan", "direct_three", "stacked", "report"]
+
+
+def test_what_is_lacking_is_made_first_and_said(projservo, stages):
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out")
+    assert answer.code == 0
+    assert stages.made == ALL[:4]
+    assert "calibrate: making it (none yet, needed by servo)" in answer.err
+    assert "direct_three" in answer.out
+    assert "calibrate" not in answer.out
+    assert max(map(len, (answer.out + answer.err).splitlines())) <= 80
+
+
+def test_up_to_date_is_skipped_and_prints_the_same(projservo, stages):
+    first = projservo("calibrate", "plan", "servo", "report", "-c", "tiny.yaml", "-o", "out", "--json")
+    assert stages.made == ALL
+    stored = (load("out").path).read_bytes()
+    second = projservo("calibrate", "plan", "servo", "report", "-o", "out", "--json")
+    assert stages.made == ALL
+    assert second.json == first.json
+    assert load("out").path.read_bytes() == stored
+
+
+@pytest.mark.parametrize(
+    ("change", "remade"),
+    [
+        ("seed=5", ALL),
+        ("robot.dh.joints.0.d_m=0.2", ALL),
+        ("task.goal.turn_deg=90", ALL[1:]),
+        ("trajectory.profile=exponential", ALL[1:]),
+        ("control.gain_t=1", ALL[2:]),
+        ("control.laws=[stacked]", ["report"]),
+        ("control.must_converge=[]", []),
+        ("report.formats=[svg]", ["report"]),
+        ("noise.servo_px=0.1", []),
+        ("name=other", []),
+    ],
+)
+def test_only_what_depends_on_a_change_is_redone(projservo, stages, change, remade):
+    assert projservo("report", "-c", "tiny.yaml", "-o", "out").code == 0
+    stages.made.clear()
+    answer = projservo("report", "-o", "out", "--set", change)
+    assert answer.code == 0
+    assert stages.made == remade
+    stages.made.clear()
+    projservo("report", "-o", "out")  # the override has become part of the stored configuration
+    assert stages.made == []
+
+
+def test_an_interrupted_chain_goes_on_where_it_stopped(projservo, stages, refused):
+    stages.fails["stacked"] = KeyboardInterrupt()
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out")
+    assert (answer.code, answer.err.splitlines()[-1]) == (130, "projservo: interrupted")
+    del stages.fails["stacked"]
+    stages.made.clear()
+    assert projservo("servo", "-o", "out").code == 0
+    assert stages.made == ["stacked"]
+
+
+def test_force_makes_the_named_stages_anew_and_drops_what_hung_on_them(projservo, stages):
+    projservo("report", "-c", "tiny.yaml", "-o", "out")
+    stages.made.clear()
+    answer = projservo("plan", "-o", "out", "--force")
+    assert stages.made == ["plan"]
+    assert "servo/direct_three, servo/stacked, report: dropped" in " ".join(answer.err.split())
+    assert list(load("out").results) == ["calibrate", "plan"]
+    projservo("servo", "-o", "out", "--force")
+    assert stages.made == ["plan", "direct_three", "stacked"]
+
+
+def test_a_table_that_changes_outdates_and_one_that_moved_away_does_not(projservo, stages, tmp_path):
+    assert projservo("calibrate", "--data", "t.csv", "-o", "out").code == 0
+    table = tmp_path / "t.csv"
+    table.rename(tmp_path / "u.csv")
+    assert projservo("calibrate", "-o", "out").code == 0
+    assert projservo("calibrate", "-o", "out", "--data", "u.csv").code == 0
+    assert stages.made == ["calibrate"]
+    moved = tmp_path / "u.csv"
+    moved.write_text(moved.read_text().replace("0,0,0.1,0.2,1,", "0,0,0.1,0.2,9,"))
+    assert projservo("calibrate", "-o", "out").code == 0
+    assert stages.made == ["calibrate"] * 2
+    assert projservo("calibrate", "-o", "out", "--data", "none.csv").code == 2
+
+
+def test_recorded_options_are_stored_with_the_run(projservo, stages, tmp_path):
+    answer = projservo("calibrate", "--data", "t.csv", "--joints", "rp", "--noise-px", "2e-1", "--json")
+    assert answer.json["run"] == str(tmp_path / "results/t/run.h5")
+    assert [joint["type"] for joint in answer.json["joints"]] == ["R", "P"]
+    stored = load("results/t").configuration
+    assert "joints: RP" in stored
+    assert "noise_px: 0.2" in stored
+
+
+def test_a_recorded_calibration_is_not_replaced_by_a_simulated_one(projservo, stages):
+    projservo("calibrate", "--data", "t.csv", "-o", "out")
+    answer = projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    assert answer.code == 2
+    assert "recorded data" in answer.err
+    assert load("out").calibration.source == "recorded"
+    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "--force").code == 0
+    assert load("out").calibration.source == "simulated"
+    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "--data", "t.csv").code == 0
+    assert load("out").calibration.source == "recorded"
+
+
+def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, stages):
+    projservo("servo", "-c", "tiny.yaml", "-o", "out")
+    stages.made.clear()
+    laws = ["--law", "blockwise", "--law", "direct_three", "--law", "blockwise"]
+    answer = projservo(*laws, "servo", "-o", "out", "--json")
+    assert [trace["law"] for trace in answer.json["laws"]] == ["blockwise", "direct_three"]
+    assert stages.made == ["blockwise"]
+    assert list(load("out").traces) == ["direct_three", "stacked", "blockwise"]
+    stages.made.clear()
+    projservo("servo", "-o", "out", "--law", "blockwise", "--set", "control.gain=1")
+    assert stages.made == ["blockwise"]
+    assert list(load("out").traces) == ["direct_three", "stacked", "blockwise"]
+
+
+def test_a_report_is_about_the_laws_and_the_configuration_of_its_call(projservo, stages):
+    projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", "blockwise")
+    answer = projservo("report", "-o", "out")
+    assert "holds: c: 3 mm" in answer.out
+    assert "left out: fig_9: no run" in answer.out
+    projservo("report", "-o", "out", "--set", "report.formats=[png]")
+    (first, _), (second, configuration) = stages.reported
+    assert first == second == ["direct_three", "stacked"]
+    assert "formats: [png]" in configuration
+    value = projservo("report", "-o", "out", "--json").json
+    assert value["figures"] == ["figures/fig_1.svg"]
+    assert value["claims"][0]["holds"] is True
+
+
+CALIBRATE_KEYS = {
+    *("run", "usable", "reason", "advice", "rms_px", "sigma_px", "chi2_per_dof", "seconds", "joints"),
+    *("outliers", "suspect_joint_readings", "swapped", "merged_poses", "merged_markers"),
+}
+LAW_KEYS = {
+    *("law", "verdict", "steps", "position_error_mm", "rotation_error_deg"),
+    *("self_occluded_steps_left", "self_occluded_steps_right"),
+    *("center_deviation_mm", "center_deviation_at_samples_mm"),
+}
+
+
+def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
+    answer = projservo("servo", "plan", "calibrate", "-c", "tiny.yaml", "-o", "out", "--json")
+    value = answer.json
+    assert all(part["run"] == str(tmp_path / "out/run.h5") for part in value.values())
+    calibrate = value["calibrate"]
+    assert set(calibrate) >= CALIBRATE_KEYS
+    assert calibrate["usable"] is True
+    assert calibrate["advice"] == ["more"]
+    assert calibrate["chi2_per_dof"] is None  # not a number
+    assert calibrate["outliers"] == [
+        {"pose": 3, "marker": 1, "view": "left"},
+        {"pose": 4, "marker": 2, "view": "both"},
+    ]
+    assert calibrate["suspect_joint_readings"] == []
+    assert calibrate["merged_poses"] == 3
+    names = [(joint["name"], joint["type"]) for joint in calibrate["joints"]]
+    assert names == [("q1", "R"), ("elbow", "R")]
+    assert set(calibrate["joints"][0]) == {"name", "type", "excitation", "weak"}
+    assert set(value["servo"]["laws"][0]) >= LAW_KEYS
+    assert value["servo"]["laws"][0]["position_error_mm"] is None
+    assert set(projservo("plan", "-o", "out", "--json").json) >= {"run", "feasible", "reason", "theta_s_deg"}
+
+
+def test_a_refused_calibration_is_an_object_with_exit_code_1(projservo, stages, refused):
+    stages.fails["calibrate"] = refused
+    answer = projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "--json")
+    assert answer.code == 1
+    assert set(answer.json) >= CALIBRATE_KEYS
+    assert (answer.json["usable"], answer.json["reason"]) == (False, str(refused))
+    assert answer.err.splitlines()[-1] == f"projservo: calibrate: {refused}"
+    chain = projservo("calibrate", "plan", "servo", "-c", "tiny.yaml", "-o", "out", "--json")
+    assert chain.code == 1
+    assert chain.json["calibrate"]["usable"] is False
+    assert chain.json["servo"]["laws"] == []
+    assert projservo("servo", "-c", "tiny.yaml", "-o", "out", "--json").json["failed"] == "calibrate"
+
+
+def test_a_failing_law_keeps_what_was_done(projservo, stages, refused):
+    stages.fails["stacked"] = refused
+    answer = projservo("plan", "servo", "-c", "tiny.yaml", "-o", "out", "--json")
+    assert answer.code == 1
+    assert answer.json["plan"]["feasible"] is True
+    assert [trace["law"] for trace in answer.json["servo"]["laws"]] == ["direct_three"]
+    assert answer.json["servo"]["failed"] == "servo/stacked"
+
+
+@pytest.mark.parametrize("named", [["servo"], ["servo", "report"]])
+def test_a_law_that_must_converge_decides_the_exit_code(projservo, stages, named):
+    stages.verdicts = {"stacked": "diverged"}
+    assert projservo(*named, "-c", "tiny.yaml", "-o", "out").code == 0
+    stages.verdicts = {"direct_three": "plateau"}
+    answer = projservo(*named, "-o", "out", "--force", "--json")
+    assert answer.code == 1
+    assert "direct_three must converge, but ended in plateau" in answer.err
+    laws = answer.json["servo"]["laws"] if len(named) > 1 else answer.json["laws"]
+    assert laws[0]["verdict"] == "plateau"
+    assert projservo(*named, "-o", "out").code == 1  # up to date, and still not converged
+    assert projservo(*named, "-o", "out", "--set", "control.must_converge=[stacked]").code == 0
+    assert projservo(*named, "-o", "out", "--set", "control.must_converge=[direct_three]").code == 1
+
+
+def test_a_dry_run_does_nothing_and_says_what_would_be_done(projservo, stages, tmp_path):
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "-n")
+    assert answer.code == 0
+    assert "servo/stacked: would be made (none yet)" in answer.out
+    assert stages.made == []
+    assert not (tmp_path / "out").exists()
+    projservo("servo", "-c", "tiny.yaml", "-o", "out")
+    answer = projservo("servo", "-o", "out", "-n", "--json", "--set", "control.gain=1")
+    whys = {(step["stage"], step["law"]): step["why"] for step in answer.json["steps"]}
+    assert whys["calibrate", None] is None
+    assert whys["servo", "stacked"] == "outdated"
+    assert "gain: 1" not in load("out").configuration
+
+
+def test_quiet_says_nothing_but_json_and_errors(projservo, stages, refused):
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "-q")
+    assert (answer.code, answer.out, answer.err) == (0, "", "")
+    assert projservo("servo", "-o", "out", "-q", "--json").json["laws"]
+    stages.fails["calibrate"] = refused
+    assert str(refused) in projservo("calibrate", "-o", "out", "-q", "--force").err
+
+
+def test_the_default_is_the_shipped_benchmark_in_results(projservo, stages, tmp_path):
+    answer = projservo("calibrate", "--json")
+    assert answer.json["run"] == str(tmp_path / "results/paper/run.h5")
+
+
+def test_a_failure_of_the_program_itself_is_one_line_and_verbose_shows_where(projservo, stages):
+    stages.fails["plan"] = ZeroDivisionError("by\nzero")
+    answer = projservo("plan", "-c", "tiny.yaml", "-o", "out")
+    assert answer.code == 1
+    assert answer.err.splitlines()[-1].startswith("projservo: internal error, ZeroDivisionError: by zero")
+    assert "Traceback" in projservo("plan", "-o", "out", "-v").err
+
+
+def test_progress_shows_only_to_someone_who_watches(capsys, monkeypatch):
+    Console(quiet=False, verbose=False).progress("work", 1, 2)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    Console(quiet=True, verbose=False).progress("work", 1, 2)
+    assert capsys.readouterr().err == ""
+    console = Console(quiet=False, verbose=False)
+    console.progress("work", 1, 2)
+    console.progress("other", 1, 3)
+    console.finish()
+    shown = capsys.readouterr().err
+    assert "work" in shown
+    assert "other" in shown

@@ -1,0 +1,128 @@
+"""The real stages through the command line: reference tables, refusals, runs that repeat."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from projservo_cli import store
+
+PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
+
+# limits on the median and the 95th percentile of the held-out distance, px
+TABLES = {
+    "ur5/trials_0.5px": ([], 0.17, 0.6),
+    "stanford/trials_0.5px": (["--joints", "RRPRRR"], 0.18, 0.5),
+}
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(monkeypatch, tmp_path):
+    """Work in an empty folder: nothing may depend on the working directory."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_a_recorded_table_predicts_images_it_has_not_seen(projservo, shared_data, name):
+    options, median, p95 = TABLES[name]
+    answer = projservo("calibrate", "--data", shared_data / f"{name}.csv", *options, "-o", "out", "--json")
+    assert (answer.code, answer.json["usable"]) == (0, True), answer.err
+    held_out = shared_data / name.split("/")[0] / "validation.csv"
+    value = projservo("validate", "out", "--data", held_out, "--json").json
+    assert value["count"] == 4000  # 200 poses, 10 markers, 2 views
+    assert value["skipped"] == {"unknown_marker": 0, "behind_camera": 0, "missing": 0}
+    assert value["median_px"] <= median
+    assert value["p95_px"] <= p95
+
+
+ON_A_LINE = (
+    "markers={positions_m: [[-0.08, 0, 0.05], [-0.02, 0, 0.05], [0.03, 0, 0.05], [0.08, 0, 0.05]], "
+    "face: [0, 1, 2]}"
+)
+UNSUPPORTED = {
+    "no amplitude": (["--set", "calibration.amplitude_deg=0"], "joint 1"),
+    "no trials": (["--set", "calibration.frames_per_joint=0"], "pose"),
+    "markers on a line": (["--set", ON_A_LINE], "line"),
+}
+
+
+@pytest.mark.parametrize("case", UNSUPPORTED)
+def test_data_that_support_no_calibration(projservo, case):
+    options, message = UNSUPPORTED[case]
+    answer = projservo("calibrate", "-c", PAPER, *options, "-o", "out", "-q", "--json")
+    assert answer.code == 1
+    assert (answer.json["usable"], answer.json["failed"]) == (False, "calibrate")
+    assert message in answer.json["reason"]
+    assert answer.err == f"projservo: calibrate: {answer.json['reason']}\n"
+    assert not Path("out/run.h5").exists()
+
+
+def test_a_goal_that_cannot_be_reached(projservo):
+    goal = "task.goal={joints: {joints: [500, 0, 0, 0, 0, 0], unit: deg}}"
+    answer = projservo("plan", "-c", PAPER, "--set", goal, "-o", "out", "-q")
+    assert answer.code == 1
+    assert "joint 1" in answer.err
+    assert answer.err.count("\n") == 1
+
+
+def test_a_recorded_run_says_which_key_a_stage_lacks(projservo, shared_data):
+    table = shared_data / "ur5" / "trials_0.5px.csv"
+    answer = projservo("servo", "--data", table, "-o", "out", "-q")
+    assert answer.code == 2
+    assert "set " in answer.err
+    assert answer.err.count("\n") == 1
+    assert list(store.load("out").results) == ["calibrate"]
+
+
+def arrays(run):
+    """Every array of a run by the name of its place."""
+    return {
+        f"{name}/{label}/{field.name}": getattr(record, field.name)
+        for name, result in run.results.items()
+        for label, record in result.records.items()
+        for field in dataclasses.fields(record)
+        if "dims" in field.metadata
+    }
+
+
+@pytest.mark.volume
+def test_the_same_seed_makes_identical_arrays_and_running_again_changes_nothing(projservo):
+    for folder in ("one", "two"):
+        answer = projservo("servo", "-c", PAPER, "--law", "direct_three", "-o", folder, "--json")
+        assert answer.code == 0, answer.err
+    (trace,) = answer.json["laws"]
+    assert trace["verdict"] == "converged"
+    one, two = (arrays(store.load(folder)) for folder in ("one", "two"))
+    assert one.keys() == two.keys()
+    assert any(name.startswith("servo/direct_three") for name in one)
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, two[name], err_msg=name)
+    before = Path("one/run.h5").read_bytes()
+    again = projservo("calibrate", "plan", "servo", "--law", "direct_three", "-o", "one", "--json")
+    assert again.code == 0
+    assert again.json["servo"]["laws"] == [trace]
+    assert Path("one/run.h5").read_bytes() == before
+    other = projservo("calibrate", "-c", PAPER, "-o", "three", "--set", "seed=2", "-q")
+    assert other.code == 0
+    assert not np.array_equal(store.load("three").observation.images, store.load("one").observation.images)
+
+
+@pytest.mark.volume
+def test_xarray_opens_a_whole_run_with_names_and_units(projservo):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    assert projservo("servo", "-c", PAPER, "--law", "direct_two", "-o", "out", "-q").code == 0
+    with xarray.open_datatree("out/run.h5", engine="h5netcdf") as tree:
+        assert set(tree.groups) == {
+            *("/", "/calibrate", "/calibrate/observation", "/calibrate/calibration"),
+            *("/plan", "/servo", "/servo/direct_two"),
+        }
+        for node in tree.subtree:
+            for name, data in node.data_vars.items():
+                assert data.attrs["units"], name
+                assert data.attrs["long_name"], name
+                assert not any(str(dim).startswith("phony") for dim in data.dims), name
+        trace = tree["servo/direct_two"]
+        assert trace["q"].dims == ("instant", "joint")
+        assert trace.sizes["instant"] == trace.sizes["step"] + 1 == trace.attrs["steps"] + 1

@@ -1,0 +1,47 @@
+"""Fixtures every test may use, and the rule for tests that need the compiler."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared" / "data"
+INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}
+
+
+def pytest_collection_modifyitems(items):
+    """Skip tests of many runs where each would take a thousand times longer."""
+    if not INTERPRETED:
+        return
+    skip = pytest.mark.skip(reason="many closed loops: only with the compiler (NUMBA_DISABLE_JIT is set)")
+    for item in items:
+        if item.get_closest_marker("volume"):
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def shared_data():
+    """Folder of reference data beside the repository; skips where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip(f"reference data not found at {SHARED}")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def reference_truth(shared_data):
+    """Function that reads the true screws, cameras and tasks of a reference robot."""
+
+    def read(name):
+        with open(shared_data / name / "truth.json", encoding="utf-8") as file:
+            return json.load(file)
+
+    return read
+
+
+@pytest.fixture
+def rng():
+    """Random numbers that are the same in every run."""
+    return np.random.default_rng(20000626)

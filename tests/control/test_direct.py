@@ -1,0 +1,156 @@
+"""Direct control: each error at its own rate, one rotation for two, and the limit of the translation."""
+
+import inspect
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from projservo_cli.control import CODES, blockwise, direct_three, direct_two, euclidean_points, stacked
+from projservo_cli.control.law import TAU, TAU_AFFINE, THETA_P, THETA_R, THETA_S
+from projservo_cli.records import LAWS
+from tests.samples import frame, operators, pixels, poe, revolute
+from tests.scene import GAINS, STEP, Run, limits, scene
+
+# Fine steps: a hundredth of the error at most, so that the sampled law follows the continuous one.
+FINE = GAINS._replace(period=0.004)
+
+
+def rates(run, column):
+    """Decay rate of one error in 1/s over the run, from the first and the last instant."""
+    errors = run.log.errors[:, column]
+    return -math.log(abs(errors[-1] / errors[0])) / (run.steps * FINE.period)
+
+
+@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
+def test_each_error_decays_at_its_own_rate(types):
+    """Gains 2.5, 1 and 0.5 per second: the factor of a step is 1 − gain·period, to second order."""
+    gains = FINE._replace(gain_t=2.5, gain_r=1.0, gain_p=0.5)
+    run = Run(scene(types=types), "direct_three", gains, limits(max_steps=100))
+    for column, gain in ((TAU_AFFINE, 2.5), (THETA_R, 1.0), (THETA_P, 0.5)):
+        assert rates(run, column) == pytest.approx(gain, rel=0.02)
+
+
+@pytest.mark.parametrize("gain", [2.5, 0.8])
+def test_one_rotation_decays_at_the_rate_of_its_gain(gain):
+    run = Run(scene(), "direct_two", FINE._replace(gain_t=1.3, gain_s=gain), limits(max_steps=100))
+    assert rates(run, TAU_AFFINE) == pytest.approx(1.3, rel=0.02)
+    assert rates(run, THETA_S) == pytest.approx(gain, rel=0.02)
+
+
+def test_error_of_both_rotations_is_the_true_angle():
+    """θ_s, and τ in metres with the metric model, against the true poses of the face at every instant."""
+    sc = scene()
+    run = Run(sc, "direct_three", GAINS, limits(max_steps=40))
+    goal = poe(sc.model, sc.q_goal)
+    center = sc.plant.M.mean(axis=0)
+    for H, errors in zip(run.log.H, run.log.errors, strict=True):
+        R = goal[:3, :3] @ H[:3, :3].T
+        sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+        assert errors[THETA_S] == pytest.approx(math.atan2(sine, (np.trace(R) - 1) / 2), abs=1e-9)
+        assert errors[TAU_AFFINE] == pytest.approx(np.linalg.norm((goal - H) @ center), abs=1e-10)
+
+
+def test_tau_has_the_scale_of_the_unit_norm_kernel():
+    """τ q̂_t is what moves the centre: Σ τ q̂_ti Ĥ_i A_c = A_c* − A_c with |q̂_t| = 1."""
+    sc = scene()
+    run = Run(sc, "direct_three", GAINS, limits(max_steps=1))
+    q_hat = run.state.q_hat[0]
+    assert np.linalg.norm(q_hat) == pytest.approx(1.0, abs=1e-12)
+    q = run.log.q[-1]
+    A_c = poe(sc.model, q) @ sc.plant.M.mean(axis=0)
+    way = poe(sc.model, sc.q_goal) @ sc.plant.M.mean(axis=0) - A_c
+    moved = run.log.errors[-1, TAU] * np.tensordot(q_hat, operators(sc.model, q), 1) @ A_c
+    assert moved == pytest.approx(way, abs=1e-10)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 0.5])
+@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
+def test_any_ratio_converges(ratio, types):
+    run = Run(scene(types=types), "direct_two", GAINS._replace(ratio_rp=ratio))
+    assert run.verdict == "converged"
+
+
+def test_ratios_turn_about_different_axes():
+    """The operator of the first step, per rad: its axes differ by degrees, its point is the centre."""
+    sc = scene()
+    axes = []
+    for ratio in (1.0, 2.0, 0.5):
+        run = Run(sc, "direct_two", FINE._replace(ratio_rp=ratio, gain_t=1e-9), limits(max_steps=1))
+        W = np.tensordot(run.log.q_dot[0], operators(sc.model, sc.q_start), 1)
+        w = np.array([W[2, 1], W[0, 2], W[1, 0]])
+        axes.append(w / np.linalg.norm(w))
+        assert np.abs(W @ sc.plant.M.mean(axis=0)).max() < 1e-8
+    for i in range(3):
+        assert math.degrees(math.acos(axes[i] @ axes[i - 1])) > 5.0
+
+
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 0.5])
+def test_ratio_is_that_of_the_two_decays(ratio):
+    """Over small rotations the errors θ_r, θ_p decay at rates of the ratio λ_r/λ_p."""
+    run = Run(scene(0.1 * STEP), "direct_two", FINE._replace(ratio_rp=ratio), limits(max_steps=100))
+    assert rates(run, THETA_R) / rates(run, THETA_P) == pytest.approx(ratio, rel=0.02)
+    # The faster of both decays at the gain of the rotation.
+    assert max(rates(run, THETA_R), rates(run, THETA_P)) == pytest.approx(GAINS.gain_s, rel=0.03)
+
+
+def test_ratio_one_turns_about_one_axis_all_along():
+    sc = scene()
+    run = Run(sc, "direct_two", FINE._replace(gain_t=1e-9), limits(max_steps=60))
+    directions = []
+    for q, q_dot in zip(run.log.q[:-1], run.log.q_dot[:-1], strict=True):
+        W = np.tensordot(q_dot, operators(sc.model, q), 1)
+        w = np.array([W[2, 1], W[0, 2], W[1, 0]])
+        directions.append(w / np.linalg.norm(w))
+    assert np.abs(np.array(directions) - directions[0]).max() < 2e-3
+
+
+def test_both_laws_agree_where_one_rotation_is_nothing():
+    """A task whose rotation lies in the plane of the face: there is nothing to compose."""
+    sc = scene()
+    three, two = (Run(sc, law, FINE, limits(max_steps=1)).log for law in ("direct_three", "direct_two"))
+    assert np.abs(three.q_dot[0] - two.q_dot[0]).max() > 1e-3
+    flat = sc.plant.M @ poe(sc.model, sc.q_start).T
+    center = flat[:, :3].mean(axis=0)
+    normal = np.cross(flat[1, :3] - flat[0, :3], flat[2, :3] - flat[0, :3])
+    goal = flat @ expm(0.6 * revolute(center, normal)).T
+    turned = sc._replace(s_star=pixels(sc.model.P, goal))
+    three, two = (Run(turned, law, FINE, limits(max_steps=1)).log for law in ("direct_three", "direct_two"))
+    assert three.q_dot[0] == pytest.approx(two.q_dot[0], abs=1e-8)
+
+
+@pytest.mark.parametrize("law", ["direct_three", "direct_two"])
+def test_path_does_not_depend_on_the_frame(law):
+    """Whole trajectories of joints agree in three frames, one of them mirrored; also the angles."""
+    sc = scene()
+    reference = Run(sc, law, bounds=limits(max_steps=60))
+    for seed in (1, 2):
+        other = Run(sc, law, bounds=limits(max_steps=60), G=frame(seed, mirrored=seed == 2))
+        assert other.log.q == pytest.approx(reference.log.q, abs=1e-8)
+        for column in (TAU, THETA_R, THETA_P, THETA_S):
+            assert other.log.errors[:, column] == pytest.approx(reference.log.errors[:, column], abs=1e-7)
+
+
+@pytest.mark.parametrize("center", [0, 3])
+def test_a_marker_as_center(center):
+    """The marker chosen heads straight for its goal; the midpoint does not."""
+    sc = scene(center=center)
+    run = Run(sc, "direct_three", FINE._replace(gain_r=7.0, gain_p=7.0), limits(max_steps=300))
+    start, goal = run.center[0], (poe(sc.model, sc.q_goal) @ sc.plant.M[center])[:3]
+    way = (goal - start) / np.linalg.norm(goal - start)
+
+    def deviation(points):
+        off = points - points[0]
+        return np.linalg.norm(off - np.outer(off @ way, way), axis=1).max()
+
+    assert deviation(run.center) < 2e-3
+    assert deviation((run.log.H @ sc.plant.M.mean(axis=0))[:, :3]) > 5e-3
+
+
+def test_laws_are_given_images_joints_and_a_model_and_nothing_else():
+    laws = (direct_three, direct_two, stacked, blockwise, euclidean_points)
+    assert tuple(CODES) == LAWS
+    for law in laws:
+        function = getattr(law, "py_func", law)
+        assert list(inspect.signature(function).parameters) == ["model", "task", "gains", "s", "q", "state"]

@@ -1,0 +1,100 @@
+"""Values of projective space: products against NumPy, incidences of points, lines and planes."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from projservo_cli.geometry.algebra import (
+    apply,
+    apply_transposed,
+    axpy,
+    combine,
+    dot,
+    dual_pencil,
+    inner,
+    mat,
+    meet,
+    mul,
+    multiple,
+    put_mat,
+    put_vec,
+    unit,
+    vec,
+)
+from projservo_cli.geometry.displacement import as_array, as_mat
+
+EPS = np.finfo(float).eps
+# Zeros and ones make special positions (axes, planes through the origin) common.
+entries = st.one_of(st.sampled_from([0.0, 1.0, -1.0]), st.floats(-1, 1, width=32))
+vectors = st.tuples(entries, entries, entries, entries)
+
+
+def test_products_agree_with_numpy(rng):
+    A, B = rng.normal(size=(2, 4, 4))
+    x, y = rng.normal(size=(2, 4))
+    A_v, B_v, x_v, y_v = as_mat(A), as_mat(B), tuple(x.tolist()), tuple(y.tolist())
+    assert as_array(mul(A_v, B_v)) == pytest.approx(A @ B, abs=1e-14)
+    assert apply(A_v, x_v) == pytest.approx(A @ x, abs=1e-14)
+    assert apply_transposed(A_v, x_v) == pytest.approx(A.T @ x, abs=1e-14)
+    assert as_array(combine(2.0, A_v, -3.0, B_v)) == pytest.approx(2 * A - 3 * B, abs=1e-14)
+    assert as_array(multiple(-0.5, A_v)) == pytest.approx(-0.5 * A, abs=1e-15)
+    assert inner(A_v, B_v) == pytest.approx(np.sum(A * B), abs=1e-14)
+    assert dot(x_v, y_v) == pytest.approx(x @ y, abs=1e-15)
+    assert axpy(2.0, x_v, y_v) == pytest.approx(2 * x + y, abs=1e-15)
+
+
+def test_values_and_arrays_convert_without_change(rng):
+    A, x = rng.normal(size=(4, 4)), rng.normal(size=4)
+    B, y = np.zeros((4, 4)), np.zeros(4)
+    put_mat(B, mat(A))
+    put_vec(y, vec(x))
+    assert np.array_equal(A, B)
+    assert np.array_equal(x, y)
+    assert np.array_equal(as_array(as_mat(A)), A)
+
+
+def test_a_matrix_of_the_wrong_shape_is_refused():
+    with pytest.raises(ValueError, match="4×4"):
+        as_mat(np.eye(3))
+
+
+def test_unit_vectors():
+    assert unit((0.0, 3.0, 0.0, -4.0)) == pytest.approx((0.0, 0.6, 0.0, -0.8))
+    assert unit((0.0, 0.0, 0.0, 0.0)) == (0.0, 0.0, 0.0, 0.0)
+
+
+@settings(deadline=None, max_examples=200)
+@given(vectors, vectors, vectors, vectors)
+def test_meet_is_the_determinant_with_one_row_open(a, b, c, x):
+    """x·meet(a, b, c) = det[x; a; b; c]: incidence with all three, and the sign of an orientation."""
+    size = np.prod([max(np.linalg.norm(y), 1e-300) for y in (a, b, c, x)])
+    wanted = np.linalg.det(np.array([x, a, b, c]))
+    assert abs(dot(meet(a, b, c), x) - wanted) <= 32 * EPS * max(size, 1e-30)
+
+
+def test_meet_of_coordinate_planes_is_a_coordinate_point_with_its_sign():
+    e = [tuple(row) for row in np.eye(4)]
+    assert meet(e[1], e[2], e[3]) == (1.0, 0.0, 0.0, 0.0)
+    assert meet(e[2], e[1], e[3]) == (-1.0, 0.0, 0.0, 0.0)
+    assert meet(e[0], e[1], e[2]) == (0.0, 0.0, 0.0, -1.0)
+
+
+@settings(deadline=None, max_examples=300)
+@given(vectors, vectors, st.integers(-13, 0))
+def test_dual_pencil_is_orthonormal_and_incident(A, D, exponent):
+    """Two orthonormal planes through A and A + D, also where D is thirteen orders smaller than A."""
+    A, D = np.array(A), 10.0**exponent * np.array(D)
+    sizes = np.linalg.norm(A), np.linalg.norm(D)
+    if min(sizes[0], sizes[1] / 10.0**exponent) < 1e-3:
+        return
+    across = D - A * (A @ D) / (A @ A)
+    if np.linalg.norm(across) < 1e-3 * sizes[1]:
+        return
+    a_1, a_2 = (np.array(a) for a in dual_pencil(tuple(A.tolist()), tuple(D.tolist())))
+    products = np.array([[a_1 @ a_1, a_1 @ a_2], [a_1 @ a_2, a_2 @ a_2]])
+    assert products == pytest.approx(np.eye(2), abs=1e-14)
+    for a in (a_1, a_2):
+        assert abs(a @ A) <= 1e-14 * sizes[0]
+        # Removing the part of D along A leaves an error of 1000 EPS at the angle allowed above.
+        assert abs(a @ D) <= 1e-12 * sizes[1]

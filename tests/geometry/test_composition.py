@@ -1,0 +1,143 @@
+"""Angles that reach a plane (13)–(15) and two rotations as one (24), (25)."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm, logm
+
+from projservo_cli.geometry.composition import (
+    angles_onto_plane,
+    compose_rotations,
+    composed_angle,
+    incidence_angles,
+    incidence_coefficients,
+    wrap,
+)
+from projservo_cli.records import WorkFailed
+from tests.samples import frame, revolute
+
+angles = st.floats(-2 * math.pi, 2 * math.pi)
+
+
+@pytest.mark.parametrize(
+    ("theta", "wanted"),
+    [(0.0, 0.0), (math.pi, math.pi), (-math.pi, math.pi), (3 * math.pi, math.pi), (4.0, 4.0 - 2 * math.pi),
+     (-4.0, 2 * math.pi - 4.0), (7.0, 7.0 - 2 * math.pi)],
+)  # fmt: skip
+def test_wrapping_ends_in_one_turn_with_pi_included(theta, wanted):
+    assert wrap(theta) == pytest.approx(wanted, abs=1e-14)
+    assert -math.pi < wrap(theta) <= math.pi
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2))
+def test_solutions_are_all_zeros_of_the_equation(p_0, p_s, p_c):
+    amplitude = math.hypot(p_s, p_c)
+    assume(amplitude > 1e-6)
+    found, plus, minus = incidence_angles(p_0, p_s, p_c)
+    assume(abs(abs(p_0) - amplitude) > 1e-9)
+    assert found == (abs(p_0) <= amplitude)
+    if not found:
+        return
+    for theta in (plus, minus):
+        assert -math.pi < theta <= math.pi
+        rest = p_0 + p_s * math.sin(theta) + p_c * math.cos(theta)
+        assert abs(rest) < 8e-14 * (1 + abs(p_0) + amplitude)
+    # Two different zeros, as many as a cosine has in one turn: none is missed.
+    if abs(p_0) < 0.999 * amplitude:
+        assert abs(wrap(plus - minus)) > 1e-3
+
+
+def test_the_printed_second_solution_holds_only_without_a_cosine():
+    """Erratum of (15): π − θ⁺ solves the equation where p_c = 0 and nowhere else."""
+    _, plus, minus = incidence_angles(0.4, 1.0, 0.0)
+    assert wrap(math.pi - plus) == pytest.approx(minus, abs=1e-15)
+    _, plus, _ = incidence_angles(0.4, 1.0, 0.5)
+    printed = math.pi - plus
+    assert abs(0.4 + math.sin(printed) + 0.5 * math.cos(printed)) > 0.5
+
+
+def test_no_angle_where_the_plane_is_never_met():
+    assert not incidence_angles(1.0, 0.3, 0.4)[0]
+    assert not incidence_angles(0.0, 0.0, 0.0)[0]
+    assert not incidence_angles(math.nan, 1.0, 0.0)[0]
+    assert incidence_angles(-0.5, 0.3, 0.4)[0]  # it only touches
+    assert angles_onto_plane(np.array([0, 0, 1.0, -5]), revolute([0, 0, 0], [1, 0, 0]), np.ones(4)) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_points_are_turned_onto_the_plane(seed):
+    generator = np.random.default_rng(seed)
+    G = frame(seed)
+    H_hat = G @ revolute(generator.normal(size=3), generator.normal(size=3)) @ np.linalg.inv(G)
+    A, a = generator.normal(size=(2, 4))
+    p_0, p_s, p_c = incidence_coefficients(a, H_hat, A)
+    for theta in (0.3, -2.0):
+        assert p_0 + p_s * math.sin(theta) + p_c * math.cos(theta) == pytest.approx(
+            a @ expm(theta * H_hat) @ A
+        )
+    solutions = angles_onto_plane(a, H_hat, A)
+    assert (solutions is None) == (abs(p_0) > math.hypot(p_s, p_c))
+    for theta in solutions or ():
+        assert abs(a @ expm(theta * H_hat) @ A) < 1e-12
+
+
+def perpendicular_pair(seed):
+    """Two revolute operators about perpendicular axes through one point, in a projective frame."""
+    generator = np.random.default_rng(seed)
+    basis = np.linalg.qr(generator.normal(size=(3, 3)))[0]
+    point = generator.normal(size=3)
+    G = frame(seed)
+    return tuple(G @ revolute(point, basis[i]) @ np.linalg.inv(G) for i in range(2))
+
+
+@settings(deadline=None, max_examples=100)
+@given(angles, angles, st.integers(0, 5))
+def test_one_rotation_equals_two(theta_r, theta_p, seed):
+    """Also beyond half a turn, where θ_s exceeds π or the axis changes sides."""
+    H_r, H_p = perpendicular_pair(seed)
+    product = expm(theta_r * H_r) @ expm(theta_p * H_p)
+    assume(math.hypot(math.sin(theta_r / 2), math.sin(theta_p / 2)) > 1e-6)
+    theta_s, H_s = compose_rotations(H_r, H_p, theta_r, theta_p)
+    assert 0.0 <= theta_s < 2 * math.pi
+    # Ĥ_s divides by sin(θ_s/2), which both angles together keep above 1e-6 … round-off 1e-9.
+    sine = math.sin(theta_s / 2)
+    assert expm(theta_s * H_s) == pytest.approx(product, abs=1e-12 + 1e-14 / max(sine, 1e-9))
+    assert math.cos(theta_s / 2) == pytest.approx(math.cos(theta_r / 2) * math.cos(theta_p / 2), abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("theta_r", "theta_p"), [(0.3, 0.5), (-0.4, 1.2), (1e-5, 2e-5), (2.0, 0.0), (0.0, -2.0)]
+)
+def test_operator_is_the_matrix_logarithm_of_the_product(theta_r, theta_p):
+    H_r, H_p = perpendicular_pair(7)
+    theta_s, H_s = compose_rotations(H_r, H_p, theta_r, theta_p)
+    logarithm = np.real(logm(expm(theta_r * H_r) @ expm(theta_p * H_p)))
+    assert theta_s * H_s == pytest.approx(logarithm, abs=1e-12)
+
+
+def test_the_printed_factor_two_is_wrong():
+    """Erratum of (25): c = 2 sin sin leaves an error of order one."""
+    H_r, H_p = perpendicular_pair(2)
+    theta_r, theta_p = 1.0, 1.4
+    theta_s, a, b, c = composed_angle(theta_r, theta_p)
+    printed = (a * H_r + b * H_p + 2 * c * (H_r @ H_p - H_p @ H_r)) / math.sin(theta_s / 2)
+    assert np.abs(expm(theta_s * printed) - expm(theta_r * H_r) @ expm(theta_p * H_p)).max() > 0.1
+
+
+@pytest.mark.parametrize("theta_p", [0.0, 0.7, math.pi])
+def test_half_a_turn(theta_p):
+    """Exactly 180° onto the plane: θ_s is π and the operator still gives the product."""
+    H_r, H_p = perpendicular_pair(4)
+    theta_s, H_s = compose_rotations(H_r, H_p, math.pi, theta_p)
+    assert theta_s == pytest.approx(math.pi, abs=1e-15)
+    assert expm(theta_s * H_s) == pytest.approx(expm(math.pi * H_r) @ expm(theta_p * H_p), abs=1e-12)
+
+
+def test_the_identity_has_no_axis():
+    H_r, H_p = perpendicular_pair(1)
+    with pytest.raises(WorkFailed, match="identity"):
+        compose_rotations(H_r, H_p, 0.0, 0.0)

@@ -1,0 +1,94 @@
+"""Exponentials against SciPy, logarithms against exponentials, and where they are refused."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from projservo_cli.geometry.displacement import (
+    as_array,
+    as_mat,
+    exp_rotation,
+    exp_translation,
+    log_rotation,
+    log_translation,
+    normalize_displacement,
+    twist_exponential,
+)
+from projservo_cli.records import WorkFailed
+from tests.samples import displacement, frame, hat, prismatic, revolute
+
+ANGLES = [0.0, 1e-12, 1e-4, 0.3, math.pi / 2, 3.0, math.pi, 4.0, 2 * math.pi, -0.7, -math.pi, 17.0]
+
+
+def conjugate(operator, seed):
+    G = frame(seed)
+    return G @ operator @ np.linalg.inv(G)
+
+
+@pytest.mark.parametrize("theta", ANGLES)
+def test_rotation_is_the_matrix_exponential(theta):
+    for seed in range(4):
+        H_hat = conjugate(revolute([0.3, -0.2, 1.5], [1, 2, -3]), seed)
+        # Round-off of entries of size 10 through the powers of the series.
+        assert exp_rotation(H_hat, theta) == pytest.approx(expm(theta * H_hat), abs=1e-12)
+
+
+@pytest.mark.parametrize("tau", [0.0, 1e-9, 0.2, -3.0])
+def test_translation_is_the_matrix_exponential(tau):
+    for seed in range(4):
+        H_hat = conjugate(prismatic([1, 2, -3]), seed)
+        assert exp_translation(H_hat, tau) == pytest.approx(expm(tau * H_hat), abs=1e-13)
+
+
+@pytest.mark.parametrize("theta", [1e-5, 0.1, math.pi / 2, 3.0, 4.0, -0.7, math.pi - 1e-5])
+def test_logarithm_inverts_the_rotation(theta):
+    H_hat = conjugate(revolute([0.3, -0.2, 1.5], [1, 2, -3]), 1)
+    # Round-off of H over the sine of the angle.
+    assert log_rotation(exp_rotation(H_hat, theta), theta) == pytest.approx(
+        H_hat, abs=1e-14 * 50 / abs(math.sin(theta))
+    )
+
+
+@pytest.mark.parametrize("theta", [0.0, 1e-7, math.pi, -math.pi, 2 * math.pi, math.pi + 1e-7, -3 * math.pi])
+def test_logarithm_is_refused_at_multiples_of_pi(theta):
+    H_hat = revolute([0.3, -0.2, 1.5], [1, 2, -3])
+    with pytest.raises(WorkFailed, match="does not determine its operator"):
+        log_rotation(exp_rotation(H_hat, theta), theta)
+
+
+def test_logarithm_inverts_the_translation():
+    H_hat = conjugate(prismatic([1, 2, -3]), 2)
+    for tau in (0.2, -3.0):
+        assert log_translation(exp_translation(H_hat, tau), tau) == pytest.approx(H_hat, abs=1e-13)
+    with pytest.raises(WorkFailed, match="does not determine its operator"):
+        log_translation(np.eye(4), 0.0)
+
+
+def test_scale_of_a_homography_keeps_points_on_their_side_of_infinity():
+    """Either sign and any scale, also half a turn, whose trace is 0 and tells nothing."""
+    G = frame(3)
+    a_inf = np.array([0, 0, 0, 1.0]) @ np.linalg.inv(G)
+    M = np.array([[0.1, 0.2, 1.4, 1], [-0.1, 0.3, 1.2, 1]]) @ G.T
+    for T in (displacement([0.2, 0.3, -0.1], [0.1, 0.2, 0.3]), displacement([0, math.pi, 0], [0, 0, 2.8])):
+        H = G @ T @ np.linalg.inv(G)
+        for k in (1.0, -1.0, 3.7, -0.02):
+            result = normalize_displacement(k * H, M, a_inf)
+            assert result == pytest.approx(H, abs=1e-12)
+            assert np.linalg.det(result) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_homography_that_reflects_or_is_singular_is_refused():
+    for H in (np.diag([1.0, 1, -1, 1]), np.diag([1.0, 1, 0, 1]), np.zeros((4, 4))):
+        with pytest.raises(WorkFailed, match="no displacement"):
+            normalize_displacement(H, np.ones((1, 4)), np.array([0, 0, 0, 1.0]))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.99e-4, 1.01e-4, 1e-2, 1.0, math.pi, 6.0])
+def test_exponential_of_any_twist(size):
+    """Both branches at the switch from series to closed form; rotation and translation together."""
+    for w, v in [([1, 2, -2], [0.3, -0.5, 0.2]), ([0, 0, 3], [1, 0, 5]), ([0, 0, 0], [1, 2, 3])]:
+        X = size * hat(np.array(w) / 3.0, v)
+        # Round-off of the entries, which grow with the translation of size·5.
+        assert as_array(twist_exponential(as_mat(X))) == pytest.approx(expm(X), abs=1e-13)

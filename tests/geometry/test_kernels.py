@@ -1,0 +1,145 @@
+"""Kernel vectors and least squares against the singular value decomposition of NumPy."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.geometry.kernels import kernel_vector, least_squares
+
+
+def workspaces(A, b=None):
+    """Columns of A as the kernels want them, with room to spare, and their workspaces."""
+    m, n = A.shape
+    B = np.full((n, max(m, n) + 3), 7.0)
+    B[:, :m] = A.T
+    rhs = np.zeros(max(m, n) + 3)
+    rhs[:m] = 0.0 if b is None else b
+    return B, m, n, np.zeros(n), np.zeros(n, dtype=np.int64), np.zeros(n), rhs
+
+
+def kernel(A):
+    B, m, n, x, pivot, z, rhs = workspaces(A)
+    found = kernel_vector(B, m, n, x, pivot, z, rhs)
+    return found, x
+
+
+def solve(A, b):
+    B, m, n, x, pivot, z, rhs = workspaces(A, b)
+    found = least_squares(B, m, n, x, pivot, z, rhs)
+    return found, x
+
+
+def singular(rng, m, n, sizes):
+    """Matrix with the given singular values, each column scaled by up to a factor of 30."""
+    U = np.linalg.qr(rng.normal(size=(m, m)))[0]
+    V = np.linalg.qr(rng.normal(size=(n, n)))[0]
+    return U[:, : len(sizes)] @ np.diag(sizes) @ V[:, : len(sizes)].T
+
+
+def least_right_vector(A):
+    return np.linalg.svd(A)[2][-1]
+
+
+@pytest.mark.parametrize(("m", "n"), [(8, 5), (8, 6), (8, 7), (12, 6), (5, 6), (6, 6), (1, 2)])
+def test_kernel_of_an_exactly_singular_matrix(rng, m, n):
+    for _ in range(20):
+        A = singular(rng, m, n, rng.uniform(0.1, 10.0, n - 1))
+        found, x = kernel(A)
+        assert found
+        assert np.linalg.norm(x) == pytest.approx(1.0, abs=1e-14)
+        # Round-off of the factorisation over the least non-zero singular value, 0.1.
+        assert np.abs(A @ x).max() < 1e-13
+        assert abs(x @ least_right_vector(A)) == pytest.approx(1.0, abs=1e-13)
+
+
+def test_kernel_of_integers_that_vanish_exactly():
+    """Dependent columns without round-off, and a column that is zero: pivots of exactly 0."""
+    A = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]])
+    assert kernel(A)[1] == pytest.approx([0, 0, 1], abs=0)
+    A = np.array([[1.0, 0, 1], [0, 2, 2], [0, 0, 0]])
+    found, x = kernel(A)
+    assert found
+    assert np.abs(x) == pytest.approx(np.full(3, 1 / np.sqrt(3)), abs=1e-15)
+    assert A @ x == pytest.approx(np.zeros(3), abs=1e-15)
+
+
+@pytest.mark.parametrize("n", [5, 6, 7])
+@pytest.mark.parametrize("noise", [1e-16, 1e-14, 1e-13, 1e-10, 1e-6, 1e-3, 1e-2, 2e-2])
+def test_noisy_kernel_is_the_least_right_singular_vector(rng, n, noise):
+    """The gain settles to 1e-12, hence the vector to 1e-6 times one further step of convergence."""
+    for _ in range(20):
+        A = singular(rng, 8, n, rng.uniform(0.5, 2.0, n - 1)) + noise * rng.normal(size=(8, n))
+        found, x = kernel(A)
+        sizes = np.linalg.svd(A, compute_uv=False)
+        ratio = (sizes[-1] / sizes[-2]) ** 2
+        v = least_right_vector(A)
+        assert found
+        assert np.linalg.norm(x - v * np.sign(v @ x)) < 1e-13 + 2e-6 * ratio / (1 - ratio)
+
+
+@pytest.mark.parametrize("n", [5, 6, 7])
+def test_a_kernel_of_two_dimensions_is_refused(rng, n):
+    """Two dimensions, three, and all of them; exactly and up to round-off."""
+    for missing in (2, 3):
+        found, x = kernel(singular(rng, 8, n, rng.uniform(0.1, 10.0, n - missing)))
+        assert not found
+        assert not x.any()
+    A = rng.normal(size=(8, n))
+    A[:, 1], A[:, 3] = A[:, 0], A[:, 2]
+    assert not kernel(A)[0]
+    A[:, 1] = A[:, 3] = 0.0
+    assert not kernel(A)[0]
+    assert not kernel(np.zeros((8, n)))[0]
+
+
+def test_no_kernel_is_refused(rng):
+    """Least singular value of the size of the others: nothing is left still."""
+    for n in (5, 6, 7):
+        found, x = kernel(singular(rng, 8, n, rng.uniform(1.0, 2.0, n)))
+        assert not found
+        assert not x.any()
+
+
+def test_kernel_scales_with_its_matrix(rng):
+    """Rank is judged against the size of the matrix, whatever its unit."""
+    A = singular(rng, 8, 6, [3.0, 2.0, 1.0, 0.5, 0.2])
+    wanted = kernel(A)[1]
+    for unit in (1e-30, 1e30):
+        found, x = kernel(unit * A)
+        assert found
+        assert abs(x @ wanted) == pytest.approx(1.0, abs=1e-13)
+
+
+def test_least_squares_agrees_with_numpy(rng):
+    for m, n in [(6, 6), (8, 6), (12, 6), (16, 7), (16, 5), (2, 1)]:
+        A, b = rng.normal(size=(m, n)), rng.normal(size=m)
+        found, x = solve(A, b)
+        assert found
+        assert x == pytest.approx(np.linalg.lstsq(A, b, rcond=None)[0], abs=1e-12 * np.linalg.cond(A))
+
+
+def test_least_squares_of_an_ill_conditioned_matrix(rng):
+    """Condition 1e6: normal equations would leave 1e-4 of error, an orthogonal factorisation 1e-9."""
+    A = singular(rng, 16, 6, np.logspace(0, -6, 6))
+    x_true = rng.normal(size=6)
+    found, x = solve(A, A @ x_true)
+    assert found
+    assert x == pytest.approx(x_true, abs=1e-9)
+
+
+def test_least_squares_refuses_dependent_columns_and_too_few_rows(rng):
+    A = rng.normal(size=(8, 6))
+    A[:, 4] = A[:, 1] - 2 * A[:, 2]
+    assert not solve(A, np.ones(8))[0]
+    assert not solve(np.zeros((8, 6)), np.ones(8))[0]
+    found, x = solve(rng.normal(size=(5, 6)), np.ones(5))
+    assert not found
+    assert not x.any()
+
+
+def test_matrices_with_nan_are_refused(rng):
+    for place in [(0, 0), (7, 5), (3, 2)]:
+        A = rng.normal(size=(8, 6))
+        A[place] = np.nan
+        for found, x in (kernel(A), solve(A, np.ones(8))):
+            assert not found
+            assert not x.any()

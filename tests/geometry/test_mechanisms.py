@@ -1,0 +1,134 @@
+"""Motions defined by what they leave still: (8), (9), (10)."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.geometry.kinematics import joint_operators
+from projservo_cli.geometry.mechanisms import rotation_about, rotation_within, translation_along
+from projservo_cli.records import WorkFailed
+from tests.samples import arm, face, frame, in_frame, prismatic, revolute
+
+TYPES = ["RRRRRR", "RRPRRR"]
+
+
+def setting(types, seed):
+    """Operators, plane at infinity, face and frame of an arm away from its reference."""
+    G = np.eye(4) if seed is None else frame(seed, mirrored=seed == 2)
+    model = in_frame(arm(types), G)
+    q = model.q_reference + np.array([0.2, -0.3, 0.15, 0.4, -0.2, 0.3])
+    return joint_operators(model, q), model.a_inf, face() @ G.T, G
+
+
+def plane_through(M):
+    """Plane through three points, by the null vector of NumPy."""
+    return np.linalg.svd(M[:3])[2][3]
+
+
+def check(mechanism, H_hat, a_inf):
+    """The operator is the combination of the joints and shares their plane at infinity."""
+    assert mechanism.H_hat == pytest.approx(np.tensordot(mechanism.q_hat, H_hat, 1), abs=1e-12)
+    assert np.abs(a_inf @ mechanism.H_hat).max() < 1e-12
+
+
+def check_rotation(H):
+    """Eigenvalues 0, 0, ±i: Ĥ³ = −Ĥ and trace(Ĥ²) = −2."""
+    assert pytest.approx(-H, abs=1e-11) == H @ H @ H
+    assert np.trace(H @ H) == pytest.approx(-2.0, abs=1e-12)
+    assert np.trace(H) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("types", TYPES)
+@pytest.mark.parametrize("seed", [None, 1, 2])
+def test_translation_keeps_every_plane_through_its_line(types, seed):
+    H_hat, a_inf, A, G = setting(types, seed)
+    mechanism = translation_along(H_hat, A[0], A[1])
+    H = mechanism.H_hat
+    check(mechanism, H_hat, a_inf)
+    assert np.linalg.norm(mechanism.q_hat) == pytest.approx(1.0, abs=1e-14)
+    assert np.abs(H @ H).max() < 1e-11
+    # Every point, at infinity too, moves along the line: velocity k (A_2 − A_1) for finite ones.
+    for X in (*A, G @ [0.3, -0.2, 1.0, 1.0]):
+        velocity = H @ X
+        rate = velocity @ (A[1] - A[0]) / ((A[1] - A[0]) @ (A[1] - A[0]))
+        assert velocity == pytest.approx(rate * (A[1] - A[0]), abs=1e-11)
+        assert abs(rate) > 0.1
+    for other in (A[2], G @ [0, 0, 0, 1.0]):
+        a = plane_through(np.array([A[0], A[1], other]))
+        assert np.abs(a @ H).max() < 1e-11
+
+
+@pytest.mark.parametrize("types", TYPES)
+@pytest.mark.parametrize("seed", [None, 1, 2])
+def test_revolution_keeps_its_axis(types, seed):
+    H_hat, a_inf, A, G = setting(types, seed)
+    mechanism = rotation_about(H_hat, A[0], A[2])
+    check(mechanism, H_hat, a_inf)
+    check_rotation(mechanism.H_hat)
+    for t in (0.0, 1.0, 0.3, -7.0):
+        assert np.abs(mechanism.H_hat @ ((1 - t) * A[0] + t * A[2])).max() < 1e-11
+    # In the metric frame it is the unit twist about that axis, up to its sense.
+    metric = np.linalg.inv(G) @ mechanism.H_hat @ G
+    M = A @ np.linalg.inv(G).T
+    wanted = revolute(M[0, :3], M[2, :3] - M[0, :3])
+    assert min(np.abs(metric - wanted).max(), np.abs(metric + wanted).max()) < 1e-11
+
+
+@pytest.mark.parametrize("types", TYPES)
+@pytest.mark.parametrize("seed", [None, 1, 2])
+@pytest.mark.parametrize("inside", [True, False])
+def test_planar_revolution_keeps_its_plane_and_its_point(types, seed, inside):
+    """About the perpendicular through the point, which need not lie in the plane."""
+    H_hat, a_inf, A, G = setting(types, seed)
+    a = plane_through(A)
+    center = A[0] if inside else G @ [0.1, 0.1, 1.2, 1.0]
+    mechanism = rotation_within(H_hat, a, center)
+    check(mechanism, H_hat, a_inf)
+    check_rotation(mechanism.H_hat)
+    assert np.abs(mechanism.H_hat @ center).max() < 1e-11
+    assert np.abs(a @ mechanism.H_hat).max() < 1e-11
+    metric = np.linalg.inv(G) @ mechanism.H_hat @ G
+    wanted = revolute((np.linalg.inv(G) @ center)[:3], (a @ G)[:3])
+    assert min(np.abs(metric - wanted).max(), np.abs(metric + wanted).max()) < 1e-11
+
+
+def test_mechanisms_do_not_depend_on_the_frame():
+    """Joint motions equal in every frame, also a mirrored one, up to their arbitrary sign."""
+    wanted = None
+    for seed in (None, 1, 2, 3):
+        H_hat, _, A, _ = setting("RRRRRR", seed)
+        found = np.array(
+            [
+                translation_along(H_hat, A[0], A[1]).q_hat,
+                rotation_about(H_hat, A[0], A[2]).q_hat,
+                rotation_within(H_hat, plane_through(A), A[0]).q_hat,
+            ]
+        )
+        found *= np.sign(found[:, :1])
+        wanted = found if wanted is None else wanted
+        assert found == pytest.approx(wanted, abs=1e-10)
+
+
+def test_a_redundant_arm_has_no_unique_motion():
+    model = arm("RRRRRRR")
+    H_hat = joint_operators(model, model.q_reference + 0.2)
+    with pytest.raises(WorkFailed, match="no unique translation"):
+        translation_along(H_hat, face()[0], face()[1])
+    with pytest.raises(WorkFailed, match="no unique rotation"):
+        rotation_about(H_hat, face()[0], face()[1])
+    with pytest.raises(WorkFailed, match="no unique planar rotation"):
+        rotation_within(H_hat, plane_through(face()), face()[0])
+
+
+def test_a_gantry_cannot_rotate():
+    """Six translations: the kernel of (9) holds no rotation that could be scaled to radians."""
+    H_hat = np.array([prismatic(axis) for axis in np.eye(3)])
+    with pytest.raises(WorkFailed):
+        rotation_about(H_hat, face()[0], face()[1])
+
+
+def test_two_joints_on_one_axis_are_a_singularity():
+    model = arm()
+    H_hat = model.H_hat_0.copy()
+    H_hat[4] = -H_hat[2]
+    with pytest.raises(WorkFailed, match="singularity"):
+        translation_along(H_hat, face()[0], face()[1])

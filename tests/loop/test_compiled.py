@@ -1,0 +1,257 @@
+"""Whole closed loops: every verdict reached by a case made for it, and what the log says of it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from projservo_cli.loop.compiled import path_deviation
+from projservo_cli.records import LAWS
+from tests.samples import displacement, pixels, poe
+from tests.scene import GAINS, STEP, Run, limits, scene
+
+DIRECT = ("direct_three", "direct_two")
+
+
+def test_log_describes_the_run_it_belongs_to():
+    """Joints integrate the commands, poses are those of the joints, pixels those of the poses."""
+    sc = scene()
+    run = Run(sc, "direct_three")
+    log = run.log
+    assert run.verdict == "converged"
+    assert log.q[0] == pytest.approx(sc.q_start, abs=0)
+    assert np.diff(log.q, axis=0) == pytest.approx(GAINS.period * log.q_dot[:-1], abs=1e-15)
+    for k in (0, 3, run.steps):
+        assert log.H[k] == pytest.approx(poe(sc.model, log.q[k]), abs=1e-12)
+        assert log.s[k] == pytest.approx(sc.images(log.q[k]), abs=1e-9)
+        rms = math.sqrt(np.sum((log.s[k] - sc.s_star) ** 2) / 8)
+        assert log.error[k] == pytest.approx(rms, rel=1e-12)
+    assert log.error[-1] <= 1e-3 < log.error[-2]
+    assert not log.q_dot[-1].any()
+    assert (log.events == [-1, -1, -1, -1]).all()
+    # Beyond its last instant the log is untouched.
+    assert not run.full.s[run.steps + 1 :].any()
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
+def test_start_at_the_goal_converges_without_a_command(law, types):
+    run = Run(scene(np.zeros(6), types), law)
+    assert (run.verdict, run.steps) == ("converged", 0)
+    assert run.log.error.max() < 1e-12  # px, round-off of the joints
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_next_to_the_goal_converges(law):
+    """Steps of 1e-9 rad: errors of 1e-6 px, directions next to nothing."""
+    run = Run(scene(1e-7 * STEP), law, bounds=limits(image_px=1e-8))
+    assert run.verdict == "converged"
+    assert run.steps < 120
+
+
+@pytest.mark.parametrize("law", DIRECT)
+def test_noise_is_added_to_what_the_law_sees(law, rng):
+    sc = scene()
+    bounds = limits(max_steps=30)
+    noise = 0.5 * rng.normal(size=(31, 2, 4, 2))
+    run = Run(sc, law, bounds=bounds, noise=noise)
+    assert run.steps == 30
+    for k in (0, 7, 30):
+        assert run.log.s[k] - sc.images(run.log.q[k]) == pytest.approx(noise[k], abs=1e-9)
+    assert np.abs(run.log.q - Run(sc, law, bounds=bounds).log.q).max() > 1e-4
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_speed_limit_scales_commands_uniformly(law):
+    """The same first command, all joints by one factor; no joint ever faster than its limit."""
+    sc = scene()
+    free = Run(sc, law, bounds=limits(max_steps=1)).log.q_dot[0]
+    speed = np.full(6, 0.2 * np.abs(free).max())
+    run = Run(sc, law, bounds=limits(speed=speed, max_steps=50))
+    assert run.log.factor[0] == pytest.approx(0.2, rel=1e-12)
+    assert run.log.q_dot[0] == pytest.approx(0.2 * free, rel=1e-12)
+    assert (np.abs(run.log.q_dot) <= speed * (1 + 1e-14)).all()
+
+
+def test_max_steps_and_plateau_differ_in_the_last_window():
+    sc = scene()
+    assert Run(sc, "direct_three", bounds=limits(max_steps=30)).verdict == "max steps"
+    still = limits(max_steps=30, speed=np.full(6, 1e-6))
+    assert Run(sc, "direct_three", bounds=still).verdict == "plateau"
+    still = limits(max_steps=10, speed=np.full(6, 1e-6))
+    assert Run(sc, "direct_three", bounds=still).verdict == "max steps"  # too short to tell
+    assert Run(sc, "direct_three", bounds=still).steps == 10
+
+
+def test_diverged():
+    """A gain of 2.5 per period overshoots: the error is half as large again after the first step."""
+    bounds = limits(diverged_factor=1.2)
+    run = Run(scene(0.1 * STEP), "stacked", GAINS._replace(gain=2.5 / GAINS.period), bounds)
+    assert (run.verdict, run.steps) == ("diverged", 1)
+    assert run.log.error[1] > 1.2 * run.log.error[0]
+    assert Run(scene(0.1 * STEP), "stacked", bounds=bounds).verdict == "converged"
+
+
+def test_left_image():
+    """An image cut just beyond the start ends the run there, or is only recorded."""
+    sc = scene()
+    free = Run(sc, "direct_three")
+    u = free.log.s[:, 0, :, 0]
+    border = u.max() - 0.25 * (u.max() - u[0].max())
+    first = int(np.argmax((u > border - 0.5).any(axis=1))) if u.max() > u[0].max() else None
+    if first is None or first == 0:
+        low = u.min(axis=1)
+        shift = 0.5 * (low[0] + low.min())
+        first = int(np.argmax(low - shift < -0.5))
+        camera = sc.plant.model.P.copy()
+        camera[0, 0] -= shift * camera[0, 2]
+        sc = sc._replace(plant=sc.plant._replace(model=sc.model._replace(P=camera)))
+        moved = [sc.images(q) for q in (sc.q_start, sc.q_goal)]
+        sc = sc._replace(s_start=moved[0], s_star=moved[1])
+    else:
+        sc = sc._replace(plant=sc.plant._replace(image_size=np.array([border, 1024.0])))
+    assert first > 0
+    run = Run(sc, "direct_three", bounds=limits(stop_at_border=True))
+    assert (run.verdict, run.steps) == ("left image", first)
+    assert run.log.events[0] == first
+    told = Run(sc, "direct_three", bounds=limits(stop_at_border=False))
+    assert told.verdict == "converged"
+    assert told.log.events[0] == first
+
+
+def test_joint_limit():
+    """Stopped before the command that would pass it, or only recorded with the joint that did."""
+    sc = scene()
+    upper = sc.plant.upper.copy()
+    upper[2] = sc.q_start[2] + 0.5 * STEP[2]
+    sc = sc._replace(plant=sc.plant._replace(upper=upper))
+    told = Run(sc, "direct_three")
+    assert told.verdict == "converged"
+    first = int(np.argmax(told.log.q[:, 2] > upper[2]))
+    assert told.log.events[1:3].tolist() == [first, 2]
+    stopped = Run(sc, "direct_three", bounds=limits(stop_at_joint_limit=True))
+    assert (stopped.verdict, stopped.steps) == ("joint limit", first - 1)
+    assert (stopped.log.q[:, 2] <= upper[2]).all()
+
+
+def test_behind_camera():
+    """The goal is in view, but the rig's frame puts a marker of the start behind the left camera."""
+    sc = scene()
+    M = sc.plant.M.copy()
+    M[0, 2] = -0.2
+    hidden = sc._replace(plant=sc.plant._replace(M=M))
+    run = Run(hidden, "direct_three", task=sc.task())
+    assert (run.verdict, run.steps) == ("behind camera", 0)
+    assert np.isnan(run.log.s[0, 0, 0]).all()
+
+
+def test_singular():
+    """Two joints on one axis at the start: no joint motion of the law is unique."""
+    sc = scene()
+    H_hat_0 = sc.model.H_hat_0.copy()
+    H_hat_0[3] = H_hat_0[2]
+    model = sc.model._replace(H_hat_0=H_hat_0)
+    wrist = sc._replace(plant=sc.plant._replace(model=model))
+    for law in LAWS:
+        run = Run(wrist, law, task=sc.task())
+        assert (run.verdict, run.steps) == ("singular", 0)
+        assert np.isnan(run.log.errors).all()
+
+
+def flipped(opaque):
+    """Face that looks away at the start although the plant remembers its front: occluded in both views."""
+    sc = scene(opaque=opaque)
+    return sc._replace(plant=sc.plant._replace(visible=-sc.plant.visible))
+
+
+def test_an_opaque_face_hides_its_markers():
+    run = Run(flipped(opaque=True), "direct_three", task=scene().task())
+    assert (run.verdict, run.steps) == ("markers lost", 0)
+    assert np.isnan(run.log.s[0]).all()
+    assert run.log.hidden.tolist() == [[1.0, 1.0]]
+
+
+def test_a_transparent_face_is_counted_and_measured():
+    run = Run(flipped(opaque=False), "direct_three", task=scene().task())
+    assert run.verdict == "converged"
+    assert run.log.hidden.all()
+
+
+def test_occlusion_begins_where_the_plane_passes_the_optical_center():
+    """A law that turns the face away: hidden exactly while the true plane has the camera behind it."""
+    sc = scene()
+    run = Run(sc, "stacked")
+    assert run.log.hidden.any()
+    assert not run.log.hidden.all()
+    for H, hidden in zip(run.log.H, run.log.hidden, strict=True):
+        M = (sc.plant.M @ H.T)[:, :3]
+        normal = np.cross(M[1] - M[0], M[2] - M[0])
+        towards = [normal @ (O[:3] - M[0]) for O in sc.plant.O]
+        start = np.cross(*(sc.plant.M[i, :3] - sc.plant.M[0, :3] for i in (1, 2)))
+        sign = [np.sign(start @ (O[:3] - sc.plant.M[0, :3])) for O in sc.plant.O]
+        assert [t * s <= 0 for t, s in zip(towards, sign, strict=True)] == (hidden > 0).tolist()
+    opaque = Run(scene(opaque=True), "stacked")
+    assert opaque.verdict == "markers lost"
+    assert opaque.steps == int(np.argmax(run.log.hidden.any(axis=1)))
+
+
+def test_visibility_limits_the_translation():
+    """Towards the cameras, τ_0 ahead: with a vanishing share δ of it the first step does not translate."""
+    sc = scene()
+    nearer = sc.plant.M - np.array([0, 0, 0.4, 0])
+    sc = sc._replace(s_star=pixels(sc.model.P, nearer))
+    free, held = (
+        Run(sc, "direct_three", GAINS._replace(delta=delta, gain_r=1e-9, gain_p=1e-9), limits(max_steps=1))
+        for delta in (0.9, 1e-9)
+    )
+    assert free.state.limited[0] == 0
+    assert held.state.limited[0] > 0
+    moved = [np.linalg.norm(run.center[-1] - run.center[0]) for run in (free, held)]
+    assert moved[1] < 1e-6 * moved[0]
+
+
+def test_deviation_from_the_line():
+    """Against the joints interpolated in plain NumPy, at the samples and at 20 points between."""
+    sc = scene()
+    run = Run(sc, "direct_three", bounds=limits(max_steps=8))
+    A_c = sc.plant.M.mean(axis=0)
+    start, goal = (poe(sc.model, q) @ A_c for q in (sc.q_start, sc.q_goal))
+    between, at_samples = path_deviation(sc.plant, run.log, run.steps, GAINS.period, start, goal, 20)
+    way = (goal - start)[:3] / np.linalg.norm((goal - start)[:3])
+
+    def distance(q):
+        off = (poe(sc.model, q) @ A_c - start)[:3]
+        return np.linalg.norm(off - (off @ way) * way)
+
+    steps = [run.log.q[k] + t / 20 * (run.log.q[k + 1] - run.log.q[k]) for k in range(8) for t in range(21)]
+    assert between == pytest.approx(max(distance(q) for q in steps), abs=1e-12)
+    assert at_samples == pytest.approx(max(distance(q) for q in run.log.q), abs=1e-12)
+    assert between >= at_samples > 1e-4
+
+
+def test_deviation_of_a_task_without_translation_is_the_distance_from_the_start():
+    sc = scene()
+    run = Run(sc, "direct_three", bounds=limits(max_steps=10))
+    start = np.append(run.center[0], 1.0)
+    _, at_samples = path_deviation(sc.plant, run.log, run.steps, GAINS.period, start, start, 1)
+    assert at_samples == pytest.approx(np.linalg.norm(run.center - run.center[0], axis=1).max(), abs=1e-12)
+
+
+def test_memory_decides_the_sense_of_a_half_turn():
+    """Exactly 180° within the plane: the run turns the way its memory tells, and arrives either way."""
+    sc = scene(np.zeros(6))
+    M = sc.plant.M[:, :3]
+    center = M.mean(axis=0)
+    normal = np.cross(M[1] - M[0], M[2] - M[0])
+    R = displacement(np.pi * normal / np.linalg.norm(normal), np.zeros(3))[:3, :3]
+    goal = np.c_[(M - center) @ R.T + center, np.ones(4)]
+    sc = sc._replace(s_star=pixels(sc.model.P, goal))
+    bounds = limits(max_steps=3)
+    first = Run(sc, "direct_two", bounds=bounds)
+    driven = first.log.q_dot[0]
+    for sign in (1.0, -1.0):
+        memory = np.zeros((2, 6))
+        memory[1] = sign * driven
+        run = Run(sc, "direct_two", bounds=bounds, memory=memory)
+        assert np.sign(run.log.q_dot[0] @ driven) == sign
+        assert (run.log.q_dot[1] @ run.log.q_dot[0]) > 0

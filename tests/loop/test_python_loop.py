@@ -1,0 +1,118 @@
+"""The loop in Python equals the compiled loop to the bit, and takes laws of others."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.control import CODES
+from projservo_cli.control.law import ERRORS, OK
+from projservo_cli.loop.python import BuiltInLaw, run
+from projservo_cli.loop.step import VERDICTS
+from projservo_cli.plants.analytic import AnalyticPlant
+from projservo_cli.records import LAWS
+from tests.samples import frame
+from tests.scene import GAINS, STEP, Run, limits, scene
+
+SPEED = np.full(6, 0.5)
+
+
+def in_python(sc, law, bounds, noise, G=None):
+    plant = AnalyticPlant(sc.plant, sc.q_start, noise)
+    built_in = BuiltInLaw(CODES[law], sc.seen(G), sc.task(G), GAINS)
+    return run(built_in, plant, sc.s_star, GAINS.period, bounds)
+
+
+def same(left, right):
+    """Equal to the bit, unknown values included."""
+    return left.tobytes() == right.tobytes()
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
+def test_both_loops_are_equal_to_the_bit(law, types, rng):
+    """With noise, a speed limit that is active, and a projective model for the laws that take one."""
+    G = None if law == "euclidean_points" else frame(2)
+    bounds = limits(speed=SPEED, max_steps=40)
+    noise = 0.3 * rng.normal(size=(41, 2, 4, 2))
+    sc = scene(types=types)
+    compiled = Run(sc, law, bounds=bounds, noise=noise, G=G)
+    verdict, steps, log = in_python(sc, law, bounds, noise, G)
+    assert (VERDICTS[verdict], steps) == (compiled.verdict, compiled.steps)
+    assert (compiled.full.factor < 1).any()
+    for name, rows in compiled.full._asdict().items():
+        assert same(getattr(log, name)[: steps + 1] if name != "events" else log.events,
+                    rows[: steps + 1] if name != "events" else rows), name  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "bounds",
+    [
+        {"image_px": 1e3},
+        {"diverged_factor": 1e-9},
+        {"max_steps": 1},
+        {"max_steps": 25, "speed": np.full(6, 1e-6)},
+        {"stop_at_joint_limit": True},
+        {"stop_at_border": True},
+    ],
+    ids=lambda given: ", ".join(given),
+)
+def test_both_loops_end_alike(bounds):
+    """The other verdicts: converged, diverged, max steps, plateau, joint limit, left image."""
+    sc = scene()
+    upper = sc.plant.upper.copy()
+    upper[2] = sc.q_start[2] + 0.5 * STEP[2]
+    sc = sc._replace(plant=sc.plant._replace(upper=upper, image_size=np.array([1280.0, 700.0])))
+    bounds = limits(**{"max_steps": 60, **bounds})
+    noise = np.zeros((bounds.max_steps + 1, 2, 4, 2))
+    compiled = Run(sc, "direct_three", bounds=bounds, noise=noise)
+    verdict, steps, log = in_python(sc, "direct_three", bounds, noise)
+    assert (VERDICTS[verdict], steps) == (compiled.verdict, compiled.steps)
+    assert same(log.events[:3], compiled.log.events[:3])
+
+
+class Towards:
+    """A law of somebody else: straight to given joints."""
+
+    def __init__(self, q_goal, status=OK):
+        self.q_goal, self.status = q_goal, status
+        self.errors = np.zeros(len(ERRORS))
+        self.calls = 0
+
+    def __call__(self, s, q):
+        self.calls += 1
+        return self.status, 5.0 * (self.q_goal - q)
+
+
+def test_a_law_of_others():
+    sc = scene()
+    law = Towards(sc.q_goal)
+    plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((200, 2, 4, 2)))
+    verdict, steps, log = run(law, plant, sc.s_star, 0.04, limits(max_steps=199))
+    assert VERDICTS[verdict] == "converged"
+    assert law.calls == steps + 1
+    # Each step leaves 0.8 of the joint error.
+    assert log.q[10] - sc.q_goal == pytest.approx(0.8**10 * (sc.q_start - sc.q_goal), abs=1e-12)
+
+
+class Broken(Towards):
+    def __call__(self, s, q):
+        raise ZeroDivisionError("made to fail")
+
+
+def test_the_plant_is_stopped_on_every_way_out(monkeypatch):
+    stopped = []
+    monkeypatch.setattr(AnalyticPlant, "stop", lambda self: stopped.append(True))
+    sc = scene()
+    for law in (Towards(sc.q_goal), Broken(sc.q_goal)):
+        plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((4, 2, 4, 2)))
+        try:
+            run(law, plant, sc.s_star, 0.04, limits(max_steps=3))
+        except ZeroDivisionError:
+            stopped.append("after the failure")
+    assert stopped == [True, True, "after the failure"]
+
+
+def test_a_command_that_is_no_number_diverges():
+    sc = scene()
+    plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((4, 2, 4, 2)))
+    verdict, steps, _ = run(Towards(np.full(6, np.nan)), plant, sc.s_star, 0.04, limits(max_steps=3))
+    assert (VERDICTS[verdict], steps) == ("diverged", 0)

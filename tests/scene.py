@@ -1,0 +1,101 @@
+"""A closed loop in miniature: the sample arm, its rig and a face between two sets of joints."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.control import CODES
+from projservo_cli.control.law import ERRORS, Gains, new_state
+from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.loop.compiled import new_log, run
+from projservo_cli.loop.step import VERDICTS, Limits
+from projservo_cli.plants.plant import Plant
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane, task_from_images
+from tests.samples import METRIC_A_INF, arm, face, in_frame, pixels, poe
+
+GAINS = Gains(2.5, 2.5, 2.5, 2.5, 1.0, 2.5, 0.04, 0.9)
+# Joint steps from start to goal: the face moves by 0.5 m and turns by 68° in view of both cameras.
+STEP = np.array([0.19, 0.35, 0.38, -0.35, -0.08, 0.3])
+
+
+class Scene(NamedTuple):
+    """True robot, rig and face, and the images of start and goal."""
+
+    plant: Plant
+    q_start: FloatArray
+    q_goal: FloatArray
+    s_start: FloatArray
+    s_star: FloatArray
+
+    @property
+    def model(self) -> Model:
+        return self.plant.model
+
+    def task(self, G=None) -> Task:
+        """Task in the frame of the model ``self.seen(G)``."""
+        return task_from_images(self.seen(G), self.s_start, self.s_star, self.plant.center)
+
+    def seen(self, G=None) -> Model:
+        """Model in another frame."""
+        return self.model if G is None else in_frame(self.model, G)
+
+    def images(self, q) -> FloatArray:
+        """True pixels of the face at the joints q."""
+        return pixels(self.model.P, self.plant.M @ poe(self.model, q).T)
+
+
+def plant_of(model, M, center=MIDPOINT, opaque=False) -> Plant:
+    """Plant of a face at its reference, which both cameras see there."""
+    order = cyclic_order(M)
+    O = optical_centers(model.P, METRIC_A_INF)
+    a = np.array(face_plane(np.ascontiguousarray(M), order, center_of(M, center)))
+    n = len(model.q_reference)
+    return Plant(
+        model, M, order, center, O, np.sign(O @ a), np.array([1280.0, 1024.0]), np.full(n, -9.0),
+        np.full(n, 9.0), opaque,
+    )  # fmt: skip
+
+
+def scene(step=STEP, types="RRRRRR", m=4, center=MIDPOINT, opaque=False) -> Scene:
+    """Scene that starts at the reference of the arm and ends a joint step away."""
+    model = arm(types)
+    plant = plant_of(model, np.ascontiguousarray(face(m)), center, opaque)
+    q_start, q_goal = model.q_reference.copy(), model.q_reference + step
+    s = [pixels(model.P, plant.M @ poe(model, q).T) for q in (q_start, q_goal)]
+    return Scene(plant, q_start, q_goal, s[0], s[1])
+
+
+def limits(n=6, **given) -> Limits:
+    """Limits that end a run only at its goal, or as given."""
+    values = {
+        "speed": np.full(n, math.inf),
+        "image_px": 1e-3,
+        "diverged_factor": 10.0,
+        "plateau_steps": 20,
+        "max_steps": 400,
+        "stop_at_joint_limit": False,
+        "stop_at_border": False,
+    }
+    return Limits(**{**values, **given})
+
+
+class Run:
+    """One compiled closed loop, and what it logged up to its last instant."""
+
+    def __init__(self, scene, law, gains=GAINS, bounds=None, noise=None, G=None, memory=None, task=None):
+        bounds = limits(len(scene.q_start)) if bounds is None else bounds
+        n, m = len(scene.q_start), len(scene.plant.M)
+        noise = np.zeros((bounds.max_steps + 1, 2, m, 2)) if noise is None else noise
+        self.state, self.full = new_state(n, m), new_log(n, m, bounds.max_steps, len(ERRORS))
+        if memory is not None:
+            self.state.memory.rotation[:] = memory
+        task = scene.task(G) if task is None else task
+        verdict, self.steps = run(
+            CODES[law], scene.seen(G), task, gains, bounds, scene.plant, noise, scene.q_start.copy(),
+            self.state, self.full,
+        )  # fmt: skip
+        self.verdict = VERDICTS[verdict]
+        self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-1]), self.full.events)
+        self.center = (self.log.H @ np.array(center_of(scene.plant.M, scene.plant.center)))[:, :3]
