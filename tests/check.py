@@ -38,7 +38,8 @@ def main(names: Sequence[str]) -> int:
         code = subprocess.run(
             command, cwd=ROOT, env={"OPENBLAS_NUM_THREADS": "1", **os.environ, **environment}, check=False
         ).returncode
-        print(f"── {name}: {'passed' if code == 0 else 'FAILED'} in {time.monotonic() - start:.0f} s\n", flush=True)
+        outcome = "passed" if code == 0 else "FAILED"
+        print(f"── {name}: {outcome} in {time.monotonic() - start:.0f} s\n", flush=True)
         if code != 0:
             failed.append(name)
     print("all checks passed" if not failed else f"failed: {', '.join(failed)}")

@@ -86,7 +86,7 @@ def _refined(
     readings: Readings, epipolar: Epipolar, frame: Frame, rng: np.random.Generator, expected: Expected
 ) -> Calibration:
     """Calibration by maximum likelihood, in its projective frame, with its covariance."""
-    solution = solve(readings, reference_joints(readings.q), epipolar, frame, rng, expected.agrees)
+    solution = solve(readings, reference_joints(readings.q), epipolar, frame, rng, expected)
     refusal = expected.refusal(solution.agreement)
     if refusal is not None:
         raise WorkFailed(refusal)

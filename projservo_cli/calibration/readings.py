@@ -100,6 +100,24 @@ def restrict(readings: Readings, keep: BoolArray) -> Readings:
     )
 
 
+def of_poses(readings: Readings, keep: BoolArray) -> Readings:
+    """Readings at some of the poses; the lists of poses and markers stay.
+
+    Parameters
+    ----------
+    readings : what was seen.
+    keep : (K,) poses that stay.
+    """
+    rows = keep[readings.pose_of]
+    return dataclasses.replace(
+        readings,
+        pose_of=readings.pose_of[rows],
+        marker_of=readings.marker_of[rows],
+        pixels=readings.pixels[:, rows],
+        seen=readings.seen[:, rows],
+    )
+
+
 def reference_pose(q: FloatArray) -> int | None:
     """Row from which every other differs in at most one joint, or None: the pose of single-joint trials.
 

@@ -151,7 +151,9 @@ def distance_spread(points: FloatArray, pairs: tuple[IntArray, IntArray, IntArra
     return float(np.median(np.concatenate(deviations))) if deviations else np.inf
 
 
-def metric_guesses(F: FloatArray, readings: Readings, frame: Frame, keep: int) -> list[Guess]:
+def metric_guesses(
+    F: FloatArray, readings: Readings, frame: Frame, keep: int, factor: float = 1.0
+) -> list[Guess]:
     """Guessed reconstructions of the pairs seen by both cameras, best first.
 
     The focal length is the one that keeps the distances between markers most constant over the
@@ -163,6 +165,7 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: Frame, keep: int) -
     readings : what was seen.
     frame : guessed principal points and sizes.
     keep : most guesses to return.
+    factor : multiplies the focal lengths found.
 
     Raises
     ------
@@ -189,7 +192,8 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: Frame, keep: int) -
     # A minimum at which the body changes its shape a lot more than at the best is none to start from.
     minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
-    return [_golden(guess, grid[i] - step, grid[i] + step, scan[i]) for i in minima]
+    best = [_golden(guess, grid[i] - step, grid[i] + step, scan[i]) for i in minima]
+    return best if factor == 1.0 else [guess(np.log(factor * b.focal)) for b in best]
 
 
 def _golden(guess: Callable[[float], Guess], low: float, high: float, best: Guess) -> Guess:

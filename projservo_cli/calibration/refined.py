@@ -1,6 +1,6 @@
 """Maximum likelihood from pixels and joint readings alone: starts, robust search, choice of the best."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,9 +9,9 @@ from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.body import Alignment, merge
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
-from projservo_cli.calibration.optimization import Problem, Weighting, fixed, minimize, prepare
-from projservo_cli.calibration.quality import LEAST_SIGMA, Agreement, require_body
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.optimization import Fit, Problem, Weighting, fixed, minimize, prepare
+from projservo_cli.calibration.quality import LEAST_SIGMA, Agreement, Expected, require_body
+from projservo_cli.calibration.readings import Readings, of_poses
 from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
 from projservo_cli.calibration.start import place, rotation_axes
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
@@ -23,7 +23,12 @@ CAUCHY = 2.385
 MASK_ROUNDS = 4
 # A start that leaves this many times the epipolar noise after the robust search is a wrong one.
 HOPELESS = 10.0
-FOCAL_MINIMA, AXIS_MINIMA = 3, 2
+# Passes over the starts until one is good enough: factors of the focal length that fits best, for a
+# wrong one often leads where the best does not. After a pass, poses whose residual is so many times
+# the median are left out of the next.
+FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
+SPOILT = 8.0
+FOCAL_MINIMA, AXIS_MINIMA = 3, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +46,9 @@ def solve(
     epipolar: Epipolar,
     frame: Frame,
     rng: np.random.Generator,
-    accept: Callable[[Agreement], bool],
+    expected: Expected,
 ) -> Solution:
-    """Best fit over the starts; the first that ``accept`` approves ends the search.
+    """Best fit over the starts; the first that leaves nothing but the expected noise ends the search.
 
     Parameters
     ----------
@@ -52,7 +57,7 @@ def solve(
     epipolar : epipolar geometry of the rig.
     frame : guessed image centres and sizes.
     rng : draws starts.
-    accept : whether a solution needs no rival.
+    expected : noise to measure fits by.
 
     Raises
     ------
@@ -62,14 +67,31 @@ def solve(
     problem = prepare(readings, q_reference)
     hopeless = HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA)
     best: Solution | None = None
-    for scene in starts(problem, epipolar, frame, rng):
-        found = robust_fit(problem, scene, hopeless)
-        if found is None:
-            continue
-        if accept(found.agreement):
-            return found
-        if best is None or _typical(found) < _typical(best):
-            best = found
+    trusted = np.ones(len(readings.q), dtype=bool)
+    for factors in FOCAL_FACTORS:
+        levels: list[float] = []
+        usable = of_poses(readings, trusted)
+        for scene in starts(problem, usable, epipolar, frame, rng, factors):
+            searched = robust_search(problem, scene, trusted)
+            level = float(np.median(_distances(searched.residual, usable_rows(problem, trusted))))
+            # Different starts that end at one place need not be followed to the end twice.
+            if any(abs(level - other) < 1e-3 * other for other in levels):
+                continue
+            levels.append(level)
+            found = least_squares(problem, searched.scene, level / RAYLEIGH, hopeless)
+            if found is None:
+                continue
+            if expected.agrees(found.agreement):
+                return found
+            if best is None or _typical(found) < _typical(best):
+                best = found
+            if factors != FOCAL_FACTORS[0] and expected.refusal(best.agreement) is None:
+                return best
+        if best is not None:
+            if expected.refusal(best.agreement) is None:
+                return best
+            # Wrong joint readings spoil the start: once the rest is roughly explained they stand out.
+            trusted = _explained(best)
     if best is None:
         raise WorkFailed(
             "no start of the adjustment puts all points in front of both cameras: check that rows of one "
@@ -78,26 +100,57 @@ def solve(
     return best
 
 
+def usable_rows(problem: Problem, trusted: BoolArray) -> BoolArray:
+    """Readings (2, N) seen at trusted poses (K,)."""
+    result: BoolArray = problem.readings.seen & trusted[problem.readings.pose_of]
+    return result
+
+
+def _distances(residual: FloatArray, mask: BoolArray) -> FloatArray:
+    """Lengths of the residuals (2, N, 2) in a mask (2, N), px."""
+    result: FloatArray = np.linalg.norm(residual[mask], axis=1)
+    return result
+
+
+def _explained(solution: Solution) -> BoolArray:
+    """Poses (K,) whose median residual is within some times that of all."""
+    readings = solution.problem.readings
+    distance = np.linalg.norm(solution.agreement.residual, axis=2)
+    limit = SPOILT * _typical(solution)
+    result = np.ones(len(readings.q), dtype=bool)
+    for k in np.unique(readings.pose_of):
+        here = readings.pose_of == k
+        result[k] = np.median(distance[:, here][readings.seen[:, here]]) <= limit
+    return result
+
+
 def _typical(solution: Solution) -> float:
     """Median residual over all readings seen, outliers included, px."""
-    distance = np.linalg.norm(solution.agreement.residual, axis=2)
-    return float(np.median(distance[solution.problem.readings.seen]))
+    return float(np.median(_distances(solution.agreement.residual, solution.problem.readings.seen)))
 
 
-def starts(problem: Problem, epipolar: Epipolar, frame: Frame, rng: np.random.Generator) -> Iterator[Scene]:
+def starts(
+    problem: Problem,
+    readings: Readings,
+    epipolar: Epipolar,
+    frame: Frame,
+    rng: np.random.Generator,
+    factors: tuple[float, ...],
+) -> Iterator[Scene]:
     """Scenes to start from, most promising first: focal lengths, and axes for each.
 
-    Parameters are those of ``solve``.
+    Parameters are those of ``solve``; ``readings`` may be those of the problem at some of its poses,
+    and ``factors`` multiply the focal lengths that fit best.
     """
-    readings = problem.readings
-    for guess in metric_guesses(epipolar.F, readings, frame, FOCAL_MINIMA):
-        alignment = _merged(guess, readings)
-        require_body(alignment.body)
-        for w in rotation_axes(alignment, problem.q, readings.prismatic, rng, AXIS_MINIMA):
-            screws = place(w, guess.points, readings, problem.q)
-            M = np.hstack([screws.body, np.ones((len(screws.body), 1))])
-            if np.isfinite(screws.H_hat).all() and np.isfinite(M).all():
-                yield Scene(guess.P, screws.H_hat, M)
+    for factor in factors:
+        for guess in metric_guesses(epipolar.F, readings, frame, FOCAL_MINIMA, factor):
+            alignment = _merged(guess, readings)
+            require_body(alignment.body)
+            for w in rotation_axes(alignment, problem.q, readings.prismatic, rng, AXIS_MINIMA):
+                screws = place(w, guess.points, readings, problem.q)
+                M = np.hstack([screws.body, np.ones((len(screws.body), 1))])
+                if np.isfinite(screws.H_hat).all() and np.isfinite(M).all():
+                    yield Scene(guess.P, screws.H_hat, M)
 
 
 def _merged(guess: Guess, readings: Readings) -> Alignment:
@@ -121,42 +174,66 @@ def cauchy(seen: BoolArray) -> Weighting:
     return weighting
 
 
-def robust_fit(problem: Problem, scene: Scene, hopeless: float = np.inf) -> Solution | None:
-    """Screws alone, then everything under a Cauchy loss, then least squares of the readings within 5σ.
+def robust_search(problem: Problem, scene: Scene, trusted: BoolArray) -> Fit:
+    """Screws alone, then everything, under a Cauchy loss over the trusted poses (K,).
 
     Parameters
     ----------
     problem : what to explain.
     scene : start.
-    hopeless : robust noise after the Cauchy loss, px, beyond which least squares is not worth its time.
+    trusted : (K,) poses that count.
+    """
+    weighting = cauchy(usable_rows(problem, trusted))
+    scene = minimize(problem, scene, weighting, cameras=False, most=20).scene
+    return minimize(problem, scene, weighting, most=100)
+
+
+def least_squares(problem: Problem, scene: Scene, sigma: float, hopeless: float) -> Solution | None:
+    """Least squares of the readings within 5σ, in rounds until they no longer change.
+
+    Parameters
+    ----------
+    problem : what to explain.
+    scene : start.
+    sigma : robust noise at the start, px.
+    hopeless : noise beyond which least squares is not worth its time, px.
 
     Returns
     -------
     None where the fit does not put the points in front of both cameras.
     """
-    seen = problem.readings.seen
-    scene = minimize(problem, scene, cauchy(seen), cameras=False, most=20).scene
-    fit = minimize(problem, scene, cauchy(seen), most=100)
-    distance = np.linalg.norm(fit.residual, axis=2)
-    sigma = max(float(np.median(distance[seen])) / RAYLEIGH, 1e-9)
-    used = seen & (distance <= OUTLIER * sigma)
+    residual = problem.residual(scene)
     if sigma > hopeless:
-        dof = degrees_of_freedom(problem, fit.scene, seen)
-        return Solution(problem, fit.scene, Agreement(fit.residual, seen, dof)) if dof > 0 else None
+        seen = problem.readings.seen
+        dof = degrees_of_freedom(problem, scene, seen)
+        return Solution(problem, scene, Agreement(residual, seen, dof)) if dof > 0 else None
+    used = _within(problem, residual, OUTLIER * max(sigma, 1e-9))
     for _ in range(MASK_ROUNDS):
-        fit = minimize(problem, fit.scene, fixed(used.astype(np.float64)))
-        dof = degrees_of_freedom(problem, fit.scene, used)
+        fit = minimize(problem, scene, fixed(used.astype(np.float64)))
+        scene = fit.scene
+        dof = degrees_of_freedom(problem, scene, used)
         if dof <= 0:
             return None
         sigma = max(float(np.sqrt(fit.cost / dof)), 1e-9)
-        before, used = used, seen & (np.linalg.norm(fit.residual, axis=2) <= OUTLIER * sigma)
+        before, used = used, _within(problem, fit.residual, OUTLIER * sigma)
         if np.array_equal(before, used):
             break
     used = before
-    _, depth = adjustment.predict_pixels(fit.scene, problem.readings, problem.q)
+    _, depth = adjustment.predict_pixels(scene, problem.readings, problem.q)
     if not (np.sign(depth) == np.sign(depth.sum(axis=1))[:, None])[used].all():
         return None
-    return Solution(problem, fit.scene, Agreement(fit.residual, used, dof))
+    return Solution(problem, scene, Agreement(fit.residual, used, dof))
+
+
+def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:
+    """Readings (2, N) within a limit, px, at poses where at least half of those seen are."""
+    readings = problem.readings
+    good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
+    K = len(readings.q)
+    seen_at = np.bincount(readings.pose_of, readings.seen.sum(axis=0), K)
+    good_at = np.bincount(readings.pose_of, good.sum(axis=0), K)
+    result: BoolArray = good & (good_at >= 0.5 * seen_at)[readings.pose_of]
+    return result
 
 
 def degrees_of_freedom(problem: Problem, scene: Scene, used: BoolArray) -> int:

@@ -11,6 +11,8 @@ from projservo_cli.records import BoolArray, FloatArray
 
 STARTS = 20
 ROTATION_STEPS = 60
+# Minima with so many times the least loss are not worth a try: they do not explain the rotations.
+UNLIKELY = 4.0
 # Pull of axis points towards the body, in units of the typical equation: keeps the axes of nearly
 # parallel joints, whose places are hardly determined, from running away.
 RIDGE = 0.03
@@ -161,7 +163,7 @@ def rotation_axes(
     w, loss = _fit_axes(w, R, q, prismatic)
     order = np.argsort(loss)
     kept: list[FloatArray] = []
-    for s in order:
+    for s in order[loss[order] <= UNLIKELY * loss[order[0]] + 1e-9]:
         same = [np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < 0.02 for other in kept]
         if not any(same):
             kept.append(w[s])

@@ -54,7 +54,7 @@ FIGURES = (
         "fig02_visibility",
         "Where the face changes visibility, and both senses of the rotation onto the plane",
         "Fig. 2, section 4.2",
-        7.0,
+        7.4,
         visibility.data,
         visibility.draw,
     ),

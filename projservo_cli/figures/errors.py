@@ -110,6 +110,7 @@ def draw_three(data: Data, figure: "Figure") -> None:
     """Above τ and what separates it from the truth, below the angles and their differences."""
     axes = figure.subplots(2, 2, sharex=True)
     t, t_metric = data["t_s"], data["t_s_metric"]
+    t_common = max(t, t_metric, key=len)
     translation: list[tuple[str, FloatArray, FloatArray, dict[str, Any]]] = [
         (r"true distance", t, data["distance"], {"color": style.SKY, "linewidth": 3.2}),
         (r"$\tau$, scale fixed through $a_\infty$", t, data["tau_affine"], {"color": style.BLACK}),
@@ -143,7 +144,7 @@ def draw_three(data: Data, figure: "Figure") -> None:
         )
         for kind, line in (("calibrated", "-"), ("true", (0, (1, 1.2)))):
             difference = data[f"{name}_difference_deg_{kind}"]
-            axes[1, 1].plot(t[: len(difference)], difference, color=color, linestyle=line)
+            axes[1, 1].plot(t_common[: len(difference)], difference, color=color, linestyle=line)
     _floor(axes[0, 1], 1e-4)
     _floor(axes[1, 1], 1e-15)
     _label_three(axes)

@@ -40,6 +40,7 @@ def draw(data: Data, figure: "Figure") -> None:
         )
         if len(chosen)
     ]
+    figure.set_figheight(figure.get_figheight() * (0.25 + 0.75 * len(kinds)))
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
     limit = float(data["step_limit_deg"])
     for column, (name, title) in enumerate((("free", "no limit"), ("limited", f"{limit:g}° per step"))):

@@ -99,7 +99,7 @@ def draw(data: Data, figure: "Figure") -> None:
         image.plot(*faces[:, k].T, color=style.GREY, linewidth=0.6)
     shown = np.unique(np.linspace(0, len(sigma) - 1, FACES).round().astype(int))
     for j in shown:
-        color = colormaps["cividis"](0.92 * sigma[j])
+        color = colormaps["cividis"](0.82 * sigma[j])
         ends = j in (shown[0], shown[-1])
         style.face(image, faces[j], {"color": color, "linewidth": 1.8 if ends else 1.0})
     style.frame_pixels(image, faces)

@@ -123,7 +123,7 @@ def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
     extent = np.stack([low - pad, high + pad], axis=1)
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
-        getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 6)
+        getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
         getattr(axes, f"{name}axis").set_major_locator(_locator(0.25 if b - a < 0.75 else 0.5))
     axes.tick_params(pad=0)
     towards = rig - points.mean(axis=0)

@@ -193,9 +193,9 @@ def _power(value: float, position: int | None = None) -> str:
     return "10" + str(exponent).translate(SUPERSCRIPTS)
 
 
-def signed(value: float) -> str:
-    """Angle with one decimal and a typographic minus."""
-    return f"{value:.1f}".replace("-", "\N{MINUS SIGN}")
+def signed(value: float, decimals: int = 1) -> str:
+    """Number with a typographic minus."""
+    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def closed(polygon: FloatArray) -> FloatArray:

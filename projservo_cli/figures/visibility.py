@@ -110,6 +110,9 @@ def _angle(axes: "Axes", data: Data, view: int) -> None:
     zeros = zeros[(zeros >= low) & (zeros <= high)]
     axes.plot(zeros, np.zeros_like(zeros), "D", color=style.BLACK, fillstyle="none")
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
+    changes = " and ".join(f"{style.signed(angle)}°" for angle in data["theta_0_deg"][view])
+    known = np.isfinite(data["theta_0_deg"][view]).all()
+    axes.set_title(rf"$\theta_0^\pm$ = {changes}" if known else r"visibility never changes")
     axes.set_xlabel(r"$\theta_r$ (deg)")
     axes.set_ylabel("margin $a\\cdot O$\n(start = 1)")
 
@@ -121,6 +124,9 @@ def _translation(axes: "Axes", data: Data, view: int) -> None:
     axes.plot([1.0], np.interp([1.0], share, margin), "s", color=style.BLACK)
     axes.plot(data["tau_0_share"][view : view + 1], [0.0], "D", color=style.BLACK, fillstyle="none")
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
+    tau_0 = data["tau_0_share"][view]
+    known = np.isfinite(tau_0)
+    axes.set_title(rf"$\tau_0$ = {style.signed(tau_0, 2)} $\tau$" if known else r"visibility never changes")
     axes.set_xlim(share[0], share[-1])
     axes.set_xlabel(r"translation as share of $\tau$ (1)")
     axes.set_ylabel("margin $a\\cdot O$\n(start = 1)")

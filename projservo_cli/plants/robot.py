@@ -161,7 +161,7 @@ def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
 def inverse_kinematics(robot: Robot, goal: FloatArray, q_start: FloatArray) -> FloatArray:
     """Joints within the limits that put the tool at a pose, as near to the start as found.
 
-    Damped Newton steps on the pose from the start and from 60 seeded places within the limits; the
+    Damped Newton steps on the pose from the start and from 30 seeded places within the limits; the
     solution with the least joint motion wins.
 
     Parameters
@@ -179,7 +179,7 @@ def inverse_kinematics(robot: Robot, goal: FloatArray, q_start: FloatArray) -> F
     span_upper = np.minimum(robot.upper, q_start + 2 * math.pi)
     best: FloatArray | None = None
     nearest = math.inf
-    for trial in range(61):
+    for trial in range(31):
         q = q_start if trial == 0 else rng.uniform(span_lower, span_upper)
         found = _newton(robot, goal, q)
         if found is None:
@@ -202,7 +202,7 @@ def inverse_kinematics(robot: Robot, goal: FloatArray, q_start: FloatArray) -> F
 def _newton(robot: Robot, goal: FloatArray, q: FloatArray) -> FloatArray | None:
     """Damped Newton steps to a pose; None where they do not arrive."""
     model = robot.model(np.zeros((2, 3, 4)))
-    for _ in range(100):
+    for _ in range(40):
         pose = forward_kinematics(model, q) @ robot.base_tool
         gap = goal @ np.linalg.inv(pose)
         error = np.r_[Rotation.from_matrix(gap[:3, :3]).as_rotvec(), goal[:3, 3] - pose[:3, 3]]

@@ -117,33 +117,34 @@ def plan_task(
             "the joint motion of the task is not unique at the start: the robot is near a singularity "
             "or moves the face in fewer than six ways"
         )
+    note = ""
     if math.pi - abs(parts.theta_p) < HALF_TURN_BAND:
         forward_sense = state.q_hat[2].copy()
-        state.memory.rotation[1] = half_turn_sense(model, task, state.A, q_start, forward_sense, bounds)
+        state.memory.rotation[1], note = half_turn_sense(model, task, state.A, q_start, forward_sense, bounds)
         parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     amplitudes = (parts.tau, parts.theta_r, parts.theta_p)
     sigma = np.linspace(0.0, 1.0, samples)
-    mu = profile_shares(profile, sigma)
+    tau_0, theta_0 = _changes(np.array(parts.a), H_hat, task)
+    tau_limit = min((delta * t for t in tau_0 if t > 0.0), default=math.inf)
+    mu = profile_shares(profile, sigma, tau_limit / parts.tau if parts.tau > 0.0 else 1.0)
     H_d = np.array([trajectory_displacement(H_hat, amplitudes, row) for row in mu])
     images = np.array([project(model.P, state.A @ H.T) for H in H_d])
     a = np.array(parts.a)
     carried = np.array([np.linalg.solve(H.T, a) for H in H_d])
     margins = margin(carried, task.O, task.visible)
     margins = margins / margins[0]
-    tau_0, theta_0 = _changes(a, H_hat, task)
-    limits = [delta * t for t in tau_0 if t > 0.0]
     sense, sense_margin = _senses(parts, task)
     feasible, reason = _verdict(profile, sigma, margins)
     return Plan(
         profile=profile,
         feasible=feasible,
-        reason=reason,
+        reason=reason + note,
         tau=parts.tau,
         theta_r=parts.theta_r,
         theta_p=parts.theta_p,
         theta_s=composed_angle(parts.theta_r, parts.theta_p)[0],
-        tau_limit=min(limits, default=math.inf),
+        tau_limit=tau_limit,
         sigma=sigma,
         mu=mu,
         H_d=H_d,
@@ -178,7 +179,7 @@ def half_turn_sense(
     q_start: FloatArray,
     q_hat_p: FloatArray,
     bounds: tuple[FloatArray, FloatArray],
-) -> FloatArray:
+) -> tuple[FloatArray, str]:
     """Sense of a half turn within the plane, as the joint motion ±q̂_p that begins it.
 
     Either sense reaches the goal, but they take the joints elsewhere. Both are rehearsed on the
@@ -189,8 +190,15 @@ def half_turn_sense(
     ----------
     A : (m, 4) face at the start.
     bounds : (n,) lower and upper joint limits, rad or m.
+
+    Returns
+    -------
+    The joint motion, and what to say of it where neither sense arrived.
     """
     n = len(q_start)
+    # Cameras have no sign of their own; the plant tells front from back by positive depths.
+    depth = model.P[:, 2] @ A.mean(axis=0)
+    model = model._replace(P=model.P * np.sign(depth)[:, None, None])
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
     endless = np.full(2, np.inf)
     plant = Plant(
@@ -207,7 +215,9 @@ def half_turn_sense(
             CODES["direct_two"], model, task, REHEARSAL, limits, plant, noise, q_start.copy(), state, log
         )
         outcomes.append((verdict != CONVERGED, log.events[1] >= 0.0, steps, -sign))
-    return -min(outcomes)[3] * q_hat_p
+    best = min(outcomes)
+    note = "; neither sense of the half turn arrived when rehearsed" if best[0] else ""
+    return -best[3] * q_hat_p, note
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:

@@ -239,7 +239,7 @@ def _require_limits(robot: Robot, q: FloatArray, where: str) -> None:
         if not robot.lower[i] <= value <= robot.upper[i]:
             raise WorkFailed(
                 f"{where}: joint {i + 1} would be at {value:.4g}, outside its limits "
-                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose other joints or wider limits"
+                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose others or wider limits"
             )
 
 

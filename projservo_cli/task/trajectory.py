@@ -10,17 +10,19 @@ PLATEAU = 0.5
 PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "planar_first")
 
 
-def profile_shares(profile: str, sigma: FloatArray) -> FloatArray:
+def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.0) -> FloatArray:
     """Shares μ_t, μ_r, μ_p of the parts along the path, [RH00] eq. (18) and section 4.3.
 
     The exponential profile (1 − exp(−kσ)) / (1 − exp(−k)), k = 5, is the paper's 1 − exp(−σ/t_*)
     stretched to reach 1. In the profiles with a part first, that part is done in the first half of
-    the path and the others stay flat until then.
+    the path and the others stay flat until then; a translation first goes no farther than visibility
+    lets the unturned face go, and does the rest while the face turns.
 
     Parameters
     ----------
     profile : one of ``PROFILES``.
     sigma : (k,) path parameter in [0, 1].
+    pure_translation : most share of the translation before any rotation, δ τ_0 / τ.
 
     Returns
     -------
@@ -38,10 +40,11 @@ def profile_shares(profile: str, sigma: FloatArray) -> FloatArray:
         return np.stack([share, share, share], axis=1)
     early = np.minimum(sigma / PLATEAU, 1.0)
     late = np.maximum((sigma - PLATEAU) / (1.0 - PLATEAU), 0.0)
+    share = min(1.0, pure_translation)
     t, r, p = {
         "linear": (sigma, sigma, sigma),
         "rotation_first": (late, early, sigma),
-        "translation_first": (early, late, sigma),
+        "translation_first": (share * early + (1.0 - share) * late, late, sigma),
         "planar_first": (late, late, early),
     }[profile]
     return np.stack([t, r, p], axis=1)

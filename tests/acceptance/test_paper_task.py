@@ -174,3 +174,25 @@ def test_drift_falls_with_the_gain_and_with_the_limit(arm: str, law: str) -> Non
     # Where the limit bends only the first of 541 steps it moves the phase at which the peak is sampled,
     # which is worth 0.03 %.
     assert np.all(np.array(limited) <= np.array(free) * (1 + 1e-3)), (limited, free)
+
+
+def planned(arm: str, profile: str) -> Plan:
+    config = configured(arm, f"trajectory.profile={profile}", "noise.calibration_px=0.0")
+    calibration, _ = calibrated(arm, 1)
+    return plan.run(config, calibration)
+
+
+def test_a_rotation_first_that_turns_the_face_away_is_named_infeasible() -> None:
+    infeasible = planned("ur5", "rotation_first")
+    assert not infeasible.feasible
+    assert "rotation_first" in infeasible.reason
+    assert "right" in infeasible.reason
+    assert infeasible.margin.min() < 0.0
+
+
+def test_a_translation_first_stops_short_of_where_the_face_is_lost() -> None:
+    # On this task the whole translation, unturned, would pass τ_0 of the left camera.
+    first = planned("ur5", "translation_first")
+    assert first.tau > first.tau_0.min() > 0.0
+    assert first.feasible
+    assert first.margin.min() == pytest.approx(1.0 - 0.9, abs=1e-9)  # delta = 0.9 of the way to τ_0

@@ -211,19 +211,19 @@ def test_visibility_limits_the_translation():
 
 
 def test_deviation_from_the_line():
-    """Against the joints interpolated in plain NumPy, at the samples and at 20 points between."""
+    """Against the joints interpolated in plain NumPy, at the samples and at 10 points between."""
     sc = scene()
-    run = Run(sc, "direct_three", bounds=limits(max_steps=8))
+    run = Run(sc, "direct_three", bounds=limits(max_steps=5))
     A_c = sc.plant.M.mean(axis=0)
     start, goal = (poe(sc.model, q) @ A_c for q in (sc.q_start, sc.q_goal))
-    between, at_samples = path_deviation(sc.plant, run.log, run.steps, GAINS.period, start, goal, 20)
+    between, at_samples = path_deviation(sc.plant, run.log, run.steps, GAINS.period, start, goal, 10)
     way = (goal - start)[:3] / np.linalg.norm((goal - start)[:3])
 
     def distance(q):
         off = (poe(sc.model, q) @ A_c - start)[:3]
         return np.linalg.norm(off - (off @ way) * way)
 
-    steps = [run.log.q[k] + t / 20 * (run.log.q[k + 1] - run.log.q[k]) for k in range(8) for t in range(21)]
+    steps = [run.log.q[k] + t / 10 * (run.log.q[k + 1] - run.log.q[k]) for k in range(5) for t in range(11)]
     assert between == pytest.approx(max(distance(q) for q in steps), abs=1e-12)
     assert at_samples == pytest.approx(max(distance(q) for q in run.log.q), abs=1e-12)
     assert between >= at_samples > 1e-4

@@ -191,8 +191,9 @@ def test_translation_is_limited_by_the_camera_that_loses_sight_first():
 
 def arc_margins(a, H_hat, theta, task):
     """Least margin of each camera along an arc, over its start's, by brute force."""
-    steps = [carried(a, expm(t * H_hat)) for t in np.linspace(0, theta, 400)]
-    values = np.array(steps) @ task.O.T * task.visible
+    t = np.linspace(0, theta, 400)[:, None, None]
+    back = np.eye(4) - np.sin(t) * H_hat + (1 - np.cos(t)) * (H_hat @ H_hat)
+    values = a @ back @ task.O.T * task.visible
     return values.min(axis=0) / np.abs(values[0])
 
 
@@ -219,7 +220,7 @@ def test_sense_of_the_turn_by_brute_force():
     Near half a turn both senses count as equal, so that noise cannot make the motion chatter.
     """
     other_taken = differ = 0
-    for seed in range(60):
+    for seed in range(40):
         a, a_t, H_hat, theta, task = sense_case(seed)
         result = chosen(a, a_t, H_hat, theta, task)
         assert result in (theta, theta - 2 * math.pi)

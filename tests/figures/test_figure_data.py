@@ -1,0 +1,195 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli.figures import drift, errors, images, joints, partition, planned, scene, visibility
+from projservo_cli.geometry.kinematics import project
+from projservo_cli.plants.robot import camera_center, look_at_camera
+from projservo_cli.records import PRISMATIC, REVOLUTE
+from tests.figures.cases import GAINS, case
+from tests.samples import prismatic, revolute
+
+# Images of exact data differ by round-off in the projective frame, px.
+PX = 1e-7
+
+
+@pytest.fixture(params=["paper", "ur5"])
+def material(request):
+    return case(request.param)[2]
+
+
+def test_partition_leads_from_the_face_to_its_goal(material):
+    data = partition.data(material)
+    np.testing.assert_allclose(data["within_plane"][0], data["A"], atol=PX)
+    np.testing.assert_allclose(data["within_plane"][-1], data["A_r"], atol=PX)
+    np.testing.assert_allclose(data["onto_plane"][0], data["A_r"], atol=PX)
+    np.testing.assert_allclose(data["onto_plane"][-1], data["A_t"], atol=PX)
+    order = material.plant.order
+    np.testing.assert_allclose(
+        np.sort(data["A_star"], axis=0), np.sort(material.plan.s_star[0, order], axis=0), atol=PX
+    )
+
+
+def test_points_on_the_axis_of_the_rotation_stay(material):
+    data = partition.data(material)
+    plan = material.plan
+    middle = project(material.calibrated.P[:1], plan.A_c[None])[0, 0]
+    along = data["axis"][1] - data["axis"][0]
+    off = middle - data["axis"][0]
+    assert abs(along[0] * off[1] - along[1] * off[0]) < 1e-6 * np.linalg.norm(along) ** 2
+
+
+def test_axis_of_a_motion_without_axis_is_the_centre():
+    A = np.c_[np.eye(3), np.ones(3)]
+    A_c = A.mean(axis=0)
+    H_hat = revolute(A_c[:3], [0, 0, 1])
+    points = partition._axis(H_hat, A_c, A_c[None] * np.ones((3, 1)))
+    np.testing.assert_allclose(points, [A_c, A_c], atol=1e-15)
+
+
+def test_margins_begin_at_one_and_vanish_where_visibility_changes(material):
+    data = visibility.data(material)
+    np.testing.assert_allclose(data["theta_margin"][:, 0], 1.0, rtol=1e-12)
+    for view in range(2):
+        at_zero = np.interp(0.0, data["tau_share"], data["tau_margin"][:, view])
+        assert at_zero == pytest.approx(1.0, abs=1e-9)
+        share = data["tau_0_share"][view]
+        if data["tau_share"][0] <= share <= data["tau_share"][-1]:
+            zero = np.interp(share, data["tau_share"], data["tau_margin"][:, view])
+            assert zero == pytest.approx(0.0, abs=1e-9)  # the margin is linear in τ
+        for theta in np.radians(data["theta_0_deg"][view]):
+            plan = material.plan
+            value = visibility._margins(plan.a, plan.H_hat[1], plan.optical_center, np.array([theta]))
+            start = plan.a @ plan.optical_center[view]
+            assert value[0, view] / start == pytest.approx(0.0, abs=1e-9)
+
+
+def test_both_senses_of_the_rotation_end_at_the_same_face(material):
+    ends = visibility.data(material)["images"][:, -1]
+    np.testing.assert_allclose(ends[0], ends[1], atol=PX)
+
+
+def test_middle_camera_of_two_equal_cameras_is_the_camera():
+    P = look_at_camera([1100, 1100], [639.5, 511.5], [1.0, -2.0, 0.5], [0.2, 0.1, 0.4], [0, 0, 1])
+    np.testing.assert_allclose(planned.middle_camera(np.stack([P, P]), np.array([1280, 1024])), P, atol=1e-9)
+
+
+def test_middle_camera_sits_between_the_two(material):
+    P = material.plant.model.P
+    camera = planned.middle_camera(P, material.plant.image_size)
+    expected = 0.5 * (camera_center(P[0]) + camera_center(P[1]))
+    np.testing.assert_allclose(camera_center(camera), expected, atol=1e-12)
+
+
+def test_rendered_plan_begins_and_ends_at_the_true_faces(material):
+    config_material = material
+    camera = planned.middle_camera(material.plant.model.P, material.plant.image_size)
+    trace = material.traces["direct_three"]
+    inverse = np.linalg.inv(material.robot.base_tool)
+    for data in (planned.data_linear(config_material), planned.data_steep(config_material)):
+        for j, pose in ((0, trace.pose[0]), (-1, trace.goal_pose)):
+            m = material.plant.M[material.plant.order] @ (pose @ inverse).T @ camera.T
+            rendered = data["faces"][j]
+            gaps = np.linalg.norm(rendered[:, None] - m[:, :2] / m[:, 2:], axis=2)
+            assert gaps.min(axis=1).max() < 1e-6
+
+
+def test_steep_profile_does_the_translation_early_and_the_same_rotations(material):
+    data = planned.data_steep(material)
+    early = data["sigma"] >= planned.STEEP
+    assert (data["mu"][early, 0] == 1.0).all()
+    np.testing.assert_array_equal(data["mu"][:, 1], data["sigma"])
+    np.testing.assert_allclose(data["margin"][0], 1.0, rtol=1e-12)
+
+
+def test_skeleton_passes_the_axes_of_revolute_joints():
+    H_hat = np.array([revolute([0, 0, 0], [0, 0, 1]), prismatic([1, 0, 0]), revolute([2, 5, 3], [0, 1, 0])])
+    kinds = np.array([REVOLUTE, PRISMATIC, REVOLUTE])
+    points = scene.skeleton(H_hat, kinds, np.array([4.0, 0, 3]))
+    np.testing.assert_allclose(points, [[0, 0, 0], [0, 0, 0], [2, 0, 3], [4, 0, 3]], atol=1e-15)
+
+
+def test_corners_of_a_viewing_pyramid_are_seen_at_the_corners_of_the_image(material):
+    size = material.plant.image_size
+    for P in material.plant.model.P:
+        corners = scene.pyramid(P, size, 0.2)[1:]
+        m = np.c_[corners, np.ones(4)] @ P.T
+        expected = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
+        np.testing.assert_allclose(m[:, :2] / m[:, 2:], expected, atol=1e-8)
+        depth = m[:, 2] / np.linalg.norm(P[2, :3])
+        np.testing.assert_allclose(depth, 0.2, rtol=1e-12)
+
+
+def test_scene_without_a_known_goal_has_none():
+    material = case()[2]
+    unknown = {
+        law: dataclasses.replace(trace, goal_pose=np.full((4, 4), np.nan))
+        for law, trace in material.traces.items()
+    }
+    data = scene.data(dataclasses.replace(material, traces=unknown))
+    assert "face_goal" not in data
+    assert "face_goal" in scene.data(material)
+
+
+def test_scene_shows_the_tool_of_the_robot_at_the_face(material):
+    data = scene.data(material)
+    trace = material.traces["direct_three"]
+    np.testing.assert_allclose(data["robot"][-1], trace.pose[0, :3, 3], atol=1e-12)
+    np.testing.assert_allclose(data["line"][0], trace.center[0], atol=1e-12)
+    np.testing.assert_allclose(data["line"][1], material.goal_center(trace), atol=1e-12)
+
+
+def test_drift_table_holds_each_run_at_its_place():
+    studies = case()[2].studies
+    table = drift.table(studies)
+    assert table.shape == (2, 2, 2, len(GAINS))
+    trace = studies.sweep["direct_two", "calibrated", True, GAINS[0]]
+    assert table[1, 1, 1, 0] == trace.center_deviation_mm
+    assert drift.table(studies, at_samples=True)[1, 1, 1, 0] == trace.center_deviation_at_samples_mm
+    assert not drift.converged(studies).any()  # four steps are too few
+
+
+def test_translation_error_is_normalised_to_100():
+    np.testing.assert_allclose(errors.percent(np.array([4.0, 2.0, 1.0])), [100, 50, 25])
+    assert np.isnan(errors.percent(np.zeros(3))).all()
+
+
+def test_metric_scale_of_the_translation_is_the_true_distance():
+    data = errors.data_three(case()[2])
+    # four steps: the centre has hardly left its line, whose direction fixes the scale of a_inf
+    np.testing.assert_allclose(data["tau_affine"], data["distance"], rtol=5e-3)
+    assert np.abs(data["tau"] - data["distance"]).max() > 1.0
+
+
+def test_projective_frame_changes_nothing():
+    data = errors.data_three(case()[2])
+    for name in ("theta_r", "theta_p"):
+        assert data[f"{name}_difference_deg_true"].max() < 1e-6
+
+
+def test_joint_steps_add_up_to_the_trajectory():
+    data = joints.data(case()[2])
+    for name in ("free", "limited"):
+        np.testing.assert_allclose(np.diff(data[f"q_{name}"], axis=0), data[f"step_{name}"], atol=1e-9)
+    assert np.abs(data["step_limited"]).max() <= data["step_limit_deg"] * (1 + 1e-12)
+
+
+def test_classical_paths_of_the_laws_that_were_run():
+    material = case()[2]
+    traces = {"stacked": material.traces["stacked"]}
+    data = images.data_classical(dataclasses.replace(material, traces=traces))
+    assert "s_stacked" in data
+    assert "s_blockwise" not in data
+    assert str(data["verdict_stacked"]) == "plateau, 4 steps" or "max steps" in str(data["verdict_stacked"])
+
+
+def test_image_errors_end_at_the_goal_by_definition():
+    material = case()[2]
+    trace = dataclasses.replace(
+        material.traces["direct_three"],
+        center=np.tile(material.goal_center(material.traces["stacked"]), (5, 1)),
+    )
+    data = images.data_errors(dataclasses.replace(material, traces={"direct_three": trace}))
+    np.testing.assert_allclose(data["center_e"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(data["e"], trace.s - trace.s_star)

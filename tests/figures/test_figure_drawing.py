@@ -1,0 +1,143 @@
+import hashlib
+
+import numpy as np
+import pytest
+
+from projservo_cli.figures import FIGURES, style
+from tests.figures.cases import case
+
+NAMES = [spec.name for spec in FIGURES]
+
+
+def drawn(spec, material):
+    with style.styled():
+        figure = style.new_figure(spec.height)
+        spec.draw(spec.data(material), figure)
+        style.arrange(figure)
+    return figure
+
+
+@pytest.fixture(scope="module", params=["paper", "stanford", pytest.param("ur5", marks=pytest.mark.volume)])
+def figures(request):
+    material = case(request.param)[2]
+    return {spec.name: drawn(spec, material) for spec in FIGURES}
+
+
+def drawn_texts(figure, monkeypatch):
+    """Every text that is really drawn, and where, in pixels; ticks beyond the limits are not."""
+    from matplotlib.text import Text
+
+    found = []
+    draw = Text.draw
+
+    def record(self, renderer, *args, **kwargs):
+        if self.get_visible() and self.get_text().strip():
+            found.append((self.get_text(), self.get_window_extent(renderer)))
+        return draw(self, renderer, *args, **kwargs)
+
+    monkeypatch.setattr(Text, "draw", record)
+    with style.styled():
+        figure.canvas.draw()
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_text_is_clipped_by_the_figure(figures, name, monkeypatch):
+    figure = figures[name]
+    found = drawn_texts(figure, monkeypatch)
+    assert len(found) > 5
+    for text, extent in found:
+        low, high = extent.get_points()
+        # half a pixel of anti-aliasing may stand over
+        assert (low >= -0.5).all(), f"{text!r} at {extent}"
+        assert (high <= figure.bbox.get_points()[1] + 0.5).all(), f"{text!r} at {extent}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_text_lies_on_another(figures, name, monkeypatch):
+    found = drawn_texts(figures[name], monkeypatch)
+    for i, (text, extent) in enumerate(found):
+        for other, place in found[:i]:
+            shared = extent.intersection(extent, place)
+            # boxes hold the leading of a line: a pixel or two in common is no touching ink
+            clash = shared is not None and min(shared.width, shared.height) > 2.5
+            assert not clash, f"{text!r} on {other!r}"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_legend_covers_no_axes(figures, name):
+    figure = figures[name]
+    legend = figure.legends[0].get_window_extent()
+    for axes in figure.axes:
+        if name != "fig03_scene":  # its axes fill the figure; what is drawn in them is tested below
+            assert not axes.get_window_extent().overlaps(legend)
+
+
+def test_scene_stands_above_its_legend(figures):
+    figure = figures["fig03_scene"]
+    axes = figure.axes[0]
+    extent = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
+    corners = np.array([*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)])
+    m = axes.get_proj() @ corners
+    shown = axes.transData.transform((m[:2] / m[3]).T)
+    assert shown[:, 1].min() >= figure.legends[0].get_window_extent().y1
+    assert (shown >= 0).all()
+    assert (shown <= figure.bbox.get_points()[1]).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_axes_have_units(figures, name):
+    for axes in figures[name].axes:
+        labels = [axes.get_xlabel(), axes.get_ylabel()]
+        if hasattr(axes, "get_zlabel"):
+            labels.append(axes.get_zlabel())
+        for label in labels:
+            assert not label or ("(" in label and ")" in label), label
+
+
+@pytest.mark.parametrize(
+    "name", [spec.name for spec in FIGURES if "classical" in spec.name or "three_two" in spec.name]
+)
+def test_pixels_are_square(figures, name):
+    for axes in figures[name].axes:
+        box = axes.get_window_extent()
+        du, dv = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
+        assert du / box.width == pytest.approx(dv / box.height, rel=1e-9)
+        assert axes.get_ylim()[0] > axes.get_ylim()[1]  # v points down
+
+
+@pytest.mark.parametrize("kind", style.FORMATS)
+def test_same_input_gives_the_same_bytes(tmp_path, kind):
+    material = case()[2]
+    spec = next(spec for spec in FIGURES if spec.name == "fig11_image_errors")
+    sums = []
+    for turn in range(2):
+        path = tmp_path / f"{turn}.{kind}"
+        figure = drawn(spec, material)
+        with style.styled():
+            style.save(figure, path, kind)
+        sums.append(hashlib.sha256(path.read_bytes()).hexdigest())
+    assert sums[0] == sums[1]
+
+
+def test_names_follow_the_numbers_of_the_paper():
+    assert [int(name[3:5]) for name in NAMES] == list(range(1, 13))
+
+
+def test_curves_differ_without_their_colour():
+    looks = [(str(style.curve(i)["linestyle"]), style.curve(i, marker=True)["marker"]) for i in range(6)]
+    assert len({line for line, _ in looks}) == 6
+    assert len({marker for _, marker in looks}) == 6
+
+
+def test_powers_of_ten_are_plain_text():
+    assert style._power(1e-12) == "10⁻¹²"
+    assert style._power(100.0) == "10²"
+
+
+def test_importing_figures_does_not_import_matplotlib():
+    import subprocess
+    import sys
+
+    code = "import sys, projservo_cli.figures; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,75 @@
+"""What the simulated plant shows: pixels, sides of the face, depths, and the object around it."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.plants.analytic import AnalyticPlant
+from projservo_cli.plants.plant import observe, rig_distance
+from tests.samples import displacement, poe
+from tests.scene import STEP, scene
+
+
+def observed(plant, H):
+    M, s, hidden = np.zeros_like(plant.M), np.zeros((2, len(plant.M), 2)), np.zeros(2)
+    in_front = observe(plant, as_mat(H), M, s, hidden)
+    return in_front, M, s, hidden
+
+
+@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
+def test_pixels_of_the_moved_face(types):
+    sc = scene(types=types)
+    H = poe(sc.model, sc.q_start + 0.5 * STEP)
+    in_front, M, s, hidden = observed(sc.plant, H)
+    assert in_front
+    assert pytest.approx(sc.plant.M @ H.T, abs=1e-13) == M
+    assert s == pytest.approx(sc.images(sc.q_start + 0.5 * STEP), abs=1e-9)
+    assert hidden.tolist() == [0.0, 0.0]
+
+
+def around_the_vertical(angle):
+    """Turn about the vertical through the middle of the sample face."""
+    middle = displacement([0, 0, 0], [0.02, -0.03, 1.4])
+    return middle @ displacement([0, angle, 0], [0, 0, 0]) @ np.linalg.inv(middle)
+
+
+@pytest.mark.parametrize("opaque", [False, True])
+def test_a_turning_face_hides_from_one_camera_before_the_other(opaque):
+    """By the signed volume of face and optical centre; an opaque face takes its markers along."""
+    plant = scene(opaque=opaque).plant
+    seen = set()
+    for angle in np.linspace(0, 2 * np.pi, 73):
+        _, M, s, hidden = observed(plant, around_the_vertical(angle))
+        normal = np.cross(M[1, :3] - M[0, :3], M[2, :3] - M[0, :3])
+        start = np.cross(*(plant.M[i, :3] - plant.M[0, :3] for i in (1, 2)))
+        sides = (plant.O[:, :3] - M[0, :3]) @ normal * ((plant.O[:, :3] - plant.M[0, :3]) @ start)
+        assert (hidden > 0).tolist() == (sides <= 0).tolist()
+        for view in range(2):
+            assert np.isnan(s[view]).all() == (opaque and hidden[view] > 0)
+        seen.add(tuple(hidden.tolist()))
+    assert seen == {(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (1.0, 1.0)}
+
+
+def test_a_marker_behind_a_camera_has_no_pixel():
+    plant = scene().plant
+    in_front, _, s, _ = observed(plant, displacement([0, 0, 0], [0, 0, -1.4]))
+    assert not in_front
+    assert np.isnan(s).any()
+
+
+def test_distance_is_from_the_middle_of_the_rig():
+    plant = scene().plant
+    assert rig_distance(plant, plant.M) == pytest.approx(np.linalg.norm(plant.M.mean(axis=0)[:3]))
+
+
+def test_the_plant_as_an_object():
+    sc = scene()
+    noise = np.arange(2 * 16, dtype=float).reshape(2, 2, 4, 2)
+    plant = AnalyticPlant(sc.plant, sc.q_start, noise)
+    assert plant.observe() == pytest.approx(sc.s_start + noise[0], abs=1e-9)
+    plant.command(0.5 * STEP, 0.04)
+    assert plant.joints() == pytest.approx(sc.q_start + 0.5 * STEP, abs=1e-15)
+    plant.joints()[:] = 7.0  # a reading is a copy
+    assert plant.observe() == pytest.approx(sc.images(sc.q_start + 0.5 * STEP) + noise[1], abs=1e-9)
+    assert plant.distance() == pytest.approx(rig_distance(sc.plant, plant.M), abs=0)
+    assert sc.q_start.tolist() == sc.model.q_reference.tolist()

@@ -1,0 +1,338 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from projservo_cli.config import to_yaml
+from projservo_cli.figures import FIGURES
+from projservo_cli.figures.material import DIRECT
+from projservo_cli.records import InputError, Report, WorkFailed
+from projservo_cli.stages import report, studies
+from projservo_cli.stages.claims import claims_of
+from projservo_cli.stages.claims.claim import listed
+from projservo_cli.stages.claims.control import decay_ranges
+from projservo_cli.stages.claims.drift import composition_claim
+from projservo_cli.store import Result, Run, load, save
+from tests.fake_records import fake
+from tests.figures.cases import GAINS, PERIODS_S, SHORT, case, config_of
+
+BY_NAME = {spec.name: spec for spec in FIGURES}
+
+
+def changed(material, **traces):
+    """The material with some traces replaced; None drops one."""
+    kept = {law: trace for law, trace in (material.traces | traces).items() if trace is not None}
+    return dataclasses.replace(material, traces=kept)
+
+
+def short(trace, steps):
+    """A trace cut after some steps."""
+    fields = {field.name: field.metadata.get("dims", ()) for field in dataclasses.fields(trace)}
+    cut = {
+        name: getattr(trace, name)[: steps + 1] for name, dims in fields.items() if dims[:1] == ("instant",)
+    }
+    cut |= {name: getattr(trace, name)[:steps] for name, dims in fields.items() if dims[:1] == ("step",)}
+    return dataclasses.replace(trace, steps=steps, verdict="diverged", **cut)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Studies of few gains and periods."""
+    monkeypatch.setattr(
+        report, "run_studies", lambda bench, progress: studies.run_studies(bench, GAINS, PERIODS_S)
+    )
+
+
+def stored(tmp_path, material, *overrides):
+    """A run file as the stages before leave it."""
+    from projservo_cli.records import Calibration
+
+    config = config_of("paper", f"stop.max_steps={SHORT}", *overrides)
+    model = material.calibrated
+    calibration = fake(
+        Calibration,
+        joint_types="RRRRRR",
+        P=model.P,
+        H_hat_0=model.H_hat_0,
+        q_reference=model.q_reference,
+        a_inf=model.a_inf,
+    )
+    results = {
+        "calibrate": Result("k", "", {}, {}, {"calibration": calibration}),
+        "plan": Result("k", "", {}, {}, {"": material.plan}),
+        **{f"servo/{law}": Result("k", "", {}, {}, {"": t}) for law, t in material.traces.items()},
+    }
+    return Run(tmp_path / "run.h5", to_yaml(config), results)
+
+
+@pytest.mark.usefixtures("few")
+def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatch):
+    specs = tuple(BY_NAME[name] for name in ("fig01_partition", "fig04_classical", "fig08_drift"))
+    monkeypatch.setattr(report, "FIGURES", specs)
+    material = changed(case()[2], stacked=None, blockwise=None, euclidean_points=None)
+    stale = tmp_path / "figures" / "fig04_classical.svg"
+    stale.parent.mkdir()
+    stale.write_text("of an earlier report")
+    (tmp_path / "figures" / "fig01_partition.pdf").write_text("of an earlier report")
+    steps = []
+    run = stored(tmp_path, material, "report.formats=[png]")
+    record = report.run(run, tmp_path, progress=lambda *step: steps.append(step))
+    assert not stale.exists()
+    assert not (tmp_path / "figures" / "fig01_partition.pdf").exists()
+    assert record.figures == ("figures/fig01_partition.png", "figures/fig08_drift.png")
+    for name in record.figures:
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    assert [entry["what"] for entry in record.left_out] == ["fig04_classical"]
+    assert steps[-1] == ("figures", 3, 3)
+    content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
+    assert content["claims"] == list(record.claims)
+    assert len(content["drift"]) == 2 * 2 * 2 * len(GAINS)
+    save(dataclasses.replace(run, results={**run.results, "report": Result("k", "", {}, {}, {"": record})}))
+    again = load(run.path).results["report"].records[""]
+    assert again.claims == record.claims
+    np.testing.assert_array_equal(again.drift_mm, record.drift_mm)
+
+
+def test_every_figure_is_supported_by_a_whole_run():
+    material = case()[2]
+    for spec in FIGURES:
+        assert report.lacking(spec, material) == ""
+        assert report.partly(spec, material) == ""
+
+
+@pytest.mark.parametrize("law", DIRECT)
+def test_a_figure_of_both_laws_needs_both(law):
+    material = changed(case()[2], **{law: None})
+    assert law in report.lacking(BY_NAME["fig07_three_two"], material)
+    assert report.lacking(BY_NAME["fig01_partition"], material) == ""
+
+
+def test_a_missing_classical_law_is_named_and_the_others_are_drawn():
+    material = changed(case()[2], blockwise=None)
+    spec = BY_NAME["fig04_classical"]
+    assert report.lacking(spec, material) == ""
+    assert "blockwise" in report.partly(spec, material)
+
+
+def test_a_run_without_a_step_has_nothing_to_show():
+    material = case()[2]
+    material = changed(material, direct_three=short(material.traces["direct_three"], 0))
+    assert "direct_three" in report.lacking(BY_NAME["fig11_image_errors"], material)
+
+
+def test_a_run_that_ended_after_three_steps_is_drawn(tmp_path, monkeypatch):
+    of_traces = tuple(spec for spec in FIGURES if spec.laws)
+    monkeypatch.setattr(report, "FIGURES", of_traces)
+    material = case()[2]
+    cut = {law: short(trace, 3) for law, trace in material.traces.items()}
+    material = changed(material, **cut)
+    left_out = []
+    written = report.draw_all(material, tmp_path, ("svg",), left_out)
+    assert len(written) == len(of_traces) >= 3
+    assert left_out == []
+    assert any(claim.claim.startswith("No self-occlusion") for claim in claims_of(material, None))
+
+
+def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, monkeypatch):
+    material = case()[2]
+
+    def unknown(trace):
+        return dataclasses.replace(
+            trace,
+            goal_pose=np.full((4, 4), np.nan),
+            position_error_mm=None,
+            rotation_error_deg=None,
+            center_deviation_mm=None,
+            center_deviation_at_samples_mm=None,
+        )
+
+    extra = material.studies
+    material = dataclasses.replace(
+        material,
+        traces={law: unknown(trace) for law, trace in material.traces.items()},
+        studies=dataclasses.replace(
+            extra,
+            sweep={key: unknown(trace) for key, trace in extra.sweep.items()},
+            own={key: unknown(trace) for key, trace in extra.own.items()},
+            rate={key: unknown(trace) for key, trace in extra.rate.items()},
+        ),
+    )
+    for spec in FIGURES:
+        assert ("pose of the goal is unknown" in report.lacking(spec, material)) == spec.goal
+    monkeypatch.setattr(report, "FIGURES", (BY_NAME["fig03_scene"], BY_NAME["fig12_joints"]))
+    assert len(report.draw_all(material, tmp_path, ("svg",), [])) == 2
+    rows = [claim.row() for claim in claims_of(material, None)]
+    json.dumps(rows, allow_nan=False)
+    assert not any("drift" in row["claim"] or "nan" in row["measured"] for row in rows)
+    record = report._record(material.studies, None, (), (), tuple(rows))
+    assert all(row["drift_mm"] is None for row in report.drift_rows(record))
+
+
+def test_failed_studies_are_named_and_their_figures_left_out(tmp_path, monkeypatch):
+    _, bench, material = case()
+
+    def fail(*_, **__):
+        raise WorkFailed("the task\ncannot be partitioned")
+
+    monkeypatch.setattr(report, "run_studies", fail)
+    left_out = []
+    run = stored(tmp_path, material)
+    made = report.material_of(run, bench, left_out, lambda *_: None)
+    assert made.studies is None
+    assert left_out == [{"what": "studies", "reason": "the task cannot be partitioned"}]
+    for spec in FIGURES:
+        assert ("cannot be partitioned" in report.lacking(spec, made)) == spec.studies
+    record = report._record(None, None, (), (), ())
+    assert report.drift_rows(record) == []
+
+
+def test_a_failed_comparison_of_eq_22_is_named(monkeypatch):
+    config, bench, _ = case()
+
+    def fail(*_):
+        raise WorkFailed("no unique motion")
+
+    monkeypatch.setattr(report, "metric_plan", fail)
+    left_out = []
+    assert report._composition(bench, config, left_out) is None
+    assert left_out == [{"what": "equation (22)", "reason": "no unique motion"}]
+
+
+def test_a_report_needs_a_plan(tmp_path):
+    run = stored(tmp_path, case()[2])
+    run = dataclasses.replace(run, results={"calibrate": run.results["calibrate"]})
+    with pytest.raises(InputError, match="holds no plan"):
+        report.run(run, tmp_path)
+
+
+def test_both_sides_of_eq_22_agree_to_first_order_only():
+    _, bench, _ = case()
+    plan = studies.metric_plan(bench, 0.9)
+    lambdas = np.array([0.02, 0.01, 0.005])
+    distance, norm = studies.composition_error(plan, lambdas)
+    # the third order adds a few per mille at λ = 0.02
+    np.testing.assert_allclose(distance[:-1] / distance[1:], 4.0, rtol=2e-2)
+    np.testing.assert_allclose(norm[:-1] / norm[1:], 4.0, rtol=2e-2)
+    # without a translation both sides are the same
+    still = dataclasses.replace(plan, tau=0.0)
+    assert studies.composition_error(still, lambdas)[0].max() < 1e-12
+    claim = composition_claim(lambdas, distance)
+    assert claim.holds is False
+    assert "λ^2.0" in claim.measured
+    assert composition_claim(lambdas, np.zeros(3)).holds is True
+
+
+def test_projective_twin_is_well_conditioned_and_sees_the_same():
+    _, bench, material = case()
+    assert np.linalg.cond(studies.H_PE) < 2.5
+    twin, true = bench.models["twin"], bench.models["true"]
+    M = np.append([0.5, 0.1, 0.6], 1.0)
+    M_twin = np.linalg.solve(studies.H_PE, M)
+    np.testing.assert_allclose(twin.P @ M_twin, true.P @ M, rtol=1e-12)
+    assert twin.a_inf @ M_twin == pytest.approx(true.a_inf @ M, rel=1e-13)
+    np.testing.assert_allclose(twin.a_inf @ twin.H_hat_0, 0.0, atol=1e-13)
+    assert material.calibrated.P.shape == (2, 3, 4)
+
+
+def test_limited_runs_keep_the_limit_and_free_ones_do_not():
+    extra = case()[2].studies
+    for (_, _, limited, gain), trace in extra.sweep.items():
+        most = np.degrees(np.abs(np.diff(trace.q, axis=0)).max())
+        assert (most <= extra.step_limit_deg * (1 + 1e-12)) == limited or gain < 0.5
+
+
+def test_periods_at_which_no_loop_survives_are_left_out():
+    _, bench, _ = case()
+    few = dataclasses.replace(bench, limits=bench.limits._replace(max_steps=1))
+    extra = studies.run_studies(few, (0.1,), (0.4, 0.04))  # gain 2.5 1/s
+    assert extra.periods == (0.04,)
+
+
+def test_claims_are_rows_with_a_number_and_a_verdict():
+    _, _, material = case()
+    claims = claims_of(material, (np.array([1.0, 0.1]), np.array([0.5, 0.005])))
+    assert len({claim.claim for claim in claims}) == len(claims) >= 24
+    for claim in claims:
+        assert claim.measured
+        assert claim.criterion
+        assert claim.source.startswith(("section", "eq."))
+        assert claim.holds in (True, False, None)
+        assert "nan" not in claim.measured
+
+
+def test_a_claim_follows_its_number():
+    material = case()[2]
+    trace = material.traces["direct_three"]
+    hidden = dataclasses.replace(trace, self_occluded_steps_left=3)
+    verdicts = [
+        next(c for c in claims_of(changed(material, direct_three=t), None) if c.claim.startswith("No self"))
+        for t in (trace, hidden)
+    ]
+    assert [claim.holds for claim in verdicts] == [True, False]
+    assert "3 left" in verdicts[1].measured
+
+
+def test_a_law_that_converges_does_not_diverge():
+    material = case()[2]
+    trace = dataclasses.replace(material.traces["blockwise"], verdict="diverged")
+    rows = {c.claim: c.holds for c in claims_of(changed(material, blockwise=trace), None)}
+    assert rows["The block-wise law diverges towards infinity"] is True
+    trace = dataclasses.replace(trace, verdict="converged")
+    rows = {c.claim: c.holds for c in claims_of(changed(material, blockwise=trace), None)}
+    assert rows["The block-wise law does not converge"] is False
+
+
+def test_numbers_in_words():
+    assert listed(np.array([1341.2, 0.012345, 7.0])) == "1341, 0.0123, 7"
+
+
+@pytest.mark.volume
+@pytest.mark.parametrize("name", ["paper", "ur5"])
+class TestWholeTask:
+    """The benchmark with exact operators, all runs to their end."""
+
+    def test_errors_decay_by_the_gain_in_every_settled_step(self, name):
+        material = case(name, 2000, whole=True)[2]
+        for law in DIRECT:
+            trace = material.studies.own[law, "calibrated", True]
+            assert trace.verdict == "converged"
+            ranges = decay_ranges(material, trace)
+            for least, most, count in ranges.values():
+                assert count >= 10
+                assert 0.9 * 0.99 <= least <= most <= 0.9 * 1.01
+
+    def test_projective_and_euclidean_models_agree(self, name):
+        extra = case(name, 2000, whole=True)[2].studies
+        for limited in (False, True):
+            twin, metric = (extra.own["direct_three", kind, limited] for kind in ("twin", "true"))
+            for angle in ("theta_r", "theta_p"):
+                difference = np.abs(getattr(twin, angle) - getattr(metric, angle))
+                assert np.degrees(difference).max() <= 1e-6
+
+    def test_drift_falls_strictly_with_the_gain(self, name):
+        extra = case(name, 2000, whole=True)[2].studies
+        table = report.table(extra)
+        assert report.converged(extra).all()
+        for law in range(2):
+            assert (np.diff(table[law, 0, 0]) < 0).all()  # gains fall along the table
+
+    def test_the_table_of_claims_holds_numbers_for_all(self, name):
+        config, bench, material = case(name, 2000, whole=True)
+        claims = claims_of(material, report._composition(bench, config, []))
+        assert all(claim.holds is not None for claim in claims)
+        held = {claim.claim for claim in claims if claim.holds}
+        assert "No self-occlusion under direct control" in held
+        assert "The block-wise law does not converge" in held
+
+    def test_all_figures_are_drawn_from_a_whole_run(self, name, tmp_path):
+        material = case(name, 2000, whole=True)[2]
+        left_out = []
+        written = report.draw_all(material, tmp_path, ("svg",), left_out)
+        assert left_out == []
+        assert len(written) == len(FIGURES)
+
+
+def test_report_is_a_record_of_the_run_file():
+    names = {field.name for field in dataclasses.fields(Report)}
+    assert {"figures", "left_out", "claims", "drift_mm"} <= names

@@ -1,0 +1,90 @@
+"""Traces: what is recorded of a run against the truth, and every way it may be told to end."""
+
+import math
+
+import numpy as np
+import pytest
+
+from projservo_cli.stages.servo import longest_plateau, rotation_between
+from tests.samples import displacement
+from tests.stages.cases import Case, case
+
+
+def test_trace_is_the_run_as_it_was():
+    example = case("ur5")
+    trace = example.trace("direct_three")
+    k = trace.steps
+    assert len(trace.q) == len(trace.s) == len(trace.theta_r) == k + 1
+    assert len(trace.q_dot) == len(trace.speed_factor) == k
+    for i in (0, k // 2, k):
+        assert trace.pose[i] == pytest.approx(example.truth.robot.pose(trace.q[i]), abs=1e-12)
+        body = np.linalg.solve(example.truth.robot.base_tool, example.truth.M_face.mean(axis=0))
+        assert trace.center[i] == pytest.approx((trace.pose[i] @ body)[:3], abs=1e-12)
+        assert trace.s[i] == pytest.approx(example.truth.images(trace.q[i], example.truth.M_face), abs=1e-8)
+    gap = 1e3 * np.linalg.norm(trace.center[-1] - example.goal_center)
+    assert trace.position_error_mm == pytest.approx(gap, abs=1e-9)
+    assert trace.tau_affine[-1] == pytest.approx(gap * 1e-3, abs=1e-9)  # a metric model
+    assert trace.rotation_error_deg == pytest.approx(math.degrees(trace.theta_s[-1]), abs=1e-7)
+    assert trace.speed_limited_steps == int((trace.speed_factor < 1).sum()) > 0
+    fastest = np.abs(trace.q_dot).max(axis=1)
+    assert fastest.max() == pytest.approx(math.radians(125), rel=1e-12)
+    assert fastest[trace.speed_factor < 1] == pytest.approx(math.radians(125), rel=1e-12)
+
+
+def test_deviation_is_that_from_the_line_between_true_start_and_goal():
+    trace, goal = case("ur5").trace("direct_two"), case("ur5").goal_center
+    way = (goal - trace.center[0]) / np.linalg.norm(goal - trace.center[0])
+    off = trace.center - trace.center[0]
+    at_samples = 1e3 * np.linalg.norm(off - np.outer(off @ way, way), axis=1).max()
+    assert trace.center_deviation_at_samples_mm == pytest.approx(at_samples, abs=1e-9)
+    assert trace.center_deviation_mm >= at_samples - 1e-9
+
+
+def test_two_runs_are_identical_to_the_bit():
+    example = case("ur5")
+    first, second = (example.servo("direct_two", max_steps=30) for _ in range(2))
+    for field in ("q", "s", "q_dot", "theta_s", "tau", "pose"):
+        assert getattr(first, field).tobytes() == getattr(second, field).tobytes()
+
+
+def test_opaque_face_loses_its_markers():
+    example = Case("paper", ["plant.self_occlusion=opaque"])
+    trace = example.trace("stacked")
+    assert trace.verdict == "markers lost"
+    assert trace.self_occluded[-1].any()
+    assert not trace.self_occluded[:-1].any()
+    assert str(trace.steps) in trace.reason
+
+
+def test_joint_limit_stops_where_it_is_told_to():
+    """The stacked law passes a joint limit on this task; told to stop it ends the step before."""
+    passed = case("paper").trace("stacked")
+    assert passed.first_beyond_limit > 0
+    example = Case("paper", ["plant.joint_limits=stop"])
+    trace = example.trace("stacked")
+    assert trace.verdict == "joint limit"
+    assert trace.steps == passed.first_beyond_limit - 1
+    assert trace.limit_joint == passed.limit_joint
+    assert f"joint {trace.limit_joint + 1}" in trace.reason
+
+
+def test_noise_widens_the_tolerance_and_is_the_same_for_every_law():
+    example = Case("ur5", ["noise.servo_px=0.5"])
+    assert example.limits.image_px == pytest.approx(0.01 + 2.0 * 0.5)
+
+
+def test_plateau_is_the_longest_stretch_without_a_fall():
+    """20 flat steps in the middle of a steep fall; the window of 5 steps must fall by 1 % to count."""
+    error = np.r_[100 * 0.9 ** np.arange(10), np.full(20, 30.0), 30 * 0.9 ** np.arange(1, 10)]
+    assert longest_plateau(error, 5) == 19
+    assert longest_plateau(100 * 0.9 ** np.arange(30), 5) == 0
+    assert longest_plateau(np.ones(3), 5) == 0
+    assert longest_plateau(np.ones(30), 5) == 29
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, math.pi - 1e-7, math.pi])
+def test_angle_between_rotations(angle):
+    """Accurate at both ends, where an arc cosine would lose half its digits."""
+    start = displacement([0.3, 0.2, -0.5], [0, 0, 0])
+    goal = displacement([0, angle, 0], [1, 2, 3]) @ start
+    assert rotation_between(start, goal) == pytest.approx(math.degrees(angle), abs=1e-12)

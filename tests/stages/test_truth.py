@@ -1,0 +1,162 @@
+"""The simulated truth: other software's robots, start and goal, and what is refused."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from projservo_cli.config import load_config
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages.truth import camera_of, generator, plant_of, reach_of, truth_of
+from tests.conftest import ROOT
+from tests.stages.cases import case
+
+
+def loaded(name, *overrides):
+    return load_config(ROOT / "configs" / f"{name}.yaml", list(overrides))
+
+
+@pytest.mark.parametrize("name", ["ur5", "stanford"])
+def test_configuration_is_the_reference_robot_unchanged(name, reference_truth):
+    truth, reference = case(name).truth, reference_truth(name)
+    assert truth.P[0].tolist() == reference["camera_left"]
+    assert truth.P[1].tolist() == reference["camera_right"]
+    assert truth.robot.base_tool.tolist() == reference["T_base_tool_at_reference"]
+    assert truth.robot.q_reference.tolist() == reference["q_reference"]
+    assert [truth.robot.lower.tolist(), truth.robot.upper.tolist()] == reference["q_limits"]
+    for H_hat, screw in zip(truth.robot.H_hat_0, reference["screws"], strict=True):
+        assert [H_hat[2, 1], H_hat[0, 2], H_hat[1, 0]] == screw["w"]
+        assert H_hat[:3, 3].tolist() == screw["v"]
+    body = np.linalg.solve(truth.robot.base_tool, truth.M.T).T[:, :3]
+    assert body == pytest.approx(np.array(reference["markers_tool"]), abs=1e-14)
+    assert truth.face == tuple(reference["face_markers"])
+
+
+def test_the_reference_task(reference_truth):
+    """First task of the reference robot: 180° of which 158.87° are onto the plane."""
+    task = reference_truth("ur5")["tasks"][0]
+    example = case("ur5")
+    assert example.reach.q_start.tolist() == task["q_start"]
+    assert example.plan.theta_r == pytest.approx(math.radians(task["theta_r_deg"]), abs=1e-9)
+    assert example.plan.theta_s == pytest.approx(math.pi, abs=1e-9)
+    goal = example.truth.robot.pose(np.array(task["q_goal"]))
+    assert example.reach.goal_pose == pytest.approx(goal, abs=0)
+
+
+@pytest.mark.parametrize("turn_deg", [180, 165])
+def test_turn_about_the_roll_axis_of_the_rig(turn_deg):
+    """Start and goal differ by that rotation about the axis midway between the cameras."""
+    config = loaded("paper", f"task.goal.turn_deg={turn_deg}")
+    truth = truth_of(config)
+    reach = reach_of(config, truth)
+    T = reach.goal_pose @ np.linalg.inv(truth.robot.pose(reach.q_start))
+    axis = np.array([-1.0, 0, 0])  # the cameras look along −x of the base, symmetric about y = 0
+    eigenvalues = np.linalg.eigvals(T[:3, :3])
+    assert np.abs(np.angle(eigenvalues)).max() == pytest.approx(abs(math.radians(turn_deg)), abs=1e-9)
+    assert T[:3, :3] @ axis == pytest.approx(axis, abs=1e-9)
+    on_axis = np.array([0.0, 0, 0.63, 1])
+    assert T @ on_axis == pytest.approx(on_axis, abs=1e-9)
+    sine = axis @ [T[2, 1] - T[1, 2], T[0, 2] - T[2, 0], T[1, 0] - T[0, 1]] / 2
+    assert sine == pytest.approx(math.sin(math.radians(turn_deg)), abs=1e-9)
+
+
+def test_the_benchmark_is_within_its_promised_dimensions():
+    """Baseline 0.2–0.5 m, 1.2–1.6 m to the face, view ≤ 60°, face ≤ 0.12 m, 5–10 markers; 180°."""
+    example = case("paper")
+    truth = example.truth
+    centers = np.array([-np.linalg.solve(P[:, :3], P[:, 3]) for P in truth.P])
+    assert 0.2 <= np.linalg.norm(centers[1] - centers[0]) <= 0.5
+    face = truth.M_face @ (truth.robot.pose(example.reach.q_start) @ np.linalg.inv(truth.robot.base_tool)).T
+    for center in centers:
+        assert 1.2 <= np.linalg.norm(face[:, :3].mean(axis=0) - center) <= 1.6
+    spread = np.linalg.norm(face[:, None, :3] - face[None, :, :3], axis=2).max()
+    assert spread <= 0.12 * math.sqrt(2)
+    assert 5 <= len(truth.M) <= 10
+    for P in truth.P:
+        K = np.linalg.inv(np.linalg.qr(np.linalg.inv(P[:, :3]))[1])
+        focal = abs(K[0, 0] / K[2, 2])
+        assert 2 * math.degrees(math.atan(truth.image_size[0] / 2 / focal)) <= 60.0
+    # Transversal to the image planes: the normal lies far from the viewing direction.
+    M = face[:, :3]
+    normal = np.cross(M[1] - M[0], M[2] - M[0])
+    cosine = abs(normal[0]) / np.linalg.norm(normal)
+    assert math.degrees(math.acos(cosine)) > 45.0
+
+
+@pytest.mark.parametrize("scale", [-1.0, 250.0, -1e-3])
+def test_a_camera_is_given_up_to_scale(scale):
+    """Any multiple, of either sign, is the camera whose depths are positive metres."""
+    P = case("ur5").truth.P[0]
+    there = camera_of(SimpleNamespace(matrix=(scale * P).tolist()))
+    assert there == pytest.approx(P, rel=1e-8)
+
+
+def test_goal_beyond_a_limit_is_refused():
+    config = loaded("ur5", "task.goal.joints.joints=[0, 0, 3.5, 0, 0, 0]")
+    with pytest.raises(WorkFailed, match=r"task\.goal: joint 3"):
+        reach_of(config, truth_of(config))
+
+
+def test_an_unreachable_goal_is_refused():
+    config = loaded("paper", "task.goal.perturbation.translation_m=[0, 0, 5]",
+                    "task.goal.perturbation.rotation_rad=[0, 0, 0]")  # fmt: skip
+    with pytest.raises(WorkFailed, match=r"task\.goal: the robot cannot put its tool"):
+        reach_of(config, truth_of(config))
+
+
+def test_perturbation_displaces_the_goal_by_what_it_says():
+    exact, other = case("paper").reach, case("paper_perturbed").reach
+    gap = np.linalg.inv(exact.goal_pose) @ other.goal_pose
+    assert 5e-4 < np.linalg.norm(gap[:3, 3]) < 2e-3
+    assert 5e-4 < np.linalg.norm(gap[:3, :3] - np.eye(3)) / math.sqrt(2) < 2e-3
+
+
+def test_streams_of_noise_are_independent_and_repeatable():
+    config = loaded("ur5")
+    draws = [generator(config, stream).standard_normal(4) for stream in (0, 1, 2)]
+    assert np.abs(np.diff(draws, axis=0)).min() > 0
+    assert generator(config, 1).standard_normal(4).tolist() == draws[1].tolist()
+    other = generator(loaded("ur5", "seed=2"), 1).standard_normal(4)
+    assert np.abs(other - draws[1]).min() > 0
+
+
+def test_servo_noise_is_on_start_and_goal_images():
+    clean = case("ur5").reach
+    config = loaded("ur5", "noise.servo_px=0.5")
+    noisy = reach_of(config, truth_of(config))
+    for a, b in ((clean.s_start, noisy.s_start), (clean.s_star, noisy.s_star)):
+        assert 0.2 < np.std(b - a) < 0.9
+
+
+def test_a_face_that_shows_the_cameras_different_sides_is_refused():
+    """Turned all around by one joint, the face passes through poses that no task can start from."""
+    example = case("ur5")
+    refused = 0
+    seen = set()
+    for turn in np.linspace(0, 2 * math.pi, 60):
+        q = example.reach.q_start + turn * np.eye(6)[4]
+        M = (
+            example.truth.M_face
+            @ (example.truth.robot.pose(q) @ np.linalg.inv(example.truth.robot.base_tool)).T
+        )
+        normal = np.cross(M[1, :3] - M[0, :3], M[2, :3] - M[0, :3])
+        sides = np.sign((example.plan.optical_center[:, :3] - M[0, :3]) @ normal)
+        if sides[0] != sides[1]:
+            refused += 1
+            with pytest.raises(WorkFailed, match="different sides"):
+                plant_of(example.config, example.truth, q)
+        else:
+            seen.add(float(plant_of(example.config, example.truth, q).visible[0]))
+    assert refused > 0
+    assert seen == {-1.0, 1.0}
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [("robot", "set robot"), ("rig", "set rig"), ("markers", r"markers"), ("task", "set task")],
+)
+def test_missing_parts_are_named(section, message):
+    bare = case("ur5").config.model_copy(update={section: None})
+    with pytest.raises(InputError, match=message):
+        reach_of(bare, truth_of(bare))
