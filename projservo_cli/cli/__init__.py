@@ -16,7 +16,8 @@ import click
 from click.core import ParameterSource
 
 from projservo_cli import __version__
-from projservo_cli.cli.options import COMMANDS, OPTIONS, allowed, help_text
+from projservo_cli.cli.commands import COMMANDS, allowed, help_text
+from projservo_cli.cli.options import OPTIONS
 
 DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
 
@@ -104,9 +105,11 @@ def _commands(words: Sequence[str]) -> tuple[list[str], list[str]]:
     if not words:
         return [], []
     if words[0] in COMMANDS and not COMMANDS[words[0]].stage:
-        most = 1 if COMMANDS[words[0]].argument else 0
+        most = len(COMMANDS[words[0]].arguments)
         if len(words) > 1 + most:
-            raise click.UsageError(f"{words[0]} takes {most or 'no'} argument, got {' '.join(words[1:])}")
+            raise click.UsageError(
+                f"{words[0]} takes {most or 'no'} argument{'s' * (most > 1)}, got {' '.join(words[1:])}"
+            )
         return [words[0]], list(words[1:])
     stages = [name for name, command in COMMANDS.items() if command.stage]
     for word in words:

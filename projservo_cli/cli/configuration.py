@@ -19,7 +19,7 @@ def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
     InputError
         When either cannot be read or makes no sense.
     """
-    overrides = _overrides(options)
+    overrides = given_overrides(options)
     stored = stored_run(options["output"]) if options["output"] else None
     if options["config"]:
         config = load_config(options["config"], overrides)
@@ -53,14 +53,17 @@ def shipped(name: str) -> Path:
     raise InputError(f"{name}: this installation lacks it; give a configuration with -c")
 
 
-def _overrides(options: dict[str, Any]) -> list[Override]:
-    """``--data, --joints, --noise-px`` and ``--set``, the last one having the last word."""
+def given_overrides(options: dict[str, Any]) -> list[Override]:
+    """``--data, --joints, --joint-unit, --noise-px`` and ``--set``, the last one having the last word."""
     found = []
     if options["data"] is not None:
         table = os.path.abspath(options["data"])
         found.append(Override(f"--data {options['data']}", ("data", "table"), table))
     if options["joints"] is not None:
         found.append(Override(f"--joints {options['joints']}", ("data", "joints"), options["joints"]))
+    if options["joint_unit"] is not None:
+        unit = options["joint_unit"]
+        found.append(Override(f"--joint-unit {unit}", ("data", "joint_unit"), unit))
     if options["noise_px"] is not None:
         found.append(
             Override.parse(f"data.noise_px={options['noise_px']}", f"--noise-px {options['noise_px']}")

@@ -16,12 +16,17 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         raise click.UsageError("validate needs a run: projservo validate RUN --data TABLE")
     if rest and options["output"] is not None:
         raise click.UsageError("validate takes one run, as an argument or with -o")
+    from projservo_cli.config import load_config
     from projservo_cli.store import load
     from projservo_cli.tables import read_table
 
     found = load(rest[0] if rest else options["output"])
     calibration = found.calibration
-    observation = read_table(options["data"], calibration.joint_types)
+    unit = options["joint_unit"]
+    if unit is None:
+        config = load_config(found.path, text=found.results["calibrate"].configuration)
+        unit = config.data.joint_unit if config.data is not None else None
+    observation = read_table(options["data"], calibration.joint_types, unit)
     from projservo_cli.calibration import residual_statistics
 
     statistics = residual_statistics(calibration, observation)

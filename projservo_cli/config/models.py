@@ -43,6 +43,7 @@ class Data(Section):
 
     table: Annotated[str, StringConstraints(min_length=1)]
     joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = None
+    joint_unit: Literal["deg", "rad"] | None = None  # None: rad, unless readings look like degrees
     noise_px: Positive | None = None
 
 

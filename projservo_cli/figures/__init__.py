@@ -7,7 +7,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from projservo_cli.figures import drift, errors, images, joints, partition, planned, scene, visibility
+from projservo_cli.figures import (
+    drift,
+    errors,
+    images,
+    joints,
+    overview,
+    partition,
+    planned,
+    scene,
+    visibility,
+)
 from projservo_cli.figures.material import CLASSICAL, DIRECT, Data, Material
 
 if TYPE_CHECKING:
@@ -42,6 +52,15 @@ class FigureSpec:
 
 
 FIGURES = (
+    FigureSpec(
+        "fig00_overview",
+        "One run at a look: the classical and the direct law in both images, and their errors",
+        "beside the paper's",
+        5.0,
+        overview.data,
+        overview.draw,
+        laws=overview.LAWS,
+    ),
     FigureSpec(
         "fig01_partition",
         "The task as a translation, a rotation onto the target plane and one within it",

@@ -48,12 +48,25 @@ def trial_motions(config: "Config", truth: Truth) -> FloatArray:
 def simulate(config: "Config", truth: Truth) -> Observation:
     """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
     q = trial_motions(config, truth)
-    images = np.stack([truth.images(row, truth.M) for row in q])
     rng = generator(config, CALIBRATION_NOISE)
-    images = images + config.noise.calibration_px * rng.standard_normal(images.shape)
+    noise = config.noise.calibration_px * rng.standard_normal((len(q), 2, len(truth.number), 2))
+    images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
+    return Observation(np.arange(len(q)), np.array(truth.number), q, images)
+
+
+def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
+    """Noisy pixels (2, m, 2) of all markers at the joints q (n,), rad or m; NaN outside an image.
+
+    Parameters
+    ----------
+    truth : robot, rig and markers.
+    q : (n,) rad or m.
+    noise : (2, m, 2) px.
+    """
+    images = truth.images(q, truth.M) + noise
     inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)
     images[~inside] = np.nan
-    return Observation(np.arange(len(q)), np.array(truth.number), q, images)
+    return images
 
 
 def run(config: "Config", *, progress: object = None) -> tuple[Observation, Calibration]:
@@ -69,13 +82,8 @@ def run(config: "Config", *, progress: object = None) -> tuple[Observation, Cali
     from projservo_cli.tables import read_table
 
     if config.data is not None:
-        observation = read_table(config.data.table)
+        observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
         types = config.joint_types or "R" * observation.q.shape[1]
-        if len(types) != observation.q.shape[1]:
-            raise InputError(
-                f"{config.data.table}: has {observation.q.shape[1]} joint columns, but the joint string "
-                f"{types} has {len(types)} letters: give one letter a column, R or P"
-            )
         size = config.rig.image_size_px if config.rig is not None else None
         return observation, calibrate(
             observation,

@@ -62,7 +62,8 @@ class Stages:
     def calibrate(self, config: Any, *, progress: Any) -> Any:
         progress("trial motions", 1, 2)
         if config.recorded:
-            source, observation = "recorded", read_table(config.data.table, config.data.joints)
+            data = config.data
+            source, observation = "recorded", read_table(data.table, data.joints, data.joint_unit)
         else:
             source, observation = "simulated", fake(Observation, 1, {"joint": len(config.joint_types)})
         self._make("calibrate")

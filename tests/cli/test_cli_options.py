@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli import __version__
 from projservo_cli.cli import main
-from projservo_cli.cli.options import COMMANDS
+from projservo_cli.cli.commands import COMMANDS
 
 PIECES = [("servo",), ("plan",), ("-c", "tiny.yaml"), ("-o", "out"), ("--json",)]
 
@@ -102,6 +102,15 @@ USAGE = {
     "validate without run": (["validate", "--data", "t.csv"], "needs a run"),
     "validate without data": (["validate", "out"], "--data TABLE"),
     "threads": (["servo", "-j", "0"], "-j"),
+    "unit": (["calibrate", "--data", "t.csv", "--joint-unit", "grad"], "--joint-unit"),
+    "record without table": (["record", "-c", "tiny.yaml"], "--output TABLE"),
+    "unit of no motions": (["record", "-o", "u.csv", "--joint-unit", "deg"], "--motions"),
+    "motions of calibrate": (["calibrate", "--motions", "m.csv"], "--motions: not used by calibrate"),
+    "one folder of images": (["detect", "left", "-o", "u.csv"], "two folders"),
+    "three folders of images": (["detect", "a", "b", "c"], "takes 2 arguments"),
+    "images without joints": (["detect", "a", "b", "-o", "u.csv"], "--joints-csv CSV"),
+    "images without table": (["detect", "a", "b", "--joints-csv", "q.csv"], "--output TABLE"),
+    "unknown points": (["detect", "a", "b", "--points", "edges"], "--points"),
 }
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import projservo_cli.calibration
 from projservo_cli.equations import REGISTER
+from projservo_cli.store import load
 
 ROOT = Path(__file__).parents[2]
 
@@ -42,6 +43,28 @@ def test_validate_wants_as_many_joints_as_the_calibration_has(projservo, stages,
     answer = projservo("validate", "out", "--data", "one.csv")
     assert answer.code == 2
     assert "1 joint columns" in answer.err
+
+
+def test_validate_takes_the_unit_of_the_run_unless_told(projservo, stages, monkeypatch, tmp_path):
+    monkeypatch.setattr(
+        projservo_cli.calibration,
+        "residual_statistics",
+        lambda calibration, observation: {"count": 0, "skipped": {}, "q": observation.q},
+    )
+    rows = (tmp_path / "t.csv").read_text()
+    (tmp_path / "deg.csv").write_text(rows.replace("0.2", "20").replace("0.3", "30"))
+    projservo("calibrate", "--data", "t.csv", "-o", "out")
+    refused = projservo("validate", "out", "--data", "deg.csv")
+    assert refused.code == 2
+    assert "q2 of pose 0 is 20" in refused.err
+    assert "--joint-unit deg" in refused.err
+    given = projservo("validate", "out", "--data", "deg.csv", "--joint-unit", "deg", "--json").json["q"]
+    assert given[0][1] == pytest.approx(0.3490658503988659, rel=1e-15)  # 20 degrees
+    projservo("calibrate", "--data", "deg.csv", "--joint-unit", "deg", "-o", "deg")
+    assert "joint_unit: deg" in load("deg").configuration
+    assert projservo("validate", "deg", "--data", "deg.csv", "--json").json["q"] == given
+    same = projservo("validate", "deg", "--data", "deg.csv", "--joint-unit", "rad", "--json").json["q"]
+    assert same == [[0.1, 20], [0.1, 30]]
 
 
 def test_show_tells_what_a_run_holds(projservo, stages, tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli import store
+from projservo_cli.tables import read_table, write_table
 
 PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
 
@@ -34,6 +35,27 @@ def test_a_recorded_table_predicts_images_it_has_not_seen(projservo, shared_data
     assert value["skipped"] == {"unknown_marker": 0, "behind_camera": 0, "missing": 0}
     assert value["median_px"] <= median
     assert value["p95_px"] <= p95
+
+
+def test_a_table_in_degrees_gives_the_calibration_of_the_table_in_radians(projservo, shared_data):
+    table = shared_data / "stanford" / "trials_0.5px.csv"
+    radians = read_table(table)
+    revolute = np.array([1, 1, 0, 1, 1, 1], dtype=bool)
+    q = np.where(revolute, np.degrees(radians.q), radians.q)
+    write_table(dataclasses.replace(radians, q=q), "deg.csv")
+    options = ["--joints", "RRPRRR", "-q"]
+    refused = projservo("calibrate", "--data", "deg.csv", *options, "-o", "deg")
+    assert refused.code == 2
+    assert "look like degrees; give --joint-unit deg" in refused.err
+    assert projservo("calibrate", "--data", table, *options, "-o", "rad").code == 0
+    assert projservo("calibrate", "--data", "deg.csv", *options, "--joint-unit", "deg", "-o", "deg").code == 0
+    value, expected = (
+        projservo("validate", run, "--data", held_out, "--json").json
+        for run in ("deg", "rad")
+        for held_out in ["deg.csv" if run == "deg" else table]
+    )
+    # readings differ by the rounding of degrees, 1e-16; the optimum is found to 1e-6 px
+    assert value["rms_px"] == pytest.approx(expected["rms_px"], abs=1e-6)
 
 
 ON_A_LINE = (

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.records import InputError, Observation
-from projservo_cli.tables import read_table, write_table
+from projservo_cli.tables import read_joints, read_table, recording_of, write_table
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
 ROWS = ["0,1,0.5,-1,10,20,30,40", "0,0,0.5,-1,11,21,31,41", "7,1,0.25,2e-1,12.5,22,,"]
@@ -94,6 +94,74 @@ def test_a_joint_string_must_fit_the_columns(tmp_path):
         read_table(path, "RRP")
 
 
+TURNS = ["0,1,0.5,370,1,2,3,4", "3,1,0.5,-90,1,2,3,4"]
+
+
+def test_revolute_readings_in_degrees_become_radians(tmp_path):
+    path = written(tmp_path, HEADER, *TURNS)
+    q = read_table(path, "PR", "deg").q
+    np.testing.assert_allclose(q, [[0.5, 37 * np.pi / 18], [0.5, -np.pi / 2]], rtol=1e-15)
+    np.testing.assert_array_equal(read_table(path, "RR", "deg").q, np.radians([[0.5, 370], [0.5, -90]]))
+
+
+@pytest.mark.parametrize("types", [None, "RR", "PR"])
+def test_readings_that_look_like_degrees_are_refused_with_the_remedy(tmp_path, types):
+    message = r"q2 of pose 0 is 370, .*\(2 such readings\).*--joint-unit deg"
+    with pytest.raises(InputError, match=message) as caught:
+        read_table(written(tmp_path, HEADER, *TURNS), types)
+    assert "\n" not in str(caught.value)
+
+
+def test_radians_are_never_mistaken_for_degrees(tmp_path):
+    path = written(tmp_path, HEADER, *TURNS)
+    assert read_table(path, "RP").q[0].tolist() == [0.5, 370]  # metres, or whatever a slide reads
+    assert read_table(path, "RR", "rad").q[0].tolist() == [0.5, 370]  # as the user says
+    widest = 2 * 2 * np.pi  # twice the range of a joint that turns fully to both sides
+    path = written(tmp_path, HEADER, f"0,1,{widest},{-widest},1,2,3,4")
+    assert read_table(path).q.tolist() == [[widest, -widest]]
+
+
+LIST = ["pose,q1,q2,left,right", "7,1,90,a.png,b.png", "3,2,-90,c.png,d.png"]
+
+
+def test_a_list_of_joints_has_numbers_and_images_or_not(tmp_path):
+    joints = read_joints(written(tmp_path, *LIST), joint_unit="as is")
+    assert (joints.pose.tolist(), joints.q.tolist()) == ([7, 3], [[1, 90], [2, -90]])
+    assert (joints.left, joints.right) == (("a.png", "c.png"), ("b.png", "d.png"))
+    plain = read_joints(written(tmp_path, "q2,q1", "90,1", "", "-90,2"), "PR", "deg")
+    assert (plain.pose.tolist(), plain.numbered, plain.left) == ([0, 1], False, None)
+    np.testing.assert_allclose(plain.q, [[1, np.pi / 2], [2, -np.pi / 2]], rtol=1e-15)
+
+
+BAD_LISTS = {
+    "degrees": (LIST, "q2 of pose 7 is 90, .*look like degrees"),
+    "twice": ([*LIST, "7,1,1,e,f"], ":4: pose 7 is already in line 2"),
+    "one side": (["q1,left", "1,a"], ":1: give the columns left and right both"),
+    "no name": (["q1,left,right", "1,a,"], ":2: an image has no name"),
+    "no rows": (["q1"], "no pose was given"),
+    "no joints": (["pose", "1"], ":1: .*lacks.*q1"),
+    "text": (["q1", "x"], ":2: q1 is 'x'; expected a finite number"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_LISTS)
+def test_bad_lists_of_joints_are_refused_with_the_line(tmp_path, case):
+    lines, message = BAD_LISTS[case]
+    with pytest.raises(InputError, match=message):
+        read_joints(written(tmp_path, *lines))
+
+
+def test_a_recording_is_told_by_a_column_of_its_own(tmp_path):
+    path = written(tmp_path, HEADER, *ROWS)
+    table = read_table(path)
+    assert recording_of(path) is None
+    write_table(table, path, recording="abc")
+    assert recording_of(path) == "abc"
+    np.testing.assert_array_equal(read_table(path).images, table.images)
+    path.write_text(path.read_text().replace("abc", "xyz", 1))
+    assert recording_of(path) is None
+
+
 finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
@@ -112,6 +180,6 @@ def test_writing_and_reading_is_exact(tmp_path_factory, data):
     table = Observation(np.array(poses), np.array(markers), q, images)
     path = tmp_path_factory.mktemp("tables") / "table.csv"
     write_table(table, path)
-    back = read_table(path)
+    back = read_table(path, joint_unit="rad")
     for name in ("pose", "marker", "q", "images"):
         np.testing.assert_array_equal(getattr(back, name), getattr(table, name))

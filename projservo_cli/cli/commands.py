@@ -1,0 +1,165 @@
+"""Commands: what there is, what belongs together, what help says."""
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import click
+
+from projservo_cli.cli.options import OPTIONS
+
+
+def _variants(**helps: str) -> dict[str, click.Option]:
+    """Options as above that mean something of their own; ``output`` is a table."""
+    found = {name: copy.copy(OPTIONS[name]) for name in helps}
+    for name, text in helps.items():
+        found[name].help = text
+    found["output"].metavar = "TABLE"
+    return found
+
+
+_EVERYWHERE = ("json", "quiet", "verbose", "help")
+_OF_STAGES = (
+    *("config", "sets", "output", "data", "joints", "joint_unit", "noise_px"),
+    *("force", "dry_run", "threads"),
+)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A word of the command line: what it takes and what help says about it.
+
+    ``options`` are the names of those it uses, ``variants`` say in help what they mean here.
+    """
+
+    summary: str
+    about: str
+    options: tuple[str, ...]
+    arguments: tuple[str, ...] = ()
+    variants: Mapping[str, click.Option] = field(default_factory=dict)
+    stage: bool = False
+
+
+COMMANDS = {
+    "calibrate": Command(
+        "Learn the projective kinematics from trial motions.",
+        "Estimates both cameras and all joint operators from images alone, simulated from the configuration "
+        "or recorded in an observation table (--data).",
+        _OF_STAGES,
+        stage=True,
+    ),
+    "plan": Command(
+        "Plan the task as a translation and two rotations.",
+        "Partitions the task by the start and goal images and lays a path on which both cameras keep seeing "
+        "the face. Calibrates first where needed.",
+        _OF_STAGES,
+        stage=True,
+    ),
+    "servo": Command(
+        "Run the control laws in closed loop.",
+        "Runs each law of control.laws (or of --law) to its verdict. Calibrates and plans first where "
+        "needed. Exit code 1 when a law of control.must_converge does not converge.",
+        (*_OF_STAGES, "laws"),
+        stage=True,
+    ),
+    "report": Command(
+        "Draw the figures and check the paper's claims.",
+        "Writes the figures and the table of claims into the folder of the run. Makes every stage before "
+        "it where needed.",
+        _OF_STAGES,
+        stage=True,
+    ),
+    "record": Command(
+        "Drive the robot through trial motions and write a table.",
+        "Drives the simulated robot of a configuration through its trial motions (and those of --motions), "
+        "in steps that the joint-speed limit allows, and writes what both cameras see into an observation "
+        "table for calibrate --data.\n\n"
+        "The table grows as the robot goes. After an interruption the same command continues it; a table of "
+        "another configuration is refused, unless --force begins anew.",
+        ("config", "sets", "output", "motions", "joint_unit", "force", "dry_run"),
+        variants=_variants(
+            config="Configuration (YAML). Default: paper.yaml.",
+            output="Observation table to write (CSV).",
+            motions="Further poses after the trial motions, a row each, with columns q1 ... qN.",
+            joint_unit="Unit of the revolute joints of --motions. Default: rad.",
+            force="Begin anew, whatever stands in the table.",
+        ),
+    ),
+    "detect": Command(
+        "Find ArUco or AprilTag markers in images and write a table.",
+        "Finds tags in the images of two folders (or quoted patterns such as 'left/*.png'), with corners to "
+        "a fraction of a pixel, and writes an observation table for calibrate --data. Needs OpenCV: "
+        "pip install 'projservo[detect]'.\n\n"
+        "The list of joint readings (--joints-csv) says which images belong together. With columns left and "
+        "right, these are the names of the two images. With a column pose, images are those whose name ends "
+        "in that number. With neither, both folders are taken in the order of their names, one image a row; "
+        "image_2 comes before image_10.\n\n"
+        "With --points corners, corner k of tag t is marker 4 t + k, in the order of the dictionary: top "
+        "left, top right, bottom right, bottom left. With --points centers, tag t is marker t, at the "
+        "crossing of its diagonals. Readings are copied as they are: say --joint-unit deg on calibrate where "
+        "they are degrees.",
+        ("output", "joints_csv", "dictionary", "points", "force"),
+        ("LEFT", "RIGHT"),
+        variants=_variants(
+            output="Observation table to write (CSV).",
+            joints_csv="Joint readings, a row a pose: columns q1 ... qN, perhaps pose or left, right.",
+            dictionary="The tags, such as 4X4_50, ARUCO_ORIGINAL, APRILTAG_36H11.",
+            points="Four markers a tag, or one.",
+            force="Replace the table if there is one.",
+        ),
+    ),
+    "validate": Command(
+        "Predict held-out images with a calibration.",
+        "Compares the pixels of an observation table (--data) with those the calibration of a run predicts "
+        "at the table's joint readings.",
+        ("output", "data", "joint_unit"),
+        ("RUN",),
+    ),
+    "show": Command(
+        "Show what a run holds and how it was made.",
+        "Lists the results in a run, whether each is up to date, and what it was made with.",
+        ("output",),
+        ("[RUN]",),
+    ),
+    "equations": Command(
+        "List the equations of the paper and the code of each.",
+        "Prints number, title, function, test and erratum of every equation.",
+        (),
+    ),
+}
+
+
+def allowed(names: list[str]) -> set[str]:
+    """Options that at least one of the named commands uses."""
+    return {option for name in names for option in (*COMMANDS[name].options, *_EVERYWHERE)}
+
+
+def help_text(names: list[str]) -> str:
+    """Help on the named commands, or on all of them where none is named."""
+    formatter = click.HelpFormatter(width=80, max_width=80)
+    variants: Mapping[str, click.Option] = {}
+    if not names:
+        formatter.write_usage("projservo", "[OPTIONS] COMMAND ...")
+        formatter.write_paragraph()
+        formatter.write_text(
+            "Uncalibrated stereo visual servoing in projective space. The stages calibrate, plan, servo and "
+            "report chain in one call; each first makes what it lacks. Options may stand anywhere."
+        )
+        for title, stage in (("Stages", True), ("Other commands", False)):
+            with formatter.section(title):
+                formatter.write_dl([(n, c.summary) for n, c in COMMANDS.items() if c.stage is stage])
+        shown = list(OPTIONS)
+    else:
+        command = COMMANDS[names[0]]
+        words = " ".join([*names, *command.arguments])
+        formatter.write_usage("projservo", f"{words} [OPTIONS]")
+        for text in "\n\n".join(COMMANDS[name].about for name in names).split("\n\n"):
+            formatter.write_paragraph()
+            formatter.write_text(text)
+        shown = [name for name in OPTIONS if name in allowed(names)]
+        variants = command.variants
+    context = click.Context(click.Command("projservo"))
+    with formatter.section("Options"):
+        options = [variants.get(name, OPTIONS[name]) for name in shown]
+        formatter.write_dl([record for option in options if (record := option.get_help_record(context))])
+    return formatter.getvalue().rstrip("\n")
