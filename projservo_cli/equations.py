@@ -189,8 +189,9 @@ REGISTER = (
     _entry(
         "22",
         "Translation and rotation at once",
-        "control.direct_two.direct_two",
-        "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit",
+        "control.direct_two.direct_two control.exact.desired",
+        "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit "
+        "control/test_exact.py::test_the_centre_keeps_to_its_line",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "
         "parallel to the axis; with Ĥ_s carried along with the moving centre the flow integrates to the "
         "product.",

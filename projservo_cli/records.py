@@ -19,7 +19,7 @@ REVOLUTE = 0
 PRISMATIC = 1
 FREE = 2  # a twist of a free-flying rig: its operator does not move with the others
 
-LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points")
+LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact")
 METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
 
 

@@ -17,7 +17,7 @@ from projservo_cli.config.fields import (
 )
 from projservo_cli.config.robot import Markers, Rig, Robot
 
-Law = Literal["direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"]
+Law = Literal["direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact"]
 Profile = Literal["linear", "exponential", "rotation_first", "translation_first", "planar_first"]
 
 
@@ -101,6 +101,7 @@ class Control(Section):
     gain: Positive = 2.5
     joint_speed_limit_deg_s: Positive | None = 125.0
     prismatic_speed_limit_m_s: Positive | None = None
+    substeps: Literal["none", "auto"] = "auto"
 
 
 class PlantSettings(Section):

@@ -4,6 +4,7 @@ from projservo_cli.control.blockwise import blockwise
 from projservo_cli.control.direct_three import direct_three
 from projservo_cli.control.direct_two import direct_two
 from projservo_cli.control.euclidean_points import euclidean_points
+from projservo_cli.control.exact import exact
 from projservo_cli.control.law import Gains, State
 from projservo_cli.control.stacked import stacked
 from projservo_cli.geometry.jit import njit
@@ -26,4 +27,6 @@ def command(
         return stacked(model, task, gains, s, q, state)
     if code == 3:
         return blockwise(model, task, gains, s, q, state)
-    return euclidean_points(model, task, gains, s, q, state)
+    if code == 4:
+        return euclidean_points(model, task, gains, s, q, state)
+    return exact(model, task, gains, s, q, state)

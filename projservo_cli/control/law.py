@@ -16,10 +16,16 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import Work, workspace
 from projservo_cli.geometry.stereo import triangulate
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
 from projservo_cli.task.visibility import limited_translation
+
+# Parts a law may split one step into.
+MOST_PARTS = 128
+
+# No joint-speed limit, for any number of joints a configuration may have.
+UNLIMITED = np.full(64, np.inf)
 
 OK = 0
 LOST = 1
@@ -40,6 +46,8 @@ class Gains(NamedTuple):
     gain : of the classical laws, 1/s.
     period : control period, s.
     delta : share of τ_0 that one pure translation may use.
+    speed : (n,) most joint motion per second, rad/s or m/s; infinite for none.
+    substeps : whether a step is sent in the parts it was solved in.
     """
 
     gain_t: float
@@ -50,6 +58,8 @@ class Gains(NamedTuple):
     gain: float
     period: float
     delta: float
+    speed: FloatArray = UNLIMITED
+    substeps: bool = False
 
 
 class State(NamedTuple):
@@ -64,6 +74,11 @@ class State(NamedTuple):
     errors : (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad.
     memory : what is carried to the next step.
     limited : (1,) how often visibility limited the translation.
+    newton : (n,) one Newton step.
+    path : (129, n) joints at the ends of the parts of a step, the current ones first.
+    share : (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the
+        limit to the loop.
+    parts : (1,) parts of the step in ``path``; 0 where the joints go straight to the end.
     """
 
     work: Work
@@ -75,6 +90,10 @@ class State(NamedTuple):
     errors: FloatArray
     memory: Memory
     limited: FloatArray
+    newton: FloatArray
+    path: FloatArray
+    share: FloatArray
+    parts: IntArray
 
 
 def new_state(n: int, m: int) -> State:
@@ -89,6 +108,10 @@ def new_state(n: int, m: int) -> State:
         np.full(len(ERRORS), np.nan),
         Memory(np.zeros((2, n))),
         np.zeros(1),
+        np.zeros(n),
+        np.zeros((MOST_PARTS + 1, n)),
+        np.full(1, -1.0),
+        np.zeros(1, dtype=np.int64),
     )
 
 

@@ -27,6 +27,16 @@ def forward(model: Model, q: FloatArray) -> Mat4:
 
 
 @njit
+def backward(model: Model, q: FloatArray) -> Mat4:
+    """Inverse of the forward kinematics, the reversed product of [RH00] eq. (6)."""
+    H = IDENTITY
+    for i in range(q.shape[0]):
+        amount = float(q[i]) - float(model.q_reference[i])
+        H = mul(joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], -amount), H)
+    return H
+
+
+@njit
 def start_pose(model: Model, q: FloatArray) -> Mat4:
     """Displacement at the first joints; a free-flying rig starts at its reference."""
     if model.joint_types[0] == FREE:

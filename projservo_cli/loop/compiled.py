@@ -25,7 +25,7 @@ from projservo_cli.loop.step import (
     verdict_at,
 )
 from projservo_cli.plants.plant import Plant, center_deviation, observe, pose_after, rig_distance
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.face import Task
 
 
@@ -42,6 +42,8 @@ class Log(NamedTuple):
     errors : (k, 5) control errors of the law.
     q_dot : (k, n) commanded joint velocities after the limit; zero where none was sent.
     factor : (k,) factor of the joint-speed limit.
+    path : (k, parts + 1, n) joints at the ends of the parts of each step.
+    parts : (k,) parts each step was sent in; 0 where the joints went straight to the end.
     events : (4,) first instant outside an image, first beyond a joint limit, that joint, and how
         often visibility limited the translation; −1 for never.
     """
@@ -54,11 +56,13 @@ class Log(NamedTuple):
     errors: FloatArray
     q_dot: FloatArray
     factor: FloatArray
+    path: FloatArray
+    parts: IntArray
     events: FloatArray
 
 
-def new_log(n: int, m: int, max_steps: int, errors: int) -> Log:
-    """Empty log for n joints, m markers and at most ``max_steps`` commands."""
+def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
+    """Empty log for n joints, m markers, at most ``max_steps`` commands and ``parts`` parts of one."""
     rows = max_steps + 1
     return Log(
         np.zeros((rows, n)),
@@ -69,6 +73,8 @@ def new_log(n: int, m: int, max_steps: int, errors: int) -> Log:
         np.full((rows, errors), np.nan),
         np.zeros((rows, n)),
         np.ones(rows),
+        np.zeros((rows, parts + 1, n)),
+        np.zeros(rows, dtype=np.int64),
         np.full(4, -1.0),
     )
 
@@ -148,10 +154,18 @@ def run(
             return verdict, k
         if k == limits.max_steps:
             break
-        log.factor[k] = limit_speed(state.q_dot, limits.speed)
+        if state.share[0] >= 0.0:
+            log.factor[k] = state.share[0]
+        else:
+            log.factor[k] = limit_speed(state.q_dot, limits.speed)
         for i in range(n):
             dq[i] = state.q_dot[i] * gains.period
         H = pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1])
+        if gains.substeps and 0 < state.parts[0] < log.path.shape[1]:
+            log.parts[k] = state.parts[0]
+            for j in range(state.parts[0] + 1):
+                for i in range(n):
+                    log.path[k, j, i] = state.path[j, i]
         joint = beyond_limits(log.q[k + 1], plant.lower, plant.upper)
         if joint >= 0 and log.events[1] < 0.0:
             log.events[1] = k + 1
@@ -174,12 +188,19 @@ def path_deviation(
     Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
     """
     dq = np.empty(log.q.shape[1])
+    part = np.empty(log.q.shape[1])
     most = 0.0
     at_samples = 0.0
     for k in range(steps):
         for i in range(dq.shape[0]):
             dq[i] = log.q_dot[k, i] * period
         H = mat(log.H[k])
-        most = max(most, center_deviation(plant, H, log.q[k], dq, start, goal, samples))
+        if log.parts[k] == 0:
+            most = max(most, center_deviation(plant, H, log.q[k], dq, start, goal, samples))
+        for j in range(log.parts[k]):
+            for i in range(dq.shape[0]):
+                part[i] = log.path[k, j + 1, i] - log.path[k, j, i]
+            share = max(1, samples // log.parts[k])
+            most = max(most, center_deviation(plant, H, log.path[k, j], part, start, goal, share))
         at_samples = max(at_samples, center_deviation(plant, H, log.q[k], dq, start, goal, 1))
     return most, at_samples

@@ -27,8 +27,15 @@ from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
 
+LEFT_TO_THE_LOOP = (-1.0,)
+
+
 class LoopLaw(Protocol):
-    """What the Python loop asks of a law."""
+    """What the Python loop asks of a law.
+
+    A law that keeps the joint-speed limit itself has an attribute ``share`` (1,), the share of the
+    amplitude its limit left; the limit is else up to the loop.
+    """
 
     errors: FloatArray
 
@@ -51,6 +58,7 @@ class BuiltInLaw:
         self.code, self.model, self.task, self.gains = code, model, task, gains
         self.state = new_state(len(model.H_hat_0), len(task.A_star))
         self.errors = self.state.errors
+        self.share = self.state.share
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
@@ -120,7 +128,8 @@ def _run(
             return verdict, k
         if k == limits.max_steps:
             break
-        log.factor[k] = limit_speed(q_dot, limits.speed)
+        share = float(getattr(law, "share", LEFT_TO_THE_LOOP)[0])
+        log.factor[k] = share if share >= 0.0 else limit_speed(q_dot, limits.speed)
         joint = beyond_limits(log.q[k] + q_dot * period, truth.lower, truth.upper)
         if joint >= 0 and log.events[1] < 0.0:
             log.events[1], log.events[2] = k + 1, joint

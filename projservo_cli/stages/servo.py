@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, Gains, new_state
+from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, new_state
 from projservo_cli.loop.compiled import Log, new_log, path_deviation
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import VERDICTS, Limits
 from projservo_cli.plants.plant import Plant
-from projservo_cli.records import METRIC_LAWS, PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
+from projservo_cli.records import METRIC_LAWS, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.stages.truth import SERVO_NOISE, Reach, Truth, generator, plant_of, reach_of, truth_of
 from projservo_cli.task.face import task_from_images
 
@@ -38,17 +38,32 @@ def gains_of(config: "Config") -> Gains:
     """Gains and limits of the laws."""
     c = config.control
     return Gains(
-        c.gain_t, c.gain_r, c.gain_p, c.gain_s, c.ratio_rp, c.gain, c.period_s, config.trajectory.delta
+        c.gain_t,
+        c.gain_r,
+        c.gain_p,
+        c.gain_s,
+        c.ratio_rp,
+        c.gain,
+        c.period_s,
+        config.trajectory.delta,
+        speed_limits(config),
+        c.substeps == "auto",
     )
 
 
-def limits_of(config: "Config", truth: Truth) -> Limits:
-    """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
+def speed_limits(config: "Config") -> FloatArray:
+    """Most joint motion per second (n,), rad/s or m/s; infinite for none."""
     c = config.control
     revolute = math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s)
     prismatic = math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s
+    types = config.robot.joint_types if config.robot is not None else ""
+    return np.array([prismatic if kind == "P" else revolute for kind in types])
+
+
+def limits_of(config: "Config") -> Limits:
+    """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
     return Limits(
-        np.where(truth.robot.joint_types == PRISMATIC, prismatic, revolute),
+        speed_limits(config),
         config.stop.image_px + config.stop.noise_factor * config.noise.servo_px,
         config.stop.diverged_factor,
         config.stop.plateau_steps,
@@ -81,7 +96,7 @@ def run(
         truth,
         reach,
         gains_of(config),
-        limits_of(config, truth),
+        limits_of(config),
         noise,
         plan.rotation_sense(),
     )
@@ -120,7 +135,7 @@ def drive(
     state = new_state(n, m)
     if sense is not None:
         state.memory.rotation[:] = sense
-    log = new_log(n, m, limits.max_steps, len(ERRORS))
+    log = new_log(n, m, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
     code, steps = run_loop(
         CODES[law], model, task, gains, limits, plant, noise, reach.q_start.copy(), state, log
     )

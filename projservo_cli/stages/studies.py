@@ -99,7 +99,7 @@ def bench_of(config: "Config", calibrated: Model, plan: Plan) -> Bench:
     if reach.goal_pose is not None:
         s_star = project(truth.P, truth.M_face @ (reach.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T)
     clean = Reach(reach.q_start, reach.goal_pose, truth.images(reach.q_start, truth.M_face), s_star)
-    limits = limits_of(config, truth)._replace(
+    limits = limits_of(config)._replace(
         image_px=config.stop.image_px, stop_at_joint_limit=False, stop_at_border=False
     )
     models = {"true": truth.model, "twin": projective_twin(truth.model), "calibrated": calibrated}

@@ -239,7 +239,7 @@ def within_plane_part(
     miss_minus = sub(apply(rotation(H_p, H_p2, minus), A_e), A_er)
     theta = plus if dot(miss_plus, miss_plus) <= dot(miss_minus, miss_minus) else minus
     if math.pi - abs(theta) <= HALF_TURN_TOLERANCE:
-        theta = abs(theta)
+        theta = -abs(theta)
     if math.pi - abs(theta) < CONTINUITY_BAND:
         previous = agreement(q_hat, memory.rotation[1])
         if theta > 0.0 and previous < 0.0:

@@ -70,7 +70,7 @@ def true_run(arm: str, law: str, *overrides: str, frame: FloatArray | None = Non
         truth,
         reach,
         servo.gains_of(config),
-        servo.limits_of(config, truth),
+        servo.limits_of(config),
         servo.servo_noise(config, len(truth.face)),
         planned.rotation_sense(),
     )

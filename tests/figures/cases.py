@@ -52,7 +52,7 @@ def case(name="paper", steps=SHORT, whole=False):
             true,
             reach,
             bench.gains,
-            servo.limits_of(config, true),
+            servo.limits_of(config),
             noise,
             bench.sense,
         )

@@ -17,7 +17,7 @@ SPEED = np.full(6, 0.5)
 
 def in_python(sc, law, bounds, noise, G=None):
     plant = AnalyticPlant(sc.plant, sc.q_start, noise)
-    built_in = BuiltInLaw(CODES[law], sc.seen(G), sc.task(G), GAINS)
+    built_in = BuiltInLaw(CODES[law], sc.seen(G), sc.task(G), GAINS._replace(speed=bounds.speed))
     return run(built_in, plant, sc.s_star, GAINS.period, bounds)
 
 

@@ -20,7 +20,7 @@ class Case:
         self.reach = reach_of(self.config, self.truth)
         self.plant = plant_of(self.config, self.truth, self.reach.q_start)
         self.gains = gains_of(self.config)
-        self.limits = limits_of(self.config, self.truth)
+        self.limits = limits_of(self.config)
         self.plan = self.planned(self.truth.model)
         self.traces = {}
 

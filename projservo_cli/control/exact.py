@@ -1,0 +1,170 @@
+"""Direct control without drift: joint steps whose product of exponentials is the desired displacement.
+
+The paper leaves open how to keep the centre on its line when joint steps are finite. Here the
+displacement wanted for one period is solved for the joint step by Newton's method on the projective
+forward kinematics alone, [RH00] eqs. (6), (19); no metric quantity enters.
+"""
+
+import math
+
+from projservo_cli.control.direct_two import rotation_about_center
+from projservo_cli.control.law import MOST_PARTS, OK, SINGULAR, Gains, State, partitioned, translation_rate
+from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, sub, vec
+from projservo_cli.geometry.composition import composed_angle, composed_operator
+from projservo_cli.geometry.displacement import rotation, translation
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kernels import least_squares
+from projservo_cli.geometry.kinematics import backward, forward, operators_at
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
+from projservo_cli.task.partition import Parts, clear
+
+MOST_NEWTON_STEPS = 6
+# A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
+# by about 0.1 mm from the path of a robot of a metre's size.
+PART_STEP = math.radians(2.5)
+# A Newton step this short, rad or m, is the last: the next would be its square, below round-off.
+SETTLED = 1e-8
+ROUND_OFF = 1e-13
+BRANCH_FACTOR = 2.0
+
+
+@njit
+def desired(parts: Parts, H_s: Mat4, tau: float, theta: float, share: float) -> Mat4:
+    """Share of the displacement of one period, exp(share τ Ĥ_t) exp(share θ Ĥ_s)."""
+    return mul(translation(parts.H_t, share * tau), rotation(H_s, mul(H_s, H_s), share * theta))
+
+
+@njit
+def reach(model: Model, H_back: Mat4, goal: Mat4, A: FloatArray, q: FloatArray, state: State) -> bool:
+    """Newton steps on the joints ``q``, in place, until they displace the face A by ``goal``.
+
+    Parameters
+    ----------
+    H_back : inverse forward kinematics at the joints where A was seen.
+    goal : displacement from there.
+
+    Returns
+    -------
+    False where the steps did not settle or the operators are singular.
+    """
+    n = q.shape[0]
+    m = A.shape[0]
+    work = state.work
+    for _ in range(MOST_NEWTON_STEPS):
+        operators_at(model, q, work.H_hat)
+        H = mul(forward(model, q), H_back)
+        for k in range(m):
+            reached = apply(H, vec(A[k]))
+            miss = sub(apply(goal, vec(A[k])), reached)
+            for j in range(4):
+                work.rhs[4 * k + j] = miss[j]
+            for i in range(n):
+                velocity = apply(mat(work.H_hat[i]), reached)
+                for j in range(4):
+                    work.B[i, 4 * k + j] = velocity[j]
+        if not least_squares(work.B, 4 * m, n, state.newton, work.pivot, work.z, work.rhs):
+            return False
+        most = 0.0
+        for i in range(n):
+            q[i] += state.newton[i]
+            most = max(most, abs(state.newton[i]))
+        if most <= SETTLED:
+            return True
+    return False
+
+
+@njit
+def first_order(parts: Parts, tau: float, theta: float, sense: float, state: State) -> float:
+    """First-order joint step τ q̂_t + θ q̂_s of one period into ``state.q_dot``; its largest entry."""
+    most = 0.0
+    for i in range(state.q_dot.shape[0]):
+        state.q_dot[i] = tau * state.q_hat[0, i] + theta * sense * state.q_hat[3, i]
+        most = max(most, abs(state.q_dot[i]))
+    return most
+
+
+@njit
+def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
+    """Share of the amplitude at which the first-order joint step keeps the joint-speed limit."""
+    share = 1.0
+    for i in range(q_step.shape[0]):
+        size = abs(q_step[i])
+        if size * share > speed[i] * period:
+            share = speed[i] * period / size
+    return share
+
+
+@njit
+def continued(
+    model: Model, q: FloatArray, parts: Parts, H_s: Mat4, tau: float, theta: float, count: int, state: State
+) -> bool:
+    """Solve the displacement in ``count`` equal parts, each from the one before, into ``state.path``.
+
+    The first part is predicted by the first-order step in ``state.q_dot``, the others by the part
+    before. A part more than twice as long as predicted is on another kinematic branch.
+
+    Returns
+    -------
+    False where a part does not settle or leaves the branch.
+    """
+    n = q.shape[0]
+    H_back = backward(model, q)
+    for i in range(n):
+        state.path[0, i] = q[i]
+    for j in range(1, count + 1):
+        predicted = 0.0
+        for i in range(n):
+            step = state.q_dot[i] / count if j == 1 else state.path[j - 1, i] - state.path[j - 2, i]
+            state.path[j, i] = state.path[j - 1, i] + step
+            predicted += step * step
+        goal = desired(parts, H_s, tau, theta, j / count)
+        if not reach(model, H_back, goal, state.A, state.path[j], state):
+            return False
+        taken = 0.0
+        for i in range(n):
+            step = state.path[j, i] - state.path[j - 1, i]
+            taken += step * step
+        if taken > BRANCH_FACTOR * BRANCH_FACTOR * predicted + ROUND_OFF * ROUND_OFF:
+            return False
+    return True
+
+
+@njit
+def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+    """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
+
+    The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before
+    any Newton step: the path itself never changes. Long steps are continued in parts of about 2.5°;
+    where a part fails there are more of them, up to 128.
+
+    Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
+    """
+    status, parts = partitioned(model, task, s, q, state)
+    if status != OK:
+        return status
+    theta_s, a, b, c = composed_angle(parts.theta_r, parts.theta_p)
+    turns, H_s = composed_operator(parts.H_r, parts.H_p, a, b, c)
+    sense = 0.0
+    if turns:
+        found, sense = rotation_about_center(state.work, H_s, model.a_inf, parts.A_c, state.q_hat[3])
+        if not found:
+            return SINGULAR
+    tau = translation_rate(task, gains, parts, state) * gains.period
+    theta = gains.gain_s * theta_s * gains.period if turns else 0.0
+    first_order(parts, tau, theta, sense, state)
+    share = speed_share(state.q_dot, gains.speed, gains.period)
+    tau *= share
+    theta *= share
+    most = first_order(parts, tau, theta, sense, state)
+    count = min(MOST_PARTS, max(1, math.ceil(most / PART_STEP)))
+    while not continued(model, q, parts, H_s, tau, theta, count, state):
+        if count == MOST_PARTS:
+            clear(state.q_dot)
+            return SINGULAR
+        count = min(MOST_PARTS, 2 * count)
+    for i in range(q.shape[0]):
+        state.q_dot[i] = (state.path[count, i] - q[i]) / gains.period
+    state.share[0] = share
+    state.parts[0] = count
+    return OK
