@@ -92,8 +92,9 @@ class Run:
         if memory is not None:
             self.state.memory.rotation[:] = memory
         task = scene.task(G) if task is None else task
+        gains = gains._replace(speed=bounds.speed)
         verdict, self.steps = run(
-            CODES[law], scene.seen(G), task, gains._replace(speed=bounds.speed), bounds, scene.plant, noise, scene.q_start.copy(),
+            CODES[law], scene.seen(G), task, gains, bounds, scene.plant, noise, scene.q_start.copy(),
             self.state, self.full,
         )  # fmt: skip
         self.verdict = VERDICTS[verdict]

@@ -26,7 +26,6 @@ from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
-
 LEFT_TO_THE_LOOP = (-1.0,)
 
 
