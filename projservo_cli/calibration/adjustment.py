@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.rotations import cross
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 CAMERA = 12
@@ -133,25 +134,24 @@ def generators(scene: Scene, prismatic: BoolArray) -> list[FloatArray]:
     """
     center = scene.M[:, :3].mean(axis=0)
     size = float(np.linalg.norm(scene.M[:, :3] - center, axis=1).mean()) or 1.0
-    result = []
-    for H_hat, slides in zip(scene.H_hat, prismatic, strict=True):
-        w = H_hat[:3, 3] if slides else np.array([H_hat[2, 1], H_hat[0, 2], H_hat[1, 0]])
-        w = w / np.linalg.norm(w)
-        across = np.linalg.svd(w[None])[2][1:]
-        near = center + np.cross(w, H_hat[:3] @ np.append(center, 1.0))
-        B = np.zeros((2 if slides else 4, 4, 4))
-        for k in range(2):
-            B[k, :3, :3] = _cross(across[k])
-            B[k, :3, 3] = 0.0 if slides else -np.cross(across[k], near)
-            if not slides:
-                B[2 + k, :3, 3] = across[k] * size
-        result.append(B)
-    return result
-
-
-def _cross(w: FloatArray) -> FloatArray:
-    """Matrix of the cross product with w."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    H_hat = scene.H_hat
+    turning = np.stack([H_hat[:, 2, 1], H_hat[:, 0, 2], H_hat[:, 1, 0]], axis=1)
+    w = np.where(prismatic[:, None], H_hat[:, :3, 3], turning)
+    w = w / np.linalg.norm(w, axis=1, keepdims=True)
+    # Two unit vectors across w: from the coordinate axis farthest from it, so that neither is short.
+    across = np.empty((len(w), 2, 3))
+    W = cross(w)
+    across[:, 0] = W[np.arange(len(w)), :, np.argmin(np.abs(w), axis=1)]
+    across[:, 0] /= np.linalg.norm(across[:, 0], axis=1, keepdims=True)
+    across[:, 1] = (W @ across[:, 0, :, None])[..., 0]
+    velocity = H_hat[:, :3] @ np.append(center, 1.0)
+    near = center + (W @ velocity[..., None])[..., 0]
+    B = np.zeros((len(w), 4, 4, 4))
+    B[:, :2, :3, :3] = cross(across)
+    B[:, :2, :3, 3] = -(B[:, :2, :3, :3] @ near[:, None, :, None])[..., 0]
+    B[:, 2:, :3, 3] = across * size
+    B[prismatic, :2, :3, 3] = 0.0
+    return [B[i, : 2 if slides else 4] for i, slides in enumerate(prismatic)]
 
 
 def derivative(scene: Scene, readings: Readings, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -240,7 +240,7 @@ def _clean(H_hat: FloatArray, before: FloatArray, slides: bool) -> FloatArray:
         return result
     w = 0.5 * np.array([H_hat[2, 1] - H_hat[1, 2], H_hat[0, 2] - H_hat[2, 0], H_hat[1, 0] - H_hat[0, 1]])
     w /= np.linalg.norm(w)
-    result[:3, :3] = _cross(w)
+    result[:3, :3] = cross(w)
     result[:3, 3] = H_hat[:3, 3] - w * (w @ H_hat[:3, 3])
     return result
 
@@ -255,7 +255,7 @@ def gauge(scene: Scene, readings: Readings, place: Layout) -> FloatArray:
     """
     motions = np.zeros((7, 4, 4))
     for k, e in enumerate(np.eye(3)):
-        motions[k, :3, :3] = _cross(e)
+        motions[k, :3, :3] = cross(e)
         motions[3 + k, :3, 3] = e
     motions[6, :3, :3] = np.eye(3)
     if readings.prismatic.any():

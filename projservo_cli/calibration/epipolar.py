@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from projservo_cli.calibration.rotations import cross
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 SAMPLES = 500
@@ -178,21 +179,16 @@ def _sampson_gradient(F: FloatArray, left: FloatArray, right: FloatArray) -> Flo
 def _tangents(U: FloatArray, phi: float, Vt: FloatArray) -> FloatArray:
     """Derivative of F by the turns of U and V and by φ, (7, 3, 3)."""
     D = np.diag([np.cos(phi), np.sin(phi), 0.0])
-    generators = [_cross(e) for e in np.eye(3)]
-    middle = [G @ D for G in generators] + [-D @ G for G in generators]
+    generators = cross(np.eye(3))
+    middle = [*(generators @ D), *(-D @ generators)]
     middle.append(np.diag([-np.sin(phi), np.cos(phi), 0.0]))
     result: FloatArray = U @ np.array(middle) @ Vt
     return result
 
 
-def _cross(w: FloatArray) -> FloatArray:
-    """Matrix of the cross product with w."""
-    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-
-
 def _turn(w: FloatArray) -> FloatArray:
     """Rotation near the identity by the Cayley map, (3, 3) from three numbers."""
-    S = 0.5 * _cross(w)
+    S = 0.5 * cross(w)
     return np.asarray(np.linalg.solve(np.eye(3) - S, np.eye(3) + S), dtype=np.float64)
 
 

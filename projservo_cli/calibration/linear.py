@@ -6,7 +6,7 @@ from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.closed_form import trials_of
 from projservo_cli.calibration.projective import Reconstruction, reconstruct
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.calibration.start import cross
+from projservo_cli.calibration.rotations import cross
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 LEAST_MARKERS = 4
