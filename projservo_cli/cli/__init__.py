@@ -15,9 +15,9 @@ from typing import Any, NoReturn
 import click
 from click.core import ParameterSource
 
-from projservo_cli import __version__
 from projservo_cli.cli.commands import COMMANDS, allowed, help_text
 from projservo_cli.cli.options import OPTIONS
+from projservo_cli.version import __version__
 
 DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
 

@@ -25,17 +25,24 @@ def render(cv, dictionary, size, tags, *, blur=0.0, noise=0.0, rng=None, cover=(
     blur, noise : standard deviation of both, px and grey values.
     cover : rectangles (u, v, width, height), px, in front of all.
     """
-    width, height = size
-    fine = np.full((height * FACTOR, width * FACTOR), 200, dtype=np.uint8)
+    image = np.full(size[::-1], 200.0)
     for number, corners in tags:
+        reach = 0.5 * np.ptp(corners, axis=0)  # the bright margin is less than half a tag wide
+        first = np.maximum(np.floor(corners.min(axis=0) - reach), 0).astype(int)
+        last = np.minimum(np.ceil(corners.max(axis=0) + reach), np.array(size)).astype(int)
+        width, height = last - first
         tag, source = picture(cv, dictionary, number)
-        target = ((np.asarray(corners) + 0.5) * FACTOR - 0.5).astype(np.float32)
+        target = ((corners - first + 0.5) * FACTOR - 0.5).astype(np.float32)
         H = cv.getPerspectiveTransform(source, target)
-        seen = cv.warpPerspective(np.full_like(tag, 255), H, fine.shape[::-1], flags=cv.INTER_NEAREST)
-        fine = np.where(seen > 0, cv.warpPerspective(tag, H, fine.shape[::-1]), fine)
+        fine = (int(width) * FACTOR, int(height) * FACTOR)
+        seen = cv.warpPerspective(np.full_like(tag, 255), H, fine, flags=cv.INTER_NEAREST) > 0
+        shares = np.where(seen, cv.warpPerspective(tag, H, fine), 0).reshape(height, FACTOR, width, FACTOR)
+        inside = seen.reshape(height, FACTOR, width, FACTOR).mean(axis=(1, 3))
+        patch = image[first[1] : last[1], first[0] : last[0]]
+        patch *= 1.0 - inside
+        patch += shares.mean(axis=(1, 3))
     for u, v, wide, high in cover:
-        fine[v * FACTOR : (v + high) * FACTOR, u * FACTOR : (u + wide) * FACTOR] = 130
-    image = fine.reshape(height, FACTOR, width, FACTOR).mean(axis=(1, 3))
+        image[v : v + high, u : u + wide] = 130
     if blur:
         image = cv.GaussianBlur(image, (0, 0), blur)
     image = 20 + 0.8 * image + (noise * rng.standard_normal(image.shape) if noise else 0.0)

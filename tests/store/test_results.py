@@ -1,0 +1,122 @@
+"""A run as an object: what its calibration predicts, against the run's own data and differences."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import projservo_cli
+from projservo_cli import cli, store
+from projservo_cli.config import load_config
+from projservo_cli.records import Calibration, InputError, Plan, Trace
+from projservo_cli.stages.truth import truth_of
+from projservo_cli.store import Result, Run, save
+from tests.fake_records import fake
+
+STANFORD = Path(__file__).parents[2] / "configs" / "stanford.yaml"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    assert cli.run(["calibrate", "-c", str(STANFORD), "-o", str(folder), "-q"]) == 0
+    return projservo_cli.load(folder)
+
+
+def test_predictions_are_near_the_truth(run):
+    calibration = run.calibration
+    truth = truth_of(load_config(STANFORD))
+    rng = np.random.default_rng(0)
+    q = calibration.q_reference + rng.uniform(-0.3, 0.3, (20, 6)) * [1, 1, 0.3, 1, 1, 1]
+    true = np.array([truth.images(row, truth.M) for row in q])
+    predicted = calibration.predict(q)
+    assert predicted.shape == (20, 2, 10, 2)
+    assert (
+        np.sqrt(np.mean((predicted - true) ** 2)) < 0.3
+    )  # 0.15 px per coordinate is what 0.5 px noise leaves
+    np.testing.assert_allclose(calibration.predict(q[3]), predicted[3], atol=1e-9)
+
+
+def test_the_jacobian_is_the_derivative_of_the_prediction(run):
+    calibration = run.calibration
+    q = calibration.q_reference + np.array([0.2, -0.1, 0.05, 0.3, -0.2, 0.1])
+    J = calibration.jacobian(q)
+    assert J.shape == (2, 10, 2, 6)
+    step = 1e-5  # truncation 1e-10 px, rounding 1e-12 / 1e-5 = 1e-7 px
+    for i, e in enumerate(np.eye(6) * step):
+        difference = (calibration.predict(q + e) - calibration.predict(q - e)) / (2 * step)
+        np.testing.assert_allclose(J[..., i], difference, atol=1e-4, rtol=1e-6)
+    np.testing.assert_array_equal(calibration.jacobian(np.array([q, q]))[1], J)
+
+
+def test_points_of_any_scale_and_sign_project_alike(run):
+    calibration = run.calibration
+    at_reference = calibration.predict(calibration.q_reference)
+    np.testing.assert_allclose(calibration.project(calibration.M), at_reference, atol=1e-9)
+    np.testing.assert_allclose(calibration.project(-3.0 * calibration.M), at_reference, atol=1e-9)
+    assert calibration.project(calibration.M[0]).shape == (2, 2)
+    grid = np.broadcast_to(calibration.M, (3, 10, 4))
+    assert calibration.project(grid).shape == (2, 3, 10, 2)
+
+
+def test_points_behind_a_camera_have_no_pixels_and_those_at_infinity_vanishing_points(run):
+    calibration = run.calibration
+    centers = np.array([np.linalg.svd(P)[2][-1] for P in calibration.P])
+    centers /= (centers @ calibration.a_inf)[:, None]
+    behind = 2.0 * centers.mean(axis=0) - calibration.M.mean(axis=0)  # the face mirrored at the rig
+    assert np.isnan(calibration.project(behind)).all()
+    way = calibration.M[0] - calibration.M[1]
+    far = [calibration.project(calibration.M[0] + sign * 1e9 * way) for sign in (1.0, -1.0)]
+    assert (np.isnan(far[0]) != np.isnan(far[1])).all()  # one end of a line is behind each camera
+    limit = np.where(np.isnan(far[0]), far[1], far[0])
+    for point in (way, -way):
+        np.testing.assert_allclose(calibration.project(point), limit, rtol=1e-6)
+
+
+@pytest.mark.parametrize("q", [np.zeros(5), np.zeros((2, 7)), np.zeros((1, 1, 6)), np.full(6, np.nan), 1.0])
+def test_other_numbers_of_joints_are_refused(run, q):
+    for function in (run.calibration.predict, run.calibration.jacobian):
+        with pytest.raises(InputError, match="expected 6 finite numbers"):
+            function(q)
+
+
+@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((4, 3)), 1.0])
+def test_points_without_four_coordinates_are_refused(run, points):
+    with pytest.raises(InputError, match="four homogeneous coordinates"):
+        run.calibration.project(points)
+
+
+def test_a_run_holds_plan_and_traces_or_says_how_to_make_them(run, tmp_path):
+    assert run.observation.images.shape == (49, 2, 10, 2)
+    assert run.traces == {}
+    with pytest.raises(InputError, match="projservo plan -o"):
+        _ = run.plan
+    results = {
+        name: Result("key", "name: x", {}, {}, {label: fake(kind)})
+        for name, label, kind in [
+            ("calibrate", "calibration", Calibration),
+            ("plan", "", Plan),
+            ("servo/stacked", "", Trace),
+        ]
+    }
+    save(Run(tmp_path / "run.h5", "name: x", results))
+    full = projservo_cli.load(tmp_path / "run.h5")
+    assert full.configuration == "name: x"
+    assert full.plan.profile == "text ä"
+    assert list(full.traces) == ["stacked"]
+    assert isinstance(full.calibration, Calibration)
+    np.testing.assert_array_equal(full.calibration.P, store.load(tmp_path).calibration.P)
+    with pytest.raises(InputError, match="there is no run file"):
+        projservo_cli.load(tmp_path / "none")
+
+
+def test_importing_the_package_stays_light():
+    code = (
+        "import sys, projservo_cli; projservo_cli.load, projservo_cli.__version__\n"
+        "heavy = {'numpy', 'scipy', 'numba', 'pydantic', 'yaml', 'h5py', 'matplotlib', 'click'}\n"
+        "sys.exit(' '.join(sorted(heavy & set(sys.modules))) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

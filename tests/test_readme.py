@@ -1,0 +1,88 @@
+"""What the README says can be done is done."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from projservo_cli import cli
+from tests.detection.rendering import render, square
+
+ROOT = Path(__file__).parents[1]
+
+
+def blocks(language):
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)
+
+
+ENVIRONMENT, CHECKS, *COMMANDS = blocks("sh")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the shipped configurations and nothing else, where commands are run in turn."""
+    path = tmp_path_factory.mktemp("readme")
+    (path / "configs").symlink_to(ROOT / "configs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(path)
+        yield path
+
+
+def test_both_first_commands_are_those_of_the_newcomer():
+    lines = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    commands = [line for line in lines if line.startswith((".venv", "python3"))]
+    assert commands == [ENVIRONMENT.strip(), CHECKS.strip()]
+
+
+def show_tags(folder):
+    """Two pairs of images with a tag, and their joint readings."""
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'projservo[detect]'")
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    for side in ("left", "right"):
+        (folder / "images" / side).mkdir(parents=True)
+        for k in range(2):
+            image = render(cv2, tags, (160, 120), [(k, square((80 + 5 * k, 60), 50, 0.2 * k))])
+            (folder / "images" / side / f"{k}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    (folder / "readings.csv").write_text("q1,q2\n0.1,0.2\n0.1,0.3\n")
+
+
+def run_all(block):
+    for line in block.splitlines():
+        program, *words = shlex.split(line, comments=True)
+        assert program == "projservo"
+        assert cli.run(words) == 0, line
+
+
+SERVO, *REST = sorted(COMMANDS, key=lambda block: "servo" not in block)
+
+
+@pytest.mark.parametrize("block", REST, ids=lambda block: block.split()[1])
+def test_commands(folder, block, capsys):
+    if "detect" in block:
+        show_tags(folder)
+    run_all(block)
+    assert capsys.readouterr().out
+
+
+@pytest.mark.volume
+def test_commands_that_run_laws_and_what_is_read_from_python(folder, capsys):
+    pytest.importorskip("xarray")
+    pytest.importorskip("h5netcdf")
+    run_all(SERVO)
+    assert cli.run(["servo", "--law", "direct_two", "-q"]) == 0  # part of the first command
+    capsys.readouterr()
+    names = {}
+    for block in blocks("python"):
+        exec(compile(block, "README.md", "exec"), names)
+    assert "converged" in capsys.readouterr().out
+    assert names["pixels"].shape == (2, 10, 2)
+    assert np.isfinite(names["rates"]).all()
+
+
+def test_every_block_is_known():
+    assert len(COMMANDS) == 3
+    assert len(blocks("python")) == 2
+    assert "servo" in SERVO
