@@ -273,6 +273,16 @@ def test_a_blank_recorded_configuration_needs_only_a_table(tmp_path, monkeypatch
     assert config.data.table == str(tmp_path / "a/trial.csv")
 
 
+def test_the_unit_of_a_table_is_degrees_radians_or_unsaid():
+    assert load_config(None, ["data.table=t.csv"]).data.joint_unit is None
+    config = load_config(None, ["data.table=t.csv", "data.joint_unit=deg"])
+    assert load_config("again.yaml", text=to_yaml(config)).data.joint_unit == "deg"
+    with pytest.raises(
+        InputError, match=r"data\.joint_unit: 'degree' is not one of them; did you mean deg\?"
+    ):
+        load_config(None, ["data.table=t.csv", "data.joint_unit=degree"])
+
+
 def test_a_table_is_sought_beside_the_configuration(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sub").mkdir()
