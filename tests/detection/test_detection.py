@@ -129,13 +129,13 @@ def scene():
     return q, np.array([truth.images(row, points) for row in q])
 
 
-def show(scene, rng, name=lambda side, k: f"{side}/{side}_{k}.png"):
+def show(scene, rng):
     """Write the images of a scene and its joint readings."""
     q, corners = scene
     for k, views in enumerate(corners):
         for side, pixels in zip(("left", "right"), views, strict=True):
             quads = list(zip(FACES, pixels.reshape(3, 4, 2), strict=True))
-            write(name(side, k), render(cv2, TAGS, (1280, 1024), quads, blur=0.8, noise=2, rng=rng))
+            write(f"{side}/{k}.png", render(cv2, TAGS, (1280, 1024), quads, blur=0.8, noise=2, rng=rng))
     rows = [",".join(map(repr, row)) for row in q.tolist()]
     Path("q.csv").write_text("\n".join(["q1,q2,q3,q4,q5,q6", *rows]) + "\n")
 
@@ -166,6 +166,26 @@ def test_images_of_a_robot_become_a_table(projservo, scene, rng):
     expected = [[[crossing(quad) for quad in view] for view in pose] for pose in quads]
     assert np.nanmax(np.abs(centers.images - expected)) < 0.2
     assert "table: t.csv" in answer.out
+
+
+@pytest.mark.volume
+def test_images_alone_calibrate_a_robot_to_hundredths_of_a_pixel(projservo, rng):
+    path = Path(__file__).parents[2] / "configs" / "ur5.yaml"
+    config = load_config(path, ["calibration.frames_per_joint=4", "calibration.amplitude_deg=20"])
+    truth = truth_of(config)
+    trials = trial_motions(config, truth)
+    others = trials[0] + rng.uniform(-0.25, 0.25, (5, 6))
+    points = tool_points().reshape(12, 4) @ truth.robot.base_tool.T
+    for q, table in ((trials, "trials.csv"), (others, "others.csv")):
+        show((q, np.array([truth.images(row, points) for row in q])), rng)
+        answer = projservo("detect", "left", "right", "--joints-csv", "q.csv", "-o", table, "-q")
+        assert answer.code == 0, answer.err
+        for image in Path().glob("*/*.png"):
+            image.unlink()
+    assert projservo("calibrate", "--data", "trials.csv", "-o", "out", "-q").code == 0
+    value = projservo("validate", "out", "--data", "others.csv", "--json").json
+    assert value["count"] > 100
+    assert value["rms_px"] < 0.05  # 0.015 px with more trials; corners are 0.008 px off, rms
 
 
 def put(names, shape=(60, 80)):
