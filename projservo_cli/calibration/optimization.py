@@ -18,6 +18,8 @@ PROBE = 0.1
 LEAST_DAMPING, MOST_DAMPING = 1e-15, 1e8
 # A step that moves the predicted images by less than this fraction of the residual is the last.
 SETTLED = 1e-7
+# Residuals below this, px, are round-off for the purpose of that rule: pixels have some 1e-13 of it.
+LEAST_RESIDUAL = 1e-5
 
 Weighting = Callable[[FloatArray], FloatArray]
 
@@ -141,7 +143,7 @@ def minimize(
         fresh = x is not None and np.isfinite(new_cost) and new_cost <= cost
         if x is not None:
             moved = float((weight[..., None] * problem.change(J, x) ** 2).sum())
-            settled = moved <= SETTLED**2 * max(cost, 1e-14 * float(weight.sum()))
+            settled = moved <= SETTLED**2 * max(cost, LEAST_RESIDUAL**2 * float(weight.sum()))
         if fresh:
             scene, residual, weight = candidate, new_residual, weighting(new_residual)
             damping = max(0.1 * damping, LEAST_DAMPING)

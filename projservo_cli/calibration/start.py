@@ -23,6 +23,9 @@ UNLIKELY = 4.0
 # Pull of axis points towards the body, in units of the typical equation: keeps the axes of nearly
 # parallel joints, whose places are hardly determined, from running away.
 RIDGE = 0.03
+# Least width of the loss on points, in units of their distance: the ridge's own bias must not weigh
+# down the motions that show an axis best.
+LEAST_SCALE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,6 +235,6 @@ def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> Fl
         A = (rows.T * W) @ rows + np.diag(ridge + 1e-9 * len(weight))
         x = np.linalg.solve(A, (rows.T * W) @ target)
         residual = np.linalg.norm((target - rows @ x).reshape(-1, 3), axis=1)
-        scale = max(float(np.median(residual)) / MAD, 1e-12)
+        scale = max(float(np.median(residual)) / MAD, LEAST_SCALE)
         weight = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
     return np.asarray(x)

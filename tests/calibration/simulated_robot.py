@@ -1,0 +1,107 @@
+"""An independent robot, rig and marker body: matrix exponentials by scipy, nothing of the package but records."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from projservo_cli.records import FloatArray, Observation
+
+IMAGE_SIZE = (1280, 1024)
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """Metric truth: twists (n, 4, 4) at q_reference, cameras (2, 3, 4), markers (m, 4) at the reference."""
+
+    joint_types: str
+    twists: FloatArray
+    cameras: FloatArray
+    markers: FloatArray
+    q_reference: FloatArray
+
+    def images(self, q: FloatArray) -> FloatArray:
+        """Noise-free pixels (K, 2, m, 2) at joint readings (K, n)."""
+        result = np.empty((len(q), 2, len(self.markers), 2))
+        for k, row in enumerate(q):
+            T = np.eye(4)
+            for twist, amount in zip(self.twists, row - self.q_reference, strict=True):
+                T = T @ expm(twist * amount)
+            m = self.cameras @ T @ self.markers.T
+            result[k] = np.swapaxes(m[:, :2] / m[:, 2:], 1, 2)
+        return result
+
+    def depths(self, q: FloatArray) -> FloatArray:
+        """Depths (K, 2, m) of the markers in both cameras, m."""
+        result = np.empty((len(q), 2, len(self.markers)))
+        for k, row in enumerate(q):
+            T = np.eye(4)
+            for twist, amount in zip(self.twists, row - self.q_reference, strict=True):
+                T = T @ expm(twist * amount)
+            result[k] = (self.cameras[:, 2] @ T @ self.markers.T)
+        return result
+
+    def observe(self, q: FloatArray, sigma: float, rng: np.random.Generator) -> Observation:
+        """Observation with normal noise; the numbers of poses and markers have gaps on purpose."""
+        images = self.images(q)
+        images = images + sigma * rng.standard_normal(images.shape)
+        m = len(self.markers)
+        return Observation(3 + 2 * np.arange(len(q)), 5 + 3 * np.arange(m), q.copy(), images)
+
+
+def rig(baseline: float = 0.3, distance: float = 1.4, focal: float = 1200.0) -> FloatArray:
+    """Two converging cameras that look at the origin from a distance, px per m."""
+    cameras = []
+    for side in (-0.5, 0.5):
+        center = np.array([side * baseline, 0.0, -distance])
+        z = -center / np.linalg.norm(center)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        R = np.stack([x, np.cross(z, x), z])
+        K = np.array([[focal, 0.0, 640.0], [0.0, focal, 512.0], [0.0, 0.0, 1.0]])
+        cameras.append(K @ np.hstack([R, (-R @ center)[:, None]]))
+    return np.array(cameras)
+
+
+def revolute(w: FloatArray, p: FloatArray) -> FloatArray:
+    """Twist of a turn by one rad about the axis w through p."""
+    w = np.asarray(w) / np.linalg.norm(w)
+    twist = np.zeros((4, 4))
+    twist[:3, :3] = np.cross(np.eye(3), w)  # rows e_i × w: the matrix of w ×
+    twist[:3, 3] = -twist[:3, :3] @ p
+    return twist
+
+
+def prismatic(v: FloatArray) -> FloatArray:
+    """Twist of a translation by one metre along v."""
+    twist = np.zeros((4, 4))
+    twist[:3, 3] = np.asarray(v) / np.linalg.norm(v)
+    return twist
+
+
+def random_robot(joint_types: str, rng: np.random.Generator, markers: int = 10) -> Robot:
+    """Axes of any direction through points within 0.4 m of the body's centre; a body of 0.1 m."""
+    twists = []
+    for letter in joint_types:
+        direction = rng.standard_normal(3)
+        point = rng.uniform(-0.4, 0.4, 3)
+        twists.append(prismatic(direction) if letter == "P" else revolute(direction, point))
+    body = rng.uniform(-0.1, 0.1, (markers, 3))
+    q = rng.uniform(-1.0, 1.0, len(joint_types))
+    return Robot(joint_types, np.array(twists), rig(), np.hstack([body, np.ones((markers, 1))]), q)
+
+
+def trials(robot: Robot, frames: int = 8, angle: float = np.radians(30.0), length: float = 0.15) -> FloatArray:
+    """The reference and single-joint trial motions, (1 + n frames, n)."""
+    rows = [robot.q_reference]
+    for i, letter in enumerate(robot.joint_types):
+        reach = length if letter == "P" else angle
+        for offset in np.linspace(-reach, reach, frames):
+            rows.append(robot.q_reference + offset * np.eye(len(robot.joint_types))[i])
+    return np.array(rows)
+
+
+def around(robot: Robot, count: int, rng: np.random.Generator, angle: float = 0.5, length: float = 0.15) -> FloatArray:
+    """Random poses about the reference, all joints at once, (count, n)."""
+    reach = np.array([length if letter == "P" else angle for letter in robot.joint_types])
+    return robot.q_reference + rng.uniform(-1.0, 1.0, (count, len(reach))) * reach

@@ -1,0 +1,138 @@
+"""The vectorised forward model and its derivatives: against finite differences, scipy and the kernels."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from projservo_cli.calibration import adjustment
+from projservo_cli.calibration.adjustment import Scene
+from projservo_cli.calibration.optimization import fixed, minimize, prepare
+from projservo_cli.calibration.readings import gather
+from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
+from projservo_cli.records import Model
+from tests.calibration.simulated_robot import Robot, around, random_robot
+
+
+def problem_of(robot: Robot, count: int = 5, unseen: float = 0.0):
+    rng = np.random.default_rng(1)
+    observation = robot.observe(around(robot, count, rng), 0.0, rng)
+    if unseen:
+        observation.images[rng.random(observation.images.shape[:3]) < unseen] = np.nan
+    readings = gather(observation, robot.joint_types)
+    return prepare(readings, robot.q_reference), Scene(robot.cameras, robot.twists, robot.markers)
+
+
+def full_jacobian(problem, J):
+    """Compact derivative spread over all parameters, (4 N, size)."""
+    return problem.dense(J, np.ones(J.shape[:2]))
+
+
+@pytest.mark.parametrize("types", ["RPR", "RRRRRR", "P"])
+def test_forward_model_agrees_with_matrix_exponentials(types):
+    robot = random_robot(types, np.random.default_rng(3))
+    problem, scene = problem_of(robot)
+    # Pixels are of order 1e3: 1e-9 px is a relative 1e-12.
+    assert np.abs(problem.residual(scene)).max() < 1e-9
+
+
+@pytest.mark.parametrize("types", ["RPR", "RRP", "PPR"])
+def test_derivative_agrees_with_central_differences(types):
+    robot = random_robot(types, np.random.default_rng(4), markers=4)
+    problem, scene = problem_of(robot)
+    _, J = adjustment.derivative(scene, problem.readings, problem.q)
+    analytic = full_jacobian(problem, J)
+    scale = np.linalg.norm(analytic, axis=0)
+    for k in range(problem.place.size):
+        step = np.zeros(problem.place.size)
+        # A step that moves images by 1e-2 px: truncation and round-off of the quotient are both below 1e-6.
+        step[k] = 0.05 / scale[k]
+        ahead, behind = (
+            problem.residual(adjustment.retract(scene, problem.readings, problem.place, s)) for s in (step, -step)
+        )
+        numeric = (ahead - behind).ravel() / (2.0 * step[k])
+        assert np.abs(numeric - analytic[:, k]).max() < 1e-6 * scale[k]
+
+
+def test_gauge_directions_change_no_image():
+    for types, dimension in (("RRR", 9), ("RPR", 8)):
+        problem, scene = problem_of(random_robot(types, np.random.default_rng(5)))
+        _, J = adjustment.derivative(scene, problem.readings, problem.q)
+        G = adjustment.gauge(scene, problem.readings, problem.place)
+        assert G.shape[1] == dimension
+        dense = full_jacobian(problem, J)
+        assert np.abs(dense @ G).max() < 1e-11 * np.abs(dense).max()
+        singular = np.linalg.svd(dense / np.linalg.norm(dense, axis=0), compute_uv=False)
+        # Nothing else is free: the next singular value stands far above round-off.
+        assert singular[-dimension] < 1e-13 < 1e-6 < singular[-dimension - 1]
+
+
+def test_blocks_of_the_normal_matrix_are_those_of_the_whole():
+    problem, scene = problem_of(random_robot("RPR", np.random.default_rng(6)), unseen=0.3)
+    _, J = adjustment.derivative(scene, problem.readings, problem.q)
+    rng = np.random.default_rng(0)
+    weight = rng.uniform(0.0, 1.0, J.shape[:2])
+    residual = rng.standard_normal(J.shape[:3])
+    dense = problem.dense(J, weight)
+    assert np.allclose(problem.normal(J, weight), dense.T @ dense, rtol=1e-12, atol=1e-9)
+    whole = full_jacobian(problem, J)
+    assert np.allclose(problem.gradient(J, residual), whole.T @ residual.ravel(), rtol=1e-12, atol=1e-9)
+    x = rng.standard_normal(problem.place.size)
+    assert np.allclose(problem.change(J, x).ravel(), whole @ x, rtol=1e-12, atol=1e-9)
+
+
+def test_twin_of_the_kernels():
+    robot = random_robot("RPRR", np.random.default_rng(7))
+    types = np.array([int(letter == "P") for letter in robot.joint_types])
+    model = Model(robot.cameras, robot.twists, types, robot.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
+    problem, scene = problem_of(robot, count=3)
+    E = adjustment.displacements(scene.H_hat, problem.readings.prismatic, problem.q)
+    for k, q in enumerate(problem.readings.q):
+        H = np.linalg.multi_dot(list(E[:, k]))
+        assert np.abs(H - forward_kinematics(model, q)).max() < 1e-12
+    _, J = adjustment.joint_derivative(scene, problem.readings, problem.q)
+    moved = adjustment.moved_points(E, scene.M, problem.readings)[0]
+    for row in range(0, len(moved), 7):
+        q = problem.readings.q[problem.readings.pose_of[row]]
+        kernel = image_jacobian(robot.cameras, moved[row : row + 1], joint_operators(model, q))
+        assert np.abs(J[:, row] - kernel[:, 0]).max() < 1e-12 * np.abs(kernel).max() * 10
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(0, 10**6), st.floats(0.01, 3.0))
+def test_a_step_of_any_length_keeps_the_constraints(seed, length):
+    rng = np.random.default_rng(seed)
+    problem, scene = problem_of(random_robot("RPRP", rng, markers=3), count=2)
+    step = length * rng.standard_normal(problem.place.size)
+    H_hat = adjustment.retract(scene, problem.readings, problem.place, step).H_hat
+    slides = problem.readings.prismatic
+    turning = H_hat[~slides]
+    assert np.abs(turning @ turning @ turning + turning).max() < 1e-11 * (1.0 + np.abs(turning).max() ** 3)
+    assert np.all(H_hat[slides] @ H_hat[slides] == 0.0)
+    # One common speed of all prismatic joints: they are conjugate to metres by one matrix.
+    assert np.allclose(np.linalg.norm(H_hat[slides, :3, 3], axis=1), 1.0, atol=1e-12)
+    assert np.all(H_hat[:, 3] == 0.0)
+
+
+def test_search_returns_to_the_truth_from_a_disturbed_start():
+    robot = random_robot("RRPR", np.random.default_rng(8))
+    problem, scene = problem_of(robot, count=30)
+    rng = np.random.default_rng(2)
+    _, J = adjustment.derivative(scene, problem.readings, problem.q)
+    scale = np.linalg.norm(full_jacobian(problem, J), axis=0)
+    # Every parameter off by what moves all images by about 3 px.
+    step = 3.0 * np.sqrt(J.size / J.shape[-1]) / scale * rng.uniform(-1.0, 1.0, scale.size)
+    start = adjustment.retract(scene, problem.readings, problem.place, step)
+    assert np.abs(problem.residual(start)).max() > 5.0
+    fit = minimize(problem, start, fixed(problem.readings.seen.astype(float)))
+    assert fit.settled
+    assert fit.cost < 1e-12
+
+
+def test_cameras_stay_where_they_are_held():
+    robot = random_robot("RRR", np.random.default_rng(9))
+    problem, scene = problem_of(robot, count=10)
+    start = Scene(scene.P, scene.H_hat, scene.M + np.array([0.01, 0.0, 0.0, 0.0]))
+    fit = minimize(problem, start, fixed(problem.readings.seen.astype(float)), cameras=False)
+    assert np.array_equal(fit.scene.P, scene.P)
+    assert fit.cost < 1e-9

@@ -1,0 +1,86 @@
+"""No truth enters a calibration: what is configured about robot, rig and markers may be garbage."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import predict
+from projservo_cli.config import load_config
+from projservo_cli.stages import calibrate as stage
+from projservo_cli.stages.truth import truth_of
+from projservo_cli.tables import write_table
+
+PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
+# Another arm, another rig, another body; the same numbers of joints, types, pixels and markers.
+GARBAGE = (
+    "robot={name: nonsense, dh: {joints: ["
+    + ", ".join(f"{{type: R, d_m: {0.1 * i}, a_m: {1.7 - 0.3 * i}, alpha_deg: {17 * i}}}" for i in range(6))
+    + "]}}",
+    "rig.left={focal_px: [77, 3000], principal_point_px: [10, 900], position_m: [-5, 2, 9], target_m: [0, 0, 0]}",
+    "rig.right={focal_px: [640, 640], principal_point_px: [0, 0], position_m: [0, 30, 0], target_m: [1, 1, 1]}",
+    "markers.positions_m=[" + ", ".join(f"[{i}, {i * i % 7}, {-i}]" for i in range(10)) + "]",
+    "task={start: {joints: [1, 2, 3, 4, 5, 6], unit: rad}, goal: {turn_deg: 90}}",
+)
+
+
+def arrays(calibration):
+    """Everything a calibration says but the time it took."""
+    return {
+        field.name: getattr(calibration, field.name)
+        for field in dataclasses.fields(calibration)
+        if field.name != "seconds"
+    }
+
+
+def same(one, other):
+    assert arrays(one).keys() == arrays(other).keys()
+    for name, value in arrays(one).items():
+        np.testing.assert_array_equal(value, arrays(other)[name], err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def honest():
+    """Observation and calibration of the simulated robot, every number of it true."""
+    return stage.run(load_config(PAPER, ()))
+
+
+@pytest.mark.parametrize("method", ["refined", "linear", "closed_form"])
+def test_a_simulated_run_with_garbage_for_truth_is_the_same(honest, monkeypatch, method):
+    observation, calibration = honest
+    if method != "refined":
+        _, calibration = stage.run(load_config(PAPER, (f"calibration.method={method}",)))
+    config = load_config(PAPER, (*GARBAGE, f"calibration.method={method}"))
+    wrong = truth_of(config)
+    q = observation.q[0]
+    # The garbage is garbage: its images have nothing to do with those observed.
+    assert np.nanmedian(np.abs(wrong.images(q, wrong.M) - observation.images[0])) > 100.0
+    monkeypatch.setattr(stage, "simulate", lambda config, truth: observation)
+    same(stage.run(config)[1], calibration)
+
+
+@pytest.fixture(scope="module")
+def table(honest, tmp_path_factory):
+    path = tmp_path_factory.mktemp("table") / "trials.csv"
+    write_table(honest[0], path)
+    return path
+
+
+def test_a_recorded_run_does_not_look_at_the_configured_robot(table):
+    data = (f"data={{table: {table}, joints: RRRRRR, noise_px: 0.5}}",)
+    same(
+        stage.run(load_config(PAPER, data))[1],
+        stage.run(load_config(PAPER, (*data, *GARBAGE)))[1],
+    )
+
+
+def test_a_recorded_run_needs_neither_robot_nor_rig(honest, table, tmp_path):
+    bare = tmp_path / "bare.yaml"
+    bare.write_text(f"name: bare\nseed: 5\ndata: {{table: {table}}}\n", encoding="utf-8")
+    observation, calibration = stage.run(load_config(bare, ()))
+    np.testing.assert_array_equal(observation.images, honest[0].images)
+    # Another seed, another guess of the image centre, σ estimated: the same optimum. The search ends
+    # when a step moves the images by 1e-7 of the residual, 1e-7 · 0.5 px · √2000 over all images.
+    assert np.abs(predict(calibration, observation.q) - predict(honest[1], observation.q)).max() <= 1e-6
+    assert calibration.sigma_px != honest[1].sigma_px
