@@ -31,13 +31,14 @@ class Case:
             self.config.trajectory.delta, samples, bounds,
         )  # fmt: skip
 
-    def servo(self, law, model=None, gains=None, **limits):
-        """Trace of one law without noise, by default with the true metric model."""
+    def servo(self, law, model=None, gains=None, sense=None, **limits):
+        """Trace of one law without noise, by default with the true metric model and the planned sense."""
+        sense = self.plan.rotation_sense() if sense is None else sense
         most = limits.get("max_steps", self.limits.max_steps)
         return drive(
             law, self.truth.model if model is None else model, self.plant, self.truth, self.reach,
             self.gains if gains is None else gains, self.limits._replace(**limits),
-            np.zeros((most + 1, 2, len(self.truth.face), 2)), self.plan.rotation_sense(),
+            np.zeros((most + 1, 2, len(self.truth.face), 2)), sense,
         )  # fmt: skip
 
     def trace(self, law):

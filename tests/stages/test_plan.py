@@ -120,6 +120,21 @@ def test_a_start_that_is_the_goal_is_a_plan_without_motion():
 
 
 @pytest.mark.parametrize("name", ["paper", "ur5"])
+def test_the_planned_sense_of_a_half_turn_is_the_better(name):
+    """Against the opposite sense: it stays within the joint limits, or arrives no later."""
+    example = case(name)
+    planned = example.trace("direct_two")
+    sense = example.plan.rotation_sense() * np.array([[1.0], [-1.0]])
+    other = example.servo("direct_two", sense=sense)
+    assert planned.verdict == "converged"
+    assert (planned.first_beyond_limit >= 0, planned.steps) <= (
+        other.verdict != "converged" or other.first_beyond_limit >= 0,
+        other.steps,
+    )
+    assert np.abs(planned.q[5] - other.q[5]).max() > 0.1
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5"])
 def test_the_planned_half_turn_does_not_depend_on_frame_or_scale(name):
     """Exactly 180°: the rehearsed sense is one of the robot, whatever the sign of its cameras."""
     example = case(name)

@@ -162,6 +162,16 @@ def test_half_a_turn_goes_on_in_the_sense_it_began(part):
         assert pytest.approx(following.A_star, abs=1e-9) == following.A @ reassembled(following).T
 
 
+def test_exactly_half_a_turn_within_the_plane_has_one_sense_in_every_frame():
+    """Round-off on either side of 180° must not decide."""
+    wanted = Split(SQUARE, SHIFT @ HALF_IN_PLANE)
+    for seed in range(12):
+        split = Split(SQUARE, SHIFT @ HALF_IN_PLANE, frame(seed, mirrored=seed % 2 == 1))
+        assert abs(split.parts.theta_p) == pytest.approx(math.pi, abs=1e-9)
+        assert split.parts.theta_p == pytest.approx(wanted.parts.theta_p, abs=1e-9)
+        assert split.q_hat[2] == pytest.approx(wanted.q_hat[2], abs=1e-9)
+
+
 def test_a_fresh_task_past_half_a_turn_takes_the_shorter_way():
     for excess in (-0.2, 0.2):
         split = Split(SQUARE, turned(SQUARE_CENTER, [0, 0, math.pi + excess]))
