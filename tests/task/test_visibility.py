@@ -215,7 +215,7 @@ def chosen(a, a_t, H_hat, theta, task, against_previous=False):
 
 
 def test_sense_of_the_turn_by_brute_force():
-    """Never more cameras lose sight than the other way; among equals, away from 180°, the better worst margin."""
+    """Fewest cameras lose sight; among equals, away from 180°, the better worst margin."""
     other_taken = differ = 0
     for seed in range(40):
         a, a_t, H_hat, theta, task = sense_case(seed)
