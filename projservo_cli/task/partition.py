@@ -230,16 +230,15 @@ def within_plane_part(
         velocity = scale(-1.0, velocity)
     a_i = meet(A_er, A_c, A_c2)
     second = apply(H_p2, A_e)
-    found, plus, minus = incidence_angles(
+    # The sense of the operator makes a_iᵀ A_e grow where A_e passes its target and fall on the far side
+    # of the axis: of both solutions θ⁻ is the one that grows.
+    found, _, theta = incidence_angles(
         dot(a_i, A_e) + dot(a_i, second), dot(a_i, velocity), -dot(a_i, second)
     )
     if not found:
         return False, 0.0, NO_OPERATOR
-    miss_plus = sub(apply(rotation(H_p, H_p2, plus), A_e), A_er)
-    miss_minus = sub(apply(rotation(H_p, H_p2, minus), A_e), A_er)
-    theta = plus if dot(miss_plus, miss_plus) <= dot(miss_minus, miss_minus) else minus
     if math.pi - abs(theta) <= HALF_TURN_TOLERANCE:
-        theta = -abs(theta)
+        theta = abs(theta)
     if math.pi - abs(theta) < CONTINUITY_BAND:
         previous = agreement(q_hat, memory.rotation[1])
         if theta > 0.0 and previous < 0.0:
