@@ -1,4 +1,4 @@
-"""Recorded tables of two arms through the command line: held-out prediction, noise, methods, order of rows."""
+"""Recorded tables of two arms, through the command line: held-out prediction, noise, methods, order."""
 
 import csv
 import json
