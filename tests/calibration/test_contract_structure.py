@@ -1,0 +1,183 @@
+"""What [RH00] section 2 says of a calibration: operators, plane at infinity, cameras, one common metric."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.geometry.kinematics import forward_kinematics, project
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+# Operators are assembled from twists and a frame change: a few hundred roundings, no more.
+EXACT = 1e-12
+
+
+@pytest.fixture(scope="module", params=["RRRRRR", "RRPRPR", "PRRPR"])
+def case(request):
+    rng = np.random.default_rng(11)
+    robot = random_robot(request.param, rng)
+    observation = robot.observe(trials(robot), 0.5, rng)
+    calibration = calibrate(observation, robot.joint_types, sigma_px=0.5)
+    return robot, observation, around(robot, 30, rng), calibration
+
+
+def revolute_of(robot):
+    return np.array([letter == "R" for letter in robot.joint_types])
+
+
+def blocks(calibration):
+    """Operators (n, 3, 3) and (n, 3) in an affine frame: the last coordinate is a_inf."""
+    a_inf = calibration.a_inf / np.linalg.norm(calibration.a_inf)
+    frame = np.vstack([np.linalg.svd(a_inf[None])[2][1:], a_inf])
+    moved = frame @ calibration.H_hat_0 @ np.linalg.inv(frame)
+    assert np.abs(moved[:, 3]).max() <= EXACT * np.abs(moved).max()
+    return moved[:, :3, :3], moved[:, :3, 3], frame
+
+
+def common_form(B):
+    """Symmetric Q (3, 3) with Bᵀ Q + Q B = 0 for all blocks, and the singular values of its equations."""
+    basis = []
+    for i in range(3):
+        for j in range(i, 3):
+            E = np.zeros((3, 3))
+            E[i, j] = E[j, i] = 1.0
+            basis.append(E)
+    rows = np.array([np.concatenate([(b.T @ E + E @ b).ravel() for b in B]) for E in basis]).T
+    _, s, Vt = np.linalg.svd(rows)
+    Q = np.tensordot(Vt[-1], np.array(basis), axes=1)
+    return Q * np.sign(np.trace(Q)), s
+
+
+def test_each_operator_is_that_of_its_joint(case):
+    robot, _, _, calibration = case
+    for H_hat, turns in zip(calibration.H_hat_0, revolute_of(robot), strict=True):
+        size = np.linalg.norm(H_hat)
+        assert abs(np.trace(H_hat)) <= EXACT * size
+        law = H_hat @ H_hat @ H_hat + H_hat if turns else H_hat @ H_hat
+        assert np.linalg.norm(law) <= EXACT * max(size, size**3)
+        s = np.linalg.svd(H_hat, compute_uv=False)
+        rank = 2 if turns else 1
+        assert s[rank - 1] > 1e-3 * s[0]
+        assert s[rank] <= EXACT * s[0]
+
+
+def test_stated_defects_are_those_of_the_operators(case):
+    robot, _, _, calibration = case
+    for i, (H_hat, turns) in enumerate(zip(calibration.H_hat_0, revolute_of(robot), strict=True)):
+        law = H_hat @ H_hat @ H_hat + H_hat if turns else H_hat @ H_hat
+        stated = calibration.operator_defect[i], calibration.trace_defect[i], calibration.plane_defect[i]
+        a_inf = calibration.a_inf / np.linalg.norm(calibration.a_inf)
+        seen = np.linalg.norm(law) / np.linalg.norm(H_hat), np.trace(H_hat), np.linalg.norm(a_inf @ H_hat)
+        np.testing.assert_allclose(stated, np.abs(seen), atol=1e-14 * np.linalg.norm(H_hat))
+
+
+def test_all_operators_leave_one_plane_and_markers_are_scaled_by_it(case):
+    _, _, _, calibration = case
+    a_inf = calibration.a_inf
+    sizes = np.linalg.norm(calibration.H_hat_0, axis=(1, 2))
+    assert (
+        np.linalg.norm(a_inf @ calibration.H_hat_0, axis=1) <= EXACT * np.linalg.norm(a_inf) * sizes
+    ).all()
+    # The plane is the only one: the operators beside each other have rank three.
+    s = np.linalg.svd(np.hstack(list(calibration.H_hat_0 / sizes[:, None, None])), compute_uv=False)
+    assert s[2] > 1e-3 * s[0]
+    np.testing.assert_allclose(calibration.M @ a_inf, 1.0, rtol=EXACT)
+
+
+def test_operators_are_conjugate_to_rigid_motions_by_one_matrix(case):
+    robot, _, q, calibration = case
+    B, v, frame = blocks(calibration)
+    turns = revolute_of(robot)
+    Q, s = common_form(B[turns])
+    assert s[-1] <= EXACT * s[0]
+    assert s[-2] > 1e-4 * s[0]  # nothing else is kept by all of them
+    values = np.linalg.eigvalsh(Q)
+    assert values[0] > 1e-4 * values[2]
+    if (~turns).sum() > 1:  # translations of one metre each are equally long in the common metric
+        speed = np.sqrt(np.einsum("ia,ab,ib->i", v[~turns], Q, v[~turns]))
+        np.testing.assert_allclose(speed, speed[0], rtol=1e-11)
+    model = calibration.model()
+    for row in q:
+        H = frame @ forward_kinematics(model, row) @ np.linalg.inv(frame)
+        np.testing.assert_allclose(H[3], [0.0, 0.0, 0.0, 1.0], atol=1e-11)
+        R = H[:3, :3]
+        np.testing.assert_allclose(R.T @ Q @ R, Q, atol=1e-11 * values[2])
+        assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-11)
+
+
+def test_the_common_metric_is_that_of_the_robot(case):
+    """Angles between axes, read off in the common metric, are the true ones to the noise."""
+    robot, _, _, calibration = case
+    B, _, _ = blocks(calibration)
+    turns = revolute_of(robot)
+    S = np.linalg.cholesky(common_form(B[turns])[0]).T
+    axes = []
+    for b in B[turns]:
+        W = S @ b @ np.linalg.inv(S)
+        axes.append([W[2, 1] - W[1, 2], W[0, 2] - W[2, 0], W[1, 0] - W[0, 1]])
+    W = robot.twists[turns][:, :3, :3]
+    true = np.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]], axis=1)
+    axes = np.array(axes) / 2.0
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0, atol=1e-9)
+    # 0.5 px on a lever of 0.1 m, 850 px per m, averaged over 8 frames and 10 markers: about 0.1°;
+    # the gauge itself is known worse, through the difference of both views alone.
+    np.testing.assert_allclose(axes @ axes.T, true @ true.T, atol=0.03)
+
+
+def test_cameras_are_finite_and_see_all_points_before_them(case):
+    _, observation, q, calibration = case
+    model = calibration.model()
+    for P in calibration.P:
+        C = np.linalg.svd(P)[2][3]
+        assert abs(C @ calibration.a_inf) > 1e-3 * np.linalg.norm(calibration.a_inf)
+        assert np.linalg.matrix_rank(P) == 3
+    for row in np.vstack([observation.q, q]):
+        M = calibration.M @ forward_kinematics(model, row).T
+        assert (np.einsum("vj,mj->vm", calibration.P[:, 2], M) > 0.0).all()
+
+
+def test_predictions_are_those_of_the_kernels(case):
+    _, _, q, calibration = case
+    model = calibration.model()
+    seen = np.array([project(model.P, calibration.M @ forward_kinematics(model, row).T) for row in q])
+    np.testing.assert_allclose(predict(calibration, q), seen, rtol=1e-12, atol=1e-9)
+
+
+def test_a_point_behind_a_camera_has_no_image(case):
+    robot, _, q, calibration = case
+    turned = calibration.P.copy()
+    turned[1] *= -1.0
+    one = predict(calibration, q)
+    other = predict(dataclasses.replace(calibration, P=turned), q)
+    np.testing.assert_array_equal(other[:, 0], one[:, 0])
+    assert np.isnan(other[:, 1]).all()
+    assert np.isfinite(one).all()
+    assert robot.depths(q).min() > 0.0
+
+
+def test_excitation_and_reference_are_those_of_the_table(case):
+    robot, observation, _, calibration = case
+    np.testing.assert_allclose(calibration.q_reference, robot.q_reference, atol=1e-15)
+    np.testing.assert_allclose(calibration.excitation, np.ptp(observation.q, axis=0), rtol=1e-14)
+    assert not calibration.weak.any()
+    assert calibration.merged_poses == len(observation.pose)
+    assert calibration.merged_markers == len(observation.marker)
+    assert calibration.joint_types == robot.joint_types
+
+
+@pytest.mark.parametrize("method", ["linear", "closed_form"])
+def test_the_other_methods_find_the_same_operators_without_noise(method):
+    rng = np.random.default_rng(3)
+    robot = random_robot("RRPRRR", rng)
+    observation = robot.observe(trials(robot), 0.0, rng)
+    q = around(robot, 30, rng)
+    calibration = calibrate(observation, robot.joint_types, method=method, source="recorded")
+    # Round-off of double precision alone: 1e-12 px measured.
+    assert np.abs(predict(calibration, q) - robot.images(q)).max() <= 1e-8
+    assert calibration.operator_defect.max() <= 1e-9
+    assert calibration.plane_defect.max() <= 1e-9
+    np.testing.assert_allclose(calibration.M @ calibration.a_inf, 1.0, rtol=1e-9)
+    # Neither claims a certainty that it has not computed.
+    assert np.isnan(calibration.covariance).all()
+    assert np.isnan(calibration.prediction_noise).all()
