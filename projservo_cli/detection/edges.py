@@ -14,8 +14,8 @@ ROUNDS = 3  # samples are taken anew around the sides that were found
 ITERATIONS = 20
 LEAST_REACH = 1.5  # px on either side of an edge: less is no profile
 MOST_REACH = 6.0
-SPOILT = 0.15  # of the contrast: mean residual of a profile that something covers
-SPOILT_SHARE = 0.1  # of the profiles of a side
+SPOILT = 0.2  # of the contrast: rms residual of a profile that something covers
+SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
 
 
 def refine_corners(image: FloatArray, corners: FloatArray, cells: int) -> FloatArray:
@@ -64,7 +64,7 @@ def fit_side(image: FloatArray, corners: FloatArray, side: int, cells: int) -> F
     depth = float(normal @ (start - corners.mean(axis=0)))
     if depth < 0.0:
         normal, depth = -normal, -depth
-    reach = min(0.8 * 2.0 * depth / cells, MOST_REACH)
+    reach = min(0.65 * 2.0 * depth / cells, MOST_REACH)
     if reach < LEAST_REACH:
         return none
     margin = 0.12 * length + 1.0
@@ -85,7 +85,26 @@ def fit_side(image: FloatArray, corners: FloatArray, side: int, cells: int) -> F
 
 
 def _fit_edge(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> tuple[float, float] | None:
-    """Offset n_0 and slope k of an edge in its profiles (T, N); None where they show no clean edge."""
+    """Offset n_0 and slope k of an edge in its profiles (T, N); None where they show no clean edge.
+
+    Profiles that something covers are left out and the rest fitted again, if few are.
+    """
+    noise = float(np.median(np.abs(np.diff(grey, axis=0))))  # about the standard deviation of a pixel
+    clean = np.ones(len(t), dtype=bool)
+    while clean.mean() >= 1.0 - SPOILT_SHARE:
+        x = _least_squares(grey[clean], t[clean], n, reach)
+        if x is None:
+            return None
+        residual, _ = _edge_model(x, grey, t, n)
+        spoilt = np.sqrt(np.mean(residual**2, axis=1)) > max(SPOILT * x[1], 3.0 * noise)
+        if not (spoilt & clean).any():
+            return float(x[2]), float(x[3])
+        clean &= ~spoilt
+    return None
+
+
+def _least_squares(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> FloatArray | None:
+    """Edge (b, a, n_0, k, σ) through all profiles; None where it is not one from dark to bright."""
     low, high = float(grey[:, : len(n) // 4].mean()), float(grey[:, -(len(n) // 4) :].mean())
     x = np.array([low, high - low, 0.0, 0.0, 1.0])
     scale = np.array([1.0, 1.0, reach, reach, reach])
@@ -100,12 +119,8 @@ def _fit_edge(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> t
         x[4] = min(max(x[4], 0.2), reach)
         if float(np.abs(step[2:] / scale[2:]).max()) < 1e-6:
             break
-    residual, _ = _edge_model(x, grey, t, n)
-    spoilt = np.abs(residual.mean(axis=1)) > SPOILT * abs(x[1])
-    inside = abs(x[2]) + 0.5 * abs(x[3]) < reach
-    if not (x[1] > 0.0 and inside and np.isfinite(x).all() and spoilt.mean() <= SPOILT_SHARE):
-        return None
-    return float(x[2]), float(x[3])
+    found = np.isfinite(x).all() and x[1] > 0.0 and abs(x[2]) + 0.5 * abs(x[3]) < reach
+    return x if found else None
 
 
 def _edge_model(
