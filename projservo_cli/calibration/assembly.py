@@ -79,7 +79,7 @@ def assemble(
         joint_types="".join("P" if slides else "R" for slides in readings.prismatic),
         usable=shortfall is None,
         reason=shortfall or reason,
-        advice=advice,
+        advice=advice if shortfall is None else (),
         rms_px=agreement.rms_px,
         sigma_px=expected.sigma_px,
         sigma_fitted_px=agreement.sigma_px,

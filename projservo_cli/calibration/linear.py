@@ -62,7 +62,10 @@ def trajectories(
 
 
 def operators(readings: Readings, F: FloatArray) -> tuple[Scene, FloatArray, BoolArray]:
-    """Scene whose operators are twists by construction, from linear equations alone.
+    """Scene from linear equations alone, its operators twists wherever noise has left them a metric.
+
+    Where no positive quadratic form is kept by all revolute operators the frame stays affine and the
+    operators as the equations gave them: a result for comparison only, as its residuals will say.
 
     Parameters
     ----------
@@ -76,7 +79,7 @@ def operators(readings: Readings, F: FloatArray) -> tuple[Scene, FloatArray, Boo
     Raises
     ------
     WorkFailed
-        If the poses are no single-joint trials, or noise has destroyed the structure.
+        If the poses are no single-joint trials, or too few markers were seen along them.
     """
     home, _ = trials_of(readings, "linear")
     both = readings.both
@@ -96,14 +99,17 @@ def operators(readings: Readings, F: FloatArray) -> tuple[Scene, FloatArray, Boo
     to_affine = np.linalg.inv(_affine_frame(a_inf, M))
     H_hat = np.array([_operator(M, V[i], W[i], bool(slides)) for i, slides in enumerate(readings.prismatic)])
     H_hat = to_affine @ H_hat @ np.linalg.inv(to_affine)
+    # To first order a velocity is parallel to the plane at infinity; exactly so from here on.
+    H_hat[:, 3] = 0.0
+    frame = to_affine
     metric = _metric_frame(H_hat[~readings.prismatic, :3, :3])
-    to_metric = np.eye(4)
-    to_metric[:3, :3] = metric
-    H_hat = to_metric @ H_hat @ np.linalg.inv(to_metric)
-    frame = to_metric @ to_affine
+    if metric is not None:
+        to_metric = np.eye(4)
+        to_metric[:3, :3] = metric
+        H_hat = _twists(to_metric @ H_hat @ np.linalg.inv(to_metric), readings.prismatic)
+        frame = to_metric @ to_affine
     M = M @ frame.T
-    scene = Scene(view.P @ np.linalg.inv(frame), _twists(H_hat, readings.prismatic), M / M[:, 3:])
-    return scene, readings.q[home], known
+    return Scene(view.P @ np.linalg.inv(frame), H_hat, M / M[:, 3:]), readings.q[home], known
 
 
 def _operator(M: FloatArray, V: FloatArray, W: FloatArray, slides: bool) -> FloatArray:
@@ -118,16 +124,11 @@ def _affine_frame(a_inf: FloatArray, M: FloatArray) -> FloatArray:
     return np.column_stack([np.linalg.svd(a_inf[None])[2][1:].T, M.mean(axis=0)])
 
 
-def _metric_frame(B: FloatArray) -> FloatArray:
+def _metric_frame(B: FloatArray) -> FloatArray | None:
     """Frame change (3, 3) after which the blocks (r, 3, 3) of revolute operators are antisymmetric.
 
     The quadratic form Q that all of them keep, Bᵀ Q + Q B = 0, is linear in its six entries; with
-    Q = Sᵀ S the change is S.
-
-    Raises
-    ------
-    WorkFailed
-        If no positive form exists, as happens under noise.
+    Q = Sᵀ S the change is S. None where that form is not positive, as happens under noise.
     """
     if len(B) == 0:
         return np.eye(3)
@@ -141,9 +142,7 @@ def _metric_frame(B: FloatArray) -> FloatArray:
     Q = Q * np.sign(np.trace(Q))
     values = np.linalg.eigvalsh(Q)
     if not values[0] > 1e-6 * values[2]:
-        raise WorkFailed(
-            "the linear method finds no common metric of the operators, too much noise for it: use refined"
-        )
+        return None
     return np.asarray(np.linalg.cholesky(Q).T)
 
 

@@ -10,7 +10,7 @@ from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.body import Alignment, merge
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.optimization import Fit, Problem, Weighting, fixed, minimize, prepare
-from projservo_cli.calibration.quality import LEAST_SIGMA, Agreement, Expected, require_body
+from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected, require_body
 from projservo_cli.calibration.readings import Readings, of_poses
 from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
 from projservo_cli.calibration.start import place, rotation_axes
@@ -28,6 +28,8 @@ HOPELESS = 10.0
 # the median are left out of the next.
 FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
 SPOILT = 8.0
+# Relative difference of robust residuals below which two starts have ended at one place.
+SAME_LEVEL = 1e-3
 FOCAL_MINIMA, AXIS_MINIMA = 3, 3
 
 
@@ -68,14 +70,17 @@ def solve(
     hopeless = HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA)
     best: Solution | None = None
     trusted = np.ones(len(readings.q), dtype=bool)
+    levels: list[float] = []
     for factors in FOCAL_FACTORS:
-        levels: list[float] = []
         usable = of_poses(readings, trusted)
         for scene in starts(problem, usable, epipolar, frame, rng, factors):
             searched = robust_search(problem, scene, trusted)
             level = float(np.median(_distances(searched.residual, usable_rows(problem, trusted))))
             # Different starts that end at one place need not be followed to the end twice.
-            if any(abs(level - other) < 1e-3 * other for other in levels):
+            if any(abs(level - other) < SAME_LEVEL * other for other in levels):
+                # Twice the same place and no gross misfit: more starts would not better it.
+                if best is not None and expected.ratio(best.agreement) <= REFUSE_RATIO:
+                    return best
                 continue
             levels.append(level)
             found = least_squares(problem, searched.scene, level / RAYLEIGH, hopeless)
@@ -91,7 +96,9 @@ def solve(
             if expected.refusal(best.agreement) is None:
                 return best
             # Wrong joint readings spoil the start: once the rest is roughly explained they stand out.
-            trusted = _explained(best)
+            before, trusted = trusted, _explained(best)
+            if not np.array_equal(before, trusted):
+                levels = []
     if best is None:
         raise WorkFailed(
             "no start of the adjustment puts all points in front of both cameras: check that rows of one "

@@ -1,4 +1,4 @@
-"""An independent robot, rig and marker body: matrix exponentials by scipy, nothing of the package but records."""
+"""An independent robot, rig and marker body: matrix exponentials by scipy, nothing of the package."""
 
 from dataclasses import dataclass
 
@@ -38,7 +38,7 @@ class Robot:
             T = np.eye(4)
             for twist, amount in zip(self.twists, row - self.q_reference, strict=True):
                 T = T @ expm(twist * amount)
-            result[k] = (self.cameras[:, 2] @ T @ self.markers.T)
+            result[k] = self.cameras[:, 2] @ T @ self.markers.T
         return result
 
     def observe(self, q: FloatArray, sigma: float, rng: np.random.Generator) -> Observation:
@@ -91,7 +91,9 @@ def random_robot(joint_types: str, rng: np.random.Generator, markers: int = 10) 
     return Robot(joint_types, np.array(twists), rig(), np.hstack([body, np.ones((markers, 1))]), q)
 
 
-def trials(robot: Robot, frames: int = 8, angle: float = np.radians(30.0), length: float = 0.15) -> FloatArray:
+def trials(
+    robot: Robot, frames: int = 8, angle: float = np.radians(30.0), length: float = 0.15
+) -> FloatArray:
     """The reference and single-joint trial motions, (1 + n frames, n)."""
     rows = [robot.q_reference]
     for i, letter in enumerate(robot.joint_types):
@@ -101,7 +103,9 @@ def trials(robot: Robot, frames: int = 8, angle: float = np.radians(30.0), lengt
     return np.array(rows)
 
 
-def around(robot: Robot, count: int, rng: np.random.Generator, angle: float = 0.5, length: float = 0.15) -> FloatArray:
+def around(
+    robot: Robot, count: int, rng: np.random.Generator, angle: float = 0.5, length: float = 0.15
+) -> FloatArray:
     """Random poses about the reference, all joints at once, (count, n)."""
     reach = np.array([length if letter == "P" else angle for letter in robot.joint_types])
     return robot.q_reference + rng.uniform(-1.0, 1.0, (count, len(reach))) * reach

@@ -48,7 +48,8 @@ def test_derivative_agrees_with_central_differences(types):
         # A step that moves images by 1e-2 px: truncation and round-off of the quotient are both below 1e-6.
         step[k] = 0.05 / scale[k]
         ahead, behind = (
-            problem.residual(adjustment.retract(scene, problem.readings, problem.place, s)) for s in (step, -step)
+            problem.residual(adjustment.retract(scene, problem.readings, problem.place, s))
+            for s in (step, -step)
         )
         numeric = (ahead - behind).ravel() / (2.0 * step[k])
         assert np.abs(numeric - analytic[:, k]).max() < 1e-6 * scale[k]

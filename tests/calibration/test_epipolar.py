@@ -36,11 +36,15 @@ def test_noise_is_estimated_in_spite_of_gross_errors(share):
     rng = np.random.default_rng(2)
     left, right = sightings(600, 0.5, rng)
     wrong = rng.random(600) < share
-    right[wrong] += rng.uniform(20.0, 50.0, (int(wrong.sum()), 2)) * rng.choice([-1.0, 1.0], (int(wrong.sum()), 2))
+    right[wrong] += rng.uniform(20.0, 50.0, (int(wrong.sum()), 2)) * rng.choice(
+        [-1.0, 1.0], (int(wrong.sum()), 2)
+    )
     found = epipolar.estimate(left, right, np.random.default_rng(3))
     # 593 degrees of freedom leave 3 % of spread; errors along the epipolar line go unnoticed and add.
     assert found.sigma_px == pytest.approx(0.5, rel=0.12)
-    true = epipolar.sampson(fundamental_matrix(rig()), epipolar.homogeneous(left), epipolar.homogeneous(right))
+    true = epipolar.sampson(
+        fundamental_matrix(rig()), epipolar.homogeneous(left), epipolar.homogeneous(right)
+    )
     far = np.abs(true) > 5.0
     assert not found.inlier[far].any()
     assert found.inlier[~wrong].mean() > 0.995

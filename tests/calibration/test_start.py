@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration import body, rotations, start
@@ -61,16 +62,12 @@ def test_screws_are_recovered_from_exact_points(types, poses):
     points = true[readings.pose_of, readings.marker_of]
     alignment = body.merge(true, np.ones(true.shape[:2], dtype=bool))
     candidates = start.rotation_axes(alignment, dq, readings.prismatic, np.random.default_rng(1), 3)
-    best = min(
-        np.abs(_screws(w, points, readings, dq) - robot.twists).max() for w in candidates
-    )
+    best = min(np.abs(_screws(w, points, readings, dq) - robot.twists).max() for w in candidates)
     # The ridge pulls axes towards the body by at most its square over the number of equations.
     assert best < 5e-3
 
 
 def _moved(robot, row):
-    from scipy.linalg import expm
-
     T = np.eye(4)
     for twist, amount in zip(robot.twists, row - robot.q_reference, strict=True):
         T = T @ expm(twist * amount)
