@@ -120,9 +120,8 @@ def test_the_common_metric_is_that_of_the_robot(case):
     true = np.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]], axis=1)
     axes = np.array(axes) / 2.0
     np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0, atol=1e-9)
-    # 0.5 px on a lever of 0.1 m, 850 px per m, averaged over 8 frames and 10 markers: about 0.1°;
-    # the gauge itself is known worse, through the difference of both views alone.
-    np.testing.assert_allclose(axes @ axes.T, true @ true.T, atol=0.03)
+    # 0.5 px of noise leaves 0.005 in these cosines (0.3°) at most, measured on the three robots.
+    np.testing.assert_allclose(axes @ axes.T, true @ true.T, atol=0.015)
 
 
 def test_cameras_are_finite_and_see_all_points_before_them(case):

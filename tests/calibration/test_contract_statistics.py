@@ -1,0 +1,232 @@
+"""χ², covariance and efficiency against a bound computed here, by complex steps through another model."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest
+
+from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.records import Observation
+from projservo_cli.tables import read_table
+from tests.calibration.simulated_robot import Robot, around, random_robot, trials
+
+SIGMA = 0.5
+STEP = 1e-30  # of the complex differentiation: exact to round-off, nothing cancels
+
+
+def images(x, joint_types, m, dq):
+    """Pixels (K, 2, m, 2) from cameras, axes, directions and markers ravelled in x; holds for complex x.
+
+    A screw is any (w, v): w is scaled to one and v freed of its part along w, so that the redundant
+    directions of x change no image. A direction is scaled to one.
+    """
+    n = len(joint_types)
+    P, x = x[:24].reshape(2, 3, 4), x[24:]
+    screws, X = x[: 6 * n].reshape(n, 6), x[6 * n :].reshape(m, 3)
+    points = np.broadcast_to(X, (len(dq), m, 3))
+    for i in range(n - 1, -1, -1):
+        w, v, theta = screws[i, :3], screws[i, 3:], dq[:, i, None, None]
+        if joint_types[i] == "P":
+            points = points + theta * v / np.sqrt(v @ v)
+            continue
+        w = w / np.sqrt(w @ w)
+        v = v - w * (w @ v)
+        velocity = np.cross(w, points) + v
+        points = points + np.sin(theta) * velocity + (1.0 - np.cos(theta)) * np.cross(w, velocity)
+    p = np.einsum("vrc,kmc->kvmr", P[..., :3], points) + P[:, None, :, 3]
+    return p[..., :2] / p[..., 2:]
+
+
+def parameters(robot):
+    twists = robot.twists
+    w = np.stack([twists[:, 2, 1], twists[:, 0, 2], twists[:, 1, 0]], axis=1)
+    screws = np.hstack([w, twists[:, :3, 3]])
+    return np.concatenate([robot.cameras.ravel(), screws.ravel(), robot.markers[:, :3].ravel()])
+
+
+def derivative(robot, q):
+    """Derivative (pixels, parameters) at the truth."""
+    x, dq = parameters(robot), q - robot.q_reference
+    columns = []
+    for k in range(len(x)):
+        moved = x.astype(complex)
+        moved[k] += 1j * STEP
+        columns.append(images(moved, robot.joint_types, len(robot.markers), dq).imag.ravel() / STEP)
+    return np.array(columns).T
+
+
+class Bound:
+    """Cramér–Rao bound of predictions: covariance factor @ factor.T per px² of noise, for visible rows."""
+
+    def __init__(self, robot, trained, q):
+        x, dq = parameters(robot), q - robot.q_reference
+        # The other model is the same robot.
+        np.testing.assert_allclose(
+            images(x, robot.joint_types, len(robot.markers), dq), robot.images(q), atol=1e-8
+        )
+        J = derivative(robot, trained)
+        scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+        _, s, Vt = np.linalg.svd(J / scale, full_matrices=False)
+        self.rank = int((s > 1e-10 * s[0]).sum())
+        # A clear gap: what is left beyond the rank is the gauge and round-off.
+        assert s[self.rank - 1] > 1e-7 * s[0]
+        basis = Vt[: self.rank].T / s[: self.rank]
+        self.factor = (derivative(robot, q) / scale) @ basis
+        self.coordinates = J.shape[0]
+
+    def mean_square(self):
+        """Mean variance of a coordinate."""
+        return float((self.factor**2).sum()) / len(self.factor)
+
+    def relative_error(self, draws):
+        """Standard error of the mean square over independent draws of normal errors, relative."""
+        spectrum = np.linalg.svd(self.factor, compute_uv=False) ** 2
+        return float(np.sqrt(2.0 * (spectrum**2).sum() / draws) / spectrum.sum())
+
+
+def expected_rank(robot):
+    """Both cameras up to scale, screws, markers, minus the frame: a similarity, rigid if a joint slides."""
+    revolute = robot.joint_types.count("R")
+    sliding = len(robot.joint_types) - revolute
+    return 22 + 4 * revolute + 2 * sliding + 3 * len(robot.markers) - (6 if sliding else 7)
+
+
+@pytest.fixture(scope="module", params=["RRRRRR", "RRPRPR"])
+def draws(request):
+    """Twenty noise draws of a small set of trials: robot, noise-free bound, calibrations."""
+    rng = np.random.default_rng(5)
+    robot = random_robot(request.param, rng, markers=5)
+    q, held_out = trials(robot, frames=4), around(robot, 40, rng)
+    bound = Bound(robot, q, held_out)
+    found = [
+        calibrate(robot.observe(q, SIGMA, np.random.default_rng(seed)), robot.joint_types, sigma_px=SIGMA)
+        for seed in range(20)
+    ]
+    return robot, held_out, bound, found
+
+
+def test_degrees_of_freedom(draws):
+    robot, _, bound, found = draws
+    assert bound.rank == expected_rank(robot)
+    for calibration in found:
+        assert calibration.outlier.size == 0  # a normal draw of 250 pairs has 5σ once in a thousand sets
+        assert calibration.dof == bound.coordinates - bound.rank
+        rank = np.linalg.matrix_rank(calibration.covariance, rtol=1e-11, hermitian=True)
+        assert rank == bound.rank
+
+
+def test_chi2_is_distributed_as_it_should(draws):
+    _, _, _, found = draws
+    dof = found[0].dof
+    value = np.array([calibration.chi2_per_dof * calibration.dof for calibration in found])
+    # The sum has twenty times the degrees of freedom; both bounds fail once in ten thousand sets of draws.
+    assert 1e-4 < chi2.cdf(value.sum(), len(found) * dof) < 1.0 - 1e-4
+    assert kstest(chi2.cdf(value, dof), "uniform").pvalue > 1e-4
+    for calibration in found:
+        assert calibration.sigma_fitted_px**2 == pytest.approx(calibration.chi2_per_dof * SIGMA**2)
+        mean_square = calibration.chi2_per_dof * SIGMA**2 * dof / (dof + expected_rank(draws[0]))
+        assert calibration.rms_px == pytest.approx(np.sqrt(2.0 * mean_square))  # two coordinates a view
+
+
+def test_covariance_is_the_bound_and_the_errors_are_as_it_says(draws):
+    robot, held_out, bound, found = draws
+    truth = robot.images(held_out)
+    square = np.array([np.mean((predict(c, held_out) - truth) ** 2) for c in found])
+    stated = np.array([prediction_variance(c, held_out).mean() for c in found])
+    limit = SIGMA**2 * bound.mean_square()
+    # The variance is evaluated at the estimate instead of the truth: a change of second order.
+    np.testing.assert_allclose(stated, limit, rtol=0.05)
+    # Four standard errors of the mean over twenty draws, from the spectrum of the bound itself.
+    assert square.mean() / limit == pytest.approx(1.0, abs=4.0 * bound.relative_error(len(found)))
+
+
+def test_single_predictions_vary_as_stated(draws):
+    robot, held_out, bound, found = draws
+    truth = robot.images(held_out)
+    one = np.sqrt((bound.factor**2).sum(axis=1)).reshape(truth.shape) * SIGMA
+    for calibration in found[:3]:
+        np.testing.assert_allclose(np.sqrt(prediction_variance(calibration, held_out)), one, rtol=0.1)
+    scores = np.array([(predict(c, held_out) - truth) / one for c in found])
+    # Each coordinate by itself is a standard normal over the draws: its mean square over 20 has a
+    # standard deviation of 0.32; over all coordinates the scatter of means shows bias if there is any.
+    assert np.abs(scores.mean(axis=0)).max() * np.sqrt(len(found)) < 5.0
+    assert np.abs(scores).max() < 6.0
+
+
+def test_variance_is_that_of_differences_of_the_prediction(draws):
+    """``prediction_variance`` against central differences of ``predict`` by every entry of P, Ĥ, M."""
+    _, held_out, _, found = draws
+    calibration, q = found[0], held_out[:4]
+    entries = [(name, i) for name in ("P", "H_hat_0", "M") for i in range(getattr(calibration, name).size)]
+    columns = []
+    for name, i in entries:
+        value = getattr(calibration, name)
+        step = 1e-6 * max(np.abs(value).max(), 1e-3)
+        moved = []
+        for sign in (1.0, -1.0):
+            entry = value.copy()
+            entry.ravel()[i] += sign * step
+            moved.append(predict(dataclasses.replace(calibration, **{name: entry}), q))
+        columns.append(((moved[0] - moved[1]) / (2.0 * step)).ravel())
+    J = np.array(columns).T
+    variance = np.einsum("ia,ab,ib->i", J, calibration.covariance, J).reshape(len(q), 2, -1, 2)
+    # Second differences: relative 1e-12, times the conditioning of the frame.
+    np.testing.assert_allclose(prediction_variance(calibration, q), variance, rtol=1e-4)
+
+
+def test_noise_is_estimated_from_the_images_alone():
+    rng = np.random.default_rng(8)
+    robot = random_robot("RRRRRR", rng)
+    q = trials(robot, frames=4)
+    ratio = []
+    for seed in range(8):
+        observation = robot.observe(q, 0.8, np.random.default_rng(seed))
+        ratio.append(calibrate(observation, robot.joint_types, source="recorded").sigma_px / 0.8)
+    # One epipolar residual a pair, 250 pairs minus 7: 4.5 % of a draw; four standard errors of the mean.
+    assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * 0.045 / np.sqrt(len(ratio)))
+    assert np.abs(np.array(ratio) - 1.0).max() < 5.0 * 0.045
+
+
+def robot_of(truth):
+    screws = truth["screws"]
+    twists = np.zeros((len(screws), 4, 4))
+    for twist, screw in zip(twists, screws, strict=True):
+        twist[:3, :3] = np.cross(np.eye(3), screw["w"])
+        twist[:3, 3] = screw["v"]
+    tool = np.array(truth["T_base_tool_at_reference"])
+    markers = np.c_[np.array(truth["markers_tool"]), np.ones(len(truth["markers_tool"]))] @ tool.T
+    cameras = np.array([truth["camera_left"], truth["camera_right"]])
+    return Robot(truth["joint_types"], twists, cameras, markers, np.array(truth["q_reference"]))
+
+
+@pytest.mark.volume
+@pytest.mark.parametrize(("name", "draws"), [("ur5", 20), ("stanford", 8)])
+def test_an_arm_of_another_lab_is_known_to_the_cramer_rao_bound(shared_data, reference_truth, name, draws):
+    robot = robot_of(reference_truth(name))
+    table = read_table(shared_data / name / "trials_0.0px.csv", robot.joint_types)
+    validation = read_table(shared_data / name / "validation.csv", robot.joint_types)
+    truth = validation.images
+    assert np.abs(robot.images(validation.q) - truth).max() < 2e-6
+    bound = Bound(robot, table.q, validation.q)
+    assert bound.rank == expected_rank(robot)
+    errors, stated, ratio = [], [], []
+    for seed in range(draws):
+        noise = SIGMA * np.random.default_rng(100 + seed).standard_normal(table.images.shape)
+        noisy = Observation(table.pose, table.marker, table.q, table.images + noise)
+        calibration = calibrate(noisy, robot.joint_types, sigma_px=SIGMA)
+        assert calibration.usable
+        assert calibration.dof == bound.coordinates - bound.rank - 2 * len(calibration.outlier)
+        errors.append(np.mean((predict(calibration, validation.q) - truth) ** 2))
+        stated.append(prediction_variance(calibration, validation.q).mean())
+        ratio.append(calibration.chi2_per_dof)
+    limit = SIGMA**2 * bound.mean_square()
+    rms = np.sqrt(np.mean(errors) / limit)
+    again = np.random.default_rng(0).integers(0, len(errors), (2000, len(errors)))
+    spread = np.sqrt(np.array(errors)[again].mean(axis=1) / limit).std()
+    assert rms <= 1.10 + 2.0 * spread
+    # Better than the bound by more than chance would mean that the bound, or the test, is wrong.
+    assert rms**2 >= 1.0 - 4.0 * bound.relative_error(len(errors))
+    np.testing.assert_allclose(stated, limit, rtol=0.1)
+    # Mean of all χ² per degree of freedom: four standard errors.
+    assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (draws * calibration.dof)))
