@@ -5,9 +5,10 @@ Every figure is a pair of functions ``data(material) -> arrays`` and ``draw(data
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from projservo_cli.figures import (
+    calibration,
     drift,
     errors,
     images,
@@ -18,7 +19,7 @@ from projservo_cli.figures import (
     scene,
     visibility,
 )
-from projservo_cli.figures.material import CLASSICAL, DIRECT, Data, Material
+from projservo_cli.figures.material import CLASSICAL, DIRECT, Data
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,21 +35,24 @@ class FigureSpec:
     title : what it shows, in a phrase.
     paper : the figure of the paper it follows, and its section.
     height : inches.
-    data, draw : what makes it.
+    data, draw : what makes it, from a ``Material``; from a ``Fit`` where it needs no task.
     laws : whose traces it shows: all of them, or any of them where ``any_law`` is set.
-    studies : whether it shows the extra runs, which need a known goal pose.
+    studies : whether it shows the extra runs.
+    goal : whether it needs a known goal pose.
+    task : whether it needs a task; without, a calibration and what it was made from will do.
     """
 
     name: str
     title: str
     paper: str
     height: float
-    data: Callable[[Material], Data]
+    data: Callable[[Any], Data]
     draw: Callable[[Data, "Figure"], None]
     laws: tuple[str, ...] = ()
     any_law: bool = False
     studies: bool = False
     goal: bool = False
+    task: bool = True
 
 
 FIGURES = (
@@ -167,5 +171,14 @@ FIGURES = (
         joints.data,
         joints.draw,
         studies=True,
+    ),
+    FigureSpec(
+        "fig13_calibration",
+        "What the calibration leaves of the images, and what the data determine",
+        "beside the paper's",
+        7.8,
+        calibration.data,
+        calibration.draw,
+        task=False,
     ),
 )

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from projservo_cli.control.law import Gains
 from projservo_cli.plants.plant import Plant
 from projservo_cli.plants.robot import Robot
-from projservo_cli.records import FloatArray, Model, Plan, Trace
+from projservo_cli.records import Calibration, FloatArray, Model, Observation, Plan, Trace
 
 Data = dict[str, npt.NDArray[Any]]
 """Named arrays behind one figure."""
@@ -54,7 +54,21 @@ class Studies:
 
 
 @dataclass(frozen=True, eq=False)
-class Material:
+class Fit:
+    """What the figures of a calibration show; a recorded run may hold no more.
+
+    Attributes
+    ----------
+    calibration : the calibration.
+    observation : what it was made from.
+    """
+
+    calibration: Calibration
+    observation: Observation
+
+
+@dataclass(frozen=True, eq=False)
+class Material(Fit):
     """All that the figures of a run may show.
 
     Attributes

@@ -83,8 +83,11 @@ def steps_for(
         one without ``force``.
     """
     last = max(named, key=STAGES.index)
+    stages = STAGES[: STAGES.index(last) + 1]
+    if not has_task(config) and set(named) <= {"calibrate", "report"}:
+        stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
     steps: list[Step] = []
-    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, last):
+    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, stages):
         step = Step(stage, law, key, "", inputs)
         remade = any(before.why for before in steps if before.stage != stage)
         steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
@@ -93,13 +96,18 @@ def steps_for(
     return steps
 
 
+def has_task(config: Config) -> bool:
+    """Whether there is a robot with a task; a recorded run may be reported on without."""
+    return not config.recorded or None not in (config.robot, config.rig, config.markers, config.task)
+
+
 def _keys(
-    config: Config, run: Run, laws: Sequence[str], last: str
+    config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
 ) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, law, key and input hashes of every result to ``last``, each key made from those before."""
+    """Stage, law, key and input hashes of every result of the stages, each key made from those before."""
     inputs = _table_hash(config, run)
     before: list[str | None] = [inputs.get("table_sha256")]
-    for stage in STAGES[: STAGES.index(last) + 1]:
+    for stage in stages:
         keys = []
         for law in dict.fromkeys(laws) if stage == "servo" else [""]:
             extra = {"before": before, "law": law}
@@ -192,6 +200,6 @@ def _records(step: Step, config: Config, run: Run, laws: Sequence[str], progress
         return {"": module.run(config, run.calibration)}
     if step.stage == "servo":
         return {"": module.run(config, run.calibration, run.plan, step.law, progress=progress)}
-    names = ["calibrate", "plan", *(SERVO + law for law in laws)]
+    names = ["calibrate", *(["plan", *(SERVO + law for law in laws)] if has_task(config) else [])]
     reported = replace(run, results={name: run.results[name] for name in names})
     return {"": module.run(reported, run.path.parent, progress=progress)}

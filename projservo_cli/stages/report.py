@@ -9,10 +9,11 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.figures import FIGURES, FigureSpec, style
 from projservo_cli.figures.drift import converged, table
-from projservo_cli.figures.material import DIRECT, Material, Studies
+from projservo_cli.figures.material import DIRECT, Fit, Material, Studies
 from projservo_cli.files import replacing
 from projservo_cli.records import Report, WorkFailed
 from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.chain import has_task
 from projservo_cli.stages.claims import claims_of
 from projservo_cli.stages.studies import (
     LAMBDAS,
@@ -38,7 +39,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
 
     Parameters
     ----------
-    run : with calibration, plan and traces.
+    run : with calibration, plan and traces; where there is no task, with the calibration.
     directory : folder that receives ``figures/`` and ``claims.json``.
     progress : told how far it is.
 
@@ -49,6 +50,12 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     """
     config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
+    if not has_task(config):
+        fit = Fit(run.calibration, run.observation)
+        written = draw_all(fit, directory, config.report.formats, left_out, progress)
+        record = _record(None, None, tuple(written), tuple(left_out), ())
+        _write_claims(record, directory / CLAIMS_FILE)
+        return record
     bench = bench_of(config, run.calibration.model(), run.plan)
     material = material_of(run, bench, left_out, progress)
     written = draw_all(material, directory, config.report.formats, left_out, progress)
@@ -69,7 +76,18 @@ def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progre
         left_out.append({"what": "studies", "reason": reason})
     numbers = tuple(truth.number[i] for i in truth.face)
     calibrated = bench.models["calibrated"]
-    return Material(calibrated, truth.robot, bench.plant, run.plan, numbers, run.traces, studies, reason)
+    return Material(
+        run.calibration,
+        run.observation,
+        calibrated,
+        truth.robot,
+        bench.plant,
+        run.plan,
+        numbers,
+        run.traces,
+        studies,
+        reason,
+    )
 
 
 def _composition(
@@ -84,7 +102,7 @@ def _composition(
 
 
 def draw_all(
-    material: Material,
+    material: Fit,
     directory: Path,
     formats: tuple[str, ...],
     left_out: list[dict[str, str]],
@@ -113,8 +131,12 @@ def draw_all(
     return written
 
 
-def lacking(spec: FigureSpec, material: Material) -> str:
+def lacking(spec: FigureSpec, material: Fit) -> str:
     """Why a figure cannot be drawn; empty where it can."""
+    if not spec.task:
+        return ""
+    if not isinstance(material, Material):
+        return "the run holds a calibration and no task: set robot, rig, markers and task"
     missing = _without_run(spec, material)
     if missing and (not spec.any_law or len(missing) == len(spec.laws)):
         return f"no run of {', '.join(missing)} with a step to show; make it: projservo servo report"
@@ -125,9 +147,9 @@ def lacking(spec: FigureSpec, material: Material) -> str:
     return ""
 
 
-def partly(spec: FigureSpec, material: Material) -> str:
+def partly(spec: FigureSpec, material: Fit) -> str:
     """What a figure that can be drawn is without; empty where it is whole."""
-    missing = _without_run(spec, material)
+    missing = _without_run(spec, material) if isinstance(material, Material) else []
     return f"without {', '.join(missing)}: no run of it with a step to show" if missing else ""
 
 
@@ -141,7 +163,7 @@ def _goal_known(material: Material) -> bool:
     return bool(traces) and all(np.isfinite(trace.goal_pose).all() for trace in traces)
 
 
-def _draw(spec: FigureSpec, material: Material, directory: Path, formats: tuple[str, ...]) -> list[str]:
+def _draw(spec: FigureSpec, material: Fit, directory: Path, formats: tuple[str, ...]) -> list[str]:
     """Write one figure in the formats asked for and remove it in all others."""
     folder = directory / FOLDER
     for kind in style.FORMATS:

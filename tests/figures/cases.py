@@ -4,11 +4,13 @@ from functools import lru_cache
 
 import numpy as np
 
+from projservo_cli.calibration.prediction import prediction_derivative
 from projservo_cli.config import load_config
 from projservo_cli.figures.material import Material
-from projservo_cli.records import LAWS, METRIC_LAWS
-from projservo_cli.stages import plan, servo, studies, truth
+from projservo_cli.records import LAWS, METRIC_LAWS, Calibration
+from projservo_cli.stages import calibrate, plan, servo, studies, truth
 from tests.conftest import ROOT
+from tests.fake_records import fake
 
 SHORT = 4
 GAINS = (0.5, 0.1)
@@ -60,8 +62,38 @@ def case(name="paper", steps=SHORT, whole=False):
     }
     extra = studies.run_studies(bench) if whole else studies.run_studies(bench, GAINS, PERIODS_S)
     numbers = tuple(true.number[i] for i in true.face)
-    material = Material(model, true.robot, bench.plant, planned, numbers, traces, extra)
+    observation = calibrate.simulate(config, true)
+    calibration = known(config, true, model, observation.q)
+    material = Material(
+        calibration, observation, model, true.robot, bench.plant, planned, numbers, traces, extra
+    )
     return config, bench, material
+
+
+def known(config, true, model, q):
+    """The record of a model known in the frame of ``projective_twin``, as if it had been fitted freely."""
+    M = np.linalg.solve(studies.H_PE, true.M.T).T
+    J = prediction_derivative(model, M, q)
+    s, Vt = np.linalg.svd(J.reshape(-1, J.shape[-1]), full_matrices=False)[1:]
+    factor = (Vt / s[:, None])[s > 1e-8 * s[0]]
+    none = np.zeros((0, 3), dtype=np.int64)
+    sigma = config.noise.calibration_px or 0.5
+    return fake(
+        Calibration,
+        sizes={"joint": len(q[0])},
+        joint_types=config.robot.joint_types,
+        sigma_px=sigma,
+        chi2_per_dof=1.0,
+        **{name: getattr(model, name) for name in ("P", "H_hat_0", "q_reference", "a_inf")},
+        marker=np.array(true.number),
+        M=M,
+        covariance=sigma**2 * factor.T @ factor,
+        excitation=np.ptp(q, axis=0),
+        weak=np.arange(len(q[0])) == 1,
+        outlier=none,
+        suspect=none[:, :2],
+        swapped=none,
+    )
 
 
 def geometric(start, factor, count):

@@ -14,7 +14,6 @@ from projservo_cli.stages.claims.claim import listed
 from projservo_cli.stages.claims.control import decay_ranges
 from projservo_cli.stages.claims.drift import composition_claim
 from projservo_cli.store import Result, Run, load, save
-from tests.fake_records import fake
 from tests.figures.cases import GAINS, PERIODS_S, SHORT, case, config_of
 
 BY_NAME = {spec.name: spec for spec in FIGURES}
@@ -46,20 +45,10 @@ def few(monkeypatch):
 
 def stored(tmp_path, material, *overrides):
     """A run file as the stages before leave it."""
-    from projservo_cli.records import Calibration
-
     config = config_of("paper", f"stop.max_steps={SHORT}", *overrides)
-    model = material.calibrated
-    calibration = fake(
-        Calibration,
-        joint_types="RRRRRR",
-        P=model.P,
-        H_hat_0=model.H_hat_0,
-        q_reference=model.q_reference,
-        a_inf=model.a_inf,
-    )
+    fit = {"calibration": material.calibration, "observation": material.observation}
     results = {
-        "calibrate": Result("k", "", {}, {}, {"calibration": calibration}),
+        "calibrate": Result("k", "", {}, {}, fit),
         "plan": Result("k", "", {}, {}, {"": material.plan}),
         **{f"servo/{law}": Result("k", "", {}, {}, {"": t}) for law, t in material.traces.items()},
     }

@@ -1,0 +1,195 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from matplotlib.container import BarContainer
+
+from projservo_cli.calibration import predict, prediction_variance
+from projservo_cli.config import load_config
+from projservo_cli.figures import FIGURES, calibration, style
+from projservo_cli.figures.material import Fit
+from projservo_cli.records import Observation
+from projservo_cli.stages import calibrate, chain
+from projservo_cli.store import Result, Run
+from tests.figures.cases import case, config_of
+
+SPEC = next(spec for spec in FIGURES if spec.name == "fig13_calibration")
+SHIFT_PX = np.array([[0.3, -0.4], [-0.1, 0.2]])  # of each view
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    """The paper's task, calibrated from its simulated trials."""
+    return Fit(*reversed(calibrate.run(config_of("paper"))))
+
+
+def shifted(name="paper", **fields):
+    """A calibration and images that are what it predicts, but for one shift in each view."""
+    known = dataclasses.replace(case(name)[2].calibration, **fields)
+    q = case(name)[2].observation.q
+    images = predict(known, q) + SHIFT_PX[:, None]
+    return Fit(known, Observation(np.arange(len(q)) + 100, known.marker, q, images))
+
+
+def drawn(fit):
+    with style.styled():
+        figure = style.new_figure(SPEC.height)
+        SPEC.draw(SPEC.data(fit), figure)
+        style.arrange(figure)
+    return figure
+
+
+def bars(axes):
+    return [bar for group in axes.containers if isinstance(group, BarContainer) for bar in group]
+
+
+def test_residuals_are_seen_minus_predicted_where_they_were_seen():
+    fit = shifted()
+    data = SPEC.data(fit)
+    for v, view in enumerate(("left", "right")):
+        np.testing.assert_allclose(data[f"residual_{view}"], np.tile(SHIFT_PX[v], (490, 1)), atol=1e-9)
+        np.testing.assert_array_equal(data[f"seen_{view}"], fit.observation.images[:, v].reshape(-1, 2))
+        assert data[f"left_out_{view}"].shape == (0, 2)
+    # rms over both views and coordinates: (0.09 + 0.16 + 0.01 + 0.04) / 4
+    np.testing.assert_allclose(data["pose_residual_px"], np.sqrt(0.075), rtol=1e-9)
+    assert set(data["pose_coordinates"]) == {40}
+
+
+def test_markers_are_matched_by_number_and_unknown_ones_left_out():
+    fit = shifted()
+    order = [3, 1, 0, 2, 9, 8, 7, 6, 5, 4]
+    images = np.concatenate([fit.observation.images[:, :, order], np.full((49, 2, 1, 2), 7.0)], axis=2)
+    marker = np.append(fit.observation.marker[order], 77)
+    other = Fit(fit.calibration, dataclasses.replace(fit.observation, marker=marker, images=images))
+    expected = SPEC.data(fit) | {f"left_out_{view}": np.full((49, 2), 7.0) for view in ("left", "right")}
+    for name, values in SPEC.data(other).items():
+        np.testing.assert_array_equal(values, expected[name], err_msg=name)
+
+
+def test_what_the_fit_left_out_is_drawn_apart_and_counts_nowhere():
+    number = case()[2].calibration.marker
+    fit = shifted(
+        outlier=np.array([[100, number[0], 0], [101, number[1], 1], [102, number[2], 2]]),
+        suspect=np.array([[103, 1]]),
+        swapped=np.array([[104, number[3], number[4]]]),
+    )
+    fit.observation.images[5, 0, 5] = np.nan  # not seen: neither used nor left out
+    data = SPEC.data(fit)
+    # left: one of its own, one of both, a pose of ten, one renamed; likewise right
+    assert [len(data[f"left_out_{view}"]) for view in ("left", "right")] == [13, 13]
+    assert [len(data[f"seen_{view}"]) for view in ("left", "right")] == [490 - 14, 490 - 13]
+    images = fit.observation.images
+    assert (data["left_out_left"] == images[0, 0, 0]).all(axis=1).any()
+    assert not (data["left_out_right"] == images[0, 1, 0]).all(axis=1).any()
+    assert len(data["pose_residual_px"]) == 48  # the pose in doubt has none
+    np.testing.assert_array_equal(data["pose_coordinates"][:5], [38, 38, 36, 36, 38])
+
+
+def test_errors_of_poses_are_rms_over_what_was_used():
+    used = np.zeros((3, 2, 2), dtype=bool)
+    used[0, 0, 0] = used[0, 1, 1] = used[2, 0, 1] = True
+    residual = np.full((3, 2, 2, 2), 99.0)
+    residual[0, 0, 0], residual[0, 1, 1], residual[2, 0, 1] = (3.0, 4.0), (0.0, 5.0), (np.sqrt(2.0), 4.0)
+    data = calibration.by_pose(
+        used, residual, np.where(used[..., None], np.full_like(residual, 0.25), np.nan)
+    )
+    np.testing.assert_allclose(data["pose_residual_px"], [np.sqrt(50.0 / 4.0), 3.0])
+    np.testing.assert_allclose(data["pose_predicted_px"], 0.5)
+    np.testing.assert_array_equal(data["pose_coordinates"], [4, 2])
+
+
+def test_information_is_the_inverse_of_the_covariance_without_its_null_space():
+    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(9, 9)))[0]
+    spread = np.array([0.0, 0.0, 0.0, 1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0])
+    values = calibration.information(basis * spread @ basis.T)
+    # round-off of the largest eigenvalue over the smallest: 4 · 1e-16 · 9 / 1e-6
+    np.testing.assert_allclose(values, [1e6, 1e3, 2.0, 0.5, 0.5, 0.25], rtol=1e-8)
+    assert calibration.information(np.full((4, 4), np.nan)).size == 0
+
+
+def test_a_residual_and_the_error_of_its_prediction_make_up_the_noise():
+    np.testing.assert_allclose(
+        calibration.expected_residual(np.array([0.0, 3.0, 5.0, 6.0]), 5.0), [5, 4, 0, 0]
+    )
+    J = np.random.default_rng(2).normal(size=(12, 3))
+    hat = J @ np.linalg.pinv(J)
+    rest = np.diag((np.eye(12) - hat) @ (np.eye(12) - hat).T)  # covariance of residuals at unit noise
+    np.testing.assert_allclose(calibration.expected_residual(np.sqrt(np.diag(hat)), 1.0) ** 2, rest)
+
+
+@pytest.mark.parametrize("extent", [40.0, 640.0, 5472.0])
+@pytest.mark.parametrize("size", [1e-9, 0.03, 0.5, 4.0])
+def test_arrows_are_magnified_by_a_round_factor_to_a_visible_length(extent, size):
+    factor = calibration.magnification(np.array([size, -size]), extent)
+    length = factor * size * np.sqrt(2.0) / (calibration.ARROW * extent)
+    assert 0.4 - 1e-9 <= length <= 1.0 + 1e-9  # the steps 1, 2, 5 are at most 2.5 apart
+    assert round(factor / 10.0 ** np.floor(np.log10(factor) + 1e-9), 9) in (1.0, 2.0, 5.0)
+
+
+def test_without_residuals_nothing_is_magnified():
+    assert calibration.magnification(np.zeros(6), 100.0) == 1.0
+    assert calibration.magnification(np.zeros(0), 100.0) == 1.0
+
+
+def test_predicted_errors_add_up_to_the_free_parameters(fitted):
+    data = SPEC.data(fitted)
+    record = fitted.calibration
+    free = data["residual"].size - record.dof
+    assert len(data["information"]) == free == 69  # two cameras, six screws, ten markers, less the gauge
+    # the trace of the projection onto what the parameters can explain is their number
+    total = (data["pose_coordinates"] * data["pose_predicted_px"] ** 2).sum()
+    assert total == pytest.approx(free * record.sigma_px**2, rel=1e-6)
+    left = (data["pose_coordinates"] * data["pose_residual_px"] ** 2).sum()
+    assert left == pytest.approx(record.chi2_per_dof * record.dof * record.sigma_px**2, rel=1e-6)
+    variance = prediction_variance(record, fitted.observation.q)
+    np.testing.assert_allclose(data["pose_predicted_px"] ** 2, variance.mean(axis=(1, 2, 3)), rtol=1e-9)
+
+
+def test_the_histogram_holds_every_residual_beside_the_normal_density(fitted):
+    axes = drawn(fitted).axes[2]
+    area = sum(bar.get_width() * bar.get_height() for bar in bars(axes))
+    assert area == pytest.approx(1.0, abs=1e-12)
+    x, density = axes.lines[0].get_data()
+    assert density.max() == pytest.approx(1.0 / (0.5 * np.sqrt(2.0 * np.pi)), rel=1e-9)
+    # the range is four σ: all of the normal density but 6e-5
+    assert np.trapezoid(density, x) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_excitation_is_in_degrees_and_metres_on_own_axes_and_weak_joints_are_hatched():
+    fit = shifted("stanford", weak=np.array([False, True, True, False, False, False]))
+    axes = drawn(fit).axes
+    left, right = axes[4], axes[6]
+    revolute = [i for i, letter in enumerate(fit.calibration.joint_types) if letter == "R"]
+    heights = [bar.get_height() for bar in bars(left)]
+    np.testing.assert_allclose(heights, np.degrees(np.ptp(fit.observation.q, axis=0)[revolute]))
+    assert [bar.get_height() for bar in bars(right)] == [np.ptp(fit.observation.q[:, 2])]
+    assert (left.get_ylabel(), right.get_ylabel()) == ("range (deg)", "range (m)")
+    assert [bool(bar.get_hatch()) for bar in bars(left)] == [False, True, False, False, False]
+    assert [bool(bar.get_hatch()) for bar in bars(right)] == [True]
+
+
+def test_a_method_without_covariance_says_so_in_both_panels():
+    size = len(case()[2].calibration.covariance)
+    axes = drawn(shifted(covariance=np.full((size, size), np.nan))).axes
+    for panel in (axes[3], axes[5]):
+        assert [text.get_text() for text in panel.texts] == ["the method has no covariance"]
+
+
+def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_path):
+    table = tmp_path / "table.csv"
+    table.write_text("pose,marker\n")
+    config = load_config(None, [f"data.table={table}", "report.formats=[svg]"])
+    material = case()[2]
+    run = Run(tmp_path / "run.h5")
+    steps = chain.steps_for(config, run, ["report"])
+    assert [step.stage for step in steps] == ["calibrate", "report"]
+    assert "plan" in [step.stage for step in chain.steps_for(config, run, ["plan", "report"])]
+    records = {"calibration": material.calibration, "observation": material.observation}
+    run = dataclasses.replace(run, results={"calibrate": Result(steps[0].key, "", {}, {}, records)})
+    made, _ = chain.make(steps[1], config, run, (), lambda *_: None)
+    report = made.results["report"].records[""]
+    assert report.figures == ("figures/fig13_calibration.svg",)
+    assert (tmp_path / report.figures[0]).read_bytes().startswith(b"<?xml")
+    assert [entry["what"] for entry in report.left_out] == [spec.name for spec in FIGURES if spec.task]
+    assert all("task" in entry["reason"] for entry in report.left_out)
+    assert report.claims == ()
