@@ -251,16 +251,17 @@ def _excitation(axes: "Axes", data: Data) -> None:
     other = axes.twinx() if mixed else axes
     if mixed:
         other.grid(visible=False)
-    for chosen, kind, scale, unit in (
-        (~prismatic, axes, np.degrees(1.0), "deg"),
-        (prismatic, other, 1.0, "m"),
+    for chosen, kind, scale, unit, color in (
+        (~prismatic, axes, np.degrees(1.0), "deg", style.BLUE),
+        (prismatic, other, 1.0, "m", style.SKY),
     ):
         for i in np.flatnonzero(chosen):
-            look = WEAK if weak[i] else RESIDUAL
+            look = WEAK if weak[i] else {"color": color}
             kind.bar(i, scale * data["excitation"][i], width=0.6, **look)
         if chosen.any():
             kind.set_ylabel(f"range ({unit})")
-    axes.set_xticks(range(len(prismatic)), [f"$q_{{{i + 1}}}$" for i in range(len(prismatic))])
+    units = [" (m)" if mixed and slides else "" for slides in prismatic]
+    axes.set_xticks(range(len(units)), [f"$q_{{{i + 1}}}${unit}" for i, unit in enumerate(units)])
     axes.set_xlim(-0.6, len(prismatic) - 0.4)
     axes.grid(visible=False, axis="x")
     axes.set_title(f"excitation, {int(weak.sum())} of {len(weak)} joints weak")

@@ -164,6 +164,11 @@ def test_excitation_is_in_degrees_and_metres_on_own_axes_and_weak_joints_are_hat
     np.testing.assert_allclose(heights, np.degrees(np.ptp(fit.observation.q, axis=0)[revolute]))
     assert [bar.get_height() for bar in bars(right)] == [np.ptp(fit.observation.q[:, 2])]
     assert (left.get_ylabel(), right.get_ylabel()) == ("range (deg)", "range (m)")
+    assert [label.get_text() for label in left.get_xticklabels()][1:4] == [
+        "$q_{2}$",
+        "$q_{3}$ (m)",
+        "$q_{4}$",
+    ]
     assert [bool(bar.get_hatch()) for bar in bars(left)] == [False, True, False, False, False]
     assert [bool(bar.get_hatch()) for bar in bars(right)] == [True]
 
