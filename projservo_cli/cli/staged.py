@@ -124,7 +124,8 @@ def _tell(call: _Call, *, as_json: bool) -> int:
     else:
         for name, value in values.items():
             call.console.show(summary(name, value))
-        call.console.show(f"run: {call.run.path}")
+        if call.run.results:
+            call.console.show(f"run: {call.run.path}")
     return _verdict(call)
 
 
@@ -135,13 +136,23 @@ def _lacking(call: _Call, name: str) -> bool:
 
 
 def _verdict(call: _Call) -> int:
-    """Exit code 1 when a stage failed or a law that must converge did not."""
+    """Exit code 1 when a stage failed, a calibration is not usable or a law that must converge did not."""
     if call.failed:
         click.echo(f"projservo: {call.failed}: {call.reason}", err=True)
         return 1
+    missed_calibration = _unusable(call)
     ends = {law: call.run.traces[law] for law in call.laws_done if law in call.config.control.must_converge}
     missed = [trace for trace in ends.values() if trace.verdict != "converged"]
     for trace in missed:
         reason = f": {trace.reason}" if trace.reason else ""
         click.echo(f"projservo: {trace.law} must converge, but ended in {trace.verdict}{reason}", err=True)
-    return 1 if missed else 0
+    return 1 if missed or missed_calibration else 0
+
+
+def _unusable(call: _Call) -> bool:
+    """Say that a calibration cannot support control; True where the call was to make it usable."""
+    if "calibrate" not in call.run.results or call.run.calibration.usable:
+        return False
+    reason = " ".join(call.run.calibration.reason.split())
+    click.echo(f"projservo: calibrate: the calibration is not usable: {reason}", err=True)
+    return "calibrate" in call.names
