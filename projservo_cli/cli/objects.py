@@ -118,11 +118,12 @@ def _servo_words(value: dict[str, Any]) -> list[str]:
 
 
 def _report_words(value: dict[str, Any]) -> list[str]:
-    words = {True: "holds", False: "fails", None: "not measured"}
+    words = {True: "holds", False: "does not hold", None: "not measured"}
+    holding = sum(row["holds"] is True for row in value["claims"])
     claims = [f"{words[row['holds']]}: {row['claim']}: {row['measured']}" for row in value["claims"]]
     left_out = [f"left out: {row['what']}: {row['reason']}" for row in value["left_out"]]
     return [
-        f"report: {len(value['figures'])} files of figures, {len(claims)} claims",
+        f"report: {len(value['figures'])} files of figures; {holding} of {len(claims)} claims hold",
         *(wrapped(text, "  ") for text in (*claims, *left_out)),
     ]
 
