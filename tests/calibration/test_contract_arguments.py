@@ -1,0 +1,114 @@
+"""Arguments of the public functions that make no sense: InputError, one line that says what to give."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import calibrate, predict, prediction_variance, residual_statistics
+from projservo_cli.records import InputError
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+ROBOT = random_robot("RPR", np.random.default_rng(6), markers=5)
+OBSERVATION = ROBOT.observe(trials(ROBOT, 4), 0.5, np.random.default_rng(1))
+
+
+def spoilt(name, value):
+    array = getattr(OBSERVATION, name).copy()
+    array.ravel()[array.size // 2] = value
+    return dataclasses.replace(OBSERVATION, **{name: array})
+
+
+CASES = {
+    "method": (OBSERVATION, "RPR", {"method": "best"}, "refined, linear, closed_form"),
+    "source": (OBSERVATION, "RPR", {"source": "dreamt"}, "simulated or recorded"),
+    "no noise": (OBSERVATION, "RPR", {"sigma_px": 0.0}, "positive"),
+    "negative noise": (OBSERVATION, "RPR", {"sigma_px": -0.5}, "positive"),
+    "noise not a number": (OBSERVATION, "RPR", {"sigma_px": np.nan}, "positive"),
+    "infinite noise": (OBSERVATION, "RPR", {"sigma_px": np.inf}, "positive"),
+    "too few letters": (OBSERVATION, "RP", {}, "3 letters"),
+    "too many letters": (OBSERVATION, "RPRR", {}, "3 letters"),
+    "another letter": (OBSERVATION, "RXR", {}, "R or P"),
+    "no letters": (OBSERVATION, "", {}, "3 letters"),
+    "joint reading not a number": (spoilt("q", np.nan), "RPR", {}, "joint readings"),
+    "infinite joint reading": (spoilt("q", np.inf), "RPR", {}, "joint readings"),
+    "infinite pixel": (spoilt("images", np.inf), "RPR", {}, "pixels"),
+    "pixel minus infinity": (spoilt("images", -np.inf), "RPR", {}, "pixels"),
+}
+
+
+@pytest.mark.parametrize("method", ["refined", "linear", "closed_form"])
+@pytest.mark.parametrize("name", CASES)
+def test_calibrate_refuses(name, method):
+    observation, types, given, word = CASES[name]
+    with pytest.raises(InputError) as caught:
+        calibrate(observation, types, **{"method": method, "source": "recorded", **given})
+    assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return calibrate(OBSERVATION, "RPR", source="recorded")
+
+
+def test_letters_of_any_case(calibration):
+    other = calibrate(OBSERVATION, "rPr", source="recorded")
+    assert other.joint_types == "RPR"
+    np.testing.assert_array_equal(other.P, calibration.P)
+
+
+@pytest.mark.parametrize("q", [np.zeros((4, 2)), np.zeros((4, 4)), np.zeros(3)])
+def test_predict_refuses_other_joints(calibration, q):
+    with pytest.raises(InputError, match="one row of 3 a pose"):
+        predict(calibration, q)
+
+
+def test_no_poses_no_images(calibration):
+    assert predict(calibration, np.zeros((0, 3))).shape == (0, 2, 5, 2)
+    assert prediction_variance(calibration, np.zeros((0, 3))).shape == (0, 2, 5, 2)
+
+
+def test_integers_and_lists_are_numbers(calibration):
+    q = np.zeros((2, 3), dtype=np.int64)
+    np.testing.assert_array_equal(predict(calibration, q), predict(calibration, q.astype(float)))
+    q = around(ROBOT, 3, np.random.default_rng(2))
+    np.testing.assert_array_equal(predict(calibration, q.tolist()), predict(calibration, q))
+
+
+def test_arguments_are_left_as_they_were():
+    before = {
+        field.name: getattr(OBSERVATION, field.name).copy() for field in dataclasses.fields(OBSERVATION)
+    }
+    for name in before:
+        getattr(OBSERVATION, name).setflags(write=False)
+    for method in ("refined", "linear", "closed_form"):
+        calibrate(OBSERVATION, "RPR", method=method, source="recorded")
+    for name, value in before.items():
+        np.testing.assert_array_equal(getattr(OBSERVATION, name), value)
+
+
+def test_statistics_by_hand(calibration):
+    """Every count and percentile against a loop over single sightings."""
+    q = around(ROBOT, 6, np.random.default_rng(9))
+    observation = ROBOT.observe(q, 3.0, np.random.default_rng(10))
+    images = observation.images.copy()
+    images[1, 0, 2] = np.nan
+    images[3, :, 1] = np.nan
+    images[4, 1, 4, 0] = np.nan  # half a pixel is no pixel
+    marker = observation.marker.copy()
+    marker[3] = 777
+    found = residual_statistics(calibration, dataclasses.replace(observation, marker=marker, images=images))
+    predicted = predict(calibration, q)
+    distances = []
+    for k in range(6):
+        for view in range(2):
+            for j in (0, 1, 2, 4):
+                du, dv = predicted[k, view, j] - images[k, view, j]
+                if not np.isnan(du + dv):
+                    distances.append((du * du + dv * dv) ** 0.5)
+    assert found["count"] == len(distances) == 6 * 2 * 4 - 4
+    assert found["rms_px"] == pytest.approx(np.sqrt(np.mean(np.square(distances))))
+    assert found["median_px"] == pytest.approx(np.median(distances))
+    assert found["p95_px"] == pytest.approx(np.quantile(distances, 0.95))
+    assert found["skipped"] == {"unknown_marker": 12, "behind_camera": 0, "missing": 4}
