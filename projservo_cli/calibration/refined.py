@@ -101,8 +101,8 @@ def solve(
                 levels = []
     if best is None:
         raise WorkFailed(
-            "no start of the adjustment puts all points in front of both cameras: check that rows of one "
-            "pose belong together and that joint readings are in rad and m"
+            "the data contradict the joint readings from the start: check that they belong to their poses, "
+            "their units (rad, m) and types (R or P), and that rows of one pose belong together"
         )
     return best
 

@@ -20,6 +20,12 @@ STARTS = 20
 ROTATION_STEPS = 60
 # Minima with so many times the least loss are not worth a try: they do not explain the rotations.
 UNLIKELY = 4.0
+# Sets that differ less, rad, lie in one valley: along it the rotations hardly determine the axes, and
+# images decide.
+DISTINCT = 0.5
+# Loss a pose beyond which axes contradict the rotations: a typical error of 45°, far more than a
+# guessed metric frame or some wrong joint readings bring about.
+CONTRADICTION = 5.5
 # Pull of axis points towards the body, in units of the typical equation: keeps the axes of nearly
 # parallel joints, whose places are hardly determined, from running away.
 RIDGE = 0.03
@@ -105,7 +111,8 @@ def rotation_axes(
 
     Returns
     -------
-    Sets of (n, 3) unit vectors; those of prismatic joints mean nothing.
+    Sets of (n, 3) unit vectors, those of prismatic joints without meaning; none where no axes explain
+    the rotations at all.
     """
     R, q = alignment.R[alignment.merged], q[alignment.merged]
     w = rng.standard_normal((STARTS, q.shape[1], 3))
@@ -116,8 +123,9 @@ def rotation_axes(
     w, loss = _fit_axes(w, R, q, prismatic)
     order = np.argsort(loss)
     kept: list[FloatArray] = []
-    for s in order[loss[order] <= UNLIKELY * loss[order[0]] + 1e-9]:
-        same = [np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < 0.02 for other in kept]
+    enough = min(UNLIKELY * loss[order[0]] + 1e-9, CONTRADICTION * len(R))
+    for s in order[loss[order] <= enough]:
+        same = [np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < DISTINCT for other in kept]
         if not any(same):
             kept.append(w[s])
         if len(kept) == keep:
