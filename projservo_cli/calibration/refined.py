@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -28,6 +29,8 @@ HOPELESS = 10.0
 # the median are left out of the next.
 FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
 SPOILT = 8.0
+# Most searches a pass: data that fit no robot are refused within seconds.
+SEARCHES = 5
 # Relative difference of robust residuals below which two starts have ended at one place.
 SAME_LEVEL = 1e-3
 FOCAL_MINIMA, AXIS_MINIMA = 3, 3
@@ -73,7 +76,7 @@ def solve(
     levels: list[float] = []
     for factors in FOCAL_FACTORS:
         usable = of_poses(readings, trusted)
-        for scene in starts(problem, usable, epipolar, frame, rng, factors):
+        for scene in islice(starts(problem, usable, epipolar, frame, rng, factors), SEARCHES):
             searched = robust_search(problem, scene, trusted)
             level = float(np.median(_distances(searched.residual, usable_rows(problem, trusted))))
             # Different starts that end at one place need not be followed to the end twice.
