@@ -92,7 +92,7 @@ def expected_rank(robot):
     return 22 + 4 * revolute + 2 * sliding + 3 * len(robot.markers) - (6 if sliding else 7)
 
 
-@pytest.fixture(scope="module", params=["RRRRRR", "RRPRPR"])
+@pytest.fixture(scope="module", params=["RRR", "RPRP"])
 def draws(request):
     """Twenty noise draws of a small set of trials: robot, noise-free bound, calibrations."""
     rng = np.random.default_rng(5)
@@ -110,7 +110,7 @@ def test_degrees_of_freedom(draws):
     robot, _, bound, found = draws
     assert bound.rank == expected_rank(robot)
     for calibration in found:
-        assert calibration.outlier.size == 0  # a normal draw of 250 pairs has 5σ once in a thousand sets
+        assert calibration.outlier.size == 0  # a normal draw of 85 pairs has 5σ once in a thousand sets
         assert calibration.dof == bound.coordinates - bound.rank
         rank = np.linalg.matrix_rank(calibration.covariance, rtol=1e-11, hermitian=True)
         assert rank == bound.rank
@@ -135,8 +135,9 @@ def test_covariance_is_the_bound_and_the_errors_are_as_it_says(draws):
     square = np.array([np.mean((predict(c, held_out) - truth) ** 2) for c in found])
     stated = np.array([prediction_variance(c, held_out).mean() for c in found])
     limit = SIGMA**2 * bound.mean_square()
-    # The variance is evaluated at the estimate instead of the truth: a change of second order.
-    np.testing.assert_allclose(stated, limit, rtol=0.02)
+    # The variance is evaluated at the estimate instead of the truth: 1.3 % of scatter, 0.3 % of the mean.
+    np.testing.assert_allclose(stated, limit, rtol=0.06)
+    assert stated.mean() == pytest.approx(limit, rel=0.012)
     # Four standard errors of the mean over twenty draws, from the spectrum of the bound itself.
     assert square.mean() / limit == pytest.approx(1.0, abs=4.0 * bound.relative_error(len(found)))
 
@@ -177,12 +178,12 @@ def test_variance_is_that_of_differences_of_the_prediction(draws):
 
 def test_noise_is_estimated_from_the_images_alone():
     rng = np.random.default_rng(8)
-    robot = random_robot("RRRRRR", rng)
-    q = trials(robot, frames=4)
+    robot = random_robot("RRR", rng)
+    q = trials(robot, frames=8)
     ratio = []
     for seed in range(8):
         observation = robot.observe(q, 0.8, np.random.default_rng(seed))
-        ratio.append(calibrate(observation, robot.joint_types, source="recorded").sigma_px / 0.8)
+        ratio.append(calibrate(observation, "RRR", source="recorded").sigma_px / 0.8)
     # One epipolar residual a pair, 250 pairs minus 7: 4.5 % of a draw; four standard errors of the mean.
     assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * 0.045 / np.sqrt(len(ratio)))
     assert np.abs(np.array(ratio) - 1.0).max() < 5.0 * 0.045
