@@ -9,22 +9,19 @@ import math
 
 from projservo_cli.control.direct_two import rotation_about_center
 from projservo_cli.control.law import MOST_PARTS, OK, SINGULAR, Gains, State, partitioned, translation_rate
-from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, sub, vec
+from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.composition import composed_angle, composed_operator
 from projservo_cli.geometry.displacement import rotation, translation
+from projservo_cli.geometry.inverse import reach
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kernels import least_squares
-from projservo_cli.geometry.kinematics import backward, forward, operators_at
+from projservo_cli.geometry.kinematics import backward
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts, clear
 
-MOST_NEWTON_STEPS = 6
 # A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
 # by about 0.1 mm from the path of a robot of a metre's size.
 PART_STEP = math.radians(2.5)
-# A Newton step this short, rad or m, is the last: the next would be its square, below round-off.
-SETTLED = 1e-8
 ROUND_OFF = 1e-13
 BRANCH_FACTOR = 2.0
 
@@ -33,45 +30,6 @@ BRANCH_FACTOR = 2.0
 def desired(parts: Parts, H_s: Mat4, tau: float, theta: float, share: float) -> Mat4:
     """Share of the displacement of one period, exp(share τ Ĥ_t) exp(share θ Ĥ_s)."""
     return mul(translation(parts.H_t, share * tau), rotation(H_s, mul(H_s, H_s), share * theta))
-
-
-@njit
-def reach(model: Model, H_back: Mat4, goal: Mat4, A: FloatArray, q: FloatArray, state: State) -> bool:
-    """Newton steps on the joints ``q``, in place, until they displace the face A by ``goal``.
-
-    Parameters
-    ----------
-    H_back : inverse forward kinematics at the joints where A was seen.
-    goal : displacement from there.
-
-    Returns
-    -------
-    False where the steps did not settle or the operators are singular.
-    """
-    n = q.shape[0]
-    m = A.shape[0]
-    work = state.work
-    for _ in range(MOST_NEWTON_STEPS):
-        operators_at(model, q, work.H_hat)
-        H = mul(forward(model, q), H_back)
-        for k in range(m):
-            reached = apply(H, vec(A[k]))
-            miss = sub(apply(goal, vec(A[k])), reached)
-            for j in range(4):
-                work.rhs[4 * k + j] = miss[j]
-            for i in range(n):
-                velocity = apply(mat(work.H_hat[i]), reached)
-                for j in range(4):
-                    work.B[i, 4 * k + j] = velocity[j]
-        if not least_squares(work.B, 4 * m, n, state.newton, work.pivot, work.z, work.rhs):
-            return False
-        most = 0.0
-        for i in range(n):
-            q[i] += state.newton[i]
-            most = max(most, abs(state.newton[i]))
-        if most <= SETTLED:
-            return True
-    return False
 
 
 @njit
@@ -119,7 +77,7 @@ def continued(
             state.path[j, i] = state.path[j - 1, i] + step
             predicted += step * step
         goal = desired(parts, H_s, tau, theta, j / count)
-        if not reach(model, H_back, goal, state.A, state.path[j], state):
+        if not reach(model, H_back, goal, state.A, state.path[j], state.work, state.newton):
             return False
         taken = 0.0
         for i in range(n):
