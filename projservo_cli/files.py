@@ -23,11 +23,10 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        os.close(handle)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
-    temporary = Path(name)
+    handle, temporary = _neighbour(path, path.parent)
+    os.close(handle)
     try:
         yield temporary
         _synchronise(temporary)
@@ -38,6 +37,35 @@ def replacing(path: Path) -> Iterator[Path]:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def require_writable(path: Path) -> None:
+    """Make sure that ``path`` could be written, before the work whose result it shall hold.
+
+    Nothing is left behind: where folders lack, the nearest one there is stands for them.
+
+    Raises
+    ------
+    InputError
+        When there is no such folder, or it cannot be written to.
+    """
+    folder = next(parent for parent in path.absolute().parents if parent.exists())
+    handle, temporary = _neighbour(path, folder)
+    os.close(handle)
+    temporary.unlink()
+
+
+def _neighbour(path: Path, folder: Path) -> tuple[int, Path]:
+    """An open temporary file in ``folder`` for what shall become ``path``."""
+    try:
+        handle, name = tempfile.mkstemp(dir=folder, prefix=f".{path.name}.", suffix=".part")
+    except NotADirectoryError as error:
+        raise InputError(f"{path}: cannot be written: {folder} is no folder; choose another") from error
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written: {error.strerror or error}; choose a folder you can write to"
+        ) from error
+    return handle, Path(name)
 
 
 def _synchronise(path: Path) -> None:

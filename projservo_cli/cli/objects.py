@@ -72,8 +72,8 @@ def _plan(run: Run) -> dict[str, Any]:
 
 def summary(stage: str, value: dict[str, Any]) -> str:
     """A stage's object in words, at most 80 columns wide."""
-    if "failed" in value:
-        return wrapped(f"{stage}: failed at {value['failed']}: {value['reason']}")
+    if "failed" in value:  # the reason is told with the exit code
+        return f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
     words = {
         "calibrate": _calibrate_words,
         "plan": _plan_words,
@@ -99,8 +99,8 @@ def _plan_words(value: dict[str, Any]) -> list[str]:
     feasible = "feasible" if value["feasible"] else "NOT feasible"
     return [
         wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}"),
-        "  rotation {theta_s_deg:.4g} deg = {theta_r_deg:.4g} deg onto the plane, "
-        "{theta_p_deg:.4g} deg within it".format_map(value),
+        "  rotation {theta_s_deg:.2f} deg = {theta_r_deg:.2f} deg onto the plane, "
+        "{theta_p_deg:.2f} deg within it".format_map(value),
     ]
 
 

@@ -64,8 +64,11 @@ def _dry(call: _Call, *, as_json: bool) -> int:
 
 def _work(call: _Call) -> None:
     """Make what has to be made, stop at the first failure, keep what was made until then."""
+    from projservo_cli.files import require_writable
     from projservo_cli.stages.chain import make
 
+    if any(step.why for step in call.steps):
+        require_writable(call.run.path)
     _announce_compilation(call)
     for done, step in enumerate(call.steps):
         call.console.progress("results", done, len(call.steps))

@@ -6,6 +6,9 @@ import click
 
 from projservo_cli.cli.output import Console, print_json
 
+# Predictions so many times the noise away come from another robot, or from other units.
+FAR = 20.0
+
 
 def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     """Compare an observation table with the predictions of a run's calibration; the exit code."""
@@ -31,10 +34,15 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
 
     statistics = residual_statistics(calibration, observation)
     value = {"run": found.path.resolve(), **statistics}
+    console = Console(quiet=options["quiet"], verbose=options["verbose"])
+    if value["count"] and value["median_px"] > FAR * calibration.sigma_px:
+        console.say(
+            f"validate: the median is {value['median_px'] / calibration.sigma_px:.3g} times the noise of "
+            "the calibration: are these the same robot, rig and markers, with joints in the same units?"
+        )
     if options["json"]:
         print_json(value)
         return 0
-    console = Console(quiet=options["quiet"], verbose=options["verbose"])
     skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
     console.show(f"validate: {value['count']} marker-view pairs; skipped: {skipped}")
     if value["count"]:

@@ -105,15 +105,18 @@ def new_figure(height: float, width: float = WIDTH) -> "Figure":
 
 def arrange(figure: "Figure") -> None:
     """Arrange the parts of a figure once, so that every format shows the same."""
-    figure.draw_without_rendering()
+    engine = figure.get_layout_engine()
+    if engine is None:
+        return
+    engine.execute(figure)
     images = [axes for axes in figure.axes if axes.get_label() == IMAGE]
     for axes in images:
         _equal_scales(axes)
     if images:  # other limits may have brought other tick labels, and with them another arrangement
-        figure.draw_without_rendering()
+        engine.execute(figure)
         for axes in images:
             _equal_scales(axes)
-    figure.set_layout_engine()  # none any more
+    figure.set_layout_engine("none")
 
 
 def _equal_scales(axes: "Axes") -> None:

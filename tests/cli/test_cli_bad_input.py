@@ -97,3 +97,11 @@ def test_runs_that_are_none(projservo, stages, tmp_path, command):
     (tmp_path / "out/run.h5").write_bytes(whole[: len(whole) // 2])
     refuse(projservo(command, "out", *data), "cut short")
     refuse(projservo("calibrate", "-c", "tiny.yaml", "-o", "out"), "cut short")
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_the_work(projservo, stages, tmp_path):
+    """The folder of the run is to be made inside a file."""
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    answer = projservo("calibrate", "-o", "file/out", "--json")
+    refuse(answer, "is no folder; choose another")
+    assert "making it" not in answer.err

@@ -32,7 +32,7 @@ def test_options_stand_anywhere_around_arguments(projservo, stages, monkeypatch,
     monkeypatch.setattr(
         projservo_cli.calibration,
         "residual_statistics",
-        lambda calibration, observation: {"count": len(observation.pose), "skipped": {}},
+        lambda calibration, observation: {"count": len(observation.pose), "median_px": 0.1, "skipped": {}},
         raising=False,
     )
     assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "-q").code == 0

@@ -37,6 +37,15 @@ def test_validate_prints_the_statistics_of_a_table(projservo, stages, statistics
     assert "median 0.25" in text
 
 
+def test_validate_asks_about_another_robot_where_nothing_fits(projservo, stages, statistics, tmp_path):
+    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    assert "same robot" not in projservo("validate", "out", "--data", "t.csv").err
+    statistics["median_px"] = 375.0
+    answer = projservo("validate", "out", "--data", "t.csv", "--json")
+    assert "are these the\nsame robot" in answer.err
+    assert answer.json["median_px"] == 375.0
+
+
 def test_validate_wants_as_many_joints_as_the_calibration_has(projservo, stages, statistics, tmp_path):
     projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
     (tmp_path / "one.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,1,2,3,4,5\n")

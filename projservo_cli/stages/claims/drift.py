@@ -8,7 +8,7 @@ from projservo_cli.figures import measures
 from projservo_cli.figures.drift import table
 from projservo_cli.figures.material import DIRECT, TITLES, Material, Studies
 from projservo_cli.geometry.kinematics import joint_operators
-from projservo_cli.records import FloatArray, Trace
+from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
 from projservo_cli.stages.claims.claim import Claim, listed
 
 # Both sides of (22) agree where the centre is moved to within this of the same place, m.
@@ -47,11 +47,12 @@ def drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
         "smaller largest deviation, true operators",
         own[1] < own[0],
     )
-    yield from _rate(studies)
+    yield from _rate(studies, material.robot.joint_types != PRISMATIC)
     yield _joints(material, studies.own[DIRECT[0], "true", False])
 
 
-def _rate(studies: Studies) -> Iterator[Claim]:
+def _rate(studies: Studies, revolute: BoolArray) -> Iterator[Claim]:
+    """Drift over the period; the longest turn in a step says how far apart the samples can be."""
     periods = np.array(studies.periods)
     for law in DIRECT:
         values = np.array(
@@ -61,11 +62,13 @@ def _rate(studies: Studies) -> Iterator[Claim]:
             continue
         order = np.polyfit(np.log(periods), np.log(values), 1)[0]
         sweep = ", ".join(f"{1e3 * period:g}" for period in periods)
+        steps = np.diff(studies.rate[law, max(studies.periods)].q[:, revolute], axis=0)
+        turn = np.degrees(np.abs(steps).max(initial=0.0))
         yield Claim(
             f"{TITLES[law]}: the drift is typical of low control rates",
             "section 7",
             f"{listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
-            f"drift ∝ period^{order:.2f}",
+            f"drift ∝ period^{order:.2f}; a joint turns by up to {turn:.0f}° in a step of the longest period",
             "falls strictly with the period, true operators and no limit",
             bool((np.diff(values[np.argsort(periods)]) > 0).all()),
         )
