@@ -7,6 +7,7 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.mechanisms import Work, rotation_mechanism
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
+from projservo_cli.task.partition import Parts
 
 
 @njit
@@ -46,24 +47,45 @@ def rotation_about_center(
 
 
 @njit
-def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
-    """Joint velocity λ_t τ q̂_t + λ_s θ_s q̂_s, [RH00] eqs. (23)–(25) as corrected.
+def single_rotation(
+    model: Model, parts: Parts, ratio: float, state: State
+) -> tuple[bool, float, float, Mat4]:
+    """Both rotations of a partition as one about the centre, [RH00] eqs. (23)–(25) as corrected.
 
     For λ_r/λ_p = ρ ≠ 1 the rotations composed in (24) are θ_r and θ_p weighted by ρ/max(1, ρ) and
     1/max(1, ρ): each then decays at its own rate, and the axis of the single rotation changes.
+
+    Parameters
+    ----------
+    ratio : ρ.
+    state : the joint motion is written to its row s.
+
+    Returns
+    -------
+    found : False where the joint motion is not unique.
+    theta_s : angle, rad; 0 where no rotation is left.
+    sense : factor that scales row s to the sense of Ĥ_s.
+    H_s : operator Ĥ_s.
     """
+    most = max(1.0, ratio)
+    theta_s, a, b, c = composed_angle(ratio / most * parts.theta_r, parts.theta_p / most)
+    turns, H_s = composed_operator(parts.H_r, parts.H_p, a, b, c)
+    if not turns:
+        return True, 0.0, 0.0, H_s
+    found, sense = rotation_about_center(state.work, H_s, model.a_inf, parts.A_c, state.q_hat[3])
+    return found, theta_s, sense, H_s
+
+
+@njit
+def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+    """Joint velocity λ_t τ q̂_t + λ_s θ_s q̂_s, [RH00] eqs. (23)–(25) as corrected."""
     status, parts = partitioned(model, task, s, q, state)
     if status != OK:
         return status
-    most = max(1.0, gains.ratio_rp)
-    theta_s, a, b, c = composed_angle(gains.ratio_rp / most * parts.theta_r, parts.theta_p / most)
-    turns, H_s = composed_operator(parts.H_r, parts.H_p, a, b, c)
-    rate = 0.0
-    if turns:
-        found, sense = rotation_about_center(state.work, H_s, model.a_inf, parts.A_c, state.q_hat[3])
-        if not found:
-            return SINGULAR
-        rate = gains.gain_s * theta_s * sense
+    found, theta_s, sense, _ = single_rotation(model, parts, gains.ratio_rp, state)
+    if not found:
+        return SINGULAR
+    rate = gains.gain_s * theta_s * sense
     t = translation_rate(task, gains, parts, state)
     for i in range(q.shape[0]):
         state.q_dot[i] = t * state.q_hat[0, i] + rate * state.q_hat[3, i]

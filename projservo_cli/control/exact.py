@@ -7,10 +7,9 @@ forward kinematics alone, [RH00] eqs. (6), (19); no metric quantity enters.
 
 import math
 
-from projservo_cli.control.direct_two import rotation_about_center
+from projservo_cli.control.direct_two import single_rotation
 from projservo_cli.control.law import MOST_PARTS, OK, SINGULAR, Gains, State, partitioned, translation_rate
 from projservo_cli.geometry.algebra import Mat4, mul
-from projservo_cli.geometry.composition import composed_angle, composed_operator
 from projservo_cli.geometry.displacement import rotation, translation
 from projservo_cli.geometry.inverse import reach
 from projservo_cli.geometry.jit import njit
@@ -101,15 +100,11 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     status, parts = partitioned(model, task, s, q, state)
     if status != OK:
         return status
-    theta_s, a, b, c = composed_angle(parts.theta_r, parts.theta_p)
-    turns, H_s = composed_operator(parts.H_r, parts.H_p, a, b, c)
-    sense = 0.0
-    if turns:
-        found, sense = rotation_about_center(state.work, H_s, model.a_inf, parts.A_c, state.q_hat[3])
-        if not found:
-            return SINGULAR
+    found, theta_s, sense, H_s = single_rotation(model, parts, 1.0, state)
+    if not found:
+        return SINGULAR
     tau = translation_rate(task, gains, parts, state) * gains.period
-    theta = gains.gain_s * theta_s * gains.period if turns else 0.0
+    theta = gains.gain_s * theta_s * gains.period
     first_order(parts, tau, theta, sense, state)
     share = speed_share(state.q_dot, gains.speed, gains.period)
     tau *= share

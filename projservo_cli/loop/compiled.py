@@ -14,6 +14,7 @@ from projservo_cli.loop.step import (
     MAX_STEPS,
     PLATEAU,
     RUNNING,
+    Instant,
     Limits,
     all_seen,
     beyond_limits,
@@ -138,18 +139,9 @@ def run(
             sound = finite(state.q_dot)
             for i in range(log.errors.shape[1]):
                 log.errors[k, i] = state.errors[i]
-        verdict = verdict_at(
-            in_front,
-            seen,
-            left,
-            log.error[k],
-            log.error[0],
-            distance,
-            first_distance,
-            sound,
-            singular,
-            limits,
-        )
+        error, first_error = log.error[k], log.error[0]
+        now = Instant(in_front, seen, left, error, first_error, distance, first_distance, sound, singular)
+        verdict = verdict_at(now, limits)
         if verdict != RUNNING:
             return verdict, k
         if k == limits.max_steps:

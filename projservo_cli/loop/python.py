@@ -12,6 +12,7 @@ from projservo_cli.loop.step import (
     MAX_STEPS,
     PLATEAU,
     RUNNING,
+    Instant,
     Limits,
     all_seen,
     beyond_limits,
@@ -111,18 +112,11 @@ def _run(
             status, q_dot = law(log.s[k], log.q[k])
             seen, singular, sound = status != LOST, status == SINGULAR, finite(q_dot)
             log.errors[k] = law.errors
-        verdict = verdict_at(
-            plant.in_front,
-            seen,
-            left,
-            log.error[k],
-            log.error[0],
-            distance,
-            first_distance,
-            sound,
-            singular,
-            limits,
+        error, first_error = log.error[k], log.error[0]
+        now = Instant(
+            plant.in_front, seen, left, error, first_error, distance, first_distance, sound, singular
         )
+        verdict = verdict_at(now, limits)
         if verdict != RUNNING:
             return verdict, k
         if k == limits.max_steps:

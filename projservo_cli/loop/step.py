@@ -68,6 +68,31 @@ class Limits(NamedTuple):
     stop_at_border: bool
 
 
+class Instant(NamedTuple):
+    """What the verdict of one instant depends on, before its command.
+
+    Attributes
+    ----------
+    in_front : whether every face marker is in front of both cameras.
+    seen : whether the law could measure with the markers that were seen.
+    left : whether a face marker lies outside an image.
+    error, first_error : image error now and at the start, px rms per marker and view.
+    distance, first_distance : of the face from the rig now and at the start, m.
+    finite_command : whether every joint velocity is a finite number.
+    singular : whether the joint motion of the law is not unique.
+    """
+
+    in_front: bool
+    seen: bool
+    left: bool
+    error: float
+    first_error: float
+    distance: float
+    first_distance: float
+    finite_command: bool
+    singular: bool
+
+
 @njit
 def image_error(s: FloatArray, s_star: FloatArray) -> float:
     """Root mean square over markers and views of the Euclidean pixel error; NaN where unseen."""
@@ -144,30 +169,20 @@ def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
 
 
 @njit
-def verdict_at(
-    in_front: bool,
-    seen: bool,
-    left: bool,
-    error: float,
-    first_error: float,
-    distance: float,
-    first_distance: float,
-    finite_command: bool,
-    singular: bool,
-    limits: Limits,
-) -> int:
+def verdict_at(now: Instant, limits: Limits) -> int:
     """Verdict of one instant before its command, in the order the module states; RUNNING for none."""
-    if not in_front:
+    if not now.in_front:
         return BEHIND_CAMERA
-    if left and limits.stop_at_border:
+    if now.left and limits.stop_at_border:
         return LEFT_IMAGE
-    if not seen:
+    if not now.seen:
         return MARKERS_LOST
-    if error <= limits.image_px:
+    if now.error <= limits.image_px:
         return CONVERGED
-    grown = error > limits.diverged_factor * first_error
-    if grown or distance > limits.diverged_factor * first_distance or not finite_command:
+    grown = now.error > limits.diverged_factor * now.first_error
+    receded = now.distance > limits.diverged_factor * now.first_distance
+    if grown or receded or not now.finite_command:
         return DIVERGED
-    if singular:
+    if now.singular:
         return SINGULAR_VERDICT
     return RUNNING

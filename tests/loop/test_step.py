@@ -15,6 +15,7 @@ from projservo_cli.loop.step import (
     RUNNING,
     SINGULAR_VERDICT,
     VERDICTS,
+    Instant,
     all_seen,
     beyond_limits,
     finite,
@@ -50,7 +51,7 @@ CALM = {
 
 def verdict(border_stops=True, **given):
     state = {**CALM, **given}
-    return verdict_at(*state.values(), limits(image_px=0.01, stop_at_border=border_stops))
+    return verdict_at(Instant(**state), limits(image_px=0.01, stop_at_border=border_stops))
 
 
 def test_a_calm_instant_goes_on():
