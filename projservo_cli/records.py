@@ -122,6 +122,42 @@ class Calibration:
 
 
 @dataclass(frozen=True, eq=False)
+class CrossValidation:
+    """Repeatability of a calibration: images at poses that the fit which predicts them has not seen.
+
+    The statistics are of Euclidean distances, one for each marker and view, as in ``validate``.
+    Readings that the calibration leaves out as outliers do not count.
+    """
+
+    folds: int = scalar(about="parts the poses were divided into, each predicted from the others")
+    seed: int = scalar(about="seed of the division")
+    unit: str = scalar(about="poses, or configurations: poses that differ in one joint stay together")
+    failed: tuple[str, ...] = scalar(about="parts that could not be predicted, each with the reason")
+    reason: str = scalar(about="how the held-out error compares with the predicted one, in words")
+    count: int = scalar(about="marker-view pairs that were predicted")
+    rms_px: float | None = scalar(units="px", about="held-out residual, root mean square")
+    median_px: float | None = scalar(units="px", about="held-out residual, median")
+    p95_px: float | None = scalar(units="px", about="held-out residual, 95th percentile")
+    predicted_rms_px: float | None = scalar(
+        units="px", about="the same root mean square from noise and covariance of each fit"
+    )
+    pose: IntArray = array("pose", about="number of the pose")
+    fold: IntArray = array("pose", about="part of the pose, from 0")
+    marker: IntArray = array("marker", about="number of the marker")
+    residual: FloatArray = array(
+        "pose", "view", "marker", "xy", units="px", about="seen minus predicted, NaN where there is none"
+    )
+    predicted: FloatArray = array(
+        "pose",
+        "view",
+        "marker",
+        "xy",
+        units="px",
+        about="deviation of the residual from noise and covariance",
+    )
+
+
+@dataclass(frozen=True, eq=False)
 class Plan:
     """A reaching task as a translation and two rotations, and the motion planned for it.
 

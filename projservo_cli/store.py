@@ -18,7 +18,7 @@ import numpy as np
 
 from projservo_cli import records as record_types
 from projservo_cli.files import replacing
-from projservo_cli.records import Calibration, InputError, Observation, Plan, Trace
+from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Plan, Trace
 
 SCHEMA = "projservo run"
 SCHEMA_VERSION = 1
@@ -65,6 +65,12 @@ class Run:
         """The calibration."""
         found: Calibration = self._record("calibrate", "calibration")
         return found
+
+    @property
+    def cross_validation(self) -> CrossValidation | None:
+        """Held-out errors of the calibration; None where they were not asked for."""
+        result = self.results.get("calibrate")
+        return None if result is None else result.records.get("cross_validation")
 
     @property
     def plan(self) -> Plan:

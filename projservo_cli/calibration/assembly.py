@@ -60,7 +60,7 @@ def assemble(
     noise, covariance = np.full(len(types), np.nan), np.full((size, size), np.nan)
     if factor is not None:
         noise = reach_noise(model, scene.M, factor, _surroundings(readings))
-        sigma = expected.sigma_px if expected.known else max(expected.sigma_px, agreement.sigma_px)
+        sigma = expected.noise_px(agreement)
         motion = image_motion(model, scene.M, span)
         quality.require_determined(noise, motion, sigma, span, readings.prismatic)
         covariance = sigma**2 * (factor @ factor.T)

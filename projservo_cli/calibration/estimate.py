@@ -2,6 +2,8 @@
 
 import dataclasses
 import time
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
@@ -18,15 +20,17 @@ from projservo_cli.calibration.frame import (
     output_gauge,
     spread_factor,
 )
+from projservo_cli.calibration.nominal import Nominal, solve_from
 from projservo_cli.calibration.optimization import Problem, prepare
 from projservo_cli.calibration.quality import Agreement, Expected
 from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
-from projservo_cli.calibration.reconstruction import Frame, image_frame
-from projservo_cli.calibration.refined import solve
+from projservo_cli.calibration.reconstruction import image_frame
+from projservo_cli.calibration.refined import Solution, solve
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 
 METHODS = ("refined", "linear", "closed_form")
 A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+Fitted = Callable[[Solution, float], None]
 
 
 def calibrate(
@@ -38,6 +42,8 @@ def calibrate(
     source: str = "simulated",
     image_size: tuple[int, int] | None = None,
     seed: int = 0,
+    init: Nominal | None = None,
+    fitted: Fitted | None = None,
 ) -> Calibration:
     """Projective kinematics [RH00] section 2 from pixels and joint readings alone.
 
@@ -50,6 +56,8 @@ def calibrate(
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : of the random starts.
+    init : robot and rig to try first as a start of ``refined``; the search follows where that misses.
+    fitted : told the solution of ``refined`` and its noise, px, for what needs more than the record.
 
     Raises
     ------
@@ -74,19 +82,28 @@ def calibrate(
         epipolar = epipolar_geometry(readings.pixels[0][both], readings.pixels[1][both], rng)
         expected = quality.expected_noise(epipolar.sigma_px, sigma_px, source)
         if method == "refined":
-            result = _refined(readings, epipolar, image_frame(readings, image_size), rng, expected)
+            frame = image_frame(readings, image_size)
+            q_reference = reference_joints(readings.q)
+            search = partial(solve, readings, q_reference, epipolar, frame, rng, expected)
+            solution, note = (
+                (search(), "")
+                if init is None
+                else solve_from(init, readings, q_reference, epipolar, expected, search)
+            )
+            result = _refined(readings, epipolar, solution, expected)
+            result = dataclasses.replace(result, advice=(*result.advice, *([note] if note else [])))
         elif method == "linear":
             result = _linear(readings, epipolar, expected)
         else:
             result = _closed_form(readings, epipolar, expected)
-    return dataclasses.replace(result, source=source, seconds=time.perf_counter() - begin)
+        seconds = time.perf_counter() - begin
+        if method == "refined" and fitted is not None:
+            fitted(solution, expected.noise_px(solution.agreement))
+    return dataclasses.replace(result, source=source, seconds=seconds)
 
 
-def _refined(
-    readings: Readings, epipolar: Epipolar, frame: Frame, rng: np.random.Generator, expected: Expected
-) -> Calibration:
-    """Calibration by maximum likelihood, in its projective frame, with its covariance."""
-    solution = solve(readings, reference_joints(readings.q), epipolar, frame, rng, expected)
+def _refined(readings: Readings, epipolar: Epipolar, solution: Solution, expected: Expected) -> Calibration:
+    """Record of the maximum likelihood in its projective frame, with its covariance."""
     refusal = expected.refusal(solution.agreement)
     if refusal is not None:
         raise WorkFailed(refusal)

@@ -75,6 +75,10 @@ class Expected:
         """Fitted over expected noise."""
         return agreement.sigma_px / self.sigma_px
 
+    def noise_px(self, agreement: Agreement) -> float:
+        """Noise a covariance is scaled by, px: the true one of a simulation, else never below the fitted."""
+        return self.sigma_px if self.known else max(self.sigma_px, agreement.sigma_px)
+
     def agrees(self, agreement: Agreement) -> bool:
         """Whether a fit leaves nothing but the expected noise, so that no other need be sought."""
         if self.known:

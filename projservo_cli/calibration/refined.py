@@ -91,7 +91,7 @@ def solve(
                 continue
             if expected.agrees(found.agreement):
                 return found
-            if best is None or _typical(found) < _typical(best):
+            if best is None or typical(found) < typical(best):
                 best = found
             if factors != FOCAL_FACTORS[0] and expected.refusal(best.agreement) is None:
                 return best
@@ -126,7 +126,7 @@ def _explained(solution: Solution) -> BoolArray:
     """Poses (K,) whose median residual is within some times that of all."""
     readings = solution.problem.readings
     distance = np.linalg.norm(solution.agreement.residual, axis=2)
-    limit = SPOILT * _typical(solution)
+    limit = SPOILT * typical(solution)
     result = np.ones(len(readings.q), dtype=bool)
     for k in np.unique(readings.pose_of):
         here = readings.pose_of == k
@@ -134,7 +134,7 @@ def _explained(solution: Solution) -> BoolArray:
     return result
 
 
-def _typical(solution: Solution) -> float:
+def typical(solution: Solution) -> float:
     """Median residual over all readings seen, outliers included, px."""
     return float(np.median(_distances(solution.agreement.residual, solution.problem.readings.seen)))
 

@@ -45,7 +45,7 @@ COMMANDS = {
         "Learn the projective kinematics from trial motions.",
         "Estimates both cameras and all joint operators from images alone, simulated from the configuration "
         "or recorded in an observation table (--data).",
-        _OF_STAGES,
+        (*_OF_STAGES, "cross_validate", "init"),
         stage=True,
     ),
     "plan": Command(

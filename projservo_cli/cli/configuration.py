@@ -54,7 +54,7 @@ def shipped(name: str) -> Path:
 
 
 def given_overrides(options: dict[str, Any]) -> list[Override]:
-    """``--data, --joints, --joint-unit, --noise-px`` and ``--set``, the last one having the last word."""
+    """Options that stand for values of the configuration, then ``--set``, which has the last word."""
     found = []
     if options["data"] is not None:
         table = os.path.abspath(options["data"])
@@ -68,4 +68,10 @@ def given_overrides(options: dict[str, Any]) -> list[Override]:
         found.append(
             Override.parse(f"data.noise_px={options['noise_px']}", f"--noise-px {options['noise_px']}")
         )
+    if options["cross_validate"] is not None:
+        folds = options["cross_validate"]
+        found.append(Override.parse(f"calibration.cross_validate={folds}", f"--cross-validate {folds}"))
+    if options["init"] is not None:
+        path = os.path.abspath(options["init"])
+        found.append(Override(f"--init {options['init']}", ("calibration", "init"), path))
     return [*found, *map(Override.parse, options["sets"])]

@@ -59,7 +59,8 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
         }
         for i, letter in enumerate(calibration.joint_types)
     ]
-    return _scalars(calibration) | {"joints": joints} | findings(calibration)
+    held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
+    return _scalars(calibration) | {"joints": joints} | findings(calibration) | held_out
 
 
 def _plan(run: Run) -> dict[str, Any]:
@@ -91,7 +92,20 @@ def _calibrate_words(value: dict[str, Any]) -> list[str]:
         f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s",
         wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
+        *_held_out_words(value.get("cross_validation")),
         *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),
+    ]
+
+
+def _held_out_words(value: dict[str, Any] | None) -> list[str]:
+    if value is None:
+        return []
+    numbers = ("rms_px", "median_px", "p95_px", "predicted_rms_px")
+    rms, median, p95, predicted = (_number(value[name]) for name in numbers)
+    return [
+        f"  held out, {value['folds']} parts of {value['unit']}: rms {rms} px (predicted {predicted}), "
+        f"median {median}, p95 {p95}",
+        wrapped(value["reason"], "  "),
     ]
 
 

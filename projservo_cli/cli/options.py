@@ -42,6 +42,16 @@ OPTIONS: dict[str, click.Option] = {
             ["--noise-px"], metavar="S", help="Pixel noise of the table, per coordinate. Default: estimated."
         ),
         click.Option(
+            ["--cross-validate"],
+            metavar="K",
+            help="On calibrate: predict the poses in K parts, each from a fit to the others.",
+        ),
+        click.Option(
+            ["--init"],
+            metavar="FILE",
+            help="On calibrate: try this robot and rig (JSON: screws, cameras, markers) first as a start.",
+        ),
+        click.Option(
             ["--motions"],
             metavar="CSV",
             help="On record: further poses after the trial motions, a row each of q1 ... qN.",

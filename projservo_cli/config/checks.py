@@ -167,6 +167,14 @@ def _enough(config: Any) -> Iterator[Finding]:
         yield ("task",), "is missing; a simulated run needs it, or calibration.reference"
 
 
+@_needs("calibration")
+def _only_refined(config: Any) -> Iterator[Finding]:
+    settings = config.calibration
+    for key in ("cross_validate", "init"):
+        if getattr(settings, key) is not None and settings.method != "refined":
+            yield ("calibration", key), f"belongs to the method refined, not to {settings.method}"
+
+
 @_needs("robot", "data")
 def _same_joints(config: Any) -> Iterator[Finding]:
     if config.data is None or config.data.joints is None or config.robot is None:

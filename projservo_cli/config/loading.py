@@ -18,6 +18,9 @@ from projservo_cli.config.models import Config
 from projservo_cli.config.yaml_source import Document, Path, Problem
 from projservo_cli.records import InputError
 
+# Values that name files, relative to the configuration.
+FILES = (("data", "table"), ("calibration", "init"))
+
 
 @dataclass(frozen=True)
 class Override:
@@ -65,7 +68,7 @@ def load_config(
     Returns
     -------
     Config
-        ``data.table`` is an absolute path, whatever the working directory later.
+        ``data.table`` and ``calibration.init`` are absolute paths, whatever the working directory later.
 
     Raises
     ------
@@ -125,12 +128,15 @@ def _apply(values: dict[str, Any], change: Override, document: Document) -> Prob
 
 
 def _defaults(values: dict[str, Any], path: pathlib.Path | str | None) -> dict[str, Any]:
-    """Fill the name from the file and make the path of the table absolute."""
+    """Fill the name from the file and make the paths of files absolute."""
+    base = pathlib.Path(path).parent if path is not None else pathlib.Path()
+    for section, key in FILES:
+        part = values.get(section)
+        if isinstance(part, dict) and isinstance(part.get(key), str) and part[key]:
+            part[key] = str((base / part[key]).resolve())
     data = values.get("data")
     table = data.get("table") if isinstance(data, dict) else None
-    if isinstance(table, str) and isinstance(data, dict) and table:
-        base = pathlib.Path(path).parent if path is not None else pathlib.Path()
-        data["table"] = str((base / table).resolve())
+    if isinstance(table, str) and table:
         values.setdefault("name", pathlib.Path(table).stem)
     if path is not None:
         values.setdefault("name", pathlib.Path(path).stem)

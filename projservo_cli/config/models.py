@@ -36,6 +36,8 @@ class CalibrationSettings(Section):
     amplitude_deg: Annotated[float, Strict(), Field(ge=0, lt=180, allow_inf_nan=False)] = 30.0
     amplitude_m: NotNegative = 0.15
     reference: JointVector | None = None
+    cross_validate: Annotated[int, Strict(), Field(ge=2, le=10_000)] | None = None
+    init: Annotated[str, StringConstraints(min_length=1)] | None = None
 
 
 class Data(Section):

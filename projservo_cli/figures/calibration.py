@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.figures import style
 from projservo_cli.figures.material import VIEWS, Data, Fit
-from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation
+from projservo_cli.records import BoolArray, Calibration, CrossValidation, FloatArray, Observation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -51,7 +51,12 @@ def data(fit: Fit) -> Data:
         "information": information(calibration.covariance),
         "parameters": np.array(len(calibration.covariance)),
         "residual": residual[used].ravel(),
-        **by_pose(used, residual, prediction_variance(calibration, observation.q)),
+        "held_out": np.array(fit.held_out is not None),
+        **(
+            by_pose(used, residual, prediction_variance(calibration, observation.q))
+            if fit.held_out is None
+            else by_pose_held_out(fit.held_out)
+        ),
     }
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
     for v, view in enumerate(VIEWS):
@@ -111,6 +116,15 @@ def by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data
         "pose_residual_px": np.sqrt(mean(residual**2)),
         "pose_coordinates": count,
     }
+
+
+def by_pose_held_out(held_out: CrossValidation) -> Data:
+    """Predicted and actual error of each pose from fits that have not seen it, as of ``by_pose``.
+
+    The predicted one has the noise of the held-out reading in it.
+    """
+    predicted = np.asarray(np.isfinite(held_out.residual).all(axis=-1))
+    return by_pose(predicted, held_out.residual, held_out.predicted**2)
 
 
 def information(covariance: FloatArray) -> FloatArray:
@@ -222,25 +236,24 @@ def _histogram(axes: "Axes", data: Data) -> None:
 
 def _poses(axes: "Axes", data: Data) -> None:
     """Residual of each pose over its predicted error, beside what the noise model leads one to expect."""
-    predicted, residual, sigma = (
-        data["pose_predicted_px"],
-        data["pose_residual_px"],
-        float(data["sigma_px"]),
-    )
-    axes.set_title("each pose, in the fit (not held out)")
-    axes.set_xlabel("predicted error (px)")
+    predicted, residual = data["pose_predicted_px"], data["pose_residual_px"]
+    sigma = float(data["sigma_px"])
+    held_out = bool(data["held_out"])
+    axes.set_title("each pose, held out" if held_out else "each pose, in the fit (not held out)")
+    axes.set_xlabel("predicted error with noise (px)" if held_out else "predicted error (px)")
     axes.set_ylabel("rms residual (px)")
     if not np.isfinite(predicted).all():
         return _without_covariance(axes)
-    x = np.linspace(0.0, 1.06 * float(predicted.max(initial=0.0)), 101)
-    expected = expected_residual(x, sigma)
-    coordinates = float(np.median(data["pose_coordinates"]))
+    most = 1.06 * float(predicted.max(initial=0.0))
+    x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
+    expected = x if held_out else expected_residual(x, sigma)
+    coordinates = float(np.median(data["pose_coordinates"])) if predicted.size else 1.0
     low, high = np.sqrt(chi2.ppf(BAND, coordinates) / coordinates)
     axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)
     axes.plot(x, expected, **MODEL)
     axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)
-    axes.set_xlim(0.0, x[-1])
-    axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * sigma))
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
     return None
 
 

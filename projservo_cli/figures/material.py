@@ -10,7 +10,7 @@ import numpy.typing as npt
 from projservo_cli.control.law import Gains
 from projservo_cli.plants.plant import Plant
 from projservo_cli.plants.robot import Robot
-from projservo_cli.records import Calibration, FloatArray, Model, Observation, Plan, Trace
+from projservo_cli.records import Calibration, CrossValidation, FloatArray, Model, Observation, Plan, Trace
 
 Data = dict[str, npt.NDArray[Any]]
 """Named arrays behind one figure."""
@@ -61,10 +61,12 @@ class Fit:
     ----------
     calibration : the calibration.
     observation : what it was made from.
+    held_out : its cross-validation, if there is one.
     """
 
     calibration: Calibration
     observation: Observation
+    held_out: CrossValidation | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,21 @@
 """Stage calibrate: trial motions or a recorded table in, projective kinematics out."""
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.calibration import calibrate
-from projservo_cli.records import PRISMATIC, Calibration, FloatArray, InputError, Observation
+from projservo_cli.calibration import calibrate, cross_validate
+from projservo_cli.calibration.refined import Solution
+from projservo_cli.records import (
+    PRISMATIC,
+    Calibration,
+    CrossValidation,
+    FloatArray,
+    InputError,
+    Observation,
+)
+from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.truth import CALIBRATION_NOISE, Truth, generator, truth_of
 
 if TYPE_CHECKING:
@@ -69,8 +79,14 @@ def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
     return images
 
 
-def run(config: "Config", *, progress: object = None) -> tuple[Observation, Calibration]:
+def run(
+    config: "Config", *, progress: Progress = silent
+) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from simulated trial motions, or from the recorded table of the configuration.
+
+    Returns
+    -------
+    What was seen, the calibration, and its held-out errors if the configuration asks for them.
 
     Raises
     ------
@@ -79,31 +95,42 @@ def run(config: "Config", *, progress: object = None) -> tuple[Observation, Cali
     WorkFailed
         If the data do not support a calibration.
     """
+    from projservo_cli.nominal import read_nominal
+
+    settings = config.calibration
+    init = read_nominal(settings.init) if settings.init is not None else None
+    observation, types, sigma_px = _observed(config)
+    held_out: list[CrossValidation] = []
+
+    def hold_out(solution: Solution, noise_px: float) -> None:
+        """Cross-validate the solution while it is at hand."""
+        folds = settings.cross_validate
+        assert folds is not None
+        tell = partial(progress, "cross-validation")
+        held_out.append(cross_validate(solution, noise_px, folds, config.seed, tell))
+
+    calibration = calibrate(
+        observation,
+        types,
+        method=settings.method,
+        sigma_px=sigma_px,
+        source="recorded" if config.recorded else "simulated",
+        image_size=config.rig.image_size_px if config.rig is not None else None,
+        seed=config.seed,
+        init=init,
+        fitted=hold_out if settings.cross_validate is not None else None,
+    )
+    return observation, calibration, held_out[0] if held_out else None
+
+
+def _observed(config: "Config") -> tuple[Observation, str, float | None]:
+    """What is to be explained, the types of the joints, and the noise if it is known, px."""
     from projservo_cli.tables import read_table
 
     if config.data is not None:
         observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
         types = config.joint_types or "R" * observation.q.shape[1]
-        size = config.rig.image_size_px if config.rig is not None else None
-        return observation, calibrate(
-            observation,
-            types,
-            method=config.calibration.method,
-            sigma_px=config.data.noise_px,
-            source="recorded",
-            image_size=size,
-            seed=config.seed,
-        )
-    truth = truth_of(config)
-    observation = simulate(config, truth)
+        return observation, types, config.data.noise_px
+    observation = simulate(config, truth_of(config))
     assert config.robot is not None
-    assert config.rig is not None
-    return observation, calibrate(
-        observation,
-        config.robot.joint_types,
-        method=config.calibration.method,
-        sigma_px=config.noise.calibration_px or None,
-        source="simulated",
-        image_size=config.rig.image_size_px,
-        seed=config.seed,
-    )
+    return observation, config.robot.joint_types, config.noise.calibration_px or None

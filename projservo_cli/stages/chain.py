@@ -19,14 +19,16 @@ from projservo_cli.stages import Progress
 from projservo_cli.store import SERVO, Result, Run, save
 
 STAGES = ("calibrate", "plan", "servo", "report")
-# Where a table lies does not matter, only what it says. Which laws are run, and which of them must
+# Where a file lies does not matter, only what it says. Which laws are run, and which of them must
 # converge, changes the run of none of them.
 NOT_HASHED: dict[str, tuple[str, ...]] = {
-    "calibrate": ("data.table",),
+    "calibrate": ("data.table", "calibration.init"),
     "plan": ("data.table",),
     "servo": ("data.table", "control.laws", "control.must_converge"),
     "report": ("data.table",),
 }
+
+EXPECTED = {"table": "a table", "init": "JSON with screws, cameras and markers"}
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def steps_for(
     Raises
     ------
     InputError
-        When the table cannot be read, or a recorded calibration would be replaced by a simulated
+        When a file cannot be read, or a recorded calibration would be replaced by a simulated
         one without ``force``.
     """
     last = max(named, key=STAGES.index)
@@ -105,8 +107,8 @@ def _keys(
     config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
 ) -> Iterator[tuple[str, str, str, dict[str, str]]]:
     """Stage, law, key and input hashes of every result of the stages, each key made from those before."""
-    inputs = _table_hash(config, run)
-    before: list[str | None] = [inputs.get("table_sha256")]
+    inputs = _file_hashes(config, run)
+    before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     for stage in stages:
         keys = []
         for law in dict.fromkeys(laws) if stage == "servo" else [""]:
@@ -121,19 +123,25 @@ def _depends_on(stage: str) -> tuple[str, ...]:
     return keys
 
 
-def _table_hash(config: Config, run: Run) -> dict[str, str]:
-    """Hash of the observation table; the stored one where that very file is gone since."""
-    if config.data is None:
-        return {}
-    path = Path(config.data.table)
+def _file_hashes(config: Config, run: Run) -> dict[str, str]:
+    """Hashes of the files that are read; the stored one where that very file is gone since."""
+    files = {"table": config.data.table if config.data is not None else None, "init": config.calibration.init}
     stored = run.results["calibrate"].inputs if "calibrate" in run.results else {}
-    if not path.exists() and stored.get("table") == config.data.table:
-        return dict(stored)
-    try:
-        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
-        return {"table": config.data.table, "table_sha256": sha256}
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected a table") from error
+    found: dict[str, str] = {}
+    for name, given in files.items():
+        if given is None:
+            continue
+        path, digested = Path(given), f"{name}_sha256"
+        if not path.exists() and stored.get(name) == given:
+            found |= {name: given, digested: stored[digested]}
+            continue
+        try:
+            found |= {name: given, digested: hashlib.sha256(path.read_bytes()).hexdigest()}
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot be read: {error.strerror or error}; expected {EXPECTED[name]}"
+            ) from error
+    return found
 
 
 def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
@@ -194,8 +202,9 @@ def _stage_of(name: str) -> int:
 def _records(step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress) -> dict[str, Any]:
     module = stage_module(step.stage)
     if step.stage == "calibrate":
-        observation, calibration = module.run(config, progress=progress)
-        return {"observation": observation, "calibration": calibration}
+        observation, calibration, held_out = module.run(config, progress=progress)
+        records = {"observation": observation, "calibration": calibration}
+        return records if held_out is None else records | {"cross_validation": held_out}
     if step.stage == "plan":
         return {"": module.run(config, run.calibration)}
     if step.stage == "servo":

@@ -51,7 +51,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
     if not has_task(config):
-        fit = Fit(run.calibration, run.observation)
+        fit = Fit(run.calibration, run.observation, held_out=run.cross_validation)
         written = draw_all(fit, directory, config.report.formats, left_out, progress)
         record = _record(None, None, tuple(written), tuple(left_out), ())
         _write_claims(record, directory / CLAIMS_FILE)
@@ -87,6 +87,7 @@ def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progre
         run.traces,
         studies,
         reason,
+        held_out=run.cross_validation,
     )
 
 

@@ -30,7 +30,7 @@ def configured(arm: str, *overrides: str) -> Config:
 @lru_cache(maxsize=64)
 def calibrated(arm: str, seed: int) -> tuple[Calibration, Plan]:
     config = configured(arm, f"seed={seed}")
-    _, calibration = calibrate.run(config)
+    _, calibration, _ = calibrate.run(config)
     return calibration, plan.run(config, calibration)
 
 
@@ -97,7 +97,7 @@ def test_held_out_prediction_and_chi_square(arm: str, seed: int) -> None:
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_refined_beats_the_closed_form_by_far(arm: str) -> None:
-    _, closed = calibrate.run(configured(arm, "calibration.method=closed_form"))
+    _, closed, _ = calibrate.run(configured(arm, "calibration.method=closed_form"))
     assert held_out_rms(arm, closed) > 5 * held_out_rms(arm, calibrated(arm, 1)[0])
 
 

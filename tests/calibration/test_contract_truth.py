@@ -43,14 +43,14 @@ def same(one, other):
 @pytest.fixture(scope="module")
 def honest():
     """Observation and calibration of the simulated robot, every number of it true."""
-    return stage.run(load_config(PAPER, ()))
+    return stage.run(load_config(PAPER, ()))[:2]
 
 
 # The linear method lives on little noise only.
 @pytest.mark.parametrize(("method", "noise"), [("refined", 0.5), ("linear", 0.01), ("closed_form", 0.5)])
 def test_a_simulated_run_with_garbage_for_truth_is_the_same(monkeypatch, method, noise):
     settings = (f"calibration.method={method}", f"noise.calibration_px={noise}")
-    observation, calibration = stage.run(load_config(PAPER, settings))
+    observation, calibration, _ = stage.run(load_config(PAPER, settings))
     config = load_config(PAPER, (*GARBAGE, *settings))
     wrong = truth_of(config)
     # The garbage is garbage: its images have nothing to do with those observed.
@@ -78,7 +78,7 @@ def test_a_recorded_run_does_not_look_at_the_configured_robot(table):
 def test_a_recorded_run_needs_neither_robot_nor_rig(honest, table, tmp_path):
     bare = tmp_path / "bare.yaml"
     bare.write_text(f"name: bare\nseed: 5\ndata: {{table: {table}}}\n", encoding="utf-8")
-    observation, calibration = stage.run(load_config(bare, ()))
+    observation, calibration, _ = stage.run(load_config(bare, ()))
     np.testing.assert_array_equal(observation.images, honest[0].images)
     # Another seed, another guess of the image centre, σ estimated: the same optimum. The search ends
     # when a step moves the images by 1e-7 of the residual, 1e-7 · 0.5 px · √2000 over all images.

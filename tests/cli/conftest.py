@@ -71,7 +71,7 @@ class Stages:
         types = config.joint_types or "R" * n
         given = {"source": source, "joint_types": types, "chi2_per_dof": float("nan"), "advice": ("more",)}
         given |= {"outlier": np.array([[3, 1, 0], [4, 2, 2]]), "suspect": np.zeros((0, 2), dtype=np.int64)}
-        return observation, fake(Calibration, config.seed, {"joint": n}, **given)
+        return observation, fake(Calibration, config.seed, {"joint": n}, **given), None
 
     def plan(self, config: Any, calibration: Any) -> Any:
         self._make("plan")

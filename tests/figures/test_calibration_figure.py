@@ -8,9 +8,10 @@ from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.config import load_config
 from projservo_cli.figures import FIGURES, calibration, style
 from projservo_cli.figures.material import Fit
-from projservo_cli.records import Observation
+from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.stages import calibrate, chain
 from projservo_cli.store import Result, Run
+from tests.fake_records import fake
 from tests.figures.cases import case, config_of
 
 SPEC = next(spec for spec in FIGURES if spec.name == "fig13_calibration")
@@ -20,7 +21,7 @@ SHIFT_PX = np.array([[0.3, -0.4], [-0.1, 0.2]])  # of each view
 @pytest.fixture(scope="module")
 def fitted():
     """The paper's task, calibrated from its simulated trials."""
-    return Fit(*reversed(calibrate.run(config_of("paper"))))
+    return Fit(*reversed(calibrate.run(config_of("paper"))[:2]))
 
 
 def shifted(name="paper", **fields):
@@ -96,6 +97,27 @@ def test_errors_of_poses_are_rms_over_what_was_used():
     np.testing.assert_allclose(data["pose_residual_px"], [np.sqrt(50.0 / 4.0), 3.0])
     np.testing.assert_allclose(data["pose_predicted_px"], 0.5)
     np.testing.assert_array_equal(data["pose_coordinates"], [4, 2])
+
+
+def test_held_out_errors_take_the_place_of_those_in_the_fit():
+    fit = shifted()
+    residual = np.full((49, 2, 10, 2), 3.0)
+    residual[7] = residual[0, 1, 4] = np.nan
+    sizes = {"pose": 49, "marker": 10}
+    given = {"residual": residual, "predicted": np.where(np.isnan(residual), np.nan, 2.0)}
+    held_out = dataclasses.replace(fit, held_out=fake(CrossValidation, sizes=sizes, **given))
+    data = SPEC.data(held_out)
+    np.testing.assert_allclose(data["pose_residual_px"], np.full(48, 3.0))
+    np.testing.assert_allclose(data["pose_predicted_px"], np.full(48, 2.0))
+    np.testing.assert_array_equal(data["pose_coordinates"], [38] + 47 * [40])
+    axes = drawn(held_out).axes[3]
+    assert axes.get_title() == "each pose, held out"
+    model = axes.lines[0].get_xydata()
+    np.testing.assert_array_equal(model[:, 0], model[:, 1])  # as predicted, so found
+    # All that is drawn lies within the axes.
+    assert axes.get_xlim()[0] < 2.0 < axes.get_xlim()[1]
+    assert axes.get_ylim()[1] > 3.0
+    assert "not held out" in drawn(fit).axes[3].get_title()
 
 
 def test_information_is_the_inverse_of_the_covariance_without_its_null_space():

@@ -1,0 +1,210 @@
+"""A start given by a file: read strictly, tried first, never trusted."""
+
+import copy
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.nominal import read_nominal
+from projservo_cli.records import InputError, WorkFailed
+from tests.calibration.simulated_robot import around, random_robot, trials
+
+SIGMA = 0.5
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return random_robot("RPRR", np.random.default_rng(3), markers=6)
+
+
+@pytest.fixture(scope="module")
+def observation(robot):
+    return robot.observe(trials(robot, 8), SIGMA, np.random.default_rng(4))
+
+
+@pytest.fixture(scope="module")
+def alone(observation):
+    """The calibration from the images alone."""
+    return calibrate(observation, "RPRR", sigma_px=SIGMA)
+
+
+def described(robot, observation):
+    """What a file says about a robot."""
+    twists = robot.twists
+    return {
+        "robot": "any",
+        "screws": [{"w": [T[2, 1], T[0, 2], T[1, 0]], "v": T[:3, 3].tolist()} for T in twists],
+        "T_base_tool_at_reference": np.eye(4).tolist(),
+        "q_reference": robot.q_reference.tolist(),
+        "camera_left": robot.cameras[0].tolist(),
+        "camera_right": robot.cameras[1].tolist(),
+        "markers_tool": robot.markers[:, :3].tolist(),
+        "marker_numbers": observation.marker.tolist(),
+    }
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(values):
+        path = tmp_path / "robot.json"
+        path.write_text(values if isinstance(values, str) else json.dumps(values), encoding="utf-8")
+        return path
+
+    return write
+
+
+def agree(one, other, q):
+    # Both searches end when a step moves the images by 1e-7 of the residual.
+    np.testing.assert_allclose(predict(one, q), predict(other, q), atol=2e-6)
+    assert one.chi2_per_dof == pytest.approx(other.chi2_per_dof, rel=1e-9)
+
+
+def test_the_file_is_the_robot_it_describes(robot, observation, written):
+    found = read_nominal(written(described(robot, observation)))
+    assert found.joint_types == "RPRR"
+    np.testing.assert_allclose(found.H_hat, robot.twists, atol=1e-12)
+    np.testing.assert_array_equal(found.P, robot.cameras)
+    np.testing.assert_allclose(found.M, robot.markers, atol=1e-15)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_same_optimum_as_from_the_images_alone(robot, observation, alone, written, seed):
+    values = described(robot, observation)
+    rng = np.random.default_rng(seed)
+    # A data sheet: cameras to a percent and of another scale and sign, markers to 5 mm.
+    for side, scale in (("left", -3.0), ("right", 0.01)):
+        P = np.array(values[f"camera_{side}"])
+        values[f"camera_{side}"] = (scale * P * (1.0 + 0.01 * rng.uniform(-1, 1, P.shape))).tolist()
+    markers = np.array(values["markers_tool"])
+    values["markers_tool"] = (markers + 0.005 * rng.uniform(-1, 1, markers.shape)).tolist()
+    found = calibrate(observation, "RPRR", sigma_px=SIGMA, init=read_nominal(written(values)))
+    assert found.advice == alone.advice
+    agree(found, alone, around(robot, 20, rng))
+
+
+def test_the_reference_of_the_file_may_be_any_pose(robot, observation, written):
+    """The truth about another reference predicts the images of all poses without any fit."""
+    from projservo_cli.calibration.adjustment import predict_pixels
+    from projservo_cli.calibration.readings import gather, reference_joints
+
+    values = described(robot, observation)
+    readings = gather(observation, "RPRR")
+    nominal = read_nominal(written(values))
+    home = reference_joints(readings.q)
+    for q_reference in (home, home + np.array([0.3, 0.1, -0.5, 0.8])):
+        scene = nominal.scene(readings, q_reference)
+        pixels, depth = predict_pixels(scene, readings, readings.q - q_reference)
+        truth = robot.images(observation.q).transpose(1, 0, 2, 3)[:, readings.pose_of, readings.marker_of]
+        np.testing.assert_allclose(pixels, truth, atol=1e-9)
+        assert (depth > 0.0).all()
+
+
+def wrong_robot(values):
+    other = random_robot("RPRR", np.random.default_rng(77), markers=6)
+    return values | {
+        "screws": described(other, other.observe(trials(other, 1), 0, np.random.default_rng(0)))["screws"]
+    }
+
+
+def wrong_zero(values):
+    return values | {"q_reference": np.add(values["q_reference"], [1.0, 0.3, -1.0, 2.0]).tolist()}
+
+
+def exchanged_cameras(values):
+    return values | {"camera_left": values["camera_right"], "camera_right": values["camera_left"]}
+
+
+def renumbered(values):
+    return values | {"marker_numbers": values["marker_numbers"][::-1]}
+
+
+def behind(values):
+    return values | {"T_base_tool_at_reference": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, -1.4], [0, 0, 0, 1]]}
+
+
+@pytest.mark.parametrize("spoil", [wrong_robot, wrong_zero, exchanged_cameras, renumbered, behind])
+def test_a_wrong_start_leads_to_the_same_fit_all_the_same(robot, observation, alone, written, spoil):
+    values = spoil(described(robot, observation))
+    found = calibrate(observation, "RPRR", sigma_px=SIGMA, init=read_nominal(written(values)))
+    agree(found, alone, around(robot, 20, np.random.default_rng(9)))
+    note = [text for text in found.advice if "was no start" in text]
+    assert len(found.advice) == len(alone.advice) + len(note)
+    if spoil is behind:
+        assert "does not put the markers in front of both cameras" in note[0]
+
+
+@pytest.mark.volume
+def test_data_that_fit_no_robot_stay_refused(written):
+    robot = random_robot("RR", np.random.default_rng(3), markers=6)
+    observation = robot.observe(trials(robot, 4), SIGMA, np.random.default_rng(4))
+    init = read_nominal(written(described(robot, observation)))
+    shuffled = dataclasses.replace(observation, images=observation.images[::-1])
+    with pytest.raises(WorkFailed):
+        calibrate(shuffled, "RR", sigma_px=SIGMA, init=init)
+
+
+def test_other_joints_or_unknown_markers_are_refused(robot, observation, written):
+    values = described(robot, observation)
+    with pytest.raises(InputError, match=r"robot.json: its joints are RPRR, those of the data RRRR"):
+        calibrate(observation, "RRRR", init=read_nominal(written(values)))
+    values["marker_numbers"][2] = 999
+    with pytest.raises(InputError, match=r"robot.json: marker 11 of the data is not in it"):
+        calibrate(observation, "RPRR", init=read_nominal(written(values)))
+
+
+BAD = {
+    "nothing": ("", r":1:1: not JSON: Expecting value"),
+    "list": ([1, 2], r": the file: input should be an object"),
+    "no camera": ({"camera_left": None}, r": camera_left: input should be a valid array"),
+    "NaN": ({"q_reference": [float("nan"), 0, 0, 0]}, r": q_reference.0: input should be a finite number"),
+    "text": ({"q_reference": ["0", 0, 0, 0]}, r": q_reference.0: input should be a valid number"),
+    "few joints": ({"q_reference": [0.0]}, r": q_reference: 1 values for 4 screws"),
+    "flat camera": ({"camera_right": [[1, 0, 0, 0]] * 3}, r": camera_right: a camera matrix has three indep"),
+    "twice": (
+        {"marker_numbers": [1, 1, 2, 3, 4, 5]},
+        r": marker_numbers: give each of the 6 markers its own",
+    ),
+    "skewed": (
+        {"T_base_tool_at_reference": (2 * np.eye(4)).tolist()},
+        r": T_base_tool_at_reference: expected a r",
+    ),
+    "long axis": ({"screws": [{"w": [0, 0, 2], "v": [0, 0, 0]}] * 4}, r": screws.0: w is a unit vector"),
+    "helix": ({"screws": [{"w": [0, 0, 1], "v": [0, 0, 1]}] * 4}, r": screws.0: v has a part along w"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files_are_one_line(robot, observation, written, name):
+    change, message = BAD[name]
+    values = copy.deepcopy(described(robot, observation))
+    path = written(values | change if isinstance(change, dict) else change)
+    with pytest.raises(InputError, match="^" + str(path) + message) as caught:
+        read_nominal(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_not_text(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_nominal(tmp_path / "none.json")
+    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="not UTF-8"):
+        read_nominal(tmp_path / "binary.json")
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match="not JSON"):
+        read_nominal(tmp_path / "deep.json")
+
+
+@pytest.mark.volume
+@pytest.mark.parametrize("name", ["ur5", "stanford"])
+def test_files_of_other_labs(shared_data, name):
+    from projservo_cli.tables import read_table
+
+    nominal = read_nominal(shared_data / name / "truth.json")
+    table = read_table(shared_data / name / "trials_0.5px.csv", nominal.joint_types)
+    found, alone = (
+        calibrate(table, nominal.joint_types, source="recorded", init=init) for init in (nominal, None)
+    )
+    agree(found, alone, table.q)
