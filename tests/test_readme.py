@@ -1,5 +1,6 @@
 """What the README says can be done is done."""
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 from projservo_cli import cli
+from projservo_cli.config import load_config
+from projservo_cli.stages.truth import truth_of
 from tests.detection.rendering import render, square
 
 ROOT = Path(__file__).parents[1]
@@ -49,6 +52,22 @@ def show_tags(folder):
     (folder / "readings.csv").write_text("q1,q2\n0.1,0.2\n0.1,0.3\n")
 
 
+def show_sheet(folder):
+    """The simulated robot of a configuration as a data sheet."""
+    truth = truth_of(load_config(folder / "configs" / "stanford.yaml"))
+    twists = truth.robot.H_hat_0
+    sheet = {
+        "screws": [{"w": [T[2, 1], T[0, 2], T[1, 0]], "v": T[:3, 3].tolist()} for T in twists],
+        "q_reference": truth.robot.q_reference.tolist(),
+        "camera_left": truth.P[0].tolist(),
+        "camera_right": truth.P[1].tolist(),
+        "markers_tool": truth.M[:, :3].tolist(),
+        "marker_numbers": list(truth.number),
+        "T_base_tool_at_reference": np.eye(4).tolist(),
+    }
+    (folder / "sheet.json").write_text(json.dumps(sheet))
+
+
 def run_all(block):
     for line in block.splitlines():
         program, *words = shlex.split(line, comments=True)
@@ -63,6 +82,8 @@ SERVO, *REST = sorted(COMMANDS, key=lambda block: "servo" not in block)
 def test_commands(folder, block, capsys):
     if "detect" in block:
         show_tags(folder)
+    if "--init" in block:
+        show_sheet(folder)
     run_all(block)
     assert capsys.readouterr().out
 
@@ -83,6 +104,6 @@ def test_commands_that_run_laws_and_what_is_read_from_python(folder, capsys):
 
 
 def test_every_block_is_known():
-    assert len(COMMANDS) == 3
+    assert len(COMMANDS) == 4
     assert len(blocks("python")) == 2
     assert "servo" in SERVO

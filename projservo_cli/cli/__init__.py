@@ -16,7 +16,7 @@ import click
 from click.core import ParameterSource
 
 from projservo_cli.cli.commands import COMMANDS, allowed, help_text
-from projservo_cli.cli.options import OPTIONS
+from projservo_cli.cli.options import LEFT_OUT, OPTIONS
 from projservo_cli.version import __version__
 
 DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
@@ -80,7 +80,7 @@ def _complain(text: str, code: int) -> int:
 
 
 def _dispatch(arguments: list[str]) -> int:
-    context = main.make_context("projservo", arguments.copy())
+    context = main.make_context("projservo", _with_values(arguments))
     given = {name for name in OPTIONS if context.get_parameter_source(name) is ParameterSource.COMMANDLINE}
     names, rest = _commands(context.params["words"])
     if "version" in given:
@@ -98,6 +98,15 @@ def _dispatch(arguments: list[str]) -> int:
     command = importlib.import_module(f"projservo_cli.cli.{module}")
     code: int = command.run(names, rest, context.params)
     return code
+
+
+def _with_values(arguments: list[str]) -> list[str]:
+    """Arguments in which an option whose number is left out has its value and takes no other word for it."""
+    after = [*arguments, ""][1:]
+    return [
+        f"{word}={LEFT_OUT[word]}" if word in LEFT_OUT and not following.isdecimal() else word
+        for word, following in zip(arguments, after, strict=True)
+    ]
 
 
 def _commands(words: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -44,8 +44,10 @@ COMMANDS = {
     "calibrate": Command(
         "Learn the projective kinematics from trial motions.",
         "Estimates both cameras and all joint operators from images alone, simulated from the configuration "
-        "or recorded in an observation table (--data).",
-        (*_OF_STAGES, "cross_validate", "init"),
+        "or recorded in an observation table (--data).\n\n"
+        "--cross-validate and --init become part of the configuration of the run. --suggest works on the "
+        "calibration as it is and writes suggestions.csv into the folder of the run, for record --motions.",
+        (*_OF_STAGES, "cross_validate", "init", "suggest"),
         stage=True,
     ),
     "plan": Command(

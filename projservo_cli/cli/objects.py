@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from projservo_cli.cli.options import wrapped
+from projservo_cli.cli.suggested import suggested_words
 from projservo_cli.config import Config
 from projservo_cli.store import Run
 
@@ -94,6 +95,7 @@ def _calibrate_words(value: dict[str, Any]) -> list[str]:
         wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
         *_held_out_words(value.get("cross_validation")),
         *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),
+        *suggested_words(value),
     ]
 
 

@@ -4,6 +4,8 @@ import textwrap
 
 import click
 
+LEFT_OUT = {"--suggest": "5"}  # what an option means whose value is left out
+
 OPTIONS: dict[str, click.Option] = {
     option.name or "": option
     for option in (
@@ -50,6 +52,12 @@ OPTIONS: dict[str, click.Option] = {
             ["--init"],
             metavar="FILE",
             help="On calibrate: try this robot and rig (JSON: screws, cameras, markers) first as a start.",
+        ),
+        click.Option(
+            ["--suggest"],
+            metavar="[N]",
+            type=click.IntRange(1, 100),
+            help="On calibrate: suggest N further poses to record, the most telling first; 5 without N.",
         ),
         click.Option(
             ["--motions"],

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import click
@@ -24,6 +24,7 @@ class _Call:
     reason: str = ""
     failed: str = ""
     laws_done: tuple[str, ...] = ()
+    suggested: dict[str, Any] = field(default_factory=dict)
 
 
 def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
@@ -35,17 +36,22 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         if law not in LAWS:
             raise click.UsageError(f"--law {law}: no such law; laws: {', '.join(LAWS)}")
     from projservo_cli.cli.configuration import resolve
+    from projservo_cli.cli.suggested import require_covariance, suggested
     from projservo_cli.stages.chain import steps_for
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
     config, stored = resolve(options)
     laws = tuple(dict.fromkeys(options["laws"] or config.control.laws))
+    if options["suggest"] is not None:
+        require_covariance(config)
     steps = steps_for(config, stored, names, laws=laws, force=options["force"])
     call = _Call(names, laws, config, stored, steps, console)
     if options["dry_run"]:
         return _dry(call, as_json=options["json"])
     try:
         _work(call)
+        if options["suggest"] is not None and not _lacking(call, "calibrate"):
+            call.suggested = suggested(config, call.run, options["suggest"])
     finally:
         console.finish()
     return _tell(call, as_json=options["json"])
@@ -118,10 +124,11 @@ def _tell(call: _Call, *, as_json: bool) -> int:
 
     values = {}
     for name in call.names:
-        if call.failed and _lacking(call, name):
+        if _lacking(call, name):
             values[name] = failed_object(name, call.run, call.reason, call.failed, call.laws_done)
         else:
             values[name] = stage_object(name, call.run, call.config, call.laws)
+            values[name] |= call.suggested if name == "calibrate" else {}
     if as_json:
         print_json(values if len(call.names) > 1 else values[call.names[0]])
     else:
@@ -134,6 +141,8 @@ def _tell(call: _Call, *, as_json: bool) -> int:
 
 def _lacking(call: _Call, name: str) -> bool:
     """Whether a stage was not completed by the call."""
+    if not call.failed:
+        return False
     order = [step.stage for step in call.steps]
     return order.index(name) >= order.index(call.failed.split("/")[0])
 
@@ -144,6 +153,9 @@ def _verdict(call: _Call) -> int:
         click.echo(f"projservo: {call.failed}: {call.reason}", err=True)
         return 1
     missed_calibration = _unusable(call)
+    if call.suggested.get("suggestions") == []:
+        click.echo(f"projservo: calibrate: {call.suggested['suggestions_reason']}", err=True)
+        missed_calibration = True
     ends = {law: call.run.traces[law] for law in call.laws_done if law in call.config.control.must_converge}
     missed = [trace for trace in ends.values() if trace.verdict != "converged"]
     for trace in missed:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from projservo_cli.config.robot import Camera
 
 # Independent streams of random numbers, each a child of the configuration's seed.
-CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE = range(3)
+CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS = range(4)
 
 
 @dataclass(frozen=True, eq=False)

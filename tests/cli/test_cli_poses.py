@@ -76,6 +76,13 @@ def test_what_cannot_be_done_is_one_line(projservo, monkeypatch, tmp_path, optio
     assert not Path("run").exists() or not list(Path("run").glob("*.h5"))
 
 
+def test_a_number_left_out_takes_no_other_word_for_it(projservo, made):
+    for words in (["--suggest", "calibrate"], ["calibrate", "--suggest"], ["--suggest", "5", "calibrate"]):
+        answer = projservo(*words, "-o", made, "--json")
+        assert answer.code == 0, answer.err
+        assert len(answer.json["suggestions"]) == 5
+
+
 def test_only_calibrate_takes_them(projservo):
     for option in (["--cross-validate", "3"], ["--init", "f.json"]):
         assert "not used by plan" in projservo("plan", *option).err

@@ -1,0 +1,160 @@
+"""Which further poses would make a calibration predict better: greedy optimum design."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from projservo_cli.calibration.prediction import image_points, prediction_derivative
+from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation, WorkFailed
+
+# Poses drawn to choose from, and to judge by; draws before giving up, in batches.
+CANDIDATES, TARGETS = 300, 150
+BATCH, BATCHES = 1500, 20
+# Markers that both views must see at a pose for it to tell the joints.
+LEAST_SEEN = 3
+# A prediction that errs by more than this share of the image does not say what will be seen.
+VAGUE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Where poses may lie and markers be seen.
+
+    Attributes
+    ----------
+    low, high : (n,) joint readings between which candidates are drawn, rad or m.
+    image : (2, 2, 2) lower and upper corner of each image, px.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    image: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestion:
+    """A pose to record, in the order of choice.
+
+    Attributes
+    ----------
+    q : (n,) joint readings, rad or m.
+    from_pose : number of the nearest pose recorded.
+    delta : (n,) the way from it, rad or m.
+    variance_before, variance_after : of predicted coordinates over the region of the data, px².
+    """
+
+    q: FloatArray
+    from_pose: int
+    delta: FloatArray
+    variance_before: float
+    variance_after: float
+
+
+def suggest(
+    calibration: Calibration,
+    observation: Observation,
+    candidates: Region,
+    targets: Region,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Suggestion, ...]:
+    """Poses that reduce the mean variance of predictions most, one after the other.
+
+    V-optimality, the mean variance over a region, taken greedily over random candidates: A. C.
+    Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS", 2007, chapter 10.
+    With Λ Λᵀ the covariance, C the derivative of what a pose would show and T that of the targets,
+    both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen where they are
+    predicted within the image.
+
+    Parameters
+    ----------
+    calibration : with its covariance.
+    observation : what it was made from.
+    candidates : region of the poses to choose from.
+    targets : region of the poses that are to be predicted well.
+    count : poses to suggest.
+    rng : draws both.
+
+    Raises
+    ------
+    InputError
+        If the method of the calibration has no covariance.
+    WorkFailed
+        If no pose of a region shows the markers to both views.
+    """
+    if not np.isfinite(calibration.covariance).all():
+        raise InputError(
+            f"suggestions need a covariance, which the method {calibration.method} has not: "
+            "use --set calibration.method=refined"
+        )
+    factor = _factor(calibration.covariance)
+    sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
+    _, T = _seen(calibration, targets, TARGETS, factor, rng)
+    q, C = _seen(calibration, candidates, CANDIDATES, factor, rng)
+    coordinates = np.count_nonzero(T.any(axis=2))
+    gram = np.einsum("kra,krb->ab", T, T, optimize=True)
+    C /= sigma
+    left = np.ones(len(q), dtype=np.bool_)
+    found: list[Suggestion] = []
+    for _ in range(min(count, len(q))):
+        before = float(np.trace(gram)) / coordinates
+        inner = np.eye(C.shape[1]) + C @ np.swapaxes(C, 1, 2)
+        gain = np.trace(np.linalg.solve(inner, C @ gram @ np.swapaxes(C, 1, 2)), axis1=1, axis2=2)
+        best = int(np.argmax(np.where(left, gain, -np.inf)))
+        left[best] = False
+        # What is left of Λ after the pose: its product with the root of (I + Cᵀ C)⁻¹.
+        root = np.linalg.inv(np.linalg.cholesky(np.eye(C.shape[2]) + C[best].T @ C[best])).T
+        C, gram = C @ root, root.T @ gram @ root
+        after = float(np.trace(gram)) / coordinates
+        nearest = int(np.argmin(np.linalg.norm(observation.q - q[best], axis=1)))
+        number = int(observation.pose[nearest])
+        found.append(Suggestion(q[best], number, q[best] - observation.q[nearest], before, after))
+    return tuple(found)
+
+
+def _factor(covariance: FloatArray) -> FloatArray:
+    """Λ (d, r) with Λ Λᵀ the covariance (d, d), without the directions that have none."""
+    spread, basis = np.linalg.eigh(covariance)
+    kept = spread > len(spread) * np.finfo(np.float64).eps * spread[-1]
+    result: FloatArray = basis[:, kept] * np.sqrt(spread[kept])
+    return result
+
+
+def _seen(
+    calibration: Calibration, region: Region, count: int, factor: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Random poses (k, n) that show enough markers, and the derivative (k, 4 m, r) of what they show.
+
+    Rows of what is not seen are zero.
+    """
+    model, M = calibration.model(), calibration.M
+    poses: list[FloatArray] = []
+    rows: list[FloatArray] = []
+    for _ in range(BATCHES):
+        q = rng.uniform(region.low, region.high, (BATCH, len(region.low)))
+        seen = _inside(image_points(model, M, q), region.image)
+        enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= LEAST_SEEN)[: count - len(poses)]
+        if enough.size:
+            J = prediction_derivative(model, M, q[enough]) @ factor
+            sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= VAGUE * np.ptp(region.image, axis=1).max()
+            seen = seen[enough] & sharp
+            J[~seen] = 0.0
+            useful = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= LEAST_SEEN)
+            poses += list(q[enough[useful]])
+            rows += list(J[useful].reshape(len(useful), -1, J.shape[-1]))
+        if len(poses) >= count:
+            break
+    if not poses:
+        raise WorkFailed(
+            f"no further pose to suggest: none within the joint ranges shows {LEAST_SEEN} markers to both "
+            "cameras as far as the calibration can tell; make it better with single-joint trials first"
+        )
+    return np.array(poses), np.array(rows)
+
+
+def _inside(m: FloatArray, image: FloatArray) -> BoolArray:
+    """Which image points (K, 2, m, 3) lie in front of the camera and within the image."""
+    pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+    inside = (pixels >= image[:, None, 0]) & (pixels <= image[:, None, 1])
+    result: BoolArray = np.asarray(inside.all(axis=-1))
+    return result
