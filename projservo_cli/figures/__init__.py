@@ -40,6 +40,7 @@ class FigureSpec:
     studies : whether it shows the extra runs.
     goal : whether it needs a known goal pose.
     task : whether it needs a task; without, a calibration and what it was made from will do.
+    alt : what can be seen, for those who do not see it; by default the title.
     """
 
     name: str
@@ -53,6 +54,7 @@ class FigureSpec:
     studies: bool = False
     goal: bool = False
     task: bool = True
+    alt: str = ""
 
 
 FIGURES = (
@@ -64,6 +66,11 @@ FIGURES = (
         overview.data,
         overview.draw,
         laws=overview.LAWS,
+        alt=(
+            "Left: paths of the markers in both camera images, from the face at the start to the goal, "
+            "for directTHREE and the stacked law, with the stretches in which the face is hidden. "
+            "Right: control errors of directTHREE and image errors of both laws over time."
+        ),
     ),
     FigureSpec(
         "fig01_partition",
@@ -72,6 +79,10 @@ FIGURES = (
         3.0,
         partition.data,
         partition.draw,
+        alt=(
+            "Three panels in the left image: the face moved along a straight line, turned onto the "
+            "target plane, and turned within it."
+        ),
     ),
     FigureSpec(
         "fig02_visibility",
@@ -80,6 +91,10 @@ FIGURES = (
         7.4,
         visibility.data,
         visibility.draw,
+        alt=(
+            "For each camera: the face turned onto the target plane in both senses, and its visibility "
+            "margin over the angle and over the translation, with the values at which it is zero."
+        ),
     ),
     FigureSpec(
         "fig03_scene",
@@ -88,6 +103,10 @@ FIGURES = (
         4.4,
         scene.data,
         scene.draw,
+        alt=(
+            "The robot's arm at the start in three dimensions, both cameras, the face at the start and "
+            "at the goal, and the straight line of its centre between them."
+        ),
     ),
     FigureSpec(
         "fig04_classical",
@@ -98,6 +117,11 @@ FIGURES = (
         images.draw_classical,
         laws=CLASSICAL,
         any_law=True,
+        alt=(
+            "A row for each classical law, a panel for each camera: the paths of the markers from start "
+            "to goal, with the stretches in which the face is hidden and in which the image error "
+            "stands still."
+        ),
     ),
     FigureSpec(
         "fig05_planned",
@@ -106,6 +130,11 @@ FIGURES = (
         3.6,
         planned.data_linear,
         planned.draw,
+        alt=(
+            "The face at several moments of the planned motion, seen from between the cameras; beside "
+            "it the shares of translation and rotations that are done and the visibility margin of both "
+            "cameras."
+        ),
     ),
     FigureSpec(
         "fig06_planned_steep",
@@ -114,6 +143,10 @@ FIGURES = (
         3.6,
         planned.data_steep,
         planned.draw,
+        alt=(
+            "As the figure before, with a translation that is driven first: the face at several "
+            "moments, the shares of the motions and the visibility margins."
+        ),
     ),
     FigureSpec(
         "fig07_three_two",
@@ -123,6 +156,7 @@ FIGURES = (
         images.data_direct,
         images.draw_direct,
         laws=DIRECT,
+        alt="Paths of the markers in both camera images under directTHREE and directTWO.",
     ),
     FigureSpec(
         "fig08_drift",
@@ -133,6 +167,11 @@ FIGURES = (
         drift.draw,
         studies=True,
         goal=True,
+        alt=(
+            "For directTHREE and directTWO: distance of the centre from its straight line along the way "
+            "for several gains, and the largest distance over the gain, with true and calibrated "
+            "operators, with and without a limit."
+        ),
     ),
     FigureSpec(
         "fig09_errors_two",
@@ -142,6 +181,10 @@ FIGURES = (
         errors.data_two,
         errors.draw_two,
         studies=True,
+        alt=(
+            "Translation and rotation error of directTWO over time, on a linear and on a logarithmic "
+            "scale, without a limit and with one."
+        ),
     ),
     FigureSpec(
         "fig10_errors_three",
@@ -152,6 +195,10 @@ FIGURES = (
         errors.draw_three,
         studies=True,
         goal=True,
+        alt=(
+            "Translation and rotation errors of directTHREE over time with the projective and the "
+            "Euclidean model, and the differences between both."
+        ),
     ),
     FigureSpec(
         "fig11_image_errors",
@@ -162,6 +209,7 @@ FIGURES = (
         images.draw_errors,
         laws=DIRECT[:1],
         goal=True,
+        alt="For each camera: the errors of u and v of every marker and of the centre over time.",
     ),
     FigureSpec(
         "fig12_joints",
@@ -171,6 +219,7 @@ FIGURES = (
         joints.data,
         joints.draw,
         studies=True,
+        alt="The joints and their steps over time under directTHREE, without a limit and with one.",
     ),
     FigureSpec(
         "fig13_calibration",
@@ -180,5 +229,10 @@ FIGURES = (
         calibration.data,
         calibration.draw,
         task=False,
+        alt=(
+            "Residuals as arrows in both images; their histogram beside the noise model; rms residual "
+            "of each pose over its predicted error; range of each joint; eigenvalues of the information "
+            "matrix."
+        ),
     ),
 )

@@ -7,7 +7,7 @@ import numpy as np
 from projservo_cli.figures import style
 from projservo_cli.figures.material import DIRECT, TITLES, Data, Material, Studies
 from projservo_cli.figures.measures import along_line, center_path
-from projservo_cli.records import FloatArray
+from projservo_cli.records import FloatArray, Report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -124,3 +124,25 @@ def _handles(gains: FloatArray, limit: float) -> list[Any]:
         style.line_handle(label, color=color, linestyle=line, marker=marker, fillstyle=fill)
         for label, color, line, marker, fill in maxima
     ]
+
+
+def drift_rows(report: Report) -> list[dict[str, Any]]:
+    """The drift table as rows: law, operators, limit in deg per step or None, gain, mm, converged."""
+    rows = []
+    for index in np.ndindex(report.drift_mm.shape):
+        law, operators, limited, gain = index
+        values = {
+            "drift_mm": float(report.drift_mm[index]),
+            "drift_at_samples_mm": float(report.drift_at_samples_mm[index]),
+        }
+        rows.append(
+            {
+                "law": DIRECT[law],
+                "operators": ("true", "calibrated")[operators],
+                "limit_deg_per_step": report.step_limit_deg if limited else None,
+                "gain_per_step": float(report.gain_per_step[gain]),
+                **{name: value if np.isfinite(value) else None for name, value in values.items()},
+                "converged": bool(report.drift_converged[index]),
+            }
+        )
+    return rows

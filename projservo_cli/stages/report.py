@@ -1,16 +1,20 @@
 """Stage report: figures after the paper's, and its claims against what the runs measure."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from projservo_cli import provenance
+from projservo_cli.columns import to_csv
 from projservo_cli.config import load_config
 from projservo_cli.figures import FIGURES, FigureSpec, style
-from projservo_cli.figures.drift import converged, table
+from projservo_cli.figures.drift import converged, drift_rows, table
 from projservo_cli.figures.material import DIRECT, Fit, Material, Studies
 from projservo_cli.files import replacing
+from projservo_cli.page import write_page
 from projservo_cli.records import Report, WorkFailed
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task
@@ -24,6 +28,7 @@ from projservo_cli.stages.studies import (
     metric_plan,
     run_studies,
 )
+from projservo_cli.store import Result
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -31,16 +36,17 @@ if TYPE_CHECKING:
 
 DEPENDS_ON = ("report",)
 FOLDER = "figures"
+NUMBERS = "csv"  # what is drawn, beside each figure
 CLAIMS_FILE = "claims.json"
 
 
 def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
-    """Make the extra runs, draw the figures and measure the claims.
+    """Make the extra runs, draw the figures, measure the claims and write the page that tells all.
 
     Parameters
     ----------
     run : with calibration, plan and traces; where there is no task, with the calibration.
-    directory : folder that receives ``figures/`` and ``claims.json``.
+    directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     progress : told how far it is.
 
     Raises
@@ -53,17 +59,22 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     if not has_task(config):
         fit = Fit(run.calibration, run.observation, held_out=run.cross_validation)
         written = draw_all(fit, directory, config.report.formats, left_out, progress)
-        record = _record(None, None, tuple(written), tuple(left_out), ())
-        _write_claims(record, directory / CLAIMS_FILE)
-        return record
+        return _told(_record(None, None, tuple(written), tuple(left_out), ()), run, directory)
     bench = bench_of(config, run.calibration.model(), run.plan)
     material = material_of(run, bench, left_out, progress)
     written = draw_all(material, directory, config.report.formats, left_out, progress)
     eq22 = _composition(bench, config, left_out)
     claims = tuple(claim.row() for claim in claims_of(material, eq22))
-    record = _record(material.studies, eq22, tuple(written), tuple(left_out), claims)
-    _write_claims(record, directory / CLAIMS_FILE)
-    return record
+    return _told(_record(material.studies, eq22, tuple(written), tuple(left_out), claims), run, directory)
+
+
+def _told(report: Report, run: "Run", directory: Path) -> Report:
+    """The report, after writing its claims and its page beside the figures."""
+    _write_claims(report, directory / CLAIMS_FILE)
+    config = load_config(run.path, text=run.configuration)
+    made = Result("", run.configuration, provenance.collect(seed=config.seed), {}, {"": report})
+    write_page(replace(run, results={**run.results, "report": made}))
+    return report
 
 
 def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progress: Progress) -> Material:
@@ -165,14 +176,17 @@ def _goal_known(material: Material) -> bool:
 
 
 def _draw(spec: FigureSpec, material: Fit, directory: Path, formats: tuple[str, ...]) -> list[str]:
-    """Write one figure in the formats asked for and remove it in all others."""
+    """Write one figure in the formats asked for, with its numbers, and remove it in all others."""
     folder = directory / FOLDER
-    for kind in style.FORMATS:
-        if kind not in formats:
+    kinds = (*formats, NUMBERS) if formats else ()
+    for kind in (*style.FORMATS, NUMBERS):
+        if kind not in kinds:
             (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
     if not formats:
         return []
     data = spec.data(material)
+    with replacing(folder / f"{spec.name}.{NUMBERS}") as path:
+        path.write_text(to_csv(data), encoding="utf-8")
     figure = style.new_figure(spec.height)
     spec.draw(data, figure)
     style.arrange(figure)
@@ -211,28 +225,6 @@ def _record(
         share=share,
         composition_mm=1e3 * distance,
     )
-
-
-def drift_rows(report: Report) -> list[dict[str, Any]]:
-    """The drift table as rows: law, operators, limit in deg per step or None, gain, mm, converged."""
-    rows = []
-    for index in np.ndindex(report.drift_mm.shape):
-        law, operators, limited, gain = index
-        values = {
-            "drift_mm": float(report.drift_mm[index]),
-            "drift_at_samples_mm": float(report.drift_at_samples_mm[index]),
-        }
-        rows.append(
-            {
-                "law": DIRECT[law],
-                "operators": ("true", "calibrated")[operators],
-                "limit_deg_per_step": report.step_limit_deg if limited else None,
-                "gain_per_step": float(report.gain_per_step[gain]),
-                **{name: value if np.isfinite(value) else None for name, value in values.items()},
-                "converged": bool(report.drift_converged[index]),
-            }
-        )
-    return rows
 
 
 def _write_claims(report: Report, path: Path) -> None:

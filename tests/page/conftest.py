@@ -1,0 +1,116 @@
+"""A run with a report of some figures, and a page read as a browser reads it."""
+
+import dataclasses
+import json
+from html.parser import HTMLParser
+
+import pytest
+
+from projservo_cli.config import to_yaml
+from projservo_cli.figures import FIGURES
+from projservo_cli.stages import report
+from projservo_cli.store import Result, Run
+from tests.figures.cases import SHORT, case, config_of
+
+SOME = ("fig01_partition", "fig08_drift", "fig11_image_errors", "fig13_calibration")
+VOID = {"meta", "br", "img", "link", "hr", "input"}
+MADE = {"argv": ["projservo", "servo"], "host": "here", "projservo": "0.1.0", "date": "2026-01-02"}
+
+
+def stored(folder, *overrides):
+    """A run file as the stages before the report leave it."""
+    material = case()[2]
+    config = config_of("paper", f"stop.max_steps={SHORT}", *overrides)
+    fit = {"calibration": material.calibration, "observation": material.observation}
+    results = {
+        "calibrate": Result("k", "", MADE, {}, fit),
+        "plan": Result("k", "", MADE, {}, {"": material.plan}),
+        **{f"servo/{law}": Result("k", "", MADE, {}, {"": t}) for law, t in material.traces.items()},
+    }
+    return Run(folder / "run.h5", to_yaml(config), results)
+
+
+def reported(folder, *overrides):
+    """A run with its report, which stands in the folder."""
+    run = stored(folder, "report.formats=[svg]", *overrides)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "FIGURES", tuple(spec for spec in FIGURES if spec.name in SOME))
+        patch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
+        record = report.run(run, folder)
+    made = Result("k", "", MADE, {}, {"": record})
+    return dataclasses.replace(run, results={**run.results, "report": made})
+
+
+@pytest.fixture(scope="session")
+def run(tmp_path_factory):
+    """A run with its report; tests only read it."""
+    return reported(tmp_path_factory.mktemp("run"))
+
+
+@dataclasses.dataclass
+class Element:
+    tag: str
+    attributes: dict
+    children: list = dataclasses.field(default_factory=list)
+
+    @property
+    def text(self):
+        text = "".join(child if isinstance(child, str) else child.text for child in self.children)
+        return f"{text} " if self.tag in ("th", "td") else text
+
+    def all(self, *tags):
+        for child in self.children:
+            if not isinstance(child, str):
+                if not tags or child.tag in tags:
+                    yield child
+                yield from child.all(*tags)
+
+
+class Reader(HTMLParser):
+    """Strict: every element is closed by its own end, in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.root = Element("", {})
+        self.open = [self.root]
+        self.feed(text)
+        self.close()
+        assert self.open == [self.root], [element.tag for element in self.open]
+
+    def handle_starttag(self, tag, attrs):
+        names = [name for name, _ in attrs]
+        assert len(set(names)) == len(names), (tag, attrs)
+        element = Element(tag, dict(attrs))
+        self.open[-1].children.append(element)
+        if tag not in VOID:
+            self.open.append(element)
+
+    def handle_startendtag(self, tag, attrs):
+        self.open[-1].children.append(Element(tag, dict(attrs)))
+
+    def handle_endtag(self, tag):
+        assert self.open.pop().tag == tag
+
+    def handle_data(self, data):
+        self.open[-1].children.append(data)
+
+
+def read(path):
+    return Reader(path.read_text(encoding="utf-8")).root
+
+
+def words(text):
+    return " ".join(text.split())
+
+
+def numbers(value):
+    """All numbers in a JSON value, not those within texts."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [number for inner in value for number in numbers(inner)]
+    return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else []
+
+
+def claims_of(folder):
+    return json.loads((folder / "claims.json").read_text(encoding="utf-8"))

@@ -1,0 +1,268 @@
+"""The page of a run: whole, self-contained, safe, and in agreement with the run."""
+
+import csv
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from projservo_cli.columns import to_csv
+from projservo_cli.figures import FIGURES
+from projservo_cli.page import PAGE_FILE, write_comparison, write_page
+from projservo_cli.page.vector import inline
+from projservo_cli.page.words import number, short
+from projservo_cli.records import Report
+from projservo_cli.store import Result
+from tests.fake_records import fake
+from tests.figures.cases import case
+from tests.page.conftest import SOME, claims_of, numbers, read, stored, words
+
+
+@pytest.fixture(scope="session")
+def page(run):
+    return read(run.path.parent / PAGE_FILE)
+
+
+def with_report(run, **given):
+    changed = dataclasses.replace(run.results["report"].records[""], **given)
+    return dataclasses.replace(run, results={**run.results, "report": Result("", "", {}, {}, {"": changed})})
+
+
+def test_the_page_loads_nothing_and_runs_nothing(page, run):
+    assert not list(page.all("script", "link", "iframe", "object", "embed", "base"))
+    for element in page.all():
+        for name, value in element.attributes.items():
+            assert not name.startswith("on")
+            assert name not in ("src", "srcset", "action", "data") or value.startswith("data:image/png")
+            if name == "href":
+                assert element.tag == "a" or value.startswith("#")
+                assert ":" not in value
+                assert value.startswith("#") or (run.path.parent / value).is_file() or value == "run.h5"
+    (style,) = page.all("style")
+    assert "url(" not in style.text
+    assert "@import" not in style.text
+
+
+def test_names_are_unique_and_references_lead_somewhere(page):
+    names = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
+    assert len(set(names)) == len(names)
+    text = " ".join(str(element.attributes) for element in page.all())
+    wanted = {e.attributes["href"][1:] for e in page.all() if e.attributes.get("href", "").startswith("#")}
+    wanted |= set(re.findall(r"url\(#([^)]*)\)", text))
+    wanted |= {e.attributes["aria-labelledby"] for e in page.all() if "aria-labelledby" in e.attributes}
+    assert wanted <= set(names)
+    assert wanted
+
+
+def test_headings_sections_language_and_title(page):
+    (html,) = page.all("html")
+    assert html.attributes["lang"] == "en"
+    assert next(page.all("title")).text == "projservo: paper"
+    assert len(list(page.all("h1"))) == len(list(page.all("main"))) == 1
+    assert [h.attributes["id"] for h in page.all("h2")] == [
+        *("run", "calibration", "plan", "control", "claims", "left-out"),
+    ]
+    for table in page.all("table"):
+        assert all("scope" in th.attributes for th in table.all("th"))
+
+
+def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
+    figures = list(page.all("figure"))
+    assert sorted(figure.attributes["id"] for figure in figures) == sorted(SOME)
+    specs = {spec.name: spec for spec in FIGURES}
+    for figure in figures:
+        spec = specs[figure.attributes["id"]]
+        (image,) = figure.all("svg")
+        assert image.attributes["role"] == "img"
+        assert image.attributes["aria-label"] == spec.alt
+        (caption,) = figure.all("figcaption")
+        assert spec.title in words(caption.text)
+        assert not spec.paper.startswith("Fig") or spec.paper in words(caption.text)
+        links = {a.text: a.attributes["href"] for a in caption.all("a")}
+        assert set(links) == {"numbers (CSV)", "SVG"}
+        assert (run.path.parent / links["numbers (CSV)"]).stat().st_size > 100
+
+
+def test_all_figures_say_what_can_be_seen():
+    texts = [spec.alt for spec in FIGURES if spec.alt]
+    assert len(set(texts)) == len(texts) >= 14
+
+
+def test_numbers_of_a_figure_are_those_that_are_drawn(run):
+    spec = next(spec for spec in FIGURES if spec.name == "fig08_drift")
+    data = spec.data(case()[2])
+    with open(run.path.parent / "figures" / "fig08_drift.csv", encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    assert {name.partition("[")[0] for name in header} == {name for name, value in data.items() if value.size}
+    for k, name in enumerate(header):
+        values = [float(row[k]) for row in rows if row[k] != ""]
+        label, _, index = name.rstrip("]").partition("[")
+        place = tuple(slice(None) if i == ":" else int(i) for i in index.split(",") if i)
+        np.testing.assert_array_equal(values, np.atleast_1d(data[label][place]).astype(float))
+
+
+def test_columns_keep_every_bit_and_kind():
+    arrays = {"x": np.array([0.1, np.nan, -np.inf]), "on": np.array([True, False]), "n": np.array(3)}
+    assert to_csv(arrays) == "x,on,n\n0.1,1,3\nnan,0,\n-inf,,\n"
+
+
+def test_all_that_the_claims_say_is_on_the_page(page, run):
+    content = claims_of(run.path.parent)
+    text = words(page.text)
+    for claim in content["claims"]:
+        for key in ("claim", "source", "measured", "criterion"):
+            assert words(claim[key]) in text
+    shown = {element.attributes["value"] for element in page.all("data")}
+    assert len(numbers(content)) > 30
+    assert {repr(value) for value in numbers(content)} <= shown
+    holding = sum(claim["holds"] is True for claim in content["claims"])
+    assert f"{holding} of {len(content['claims'])} hold" in text
+
+
+def test_what_was_run_and_why_each_law_ended(page, run):
+    text = words(page.text)
+    for value in ("seed 1", "projservo servo", "here", "2026-01-02", "simulated"):
+        assert value in text
+    for trace in run.traces.values():
+        assert f"{trace.verdict} after {trace.steps} steps" in text
+        assert words(trace.reason) in text
+    assert run.calibration.reason in text
+    assert run.plan.reason in text
+    worst = int(np.argmax(run.calibration.prediction_noise)) + 1
+    assert f"Joint {worst} is known worst" in text
+    (configuration,) = page.all("pre")
+    assert configuration.text.strip() == run.configuration.strip()
+
+
+def test_the_same_run_gives_the_same_bytes(run):
+    path = run.path.parent / PAGE_FILE
+    texts = []
+    for _ in range(2):
+        write_page(run)
+        texts.append(path.read_bytes())
+    assert texts[0] == texts[1]
+
+
+HOSTILE = "<script>alert(1)</script>\"'&{{ 7*7 }}"
+
+
+def test_hostile_texts_are_shown_and_not_run(run, tmp_path):
+    claims = ({"claim": HOSTILE, "source": "s", "measured": HOSTILE, "criterion": "c", "holds": None},)
+    left_out = ({"what": HOSTILE, "reason": HOSTILE},)
+    files = ("figures/../x.svg", "javascript:alert(1)//fig01_partition.svg", "figures/fig01_partition.svg")
+    other = with_report(run, claims=claims, left_out=left_out, figures=files)
+    trace = dataclasses.replace(run.traces["stacked"], verdict=HOSTILE, reason=HOSTILE)
+    made = {"argv": ["projservo", HOSTILE], "host": HOSTILE}
+    results = {**other.results, "servo/stacked": Result("", "", made, {}, {"": trace})}
+    configuration = run.configuration.replace("PUMA 560", "</pre><script>")
+    other = dataclasses.replace(other, path=tmp_path / "run.h5", results=results, configuration=configuration)
+    bad = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1 1"><script>alert(1)</script></svg>'
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "fig01_partition.svg").write_text(bad)
+    page = read(write_page(other))
+    assert not list(page.all("script"))
+    assert words(page.text).count(HOSTILE) >= 6
+    assert not any("javascript" in a.attributes["href"] for a in page.all("a"))
+    assert "</pre><script>" in next(page.all("pre")).text
+
+
+EVIL = """<?xml version="1.0"?>
+<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" viewBox="0 0 9 9"
+     onload="alert(1)">
+ <style>* { background: url(http://x/) }</style><a href="http://x/"><path d="M 0 0"/></a>
+ <script>alert(1)</script><foreignObject><body/></foreignObject>
+ <path id="a" d="M 0 0" onclick="alert(1)" style="fill: red"/><path id="unused" d="M 1 1"/>
+ <use xlink:href="#a" clip-path="url(#c)"/><use xlink:href="http://x/#a"/>
+ <rect style="fill: url('http://x/')"/><rect style="fill: u\\72l(http://x/)"/>
+ <image xlink:href="http://x/"/><image xlink:href="data:image/svg+xml,x"/>
+ <image xlink:href="data:image/png;base64,AA"/>
+</svg>"""
+
+
+def test_of_a_vector_image_only_shapes_remain():
+    text = inline(EVIL.encode(), "p-", 'what "it" shows')
+    assert text is not None
+    assert not re.search(r"http|alert|script|style>|foreign|svg\+xml|unused|\\|<a[ >]", text)
+    assert 'aria-label="what &quot;it&quot; shows"' in text
+    assert 'id="p-a"' in text
+    assert 'href="#p-a" clip-path="url(#p-c)"' in text
+    assert 'style="fill: red"' in text
+    assert 'href="data:image/png;base64,AA"' in text
+
+
+@pytest.mark.parametrize("content", [b"", b"<svg", b"<html/>", b"\xff\xfe", b"<svg viewBox='0 0 1 1'/>"])
+def test_what_is_no_vector_image_is_not_shown(content):
+    assert inline(content, "p-", "") is None
+
+
+def test_a_figure_without_its_file_says_so(run, tmp_path):
+    gone = dataclasses.replace(run, path=tmp_path / "run.h5")
+    page = read(write_page(gone))
+    assert words(page.text).count("cannot show the figure") == len(SOME)
+
+
+def test_a_picture_stands_in_where_there_is_no_vector_image(run, tmp_path):
+    files = ("figures/fig01_partition.png", "figures/fig01_partition.pdf")
+    other = dataclasses.replace(with_report(run, figures=files), path=tmp_path / "run.h5")
+    (tmp_path / "figures").mkdir()
+    (tmp_path / files[0]).write_bytes(b"\x89PNG")
+    page = read(write_page(other))
+    (image,) = page.all("img")
+    assert image.attributes["src"] == "data:image/png;base64,iVBORw=="
+    assert image.attributes["alt"].startswith("Three panels")
+    assert [a.text for a in next(page.all("figcaption")).all("a")] == ["PDF", "PNG"]
+
+
+def test_a_calibration_alone_is_told_as_far_as_it_goes(tmp_path):
+    whole = stored(tmp_path)
+    run = dataclasses.replace(whole, results={"calibrate": whole.results["calibrate"]})
+    text = words(read(write_page(run)).text)
+    assert "This run holds no plan." in text
+    assert "No law was run." in text
+    assert "No claim was measured." in text
+    assert "projservo report -o" in text
+
+
+def test_a_report_of_a_recording_has_no_drift(run, tmp_path):
+    empty = np.zeros((2, 2, 2, 0))
+    drift = {"drift_mm": empty, "drift_at_samples_mm": empty, "drift_converged": empty.astype(bool)}
+    record = fake(Report, claims=(), figures=(), left_out=(), **drift)
+    results = {"calibrate": run.results["calibrate"], "report": Result("", "", {}, {}, {"": record})}
+    other = dataclasses.replace(run, path=tmp_path / "run.h5", results=results)
+    assert "No drift was measured." in words(read(write_page(other)).text)
+
+
+def test_runs_stand_side_by_side(run, tmp_path):
+    other = dataclasses.replace(run, configuration=run.configuration.replace("seed: 1", "seed: 22"))
+    path = tmp_path / "both.html"
+    write_comparison([run, other], path)
+    page = read(path)
+    names = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
+    assert len(set(names)) == len(names)
+    assert len(list(page.all("figure"))) == 2 * len(SOME)
+    (row,) = [tr for tr in page.all("tr") if tr.children and "seed" in words(tr.text) and "22" in tr.text][
+        -1:
+    ]
+    assert words(row.text) == "seed 1 22"
+    claims = claims_of(run.path.parent)["claims"]
+    (table,) = [t for t in page.all("table") if "What the paper claims" in t.text]
+    assert len(list(table.all("tr"))) == 1 + len(claims)
+    for link in page.all("a"):
+        target = link.attributes["href"]
+        assert target.startswith("#") or target.endswith("run.h5") or (tmp_path / target).is_file()
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"), (116, "116"), (1461.2, "1461"), (12.345, "12.3"), (-0.5, "−0.5"), (float("nan"), "–"),
+        (None, "–"), (2.34e-12, "2.34 × 10⁻¹²"), (1.5e9, "1.5 × 10⁹"), (999.9, "1000"), (99.99, "100"),
+    ],
+)  # fmt: skip
+def test_numbers_for_the_eye(value, text):
+    assert short(value) == text
+
+
+def test_numbers_carry_all_their_digits():
+    assert number(np.float64(1 / 3)) == f'<data value="{1 / 3!r}">0.333</data>'
