@@ -50,7 +50,12 @@ def suggested(config: Config, run: Run, count: int) -> dict[str, Any]:
         }
         for one in found
     ]
-    return {"suggestions": rows, "suggestions_file": path.resolve(), "suggestions_unit": unit or "rad"}
+    return {
+        "suggestions": rows,
+        "suggestions_file": path.resolve(),
+        "suggestions_unit": unit or "rad",
+        "suggestions_limited": config.robot is not None,
+    }
 
 
 def suggested_words(value: dict[str, Any]) -> list[str]:
@@ -69,7 +74,10 @@ def suggested_words(value: dict[str, Any]) -> list[str]:
         lines.append(
             f"  {row['from_pose']:>9}" + "".join(f"{d:>+9.1f}" for d in way) + f"{_error(row, 'after'):>9}"
         )
-    return [*lines, f"  joints of these poses: {value['suggestions_file']} ({value['suggestions_unit']}, m)"]
+    lines.append(f"  joints of these poses: {value['suggestions_file']} ({value['suggestions_unit']}, m)")
+    if not value["suggestions_limited"]:
+        lines.append("  joint limits are not known here: leave out what your robot cannot reach")
+    return lines
 
 
 def _error(row: dict[str, Any], when: str) -> str:
