@@ -47,10 +47,13 @@ def bound(robot: Robot, q: FloatArray, q_new: FloatArray) -> float:
 
 
 def test_it_sees_pixels_and_joint_readings_only():
-    parameters = set(inspect.signature(calibrate).parameters)
-    assert parameters == {
+    """Anything else, as a start (``init``), is left out by default."""
+    parameters = inspect.signature(calibrate).parameters
+    assert set(parameters) == {
         "observation", "joint_types", "method", "sigma_px", "source", "image_size", "seed",
+        "init", "fitted",
     }  # fmt: skip
+    assert parameters["init"].default is None
 
 
 @pytest.mark.parametrize("types", ["RRPRRR", "RRRRRR", "PRP", "R"])
