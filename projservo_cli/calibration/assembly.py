@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration import quality
+from projservo_cli.calibration import excitation, quality
 from projservo_cli.calibration.culprits import Culprits
 from projservo_cli.calibration.frame import ProjectiveScene
 from projservo_cli.calibration.prediction import image_points, prediction_derivative
@@ -54,15 +54,16 @@ def assemble(
     """
     types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
     model = Model(scene.P, scene.H_hat_0, types, q_reference, scene.a_inf)
-    span = quality.require_motion(readings)
+    span = excitation.require_motion(readings)
     size = 24 + 16 * len(types) + 4 * len(scene.M)
     # NaN, not zero: a method without covariance does not claim certainty.
     noise, covariance = np.full(len(types), np.nan), np.full((size, size), np.nan)
+    # Residuals of a method without covariance are its own doing, not noise of the images.
+    sigma = expected.sigma_px if factor is None else expected.noise_px(agreement)
+    excitation.require_moved(image_motion(model, scene.M, span), sigma, span, readings.prismatic)
     if factor is not None:
         noise = reach_noise(model, scene.M, factor, _surroundings(readings))
-        sigma = expected.noise_px(agreement)
-        motion = image_motion(model, scene.M, span)
-        quality.require_determined(noise, motion, sigma, span, readings.prismatic)
+        excitation.require_determined(noise, span, readings.prismatic)
         covariance = sigma**2 * (factor @ factor.T)
     if found is None:
         found = Culprits(
@@ -94,7 +95,7 @@ def assemble(
         M=scene.M,
         covariance=covariance,
         excitation=span,
-        weak=noise > quality.WEAK_NOISE,
+        weak=noise > excitation.WEAK_NOISE,
         **defects(scene, readings.prismatic),
         prediction_noise=noise,
         merged_poses=int(np.unique(readings.pose_of[used_rows]).size),
@@ -131,7 +132,7 @@ def reach_noise(model: Model, M: FloatArray, factor: FloatArray, surroundings: F
     """
     noise = np.zeros(len(model.joint_types))
     for i, kind in enumerate(model.joint_types):
-        reach = quality.REACH_M if kind == PRISMATIC else quality.REACH_RAD
+        reach = excitation.REACH_M if kind == PRISMATIC else excitation.REACH_RAD
         for _ in range(10):
             q = np.tile(model.q_reference, (2, 1))
             q[:, i] += (reach, -reach)

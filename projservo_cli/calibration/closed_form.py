@@ -4,7 +4,7 @@ import numpy as np
 
 from projservo_cli.calibration.frame import ProjectiveScene, isotropic
 from projservo_cli.calibration.projective import reconstruct
-from projservo_cli.calibration.readings import SAME_READING, Readings, reference_pose
+from projservo_cli.calibration.readings import Readings, joint_trials, reference_pose
 from projservo_cli.geometry.displacement import log_rotation, log_translation, normalize_displacement
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
@@ -34,8 +34,7 @@ def trials_of(readings: Readings, method: str) -> tuple[int, list[list[int]]]:
             f"the {method} method needs single-joint trials about one reference pose, and these poses move "
             "several joints at once: use refined"
         )
-    moved = np.abs(readings.q - readings.q[home]) > SAME_READING
-    trials = [np.flatnonzero(moved[:, i]).tolist() for i in range(readings.q.shape[1])]
+    trials = joint_trials(readings.q, home)
     for i, rows in enumerate(trials):
         if not rows:
             raise WorkFailed(f"joint {i + 1} has no trial motion: record poses in which it alone moves")
@@ -154,7 +153,10 @@ def _mean_operator(
             refused = f"a turn by {np.degrees(amplitude):.4g}° leaves equation (4) undefined"
             continue
         A, B = M[home, common], M[k, common]
-        H = normalize_displacement(homography(A, B), A, depth)
+        try:
+            H = normalize_displacement(homography(A, B), A, depth)
+        except WorkFailed as error:
+            raise WorkFailed(f"joint {i + 1}, pose {readings.pose[k]}: {error}") from None
         logarithm = log_translation if readings.prismatic[i] else log_rotation
         total += lever**2 * logarithm(H, amplitude)
         weights += lever**2

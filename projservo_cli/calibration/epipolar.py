@@ -210,7 +210,10 @@ def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> E
     """
     count = left.shape[0]
     if count < 8:
-        raise WorkFailed(f"only {count} markers were seen by both cameras: at least 8 sightings are needed")
+        raise WorkFailed(
+            f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that rows "
+            "hold the pixels of both views"
+        )
     T, T_ = normalization(left), normalization(right)
     a, b = homogeneous(left) @ T.T, homogeneous(right) @ T_.T
     picks = rng.permuted(np.broadcast_to(np.arange(count), (SAMPLES, count)), axis=1)[:, :8]

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from projservo_cli.calibration import adjustment, closed_form, culprits, linear, quality
+from projservo_cli.calibration import adjustment, closed_form, culprits, excitation, linear, quality
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.assembly import assemble
 from projservo_cli.calibration.epipolar import Epipolar
@@ -16,6 +16,7 @@ from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
 from projservo_cli.calibration.frame import (
     ProjectiveScene,
     isotropic,
+    marker_factor,
     output_derivative,
     output_gauge,
     spread_factor,
@@ -26,6 +27,7 @@ from projservo_cli.calibration.quality import Agreement, Expected
 from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
 from projservo_cli.calibration.reconstruction import image_frame
 from projservo_cli.calibration.refined import Solution, solve
+from projservo_cli.calibration.shown import require_images
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 
 METHODS = ("refined", "linear", "closed_form")
@@ -72,15 +74,21 @@ def calibrate(
         raise InputError(f"calibration source {source!r}: choose simulated or recorded")
     if sigma_px is not None and not 0.0 < sigma_px < np.inf:
         raise InputError(f"pixel noise {sigma_px!r}: give a positive number, or none to estimate it")
+    if image_size is not None and not all(0.0 < length < np.inf for length in image_size):
+        raise InputError(f"image size {image_size!r}: give a positive width and height, px")
+    if seed < 0:
+        raise InputError(f"seed {seed!r}: give a whole number that is not negative")
     begin = time.perf_counter()
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
         readings = gather(observation, joint_types)
-        quality.require_motion(readings)
+        excitation.require_motion(readings)
+        require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
         both = readings.both
         epipolar = epipolar_geometry(readings.pixels[0][both], readings.pixels[1][both], rng)
         expected = quality.expected_noise(epipolar.sigma_px, sigma_px, source)
+        require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "refined":
             frame = image_frame(readings, image_size)
             q_reference = reference_joints(readings.q)
@@ -121,6 +129,7 @@ def _refined(readings: Readings, epipolar: Epipolar, solution: Solution, expecte
     factor = output_derivative(scene, readings, problem.place, result) @ factor
     gauge = output_gauge(result)
     factor -= gauge @ (gauge.T @ factor)
+    quality.require_off_line(result.M, agreement.sigma_px * marker_factor(result, factor))
     return assemble("refined", result, readings, problem.q_reference, agreement, expected, factor, found)
 
 

@@ -132,6 +132,23 @@ def output_gauge(result: ProjectiveScene) -> FloatArray:
     return gauge
 
 
+def marker_factor(result: ProjectiveScene, factor: FloatArray) -> FloatArray:
+    """Factor (4 m, r) of the covariance of the markers as points, whatever frame and scale they are given.
+
+    Parameters
+    ----------
+    result : the scene.
+    factor : (24 + 16 n + 4 m or more, r) factor of the covariance of P, H_hat_0, M.
+    """
+    first, m = result.P.size + result.H_hat_0.size, len(result.M)
+    scales = np.zeros((first + 4 * m, m))
+    for j in range(m):
+        scales[first + 4 * j : first + 4 * (j + 1), j] = result.M[j]
+    free = np.linalg.qr(np.hstack([output_gauge(result), scales]))[0]
+    factor = factor[: first + 4 * m]
+    return (factor - free @ (free.T @ factor))[first:]
+
+
 def spread_factor(J: FloatArray, gauge: FloatArray) -> FloatArray:
     """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that images determine.
 
@@ -146,7 +163,9 @@ def spread_factor(J: FloatArray, gauge: FloatArray) -> FloatArray:
     -------
     (size, size − g) factor; a direction the data leave open has a column of enormous length.
     """
-    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    scale = np.linalg.norm(J, axis=0)
+    # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
+    scale = np.where(scale > 0.0, scale, scale.max())
     G = np.linalg.qr(scale[:, None] * gauge)[0]
     free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
     _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))

@@ -20,17 +20,27 @@ def image_points(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
     Raises
     ------
     InputError
-        If the readings have another number of joints.
+        If the readings have another number of joints or are not finite.
     """
+    dq = _from_reference(model, q)
+    n = len(model.H_hat_0)
+    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, dq)
+    moved = np.broadcast_to(M.T, (len(dq), 4, len(M)))
+    for i in range(n - 1, -1, -1):
+        moved = E[i] @ moved
+    result: FloatArray = np.swapaxes(model.P[None] @ moved[:, None], 2, 3)
+    return result
+
+
+def _from_reference(model: Model, q: FloatArray) -> FloatArray:
+    """Joint values (K, n) from the reference, after a check of the readings (K, n), rad or m."""
     q = np.asarray(q, dtype=np.float64)
     n = len(model.H_hat_0)
     if q.ndim != 2 or q.shape[1] != n:
         raise InputError(f"joint readings of shape {q.shape}: expected one row of {n} a pose")
-    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, q - model.q_reference)
-    moved = np.broadcast_to(M.T, (len(q), 4, len(M)))
-    for i in range(n - 1, -1, -1):
-        moved = E[i] @ moved
-    result: FloatArray = np.swapaxes(model.P[None] @ moved[:, None], 2, 3)
+    if not np.isfinite(q).all():
+        raise InputError("joint readings must be finite numbers")
+    result: FloatArray = q - model.q_reference
     return result
 
 
@@ -50,7 +60,7 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
     Raises
     ------
     InputError
-        If the readings have another number of joints.
+        If the readings have another number of joints or are not finite.
     """
     return _pixels(image_points(calibration.model(), calibration.M, q))
 
@@ -78,7 +88,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     Raises
     ------
     InputError
-        If the readings have another number of joints.
+        If the readings have another number of joints or are not finite.
     """
     known = np.isin(observation.marker, calibration.marker)
     column = {int(number): j for j, number in enumerate(calibration.marker)}
@@ -113,6 +123,11 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     Returns
     -------
     (K, 2, m, 2) variances of u and v, px².
+
+    Raises
+    ------
+    InputError
+        If the readings have another number of joints or are not finite.
     """
     J = prediction_derivative(calibration.model(), calibration.M, q)
     variance = np.einsum("...a,ab,...b->...", J, calibration.covariance, J, optimize=True)
@@ -132,7 +147,7 @@ def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatAr
     q : (K, n) joint readings, rad or m.
     """
     H_hat, slides = model.H_hat_0, model.joint_types == PRISMATIC
-    dq = np.asarray(q, dtype=np.float64) - model.q_reference
+    dq = _from_reference(model, q)
     K, n, m = len(dq), len(H_hat), len(M)
     E = displacements(H_hat, slides, dq)
     Y = np.empty((n + 1, K, m, 4))

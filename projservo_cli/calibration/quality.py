@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.excitation import WEAK_NOISE, describe_joint
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 # Fitted noise over the noise expected: above the first more than pixel noise is left, above the
@@ -15,14 +15,9 @@ WARN_RATIO, REFUSE_RATIO = 1.15, 3.0
 MOST_UNEXPLAINED, MOST_SUSPECT = 0.02, 0.4
 CHI2_TAIL = 1e-4
 LEAST_SIGMA = 1e-4
-# Second over first extent of a body that counts as a line.
-COLLINEAR = 0.03
-# Reach at which predictions are judged, rad and m, and their noise there in units of the pixel
-# noise: above the first a joint is weak, above the second undetermined.
-REACH_RAD, REACH_M = 0.5, 0.15
-WEAK_NOISE, UNDETERMINED_NOISE = 3.0, 1000.0
-# Least motion of the images over the range of a joint, in units of the pixel noise.
-LEAST_MOTION = 5.0
+# Least distance of the markers from their best line, in units of its own noise.
+OFF_LINE = 5.0
+ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,105 +113,30 @@ def expected_noise(epipolar_px: float, sigma_px: float | None, source: str) -> E
     return Expected(sigma_px, source == "simulated", "that were given")
 
 
-def amount(value: float, prismatic: bool) -> str:
-    """A joint motion in words, mm or degrees."""
-    return f"{1e3 * value:.3g} mm" if prismatic else f"{np.degrees(value):.3g}°"
-
-
-def require_motion(readings: Readings) -> FloatArray:
-    """Range of each joint over the poses, (n,) rad or m.
-
-    Raises
-    ------
-    WorkFailed
-        If a joint never moves, fewer than three markers were seen, or there is only one pose.
-    """
-    m = readings.marker.size
-    if m < 3:
-        what = ("no marker was", "only one marker was", "only two markers, which lie on a line, were")[m]
-        raise WorkFailed(
-            f"{what} seen: a rotation about a line through them shows in no image; "
-            "use three or more markers that are not on one line"
-        )
-    if len(readings.q) < 2:
-        raise WorkFailed("only one pose: trial motions of every joint are needed")
-    present = np.unique(readings.pose_of)
-    span: FloatArray = np.ptp(readings.q[present], axis=0)
-    for i in np.flatnonzero(span <= 1e-6):
-        raise WorkFailed(
-            f"joint {i + 1} has no trial motion: it never moves in the data; record poses in which it does"
-        )
-    return span
-
-
-def require_body(body: FloatArray) -> None:
-    """Refuse a body whose markers lie on one line.
+def require_off_line(M: FloatArray, factor: FloatArray) -> None:
+    """Refuse a body that its covariance cannot tell from a line, the span of two points.
 
     Parameters
     ----------
-    body : (m, 3) markers in a guessed metric frame, NaN where unknown.
+    M : (m, 4) fitted markers in an isotropic projective frame.
+    factor : (4 m, r) factor of their covariance.
 
     Raises
     ------
     WorkFailed
-        If fewer than three markers are known or all lie on one line.
+        If the markers are not off their best line by several times the noise of their distances from it.
     """
-    known = body[np.isfinite(body[:, 0])]
-    if len(known) < 3:
-        raise WorkFailed("no three markers are seen together by both cameras: more must be seen at once")
-    extent = np.linalg.svd(known - known.mean(axis=0), compute_uv=False)
-    if extent[1] < COLLINEAR * extent[0]:
-        raise WorkFailed(
-            "the markers lie on one line: turns about it show in no image; move one marker off the line"
-        )
+    U, extent, Vt = np.linalg.svd(M, full_matrices=False)
+    m = len(M)
+    across = np.eye(m) - U[:, :2] @ U[:, :2].T
+    noise = np.einsum("ij,jkr,ck->icr", across, factor.reshape(m, 4, -1), Vt[2:], optimize=True)
+    if extent[2] < OFF_LINE * float(np.linalg.norm(noise)):
+        raise WorkFailed(ON_A_LINE)
 
 
 def chi2_band(dof: int) -> tuple[float, float]:
     """Quantiles of χ² per degree of freedom between which a true model stays, all but 2e-4 of the time."""
     return float(chi2.ppf(CHI2_TAIL, dof)) / dof, float(chi2.isf(CHI2_TAIL, dof)) / dof
-
-
-def describe_joint(i: int, span: float, prismatic: bool) -> str:
-    """Advice for a joint that moved too little, or never apart from the others."""
-    reach = REACH_M if prismatic else REACH_RAD
-    moved = amount(span, prismatic)
-    if span >= reach:
-        return f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone"
-    more = amount(min(2.0 * reach, max(4.0 * span, 0.5 * reach)), prismatic)
-    return f"joint {i + 1} moved only {moved}: move it at least {more}"
-
-
-def require_determined(
-    noise: FloatArray, motion_px: FloatArray, sigma_px: float, span: FloatArray, prismatic: BoolArray
-) -> None:
-    """Refuse a joint whose operator the data leave open.
-
-    Parameters
-    ----------
-    noise : (n,) predicted noise of images at the reach of each joint, in units of the pixel noise.
-    motion_px : (n,) how far the joint's range moves the images, px.
-    sigma_px : pixel noise per coordinate.
-    span : (n,) range of each joint in the data, rad or m.
-    prismatic : (n,) types of the joints.
-
-    Raises
-    ------
-    WorkFailed
-        Naming the worst joint.
-    """
-    i = int(np.argmin(motion_px))
-    if motion_px[i] < LEAST_MOTION * sigma_px:
-        raise WorkFailed(
-            f"too little excitation: the range of joint {i + 1} moves the images by {motion_px[i]:.3g} px, "
-            f"less than {LEAST_MOTION:g} times their noise of {sigma_px:.3g} px; "
-            f"{describe_joint(i, float(span[i]), bool(prismatic[i]))}"
-        )
-    i = int(np.argmax(noise))
-    if noise[i] > UNDETERMINED_NOISE:
-        raise WorkFailed(
-            f"joint {i + 1} is not determined: near the reference its images would be wrong by "
-            f"{noise[i]:.3g} times the pixel noise; {describe_joint(i, float(span[i]), bool(prismatic[i]))}"
-        )
 
 
 def require_explained(unexplained: int, sightings: int, suspect_poses: int, poses: int) -> None:

@@ -43,6 +43,32 @@ class Readings:
         return result
 
 
+def require_shapes(observation: Observation) -> None:
+    """Refuse an observation whose arrays do not fit each other.
+
+    Raises
+    ------
+    InputError
+        Naming the array and its shape.
+    """
+    if observation.q.ndim != 2:
+        raise InputError(f"joint readings of shape {observation.q.shape}: expected (poses, joints)")
+    for name, numbers in (("pose", observation.pose), ("marker", observation.marker)):
+        if numbers.ndim != 1:
+            raise InputError(f"{name} numbers of shape {numbers.shape}: expected one dimension")
+        values, count = np.unique(numbers, return_counts=True)
+        if (count > 1).any():
+            raise InputError(f"{name} number {values[count > 1][0]} stands twice: number each {name} once")
+    K, m = len(observation.q), len(observation.marker)
+    if len(observation.pose) != K:
+        raise InputError(f"{len(observation.pose)} pose numbers for {K} rows of joint readings")
+    if observation.images.shape != (K, 2, m, 2):
+        raise InputError(
+            f"images of shape {observation.images.shape}: expected {(K, 2, m, 2)} for {K} poses, two views, "
+            f"{m} markers and two coordinates"
+        )
+
+
 def gather(observation: Observation, joint_types: str) -> Readings:
     """Flatten an observation into the list of what was seen.
 
@@ -54,8 +80,9 @@ def gather(observation: Observation, joint_types: str) -> Readings:
     Raises
     ------
     InputError
-        If the letters do not fit the joints, or values are not finite.
+        If the arrays or the letters do not fit each other, or values are not finite.
     """
+    require_shapes(observation)
     letters = joint_types.upper()
     n = observation.q.shape[1]
     if len(letters) != n or set(letters) - {"R", "P"}:
@@ -132,6 +159,18 @@ def reference_pose(q: FloatArray) -> int | None:
     # With trials of a single joint every row qualifies: the one in the middle moves least.
     travel = np.abs(q[:, None] - q[None]).sum(axis=(1, 2))
     return int(candidates[np.argmin(travel[candidates])])
+
+
+def joint_trials(q: FloatArray, home: int) -> list[list[int]]:
+    """Rows of each joint's trials, in which it differs from the reference.
+
+    Parameters
+    ----------
+    q : (K, n) joint readings of single-joint trials, rad or m.
+    home : row of the reference.
+    """
+    moved = np.abs(q - q[home]) > SAME_READING
+    return [np.flatnonzero(moved[:, i]).tolist() for i in range(q.shape[1])]
 
 
 def reference_joints(q: FloatArray) -> FloatArray:

@@ -8,10 +8,10 @@ import numpy as np
 
 from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import Scene
-from projservo_cli.calibration.body import Alignment, merge
+from projservo_cli.calibration.body import LEAST, Alignment, merge
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.optimization import Fit, Problem, Weighting, fixed, minimize, prepare
-from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected, require_body
+from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected
 from projservo_cli.calibration.readings import Readings, of_poses
 from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
 from projservo_cli.calibration.start import place, rotation_axes
@@ -155,7 +155,10 @@ def starts(
     for factor in factors:
         for guess in metric_guesses(epipolar.F, readings, frame, FOCAL_MINIMA, factor):
             alignment = _merged(guess, readings)
-            require_body(alignment.body)
+            if int(np.isfinite(alignment.body[:, 0]).sum()) < LEAST:
+                raise WorkFailed(
+                    "no three markers are seen together by both cameras: more must be seen at once"
+                )
             for w in rotation_axes(alignment, problem.q, readings.prismatic, rng, AXIS_MINIMA):
                 screws = place(w, guess.points, readings, problem.q)
                 M = np.hstack([screws.body, np.ones((len(screws.body), 1))])

@@ -19,7 +19,30 @@ def spoilt(name, value):
     return dataclasses.replace(OBSERVATION, **{name: array})
 
 
+def shaped(**given):
+    return dataclasses.replace(OBSERVATION, **given)
+
+
+K, M = len(OBSERVATION.pose), len(OBSERVATION.marker)
 CASES = {
+    "readings of fewer poses": (
+        shaped(q=OBSERVATION.q[:-1]),
+        "RPR",
+        {},
+        f"{K} pose numbers for {K - 1} rows",
+    ),
+    "readings in a row": (shaped(q=OBSERVATION.q[:, 0]), "R", {}, "expected (poses, joints)"),
+    "images of fewer poses": (shaped(images=OBSERVATION.images[:-1]), "RPR", {}, f"for {K} poses"),
+    "fewer marker numbers": (shaped(marker=OBSERVATION.marker[:-1]), "RPR", {}, f"{M - 1} markers"),
+    "fewer pose numbers": (shaped(pose=OBSERVATION.pose[:-1]), "RPR", {}, f"{K - 1} pose numbers"),
+    "a pose twice": (spoilt("pose", OBSERVATION.pose[0]), "RPR", {}, "pose number 3 stands twice"),
+    "a marker twice": (spoilt("marker", 5), "RPR", {}, "marker number 5 stands twice"),
+    "markers in a table": (shaped(marker=OBSERVATION.marker[:, None]), "RPR", {}, "one dimension"),
+    "three views": (shaped(images=OBSERVATION.images[:, [0, 1, 1]]), "RPR", {}, "two views"),
+    "no image": (OBSERVATION, "RPR", {"image_size": (0, 0)}, "positive width"),
+    "image size not a number": (OBSERVATION, "RPR", {"image_size": (np.nan, 10)}, "positive width"),
+    "negative image size": (OBSERVATION, "RPR", {"image_size": (-5, 10)}, "positive width"),
+    "negative seed": (OBSERVATION, "RPR", {"seed": -1}, "seed -1"),
     "method": (OBSERVATION, "RPR", {"method": "best"}, "refined, linear, closed_form"),
     "source": (OBSERVATION, "RPR", {"source": "dreamt"}, "simulated or recorded"),
     "no noise": (OBSERVATION, "RPR", {"sigma_px": 0.0}, "positive"),
@@ -59,9 +82,17 @@ def test_letters_of_any_case(calibration):
 
 
 @pytest.mark.parametrize("q", [np.zeros((4, 2)), np.zeros((4, 4)), np.zeros(3)])
-def test_predict_refuses_other_joints(calibration, q):
+@pytest.mark.parametrize("function", [predict, prediction_variance])
+def test_predictions_refuse_other_joints(calibration, q, function):
     with pytest.raises(InputError, match="one row of 3 a pose"):
-        predict(calibration, q)
+        function(calibration, q)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("function", [predict, prediction_variance])
+def test_predictions_refuse_readings_that_are_no_numbers(calibration, value, function):
+    with pytest.raises(InputError, match="finite"):
+        function(calibration, np.array([[0.0, value, 0.0]]))
 
 
 def test_no_poses_no_images(calibration):

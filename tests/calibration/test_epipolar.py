@@ -68,7 +68,7 @@ def test_gradient_of_the_sampson_distance(seed):
 
 def test_too_few_and_flat_sightings_are_refused():
     left, right = sightings(7, 0.0, np.random.default_rng(4))
-    with pytest.raises(WorkFailed, match="only 7 markers"):
+    with pytest.raises(WorkFailed, match="7 sightings of a marker by both"):
         epipolar.estimate(left, right, np.random.default_rng(0))
     left, _ = sightings(50, 0.3, np.random.default_rng(5))
     again = left + 0.3 * np.random.default_rng(6).standard_normal(left.shape)
