@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from projservo_cli.calibration.quality import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
+from projservo_cli.calibration.excitation import REACH_M, REACH_RAD, WEAK_NOISE
+from projservo_cli.calibration.quality import chi2_band
 from projservo_cli.figures.material import TITLES
 from projservo_cli.records import Calibration, Trace
 
