@@ -92,8 +92,8 @@ def test_commands(folder, block, capsys):
 def test_commands_that_run_laws_and_what_is_read_from_python(folder, capsys):
     pytest.importorskip("xarray")
     pytest.importorskip("h5netcdf")
-    run_all(SERVO)
     assert cli.run(["servo", "--law", "direct_two", "-q"]) == 0  # part of the first command
+    run_all(SERVO)
     capsys.readouterr()
     names = {}
     for block in blocks("python"):

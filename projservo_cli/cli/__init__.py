@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 import click
 from click.core import ParameterSource
+from click.shell_completion import CompletionItem
 
 from projservo_cli.cli.commands import COMMANDS, allowed, help_text
 from projservo_cli.cli.options import LEFT_OUT, OPTIONS
@@ -26,13 +27,30 @@ class _Projservo(click.Command):
     """A command whose words and options stand in any order, which chained click groups do not allow."""
 
     def main(self, args: Sequence[str] | None = None, *_: Any, **__: Any) -> NoReturn:
-        """Run the command line and leave with its exit code."""
+        """Run the command line, or answer a shell that completes it, and leave with the exit code."""
+        self._main_shell_completion({}, "projservo")
         sys.exit(run(sys.argv[1:] if args is None else args))
+
+
+def _complete(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Words that may follow: commands, further stages, or files."""
+    del parameter
+    words = context.params.get("words") or ()
+    if words and not (words[0] in COMMANDS and COMMANDS[words[0]].stage):
+        return [CompletionItem(incomplete, type="file")]
+    return [
+        CompletionItem(name, help=command.summary)
+        for name, command in COMMANDS.items()
+        if name.startswith(incomplete) and name not in words and (command.stage or not words)
+    ]
 
 
 main = _Projservo(
     "projservo",
-    params=[*OPTIONS.values(), click.Argument(["words"], nargs=-1, type=click.UNPROCESSED)],
+    params=[
+        *OPTIONS.values(),
+        click.Argument(["words"], nargs=-1, type=click.UNPROCESSED, shell_complete=_complete),
+    ],
     add_help_option=False,
 )
 
@@ -114,8 +132,8 @@ def _commands(words: Sequence[str]) -> tuple[list[str], list[str]]:
     if not words:
         return [], []
     if words[0] in COMMANDS and not COMMANDS[words[0]].stage:
-        most = len(COMMANDS[words[0]].arguments)
-        if len(words) > 1 + most:
+        most = COMMANDS[words[0]].most
+        if most is not None and len(words) > 1 + most:
             raise click.UsageError(
                 f"{words[0]} takes {most or 'no'} argument{'s' * (most > 1)}, got {' '.join(words[1:])}"
             )

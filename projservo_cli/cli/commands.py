@@ -9,12 +9,13 @@ import click
 from projservo_cli.cli.options import OPTIONS
 
 
-def _variants(**helps: str) -> dict[str, click.Option]:
-    """Options as above that mean something of their own; ``output`` is a table."""
+def _variants(output: str = "TABLE", /, **helps: str) -> dict[str, click.Option]:
+    """Options as above that mean something of their own, with what ``output`` names."""
     found = {name: copy.copy(OPTIONS[name]) for name in helps}
     for name, text in helps.items():
         found[name].help = text
-    found["output"].metavar = "TABLE"
+    if "output" in found:
+        found["output"].metavar = output
     return found
 
 
@@ -29,15 +30,22 @@ _OF_STAGES = (
 class Command:
     """A word of the command line: what it takes and what help says about it.
 
-    ``options`` are the names of those it uses, ``variants`` say in help what they mean here.
+    ``options`` are the names of those it uses, ``variants`` say in help what they mean here,
+    ``example`` is a call. The last of the ``arguments`` may stand for any number of them.
     """
 
     summary: str
     about: str
     options: tuple[str, ...]
     arguments: tuple[str, ...] = ()
+    example: str = ""
     variants: Mapping[str, click.Option] = field(default_factory=dict)
     stage: bool = False
+
+    @property
+    def most(self) -> int | None:
+        """Number of arguments it takes at most; None for any number."""
+        return None if self.arguments and self.arguments[-1].endswith("...") else len(self.arguments)
 
 
 COMMANDS = {
@@ -49,6 +57,7 @@ COMMANDS = {
         "calibration as it is and writes suggestions.csv into the folder of the run, for record --motions.",
         (*_OF_STAGES, "cross_validate", "init", "suggest"),
         stage=True,
+        example="projservo calibrate --data trials.csv --joints RRPRRR -o results/mine",
     ),
     "plan": Command(
         "Plan the task as a translation and two rotations.",
@@ -56,6 +65,7 @@ COMMANDS = {
         "the face. Calibrates first where needed.",
         _OF_STAGES,
         stage=True,
+        example="projservo plan -c configs/ur5.yaml --set trajectory.profile=exponential",
     ),
     "servo": Command(
         "Run the control laws in closed loop.",
@@ -63,13 +73,16 @@ COMMANDS = {
         "needed. Exit code 1 when a law of control.must_converge does not converge.",
         (*_OF_STAGES, "laws"),
         stage=True,
+        example="projservo servo -o results/ur5 --law direct_two --law stacked",
     ),
     "report": Command(
         "Draw the figures and check the paper's claims.",
-        "Writes the figures and the table of claims into the folder of the run. Makes every stage before "
-        "it where needed.",
+        "Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; "
+        "and report.html, one page that tells it all and needs no other file. Makes every stage before it "
+        "where needed.",
         _OF_STAGES,
         stage=True,
+        example="projservo calibrate plan servo report -c configs/ur5.yaml -o results/ur5",
     ),
     "record": Command(
         "Drive the robot through trial motions and write a table.",
@@ -86,6 +99,7 @@ COMMANDS = {
             joint_unit="Unit of the revolute joints of --motions. Default: rad.",
             force="Begin anew, whatever stands in the table.",
         ),
+        example="projservo record -c configs/stanford.yaml --output trials.csv",
     ),
     "detect": Command(
         "Find ArUco or AprilTag markers in images and write a table.",
@@ -109,6 +123,7 @@ COMMANDS = {
             points="Four markers a tag, or one.",
             force="Replace the table if there is one.",
         ),
+        example="projservo detect images/left images/right --joints-csv q.csv --output tags.csv",
     ),
     "validate": Command(
         "Predict held-out images with a calibration.",
@@ -116,17 +131,71 @@ COMMANDS = {
         "at the table's joint readings.",
         ("output", "data", "joint_unit"),
         ("RUN",),
+        example="projservo validate results/mine --data validation.csv",
     ),
     "show": Command(
         "Show what a run holds and how it was made.",
         "Lists the results in a run, whether each is up to date, and what it was made with.",
         ("output",),
         ("[RUN]",),
+        example="projservo show results/ur5 --json",
+    ),
+    "compare": Command(
+        "Show runs side by side on one page.",
+        "Writes one page like report.html with the differences of the configurations, and calibrations, "
+        "plans, laws, claims and figures beside each other.",
+        ("output", "force"),
+        ("RUN", "RUN ..."),
+        example="projservo compare results/paper results/ur5 -o both.html",
+        variants=_variants(
+            "PAGE",
+            output="Page to write. Default: compare.html.",
+            force="Replace the page if there is one.",
+        ),
+    ),
+    "export": Command(
+        "Write all arrays of a run as CSV, MATLAB or NumPy files.",
+        "--to csv writes a folder with a table for each result, a column for each index of an array, and "
+        "fields.csv, which says what every array is, in which unit. --to mat and --to npz write one file, "
+        "with servo.direct_two.q or a name such as servo/direct_two/q.",
+        ("output", "to", "force"),
+        ("RUN",),
+        example="projservo export results/ur5 --to mat",
+        variants=_variants(
+            "PATH",
+            output="Folder (csv) or file to write. Default: csv, run.mat or run.npz beside run.h5.",
+            force="Replace what is there.",
+        ),
     ),
     "equations": Command(
         "List the equations of the paper and the code of each.",
         "Prints number, title, function, test and erratum of every equation.",
         (),
+        example="projservo equations --json",
+    ),
+    "init": Command(
+        "Write a commented configuration to start from.",
+        "Writes a configuration that runs as it is, with a comment on every key, and beside it the schema by "
+        "which editors complete and check it.",
+        ("force",),
+        ("[FILE]",),
+        example="projservo init mine.yaml",
+        variants=_variants("", force="Replace the file if there is one."),
+    ),
+    "schema": Command(
+        "Print the JSON Schema of the configuration.",
+        "Editors that speak YAML complete and check a configuration whose first line names the schema: "
+        "# yaml-language-server: $schema=FILE",
+        ("output",),
+        example="projservo schema -o schema.json",
+        variants=_variants("FILE", output="File to write. Default: standard output."),
+    ),
+    "doctor": Command(
+        "Say what is installed and where things go.",
+        "Lists versions, extras, whether the kernels are compiled, and the folder of results. Exit code 1 "
+        "when something is missing that every run needs.",
+        (),
+        example="projservo doctor --json",
     ),
 }
 
@@ -160,6 +229,8 @@ def help_text(names: list[str]) -> str:
             formatter.write_text(text)
         shown = [name for name in OPTIONS if name in allowed(names)]
         variants = command.variants
+        with formatter.section("Example"):
+            formatter.write_text(command.example)
     context = click.Context(click.Command("projservo"))
     with formatter.section("Options"):
         options = [variants.get(name, OPTIONS[name]) for name in shown]

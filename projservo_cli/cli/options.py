@@ -6,12 +6,22 @@ import click
 
 LEFT_OUT = {"--suggest": "5"}  # what an option means whose value is left out
 
+
+def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Laws for the completion of a shell."""
+    del context, parameter
+    from projservo_cli.records import LAWS
+
+    return [law for law in LAWS if law.startswith(incomplete)]
+
+
 OPTIONS: dict[str, click.Option] = {
     option.name or "": option
     for option in (
         click.Option(
             ["-c", "--config"],
             metavar="FILE",
+            type=click.Path(),
             help="Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml.",
         ),
         click.Option(
@@ -23,11 +33,13 @@ OPTIONS: dict[str, click.Option] = {
         click.Option(
             ["-o", "--output"],
             metavar="DIR",
+            type=click.Path(),
             help="Folder of the run, or its run.h5. Default: results/<configuration name>.",
         ),
         click.Option(
             ["--data"],
             metavar="TABLE",
+            type=click.Path(),
             help="Observation table (CSV): calibrate from it, or validate with it.",
         ),
         click.Option(
@@ -51,6 +63,7 @@ OPTIONS: dict[str, click.Option] = {
         click.Option(
             ["--init"],
             metavar="FILE",
+            type=click.Path(),
             help="On calibrate: try this robot and rig (JSON: screws, cameras, markers) first as a start.",
         ),
         click.Option(
@@ -62,11 +75,13 @@ OPTIONS: dict[str, click.Option] = {
         click.Option(
             ["--motions"],
             metavar="CSV",
+            type=click.Path(),
             help="On record: further poses after the trial motions, a row each of q1 ... qN.",
         ),
         click.Option(
             ["--joints-csv"],
             metavar="CSV",
+            type=click.Path(),
             help="On detect: joint readings q1 ... qN, a row a pose, perhaps with pose or left and right.",
         ),
         click.Option(
@@ -87,7 +102,13 @@ OPTIONS: dict[str, click.Option] = {
             ["laws", "--law"],
             metavar="NAME",
             multiple=True,
+            shell_complete=_laws,
             help="On servo: this law instead of control.laws. Repeatable.",
+        ),
+        click.Option(
+            ["--to"],
+            type=click.Choice(["csv", "mat", "npz"]),
+            help="On export: the kind of file.",
         ),
         click.Option(["--force"], is_flag=True, help="Make the named stages even where they are up to date."),
         click.Option(["-n", "--dry-run"], is_flag=True, help="Say what would be done, do nothing."),

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,7 +46,12 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
     for k, run in enumerate(runs, 1):
         folder = os.path.relpath(run.path.parent.resolve(), base)
         views.append(view_of(run, folder=Path(folder).as_posix() + "/", prefix=f"run{k}-"))
-    _write(path, views)
+    shared = {view.name for view in views if sum(view.name == other.name for other in views) > 1}
+    named = [
+        replace(view, name=f"{view.name} ({view.folder.rstrip('/')})") if view.name in shared else view
+        for view in views
+    ]
+    _write(path, named)
 
 
 def _write(path: Path, views: list[View]) -> None:

@@ -1,0 +1,40 @@
+"""The JSON Schema of a configuration, by which editors complete and check it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from projservo_cli.config.models import Config
+
+# A configuration with a comment on every key, to start from.
+STARTER = Path(__file__).with_name("starter.yaml")
+DRAFT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def json_schema() -> dict[str, Any]:
+    """The schema of a configuration file; what must hold between values, only loading it tells."""
+    schema: dict[str, Any] = _plain(Config.model_json_schema())
+    schema["required"].remove("name")  # by default that of the file
+    return {"$schema": DRAFT, **schema, "title": "Configuration of projservo"}
+
+
+def schema_text() -> str:
+    """The schema as the text of a file."""
+    return json.dumps(json_schema(), ensure_ascii=False, indent=2) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    """Without titles that repeat the key, and with vectors in the form that every draft understands."""
+    if isinstance(value, list):
+        return [_plain(inner) for inner in value]
+    if not isinstance(value, dict):
+        return value
+    kept = {key: _plain(inner) for key, inner in value.items() if not _is_title(key, inner)}
+    entries = kept.get("prefixItems")
+    if isinstance(entries, list) and all(entry == entries[0] for entry in entries):
+        kept["items"] = kept.pop("prefixItems")[0]
+    return kept
+
+
+def _is_title(key: str, inner: Any) -> bool:
+    return key == "title" and isinstance(inner, str)
