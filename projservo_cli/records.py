@@ -23,14 +23,17 @@ LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"
 METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
 
 
-def array(*dims: str, units: str = "1", about: str = "") -> Any:
+def array(*dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare an array field: the names of its dimensions, its unit and what it holds."""
-    return field(metadata={"dims": dims, "units": units, "about": about})
+    return field(metadata={"dims": dims, "units": units, "about": about}, **default)
 
 
 def scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare a scalar or text field with its unit and what it holds."""
     return field(metadata={"units": units, "about": about}, **default)
+
+
+NO_LENS = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2)
 
 
 class Model(NamedTuple):
@@ -46,6 +49,7 @@ class Model(NamedTuple):
     joint_types : (n,) ``REVOLUTE``, ``PRISMATIC`` or ``FREE``.
     q_reference : (n,) joint reading at the reference, rad or m.
     a_inf : (4,) plane at infinity, the common left null vector of the operators.
+    lens : (2, 5) radial distortion of both views: image centre u, v and radius, px, then k1, k2.
     """
 
     P: FloatArray
@@ -53,6 +57,7 @@ class Model(NamedTuple):
     joint_types: IntArray
     q_reference: FloatArray
     a_inf: FloatArray
+    lens: FloatArray = NO_LENS
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +96,9 @@ class Calibration:
     marker: IntArray = array("marker", about="number of the marker")
     M: FloatArray = array("marker", "coordinate", about="markers at the reference, a_inf @ M = 1")
     covariance: FloatArray = array(
-        "parameter", "parameter_", about="of P.ravel(), H_hat_0.ravel(), M.ravel(), gauge fixed"
+        "parameter",
+        "parameter_",
+        about="of P.ravel(), H_hat_0.ravel(), M.ravel(), gauge fixed, and k1, k2 of both lenses if any",
     )
     excitation: FloatArray = array("joint", units="rad or m", about="range of joint motion in the data")
     weak: BoolArray = array("joint", about="joints whose operator the data hardly determine")
@@ -114,11 +121,18 @@ class Calibration:
     swapped: IntArray = array(
         "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
     )
+    lens: FloatArray | None = array(
+        "view",
+        "lens_term",
+        about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
+        default=None,
+    )
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""
         types = np.array([PRISMATIC if t == "P" else REVOLUTE for t in self.joint_types], dtype=np.int64)
-        return Model(self.P, self.H_hat_0, types, self.q_reference, self.a_inf)
+        lens = NO_LENS if self.lens is None else self.lens
+        return Model(self.P, self.H_hat_0, types, self.q_reference, self.a_inf, lens)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from projservo_cli import store
 from projservo_cli.calibration import predict
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.geometry.kinematics import project as pixels_of
+from projservo_cli.geometry.lens import bent_derivative, through
 from projservo_cli.records import Calibration, FloatArray, InputError
 
 AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
@@ -68,6 +69,8 @@ class ImageModel(Calibration):
                 for row in rows
             ]
         )
+        straight = np.array([pixels_of(model.P, self.M @ forward_kinematics(model, row).T) for row in rows])
+        J = bent_derivative(self._lens(1), straight)[0] @ J
         J[np.isnan(predict(self, rows)[..., 0])] = np.nan
         return np.asarray(J[0] if single else J)
 
@@ -95,7 +98,12 @@ class ImageModel(Calibration):
         norms = np.linalg.norm(A, axis=-1) * np.linalg.norm(self.a_inf)
         ahead = np.where(np.abs(side) > AT_INFINITY * norms, depth * side > 0.0, depth != 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(ahead[..., None], pixels_of(self.P, A), np.nan)
+            straight = np.where(ahead[..., None], pixels_of(self.P, A), np.nan)
+        return through(self._lens(A.ndim - 1), straight)
+
+    def _lens(self, dims: int) -> FloatArray:
+        """Lenses (2, ..., 5) to go with pixels (2, ..., 2) of so many dimensions of points."""
+        return self.model().lens.reshape(2, *(1,) * dims, 5)
 
     def _rows(self, q: FloatArray) -> tuple[FloatArray, bool]:
         readings = np.asarray(q, dtype=np.float64)

@@ -20,14 +20,14 @@ def fake(kind: type, seed: int = 0, sizes: dict[str, int] | None = None, **given
         hint = hints[field.name]
         if field.name in given:
             values[field.name] = given[field.name]
+        elif type(None) in typing.get_args(hint):
+            values[field.name] = None
         elif "dims" in field.metadata:
             values[field.name] = _array(
                 rng, str(hint), [extent.get(dim, 3) for dim in field.metadata["dims"]]
             )
         elif hint in SCALARS:
             values[field.name] = SCALARS[hint]
-        elif type(None) in typing.get_args(hint):
-            values[field.name] = None
         else:
             values[field.name] = ()
     return kind(**values)

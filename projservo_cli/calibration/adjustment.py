@@ -14,9 +14,11 @@ from scipy.linalg import expm
 
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.calibration.rotations import cross
+from projservo_cli.geometry.lens import FIRST, bent, bent_derivative
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 CAMERA = 12
+LENS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,48 +30,59 @@ class Scene:
     P : (2, 3, 4) cameras to pixels.
     H_hat : (n, 4, 4) twists at the reference: unit rotations without pitch, or translations.
     M : (m, 4) markers at the reference, last coordinate one.
+    lens : (2, 5) lenses, of which k1 and k2 vary; None where none is sought.
     """
 
     P: FloatArray
     H_hat: FloatArray
     M: FloatArray
+    lens: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where each parameter stands: both cameras, then joints, then markers.
+    """Where each parameter stands: both cameras, then joints, then markers, then both lenses.
 
     Attributes
     ----------
     joint : (n + 1,) first parameter of each joint, then of the markers.
+    lens : first parameter of the lenses; ``size`` where none is sought.
     size : number of parameters.
     groups : rows of each marker, as slices of the lists of ``Readings``.
     columns : (2, m, c) parameters that the images of a marker in a view depend on.
     """
 
     joint: IntArray
+    lens: int
     size: int
     groups: tuple[slice, ...]
     columns: IntArray
 
 
-def layout(readings: Readings) -> Layout:
-    """Parameters of a problem: 12 a camera, 4 a revolute and 2 a prismatic joint, 3 a marker."""
+def layout(readings: Readings, lens: bool = False) -> Layout:
+    """Parameters of a problem: 12 a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, 2 a lens."""
     joint = 2 * CAMERA + np.concatenate([[0], np.cumsum(np.where(readings.prismatic, 2, 4))])
     m = readings.marker.size
     edges = np.searchsorted(readings.marker_of, np.arange(m + 1))
     groups = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
     joints = np.arange(joint[0], joint[-1])
+    first = int(joint[-1]) + 3 * m
+    count = LENS if lens else 0
     columns = np.array(
         [
             [
-                np.concatenate([v * CAMERA + np.arange(CAMERA), joints, joint[-1] + 3 * j + np.arange(3)])
+                np.r_[
+                    v * CAMERA + np.arange(CAMERA),
+                    joints,
+                    joint[-1] + 3 * j + np.arange(3),
+                    first + v * count + np.arange(count),
+                ]
                 for j in range(m)
             ]
             for v in (0, 1)
         ]
     )
-    return Layout(joint, int(joint[-1]) + 3 * m, groups, columns)
+    return Layout(joint, first, first + 2 * count, groups, columns)
 
 
 def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
@@ -124,7 +137,8 @@ def predict_pixels(scene: Scene, readings: Readings, q: FloatArray) -> tuple[Flo
     """
     Y = moved_points(displacements(scene.H_hat, readings.prismatic, q), scene.M, readings)
     m = Y[0] @ np.swapaxes(scene.P, 1, 2)
-    return pixels_of(m), m[..., 2]
+    pixels = pixels_of(m)
+    return pixels if scene.lens is None else bent(scene.lens[:, None], pixels), m[..., 2]
 
 
 def generators(scene: Scene, prismatic: BoolArray) -> list[FloatArray]:
@@ -157,41 +171,48 @@ def generators(scene: Scene, prismatic: BoolArray) -> list[FloatArray]:
 def derivative(scene: Scene, readings: Readings, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pixels (2, N, 2) and their derivative (2, N, 2, c) by the parameters each depends on.
 
-    The c columns are those of ``Layout.columns``: the view's camera, all joints, the own marker. The
-    rest of the Jacobian is zero and never formed. With Y_i the point behind joint i, D_i the image
-    derivative carried to it and B a generator, a joint contributes D_i (B Y_i − E_i B Y_{i+1}).
+    The c columns are those of ``Layout.columns``: the view's camera, all joints, the own marker, the
+    view's lens. The rest of the Jacobian is zero and never formed. With Y_i the point behind joint i,
+    D_i the image derivative carried to it and B a generator, a joint contributes D_i (B Y_i − E_i B Y_{i+1}).
 
     Parameters are those of ``predict_pixels``.
     """
     E = displacements(scene.H_hat, readings.prismatic, q)
     Y = moved_points(E, scene.M, readings)
-    pixels, G = projection_derivative(scene.P, Y[0])
+    pixels, G, lens = projection_derivative(scene, Y[0])
     blocks = [(G[..., None] * Y[0][:, None, None, :]).reshape(*G.shape[:3], CAMERA)]
     D = G @ scene.P[:, None]
     for i, B in enumerate(generators(scene, readings.prismatic)):
         before = D @ np.einsum("bij,Nj->Nib", B, Y[i])
         D = D @ E[i][readings.pose_of]
         blocks.append(before - D @ np.einsum("bij,Nj->Nib", B, Y[i + 1]))
-    blocks.append(D[..., :3])
+    blocks += [D[..., :3], *lens]
     return pixels, np.concatenate(blocks, axis=3)
 
 
-def projection_derivative(P: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (2, N, 2) of points and their derivative (2, N, 2, 3) by the image points.
+def projection_derivative(
+    scene: Scene, points: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[FloatArray, ...]]:
+    """Pixels (2, N, 2) of points, their derivative (2, N, 2, 3) by the image points, and that by the lens.
 
-    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3.
+    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lens, if there
+    is one, whose derivative is (2, N, 2, 2) by k1 and k2.
 
     Parameters
     ----------
-    P : (2, 3, 4) cameras.
+    scene : cameras and lenses.
     points : (N, 4) points.
     """
-    m = points @ np.swapaxes(P, 1, 2)
+    m = points @ np.swapaxes(scene.P, 1, 2)
     pixels = pixels_of(m)
     G = np.zeros((*m.shape[:2], 2, 3))
     G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
     G[..., 2] = -pixels / m[..., 2:]
-    return pixels, G
+    if scene.lens is None:
+        return pixels, G, ()
+    lens = scene.lens[:, None]
+    by_pixel, by_lens = bent_derivative(lens, pixels)
+    return bent(lens, pixels), by_pixel @ G, (by_lens,)
 
 
 def joint_derivative(scene: Scene, readings: Readings, q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -201,7 +222,7 @@ def joint_derivative(scene: Scene, readings: Readings, q: FloatArray) -> tuple[F
     """
     E = displacements(scene.H_hat, readings.prismatic, q)
     Y = moved_points(E, scene.M, readings)
-    pixels, G = projection_derivative(scene.P, Y[0])
+    pixels, G, _ = projection_derivative(scene, Y[0])
     D = G @ scene.P[:, None]
     J = np.empty((*pixels.shape, len(E)))
     for i in range(len(E)):
@@ -227,8 +248,12 @@ def retract(scene: Scene, readings: Readings, place: Layout, x: FloatArray) -> S
         H_hat[i] = motion @ H_hat[i] @ np.linalg.inv(motion)
         H_hat[i] = _clean(H_hat[i], scene.H_hat[i], bool(readings.prismatic[i]))
     M = scene.M.copy()
-    M[:, :3] += x[place.joint[-1] :].reshape(-1, 3)
-    return Scene(scene.P + x[: 2 * CAMERA].reshape(2, 3, 4), H_hat, M)
+    M[:, :3] += x[place.joint[-1] : place.lens].reshape(-1, 3)
+    lens = scene.lens
+    if lens is not None:
+        lens = lens.copy()
+        lens[:, FIRST:] += x[place.lens :].reshape(2, LENS)
+    return Scene(scene.P + x[: 2 * CAMERA].reshape(2, 3, 4), H_hat, M, lens)
 
 
 def _clean(H_hat: FloatArray, before: FloatArray, slides: bool) -> FloatArray:
@@ -268,7 +293,7 @@ def gauge(scene: Scene, readings: Readings, place: Layout) -> FloatArray:
             wanted = (Z @ scene.H_hat[i] - scene.H_hat[i] @ Z).ravel()
             reach = (B @ scene.H_hat[i] - scene.H_hat[i] @ B).reshape(len(B), 16).T
             result[place.joint[i] : place.joint[i + 1], k] = np.linalg.lstsq(reach, wanted, rcond=None)[0]
-        result[place.joint[-1] :, k] = (scene.M @ Z.T)[:, :3].ravel()
+        result[place.joint[-1] : place.lens, k] = (scene.M @ Z.T)[:, :3].ravel()
     for v in (0, 1):
         result[v * CAMERA : (v + 1) * CAMERA, len(motions) + v] = scene.P[v].ravel()
     directions: FloatArray = result / np.linalg.norm(result, axis=0)

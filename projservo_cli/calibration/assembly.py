@@ -7,10 +7,11 @@ import numpy as np
 from projservo_cli.calibration import excitation, quality
 from projservo_cli.calibration.culprits import Culprits
 from projservo_cli.calibration.frame import ProjectiveScene
-from projservo_cli.calibration.prediction import image_points, prediction_derivative
+from projservo_cli.calibration.prediction import marker_pixels, prediction_derivative
 from projservo_cli.calibration.quality import Agreement, Expected
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.records import (
+    NO_LENS,
     PRISMATIC,
     REVOLUTE,
     BoolArray,
@@ -33,6 +34,7 @@ def assemble(
     expected: Expected,
     factor: FloatArray | None,
     found: Culprits | None = None,
+    suspicion: str = "lens or joint readings",
 ) -> Calibration:
     """Record of a fit in its projective frame.
 
@@ -44,8 +46,9 @@ def assemble(
     q_reference : (n,) joint readings at the reference, rad or m.
     agreement, expected : what the fit leaves of the images, and what it should.
     factor : (24 + 16 n + 4 m, r) factor of the covariance of P, H_hat_0, M at a noise of one pixel,
-        None for a method that has none.
+        with four rows more for k1 and k2 where lenses were sought; None for a method that has none.
     found : what explains readings left out.
+    suspicion : what may be to blame for more than pixel noise.
 
     Raises
     ------
@@ -53,9 +56,10 @@ def assemble(
         If a joint is not determined.
     """
     types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
-    model = Model(scene.P, scene.H_hat_0, types, q_reference, scene.a_inf)
+    lens = NO_LENS if scene.lens is None else scene.lens
+    model = Model(scene.P, scene.H_hat_0, types, q_reference, scene.a_inf, lens)
     span = excitation.require_motion(readings)
-    size = 24 + 16 * len(types) + 4 * len(scene.M)
+    size = 24 + 16 * len(types) + 4 * len(scene.M) + (0 if scene.lens is None else 4)
     # NaN, not zero: a method without covariance does not claim certainty.
     noise, covariance = np.full(len(types), np.nan), np.full((size, size), np.nan)
     # Residuals of a method without covariance are its own doing, not noise of the images.
@@ -71,7 +75,7 @@ def assemble(
         )
     outlier = outlier_list(readings, agreement.used | found.explained)
     counts = (len(outlier), len(found.suspect), len(found.swapped))
-    reason, advice = quality.verdict(agreement, expected, noise, span, readings.prismatic, counts)
+    reason, advice = quality.verdict(agreement, expected, noise, span, readings.prismatic, counts, suspicion)
     shortfall = quality.shortfall(method, agreement, expected)
     used_rows = agreement.used.any(axis=0)
     return Calibration(
@@ -105,6 +109,7 @@ def assemble(
         swapped=np.concatenate(
             [readings.pose[found.swapped[:, :1]], readings.marker[found.swapped[:, 1:]]], axis=1
         ),
+        lens=scene.lens,
     )
 
 
@@ -136,8 +141,7 @@ def reach_noise(model: Model, M: FloatArray, factor: FloatArray, surroundings: F
         for _ in range(10):
             q = np.tile(model.q_reference, (2, 1))
             q[:, i] += (reach, -reach)
-            m = image_points(model, M, q)
-            pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+            pixels = marker_pixels(model, M, q)
             counts = np.all(
                 (pixels >= surroundings[:, None, 0]) & (pixels <= surroundings[:, None, 1]), axis=-1
             )

@@ -128,9 +128,10 @@ def _predicted(
     whole = solution.problem.readings
     training = of_poses(whole, ~held_out)
     known = np.bincount(training.marker_of, training.seen.sum(axis=0), whole.marker.size) > 0
-    problem = prepare(restrict(training, known), solution.problem.q_reference)
+    lens = solution.scene.lens
+    problem = prepare(restrict(training, known), solution.problem.q_reference, lens is not None)
     require_motion(problem.readings)
-    scene = adjustment.Scene(solution.scene.P, solution.scene.H_hat, solution.scene.M[known])
+    scene = adjustment.Scene(solution.scene.P, solution.scene.H_hat, solution.scene.M[known], lens)
     found = least_squares(problem, scene, solution.agreement.sigma_px, np.inf)
     if found is None:
         raise WorkFailed(OPEN)
@@ -140,7 +141,7 @@ def _predicted(
         adjustment.gauge(found.scene, problem.readings, problem.place),
     )
     place = held_out[whole.pose_of] & known[whole.marker_of]
-    test = prepare(restrict(of_poses(whole, held_out), known), problem.q_reference)
+    test = prepare(restrict(of_poses(whole, held_out), known), problem.q_reference, lens is not None)
     pixels, J = adjustment.derivative(found.scene, test.readings, test.q)
     spread = test.dense(J, np.ones(test.readings.seen.shape)) @ factor
     variance = (spread**2).sum(axis=1).reshape(pixels.shape)

@@ -12,7 +12,8 @@ from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, homogeneous, s
 from projservo_cli.calibration.optimization import Problem
 from projservo_cli.calibration.prediction import image_points
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.records import BoolArray, FloatArray, IntArray, Model
+from projservo_cli.geometry.lens import through
+from projservo_cli.records import NO_LENS, BoolArray, FloatArray, IntArray, Model
 
 RAYLEIGH = 1.1774100225154747
 # A pose is explained by a corrected joint reading when its median residual falls below so many σ.
@@ -78,9 +79,10 @@ def _swaps(problem: Problem, scene: Scene, out: BoolArray, limit: float) -> tupl
     """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N)."""
     readings = problem.readings
     types = readings.prismatic.astype(np.int64)
+    lens = NO_LENS if scene.lens is None else scene.lens
     model = Model(scene.P, scene.H_hat, types, np.zeros(len(types)), np.array([0.0, 0.0, 0.0, 1.0]))
     m = image_points(model, scene.M, problem.q)
-    predicted = m[..., :2] / m[..., 2:]
+    predicted = through(lens[:, None], m[..., :2] / m[..., 2:])
     rows = np.flatnonzero(out.any(axis=0))
     distance = np.linalg.norm(
         predicted[readings.pose_of[rows]] - readings.pixels[:, rows].transpose(1, 0, 2)[:, :, None], axis=3

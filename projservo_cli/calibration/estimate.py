@@ -8,7 +8,15 @@ from functools import partial
 import numpy as np
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
-from projservo_cli.calibration import adjustment, closed_form, culprits, excitation, linear, quality
+from projservo_cli.calibration import (
+    adjustment,
+    closed_form,
+    culprits,
+    distortion,
+    excitation,
+    linear,
+    quality,
+)
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.assembly import assemble
 from projservo_cli.calibration.epipolar import Epipolar
@@ -25,7 +33,7 @@ from projservo_cli.calibration.nominal import Nominal, solve_from
 from projservo_cli.calibration.optimization import Problem, prepare
 from projservo_cli.calibration.quality import Agreement, Expected
 from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
-from projservo_cli.calibration.reconstruction import image_frame
+from projservo_cli.calibration.reconstruction import Frame, image_frame
 from projservo_cli.calibration.refined import Solution, solve
 from projservo_cli.calibration.shown import require_images
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
@@ -44,6 +52,7 @@ def calibrate(
     source: str = "simulated",
     image_size: tuple[int, int] | None = None,
     seed: int = 0,
+    lens: bool = False,
     init: Nominal | None = None,
     fitted: Fitted | None = None,
 ) -> Calibration:
@@ -58,6 +67,7 @@ def calibrate(
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : of the random starts.
+    lens : whether to estimate two coefficients of radial distortion a camera, about the image centre.
     init : robot and rig to try first as a start of ``refined``; the search follows where that misses.
     fitted : told the solution of ``refined`` and its noise, px, for what needs more than the record.
 
@@ -78,16 +88,23 @@ def calibrate(
         raise InputError(f"image size {image_size!r}: give a positive width and height, px")
     if seed < 0:
         raise InputError(f"seed {seed!r}: give a whole number that is not negative")
+    if lens and method != "refined":
+        raise InputError(
+            f"calibration method {method!r} estimates no lens: choose refined, or calibrate without"
+        )
     begin = time.perf_counter()
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
         readings = gather(observation, joint_types)
         excitation.require_motion(readings)
+        if lens and image_size is not None:
+            distortion.require_size(readings, image_size)
         require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
         both = readings.both
         epipolar = epipolar_geometry(readings.pixels[0][both], readings.pixels[1][both], rng)
-        expected = quality.expected_noise(epipolar.sigma_px, sigma_px, source)
+        expect = partial(quality.expected_noise, sigma_px=sigma_px, source=source)
+        expected = expect(epipolar.sigma_px)
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "refined":
             frame = image_frame(readings, image_size)
@@ -98,7 +115,11 @@ def calibrate(
                 if init is None
                 else solve_from(init, readings, q_reference, epipolar, expected, search)
             )
-            result = _refined(readings, epipolar, solution, expected)
+            if lens:
+                solution = distortion.with_lens(solution, frame, epipolar)
+                epipolar = distortion.straight_epipolar(solution, rng)
+                expected = expect(epipolar.sigma_px)
+            result = _refined(readings, epipolar, solution, expected, frame)
             result = dataclasses.replace(result, advice=(*result.advice, *([note] if note else [])))
         elif method == "linear":
             result = _linear(readings, epipolar, expected)
@@ -110,18 +131,25 @@ def calibrate(
     return dataclasses.replace(result, source=source, seconds=seconds)
 
 
-def _refined(readings: Readings, epipolar: Epipolar, solution: Solution, expected: Expected) -> Calibration:
+def _refined(
+    readings: Readings, epipolar: Epipolar, solution: Solution, expected: Expected, frame: Frame
+) -> Calibration:
     """Record of the maximum likelihood in its projective frame, with its covariance."""
+    share = distortion.share_explained(solution, frame) if solution.scene.lens is None else 0.0
     refusal = expected.refusal(solution.agreement)
     if refusal is not None:
-        raise WorkFailed(refusal)
+        raise WorkFailed(refusal + distortion.hint(share))
     problem, scene, agreement = solution.problem, solution.scene, solution.agreement
     found = culprits.find(problem, scene, agreement.used, agreement.sigma_px)
-    quality.require_explained(
-        *culprits.unexplained(readings, agreement.used, found.explained, epipolar),
-        len(np.unique(found.suspect[:, 0])),
-        len(readings.q),
-    )
+    straight = distortion.straight_readings(readings, scene.lens)
+    try:
+        quality.require_explained(
+            *culprits.unexplained(straight, agreement.used, found.explained, epipolar),
+            len(np.unique(found.suspect[:, 0])),
+            len(readings.q),
+        )
+    except WorkFailed as refused:
+        raise WorkFailed(f"{refused}{distortion.hint(share)}") from None
     result = _projective(problem, scene)
     _, J = adjustment.derivative(scene, readings, problem.q)
     used = agreement.used.astype(np.float64)
@@ -130,14 +158,19 @@ def _refined(readings: Readings, epipolar: Epipolar, solution: Solution, expecte
     gauge = output_gauge(result)
     factor -= gauge @ (gauge.T @ factor)
     quality.require_off_line(result.M, agreement.sigma_px * marker_factor(result, factor))
-    return assemble("refined", result, readings, problem.q_reference, agreement, expected, factor, found)
+    suspicion = "lens" if share else "joint readings"
+    record = assemble(
+        "refined", result, readings, problem.q_reference, agreement, expected, factor, found, suspicion
+    )
+    advice = (*record.advice, *distortion.advice(record, share, frame.known))
+    return dataclasses.replace(record, advice=advice)
 
 
 def _projective(problem: Problem, scene: Scene) -> ProjectiveScene:
     """The scene in the isotropic projective frame of the points seen."""
     E = adjustment.displacements(scene.H_hat, problem.readings.prismatic, problem.q)
     moved = adjustment.moved_points(E, scene.M, problem.readings)[0]
-    return isotropic(scene.P, scene.H_hat, scene.M, A_INF, moved)
+    return dataclasses.replace(isotropic(scene.P, scene.H_hat, scene.M, A_INF, moved), lens=scene.lens)
 
 
 def _linear(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:

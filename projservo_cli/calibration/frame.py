@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from projservo_cli.calibration import adjustment
-from projservo_cli.calibration.adjustment import CAMERA, Layout, Scene
+from projservo_cli.calibration.adjustment import CAMERA, LENS, Layout, Scene
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.records import FloatArray
 
@@ -24,6 +24,7 @@ class ProjectiveScene:
     a_inf : (4,) plane at infinity.
     W : (4, 4) frame change that led here.
     camera_scale : (2,) factors the cameras took.
+    lens : (2, 5) lenses, which no change of frame touches; None where none was sought.
     """
 
     P: FloatArray
@@ -32,6 +33,7 @@ class ProjectiveScene:
     a_inf: FloatArray
     W: FloatArray
     camera_scale: FloatArray
+    lens: FloatArray | None = None
 
 
 def isotropic(
@@ -76,7 +78,7 @@ def isotropic(
 
 
 def output_derivative(scene: Scene, readings: Readings, place: Layout, result: ProjectiveScene) -> FloatArray:
-    """Derivative of P, H_hat_0, M (ravelled, in this order) by the parameters of the adjustment.
+    """Derivative of P, H_hat_0, M and the lenses (ravelled, in this order) by the adjusted parameters.
 
     The frame and the camera scales are held: they are part of the gauge.
 
@@ -89,11 +91,13 @@ def output_derivative(scene: Scene, readings: Readings, place: Layout, result: P
 
     Returns
     -------
-    (24 + 16 n + 4 m, size) derivative.
+    (24 + 16 n + 4 m, size) derivative, of four rows more where the lenses are adjusted.
     """
     n, m = scene.H_hat.shape[0], scene.M.shape[0]
     back = np.linalg.inv(result.W)
-    J = np.zeros((2 * CAMERA + 16 * n + 4 * m, place.size))
+    size = 2 * CAMERA + 16 * n + 4 * m
+    J = np.zeros((size + place.size - place.lens, place.size))
+    J[size:, place.lens :] = np.eye(place.size - place.lens)
     for v in (0, 1):
         rows = slice(v * CAMERA, (v + 1) * CAMERA)
         J[rows, rows] = result.camera_scale[v] * np.kron(np.eye(3), back.T)
@@ -109,7 +113,11 @@ def output_derivative(scene: Scene, readings: Readings, place: Layout, result: P
 
 
 def output_gauge(result: ProjectiveScene) -> FloatArray:
-    """Orthonormal directions of P, H_hat_0, M that change no image: 16 of the frame, 2 of the cameras."""
+    """Orthonormal directions of P, H_hat_0, M that change no image: 16 of the frame, 2 of the cameras.
+
+    Lenses have no part in them: their rows, where they are adjusted, are zero.
+    """
+    lenses = np.zeros(0 if result.lens is None else 2 * LENS)
     directions = []
     for k in range(16):
         Z = np.zeros((4, 4))
@@ -120,6 +128,7 @@ def output_gauge(result: ProjectiveScene) -> FloatArray:
                     -(result.P @ Z).ravel(),
                     (Z @ result.H_hat_0 - result.H_hat_0 @ Z).ravel(),
                     (result.M @ Z.T).ravel(),
+                    lenses,
                 ]
             )
         )
@@ -144,7 +153,7 @@ def marker_factor(result: ProjectiveScene, factor: FloatArray) -> FloatArray:
     scales = np.zeros((first + 4 * m, m))
     for j in range(m):
         scales[first + 4 * j : first + 4 * (j + 1), j] = result.M[j]
-    free = np.linalg.qr(np.hstack([output_gauge(result), scales]))[0]
+    free = np.linalg.qr(np.hstack([output_gauge(result)[: first + 4 * m], scales]))[0]
     factor = factor[: first + 4 * m]
     return (factor - free @ (free.T @ factor))[first:]
 

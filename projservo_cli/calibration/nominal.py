@@ -8,13 +8,13 @@ import numpy as np
 from projservo_cli.calibration.adjustment import Scene, predict_pixels
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.optimization import prepare
-from projservo_cli.calibration.quality import LEAST_SIGMA, Expected
+from projservo_cli.calibration.quality import Expected
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.calibration.refined import (
-    HOPELESS,
     RAYLEIGH,
     SAME_LEVEL,
     Solution,
+    hopeless_px,
     least_squares,
     robust_search,
     typical,
@@ -141,6 +141,4 @@ def _from(scene: Scene, readings: Readings, q_reference: FloatArray, epipolar: E
         return None
     found = robust_search(problem, scene, np.ones(len(readings.q), dtype=np.bool_))
     level = float(np.median(np.linalg.norm(found.residual[readings.seen], axis=1)))
-    return least_squares(
-        problem, found.scene, level / RAYLEIGH, HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA)
-    )
+    return least_squares(problem, found.scene, level / RAYLEIGH, hopeless_px(epipolar))

@@ -99,9 +99,9 @@ class Problem:
         return result.reshape(-1, self.place.size)
 
 
-def prepare(readings: Readings, q_reference: FloatArray) -> Problem:
+def prepare(readings: Readings, q_reference: FloatArray, lens: bool = False) -> Problem:
     """Problem of explaining the readings about the reference joints (n,), rad or m."""
-    return Problem(readings, readings.q - q_reference, q_reference, adjustment.layout(readings))
+    return Problem(readings, readings.q - q_reference, q_reference, adjustment.layout(readings, lens))
 
 
 def fixed(weight: FloatArray) -> Weighting:
@@ -134,7 +134,7 @@ def minimize(
         steps += 1
         if fresh:
             _, J = adjustment.derivative(scene, readings, problem.q)
-            A, g, scale, G = _scaled_normal(problem, scene, J, weight, residual, free, scale)
+            A, g, scale, G = scaled_normal(problem, scene, J, weight, residual, free, scale)
             cost = float((weight[..., None] * residual**2).sum())
         x = _step(problem, scene, J, weight, residual, (A, g, scale, G), damping, free)
         candidate = adjustment.retract(scene, readings, place, x) if x is not None else scene
@@ -153,7 +153,7 @@ def minimize(
     return Fit(scene, residual, weight, cost, steps, settled)
 
 
-def _scaled_normal(
+def scaled_normal(
     problem: Problem,
     scene: Scene,
     J: FloatArray,

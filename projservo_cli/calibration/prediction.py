@@ -4,12 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration.adjustment import CAMERA, displacements
+from projservo_cli.calibration.adjustment import CAMERA, LENS, displacements
+from projservo_cli.geometry.lens import FIRST, bent_derivative, through
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, InputError, Model, Observation
 
 
 def image_points(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
-    """Homogeneous image points (K, 2, m, 3) of markers at joint readings, [RH00] eqs. (1), (6).
+    """Homogeneous image points (K, 2, m, 3) of markers at joint readings, [RH00] eqs. (1), (6), no lens.
 
     Parameters
     ----------
@@ -55,21 +56,23 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
     Returns
     -------
     (K, 2, m, 2) pixels, markers in the order of ``calibration.marker``; NaN for a point that does
-    not lie in front of the camera.
+    not lie in front of the camera, or beyond where its lens distortion turns back.
 
     Raises
     ------
     InputError
         If the readings have another number of joints or are not finite.
     """
-    return _pixels(image_points(calibration.model(), calibration.M, q))
+    return marker_pixels(calibration.model(), calibration.M, q)
 
 
-def _pixels(m: FloatArray) -> FloatArray:
-    """Pixels (..., 2) of image points (..., 3), NaN where the depth is not positive."""
-    depth = np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
-    result: FloatArray = m[..., :2] / depth
-    return result
+def marker_pixels(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
+    """Pixels (K, 2, m, 2) of markers at joint readings; NaN as of ``predict``.
+
+    Parameters are those of ``image_points``.
+    """
+    m = image_points(model, M, q)
+    return through(model.lens[:, None], m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan))
 
 
 def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:
@@ -138,6 +141,8 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
 def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
     """Derivative of predicted pixels by P, H_hat_0, M (ravelled): (K, 2, m, 2, 24 + 16 n + 4 m).
 
+    With a lens, by k1 and k2 of both views in four more columns.
+
     An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ).
 
     Parameters
@@ -158,7 +163,14 @@ def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatAr
     G = np.zeros((K, 2, m, 2, 3))
     G[..., 0, 0] = G[..., 1, 1] = 1.0 / image[..., 2]
     G[..., 2] = -image[..., :2] / image[..., 2:] ** 2
-    J = np.zeros((K, 2, m, 2, 2 * CAMERA + 16 * n + 4 * m))
+    lenses = model.lens[:, FIRST:].any()
+    size = 2 * CAMERA + 16 * n + 4 * m
+    J = np.zeros((K, 2, m, 2, size + (2 * LENS if lenses else 0)))
+    if lenses:
+        by_pixel, by_lens = bent_derivative(model.lens[:, None], image[..., :2] / image[..., 2:])
+        G = by_pixel @ G
+        for v in (0, 1):
+            J[:, v, ..., size + v * LENS : size + (v + 1) * LENS] = by_lens[:, v]
     for v in (0, 1):
         camera = G[:, v, :, :, :, None] * Y[0][:, :, None, None, :]
         J[:, v, ..., v * CAMERA : (v + 1) * CAMERA] = camera.reshape(K, m, 2, CAMERA)

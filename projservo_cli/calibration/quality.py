@@ -187,6 +187,7 @@ def verdict(
     span: FloatArray,
     prismatic: BoolArray,
     left_out: tuple[int, int, int],
+    suspicion: str,
 ) -> tuple[str, tuple[str, ...]]:
     """Why a calibration is usable, what limits it, and what to do next, in words.
 
@@ -195,21 +196,21 @@ def verdict(
     agreement, expected : what the fit leaves, and what it should.
     noise, span, prismatic : (n,) as in ``require_determined``.
     left_out : number of outliers, of suspect joint readings and of exchanged markers.
+    suspicion : what may be to blame for more than pixel noise.
     """
     sigma, ratio = agreement.sigma_px, expected.ratio(agreement)
     advice = [
         describe_joint(int(i), float(span[i]), bool(prismatic[i])) for i in np.flatnonzero(noise > WEAK_NOISE)
     ]
-    limit = "amplitude" if advice else "noise"
+    limit = "lens" if suspicion == "lens" else "amplitude" if advice else "noise"
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
     reason = f"residuals of {sigma:.3g} px a coordinate agree with {wanted}"
     if ratio > WARN_RATIO:
-        limit = "lens or joint readings"
-        reason = (
-            f"more than pixel noise is left: residuals of {sigma:.3g} px a coordinate are {ratio:.3g} times "
-            + wanted
-        )
-        advice.append("look for lens distortion and for joint readings that lag behind the images")
+        limit = suspicion
+        left = f"residuals of {sigma:.3g} px a coordinate are {ratio:.3g} times {wanted}"
+        reason = f"more than pixel noise is left: {left}"
+        if "joint readings" in suspicion:
+            advice.append("look for joint readings that lag behind the images")
     outliers, suspects, swaps = left_out
     if outliers:
         advice.append(f"{outliers} sightings were left out as outliers: check the detection of markers")

@@ -39,10 +39,11 @@ class Guess:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Guessed principal points (2, 2) and sizes (2,) of both images, px."""
+    """Guessed principal points (2, 2) and sizes (2,) of both images, px; whether the images are known."""
 
     center: FloatArray
     size: FloatArray
+    known: bool
 
 
 def image_frame(readings: Readings, image_size: tuple[int, int] | None) -> Frame:
@@ -55,13 +56,13 @@ def image_frame(readings: Readings, image_size: tuple[int, int] | None) -> Frame
     """
     if image_size is not None:
         center = np.tile(0.5 * np.asarray(image_size, dtype=np.float64), (2, 1))
-        return Frame(center, np.full(2, float(max(image_size))))
+        return Frame(center, np.full(2, float(max(image_size))), True)
     # The outermost percent is left out: it may be outliers.
     low, high = zip(
         *(np.percentile(readings.pixels[v][readings.seen[v]], [1, 99], axis=0) for v in (0, 1)), strict=True
     )
     size = np.array([float(np.max(h - l)) or 1.0 for l, h in zip(low, high, strict=True)])
-    return Frame(0.5 * (np.array(low) + np.array(high)), size)
+    return Frame(0.5 * (np.array(low) + np.array(high)), size, False)
 
 
 def intrinsics(frame: Frame, focal: float) -> FloatArray:

@@ -70,7 +70,7 @@ def solve(
         If no start leads anywhere.
     """
     problem = prepare(readings, q_reference)
-    hopeless = HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA)
+    hopeless = hopeless_px(epipolar)
     best: Solution | None = None
     trusted = np.ones(len(readings.q), dtype=bool)
     levels: list[float] = []
@@ -78,7 +78,7 @@ def solve(
         usable = of_poses(readings, trusted)
         for scene in islice(starts(problem, usable, epipolar, frame, rng, factors), SEARCHES):
             searched = robust_search(problem, scene, trusted)
-            level = float(np.median(_distances(searched.residual, usable_rows(problem, trusted))))
+            level = float(np.median(distances(searched.residual, usable_rows(problem, trusted))))
             # Different starts that end at one place need not be followed to the end twice.
             if any(abs(level - other) < SAME_LEVEL * other for other in levels):
                 # Twice the same place and no gross misfit: more starts would not better it.
@@ -110,13 +110,18 @@ def solve(
     return best
 
 
+def hopeless_px(epipolar: Epipolar) -> float:
+    """Noise beyond which least squares is not worth its time, px."""
+    return HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA)
+
+
 def usable_rows(problem: Problem, trusted: BoolArray) -> BoolArray:
     """Readings (2, N) seen at trusted poses (K,)."""
     result: BoolArray = problem.readings.seen & trusted[problem.readings.pose_of]
     return result
 
 
-def _distances(residual: FloatArray, mask: BoolArray) -> FloatArray:
+def distances(residual: FloatArray, mask: BoolArray) -> FloatArray:
     """Lengths of the residuals (2, N, 2) in a mask (2, N), px."""
     result: FloatArray = np.linalg.norm(residual[mask], axis=1)
     return result
@@ -136,7 +141,7 @@ def _explained(solution: Solution) -> BoolArray:
 
 def typical(solution: Solution) -> float:
     """Median residual over all readings seen, outliers included, px."""
-    return float(np.median(_distances(solution.agreement.residual, solution.problem.readings.seen)))
+    return float(np.median(distances(solution.agreement.residual, solution.problem.readings.seen)))
 
 
 def starts(

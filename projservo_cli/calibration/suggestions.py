@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import image_points, prediction_derivative
+from projservo_cli.calibration.prediction import marker_pixels, prediction_derivative
 from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation, WorkFailed
 
 # Poses drawn to choose from, and to judge by; draws before giving up, in batches.
@@ -132,7 +132,7 @@ def _seen(
     rows: list[FloatArray] = []
     for _ in range(BATCHES):
         q = rng.uniform(region.low, region.high, (BATCH, len(region.low)))
-        seen = _inside(image_points(model, M, q), region.image)
+        seen = _inside(marker_pixels(model, M, q), region.image)
         enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= LEAST_SEEN)[: count - len(poses)]
         if enough.size:
             J = prediction_derivative(model, M, q[enough]) @ factor
@@ -152,9 +152,8 @@ def _seen(
     return np.array(poses), np.array(rows)
 
 
-def _inside(m: FloatArray, image: FloatArray) -> BoolArray:
-    """Which image points (K, 2, m, 3) lie in front of the camera and within the image."""
-    pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+def _inside(pixels: FloatArray, image: FloatArray) -> BoolArray:
+    """Which pixels (K, 2, m, 2) lie within the image; none that is NaN, behind the camera, does."""
     inside = (pixels >= image[:, None, 0]) & (pixels <= image[:, None, 1])
     result: BoolArray = np.asarray(inside.all(axis=-1))
     return result

@@ -21,7 +21,7 @@ def _variants(output: str = "TABLE", /, **helps: str) -> dict[str, click.Option]
 
 _EVERYWHERE = ("json", "quiet", "verbose", "help")
 _OF_STAGES = (
-    *("config", "sets", "output", "data", "joints", "joint_unit", "noise_px"),
+    *("config", "sets", "output", "data", "joints", "joint_unit", "noise_px", "lens", "image_size"),
     *("force", "dry_run", "threads"),
 )
 

@@ -74,4 +74,17 @@ def given_overrides(options: dict[str, Any]) -> list[Override]:
     if options["init"] is not None:
         path = os.path.abspath(options["init"])
         found.append(Override(f"--init {options['init']}", ("calibration", "init"), path))
+    if options["lens"]:
+        found.append(Override("--lens", ("calibration", "lens"), True))
+    if options["image_size"] is not None:
+        found.append(_image_size(options["image_size"]))
     return [*found, *map(Override.parse, options["sets"])]
+
+
+def _image_size(text: str) -> Override:
+    """``--image-size 1280x1024``."""
+    flag = f"--image-size {text}"
+    sides = text.lower().split("x")
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
+        raise InputError(f"{flag}: expected width and height in px, such as 1280x1024")
+    return Override(flag, ("data", "image_size_px"), [int(side) for side in sides])

@@ -8,6 +8,7 @@ from typing import Any
 from projservo_cli.cli.options import wrapped
 from projservo_cli.cli.suggested import suggested_words
 from projservo_cli.config import Config
+from projservo_cli.records import Calibration
 from projservo_cli.store import Run
 
 LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
@@ -32,7 +33,13 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
     result: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
     if stage == "calibrate":
         lists: dict[str, list[Any]] = {name: [] for name in ("advice", "joints", *LISTS)}
-        return result | {"usable": False} | dict.fromkeys(NUMBERS) | dict.fromkeys(COUNTS, 0) | lists
+        return (
+            result
+            | {"usable": False, "lens": None}
+            | dict.fromkeys(NUMBERS)
+            | dict.fromkeys(COUNTS, 0)
+            | lists
+        )
     if stage == "plan":
         return result | {"feasible": False}
     if stage == "servo":
@@ -61,7 +68,22 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
         for i, letter in enumerate(calibration.joint_types)
     ]
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    return _scalars(calibration) | {"joints": joints} | findings(calibration) | held_out
+    return (
+        _scalars(calibration)
+        | {"joints": joints, "lens": _lens(calibration)}
+        | findings(calibration)
+        | held_out
+    )
+
+
+def _lens(calibration: Calibration) -> dict[str, Any] | None:
+    """Radial distortion of both views, None where it was not estimated."""
+    if calibration.lens is None:
+        return None
+    return {
+        view: {"center_px": terms[:2], "radius_px": terms[2], "k1": terms[3], "k2": terms[4]}
+        for view, terms in zip(("left", "right"), calibration.lens.tolist(), strict=True)
+    }
 
 
 def _plan(run: Run) -> dict[str, Any]:
@@ -92,6 +114,7 @@ def _calibrate_words(value: dict[str, Any]) -> list[str]:
         wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}"),
         f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s",
+        *(_lens_words(value["lens"]) if value["lens"] else []),
         wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
         *_held_out_words(value.get("cross_validation")),
         *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),
@@ -108,6 +131,15 @@ def _held_out_words(value: dict[str, Any] | None) -> list[str]:
         f"  held out, {value['folds']} parts of {value['unit']}: rms {rms} px (predicted {predicted}), "
         f"median {median}, p95 {p95}",
         wrapped(value["reason"], "  "),
+    ]
+
+
+def _lens_words(lens: dict[str, Any]) -> list[str]:
+    """Distortion at the radius of each view, half the image size."""
+    return [
+        f"  lens {view}: k1 {terms['k1']:.3g}, k2 {terms['k2']:.3g} at {terms['radius_px']:.4g} px from "
+        f"({terms['center_px'][0]:.4g}, {terms['center_px'][1]:.4g})"
+        for view, terms in lens.items()
     ]
 
 

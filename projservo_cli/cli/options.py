@@ -73,6 +73,16 @@ OPTIONS: dict[str, click.Option] = {
             help="On calibrate: suggest N further poses to record, the most telling first; 5 without N.",
         ),
         click.Option(
+            ["--lens"],
+            is_flag=True,
+            help="Estimate radial lens distortion, two coefficients a camera. Default: none.",
+        ),
+        click.Option(
+            ["--image-size"],
+            metavar="WxH",
+            help="Size of the table's images, px. Default: that of rig, else from where markers were seen.",
+        ),
+        click.Option(
             ["--motions"],
             metavar="CSV",
             type=click.Path(),

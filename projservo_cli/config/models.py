@@ -38,6 +38,7 @@ class CalibrationSettings(Section):
     reference: JointVector | None = None
     cross_validate: Annotated[int, Strict(), Field(ge=2, le=10_000)] | None = None
     init: Annotated[str, StringConstraints(min_length=1)] | None = None
+    lens: Annotated[bool, Strict()] = False
 
 
 class Data(Section):
@@ -47,6 +48,7 @@ class Data(Section):
     joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = None
     joint_unit: Literal["deg", "rad"] | None = None  # None: rad, unless readings look like degrees
     noise_px: Positive | None = None
+    image_size_px: tuple[Count, Count] | None = None
 
 
 class Perturbation(Section):

@@ -115,12 +115,20 @@ def run(
         method=settings.method,
         sigma_px=sigma_px,
         source="recorded" if config.recorded else "simulated",
-        image_size=config.rig.image_size_px if config.rig is not None else None,
+        image_size=image_size_of(config),
         seed=config.seed,
+        lens=settings.lens,
         init=init,
         fitted=hold_out if settings.cross_validate is not None else None,
     )
     return observation, calibration, held_out[0] if held_out else None
+
+
+def image_size_of(config: "Config") -> tuple[int, int] | None:
+    """Width and height of the images, px, if they are known."""
+    if config.data is not None and config.data.image_size_px is not None:
+        return config.data.image_size_px
+    return config.rig.image_size_px if config.rig is not None else None
 
 
 def _observed(config: "Config") -> tuple[Observation, str, float | None]:

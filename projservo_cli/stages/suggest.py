@@ -10,6 +10,7 @@ import numpy as np
 from projservo_cli.calibration.suggestions import Region, Suggestion, suggest
 from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, FloatArray, Observation
+from projservo_cli.stages.calibrate import image_size_of
 from projservo_cli.stages.truth import SUGGESTIONS, generator, robot_of
 
 if TYPE_CHECKING:
@@ -48,10 +49,10 @@ def run(
 
 
 def _image(config: "Config", observation: Observation) -> FloatArray:
-    """Corners (2, 2, 2) of both images, px; without a configured rig, of where markers were seen."""
-    if config.rig is not None:
-        size = np.array(config.rig.image_size_px, dtype=np.float64)
-        return np.array([[[-0.5, -0.5], size - 0.5]] * 2)
+    """Corners (2, 2, 2) of both images, px; where their size is not known, of where markers were seen."""
+    size = image_size_of(config)
+    if size is not None:
+        return np.array([[[-0.5, -0.5], np.array(size) - 0.5]] * 2)
     pixels = observation.images
     return np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)
 

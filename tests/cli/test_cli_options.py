@@ -103,6 +103,8 @@ USAGE = {
     "validate without data": (["validate", "out"], "--data TABLE"),
     "threads": (["servo", "-j", "0"], "-j"),
     "unit": (["calibrate", "--data", "t.csv", "--joint-unit", "grad"], "--joint-unit"),
+    "image size without height": (["calibrate", "--data", "t.csv", "--image-size", "1280"], "1280x1024"),
+    "lens of show": (["show", "--lens"], "--lens: not used by show"),
     "record without table": (["record", "-c", "tiny.yaml"], "--output TABLE"),
     "unit of no motions": (["record", "-o", "u.csv", "--joint-unit", "deg"], "--motions"),
     "motions of calibrate": (["calibrate", "--motions", "m.csv"], "--motions: not used by calibrate"),

@@ -1,0 +1,170 @@
+"""Radial lens distortion: between the pixels of a camera and those of its projective model.
+
+Source: D. C. Brown, "Close-range camera calibration", Photogrammetric Engineering 37(8), 1971, the
+first two radial terms. A view's lens is (5,): image centre u, v and a radius, px, then k1 and k2 in
+units of that radius; both zero means none. [RH00] knows projective cameras alone: theirs are the
+*straight* pixels, and what a camera reports is *bent*.
+"""
+
+import math
+from typing import TypeVar
+
+import numpy as np
+
+from projservo_cli.geometry.jit import njit
+from projservo_cli.records import BoolArray, FloatArray
+
+FIRST = 3
+"""Where k1 stands in a lens; k2 follows."""
+
+MOST_STEPS = 50
+# A Newton step of this share of the radius is the last: the next would be its square, below round-off.
+SETTLED = 1e-9
+
+Number = TypeVar("Number", float, FloatArray)
+
+
+def swelling(k1: Number, k2: Number, square: Number) -> Number:
+    """Factor 1 + k1 ρ² + k2 ρ⁴ of a radius, from its square."""
+    return 1.0 + square * (k1 + square * k2)
+
+
+def swelling_rate(k1: Number, k2: Number, square: Number) -> Number:
+    """Derivative k1 + 2 k2 ρ² of the factor by the square of the radius."""
+    return k1 + 2.0 * (square * k2)
+
+
+def turning(k1: float, k2: float) -> float:
+    """Square of the radius at which the bent radius ρ (1 + k1 ρ² + k2 ρ⁴) turns back, infinite for never."""
+    inner = 9.0 * (k1 * k1) - 20.0 * k2
+    if not inner >= 0.0:
+        return math.inf
+    root = math.sqrt(inner) - 3.0 * k1
+    return 2.0 / root if root > 0.0 else math.inf
+
+
+# The same three for the kernels, which call nothing that is not compiled.
+_swelling, _swelling_rate, _turning = njit(swelling), njit(swelling_rate), njit(turning)
+
+
+@njit
+def _from_center(lens: FloatArray, factor: float, u: float, v: float) -> tuple[float, float]:
+    """Pixel whose distance from the image centre is so many times that of another."""
+    u0, v0 = float(lens[0]), float(lens[1])
+    return u0 + factor * (u - u0), v0 + factor * (v - v0)
+
+
+@njit
+def _straight_radius(k1: float, k2: float, radius: float) -> float:
+    """Radius that bends to another, before the turn: Newton within a bracket; NaN where there is none."""
+    low = 0.0
+    limit = _turning(k1, k2)
+    if limit < math.inf:
+        high = math.sqrt(limit)
+        if not radius < high * _swelling(k1, k2, limit):
+            return math.nan
+    else:
+        high = radius
+        while high * _swelling(k1, k2, high * high) < radius:
+            high *= 2.0
+    rho = min(radius, high)
+    for _ in range(MOST_STEPS):
+        square = rho * rho
+        factor = _swelling(k1, k2, square)
+        slope = factor + 2.0 * (square * _swelling_rate(k1, k2, square))
+        excess = rho * factor - radius
+        if excess > 0.0:
+            high = rho
+        else:
+            low = rho
+        step = -excess / slope if slope > 0.0 else math.inf
+        if abs(step) <= SETTLED * radius:
+            return rho + step
+        rho = rho + step if low < rho + step < high else 0.5 * (low + high)
+    return math.nan
+
+
+@njit
+def straighten(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Straight pixel of a bent one; NaN where none before the turning point is bent there."""
+    k1, k2 = float(lens[3]), float(lens[4])
+    if k1 == 0.0 and k2 == 0.0:
+        return u, v
+    x = (u - float(lens[0])) / float(lens[2])
+    y = (v - float(lens[1])) / float(lens[2])
+    radius = math.sqrt(x * x + y * y)
+    if radius == 0.0:
+        return u, v
+    if not radius < math.inf:
+        return math.nan, math.nan
+    return _from_center(lens, _straight_radius(k1, k2, radius) / radius, u, v)
+
+
+@njit
+def bend(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
+    """Bent pixel of a straight one; NaN beyond the turning point."""
+    k1, k2 = float(lens[3]), float(lens[4])
+    if k1 == 0.0 and k2 == 0.0:
+        return u, v
+    x = (u - float(lens[0])) / float(lens[2])
+    y = (v - float(lens[1])) / float(lens[2])
+    square = x * x + y * y
+    if not square < _turning(k1, k2):
+        return math.nan, math.nan
+    return _from_center(lens, _swelling(k1, k2, square), u, v)
+
+
+def _offsets(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (..., 2) from the centre in units of the radius, and the squares of their length (...)."""
+    x = (pixels - lens[..., :2]) / lens[..., 2:3]
+    return x, np.asarray((x**2).sum(axis=-1))
+
+
+def bent(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Bent pixels of straight ones, all at once: the twin of ``bend``, which does not stop at the turn.
+
+    Parameters
+    ----------
+    lens : (..., 5) lenses.
+    pixels : (..., 2) px; leading dimensions are broadcast.
+    """
+    _, square = _offsets(lens, pixels)
+    factor = swelling(lens[..., 3], lens[..., 4], square)[..., None]
+    result: FloatArray = lens[..., :2] + factor * (pixels - lens[..., :2])
+    return result
+
+
+def straightened(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Straight pixels (N, 2) of bent ones in one view, NaN as of ``straighten``."""
+    return np.array([straighten(lens, u, v) for u, v in pixels]).reshape(-1, 2)
+
+
+def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:
+    """Which straight pixels (..., 2) lie on this side of the turning point of a lens (..., 5)."""
+    _, square = _offsets(lens, pixels)
+    limit = np.vectorize(turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
+    return np.asarray(square < limit)
+
+
+def through(lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """What cameras report of straight pixels: bent, NaN beyond the turning point; the same without a lens.
+
+    Parameters are those of ``bent``.
+    """
+    if not lens[..., FIRST:].any():
+        return pixels
+    return np.where(within(lens, pixels)[..., None], bent(lens, pixels), np.nan)
+
+
+def bent_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of bent pixels by straight ones (..., 2, 2), and by k1 and k2 (..., 2, 2).
+
+    Parameters are those of ``bent``.
+    """
+    x, square = _offsets(lens, pixels)
+    k1, k2 = lens[..., 3], lens[..., 4]
+    rate = 2.0 * swelling_rate(k1, k2, square)
+    by_pixel = rate[..., None, None] * (x[..., :, None] * x[..., None, :])
+    by_pixel = by_pixel + swelling(k1, k2, square)[..., None, None] * np.eye(2)
+    powers = np.stack([square, square**2], axis=-1)
+    return by_pixel, (lens[..., 2:3] * x)[..., :, None] * powers[..., None, :]

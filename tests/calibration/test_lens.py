@@ -1,0 +1,184 @@
+"""Lens distortion estimated with all the rest: its derivative, its size, its uncertainty, its refusals."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import adjustment, calibrate, predict, prediction_variance
+from projservo_cli.calibration.adjustment import Scene
+from projservo_cli.calibration.optimization import prepare
+from projservo_cli.calibration.readings import gather
+from projservo_cli.records import InputError, WorkFailed
+from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot
+
+SIGMA = 0.5
+LENS = np.array([[640.0, 512.0, 640.0, -0.06, 0.01], [640.0, 512.0, 640.0, 0.03, -0.01]])
+
+
+def lensed(straight, lens):
+    """Pixels (..., 2, m, 2) through a radial lens in both views, written out anew."""
+    offset = straight - lens[:, None, :2]
+    square = (offset**2).sum(axis=-1, keepdims=True) / lens[:, None, 2:3] ** 2
+    return lens[:, None, :2] + offset * (1.0 + lens[:, None, 3:4] * square + lens[:, None, 4:] * square**2)
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return random_robot("RRPRRR", np.random.default_rng(30))
+
+
+@pytest.fixture(scope="module")
+def poses(robot):
+    """Poses whose markers reach over most of the images."""
+    rng = np.random.default_rng(3)
+    return around(robot, 70, rng, angle=0.8, length=0.3)
+
+
+def observed(robot, q, lens, seed=1):
+    observation = robot.observe(q, SIGMA, np.random.default_rng(seed))
+    noise = observation.images - robot.images(q)
+    images = lensed(robot.images(q), lens) + noise
+    inside = ((images >= 0.0) & (images <= np.array(IMAGE_SIZE))).all(axis=-1)
+    return dataclasses.replace(observation, images=np.where(inside[..., None], images, np.nan))
+
+
+@pytest.fixture(scope="module")
+def bent(robot, poses):
+    return observed(robot, poses, LENS)
+
+
+@pytest.fixture(scope="module")
+def fitted(robot, bent):
+    return calibrate(
+        bent, robot.joint_types, sigma_px=SIGMA, source="recorded", image_size=IMAGE_SIZE, lens=True
+    )
+
+
+def test_derivative_agrees_with_central_differences(robot):
+    readings = gather(
+        robot.observe(around(robot, 4, np.random.default_rng(1)), 0.0, np.random.default_rng(1)),
+        robot.joint_types,
+    )
+    problem = prepare(readings, robot.q_reference, lens=True)
+    scene = Scene(robot.cameras, robot.twists, robot.markers, LENS)
+    _, J = adjustment.derivative(scene, readings, problem.q)
+    dense = problem.dense(J, np.ones(J.shape[:2]))
+    scale = np.linalg.norm(dense, axis=0)
+    for k in range(problem.place.size):
+        # As without a lens: a step that moves the images by 1e-2 px; truncation and round-off < 1e-6.
+        step = 0.05 / scale[k] * np.eye(problem.place.size)[k]
+        ahead, behind = (
+            problem.residual(adjustment.retract(scene, readings, problem.place, s)) for s in (step, -step)
+        )
+        numeric = (ahead - behind).ravel() / (2.0 * step[k])
+        assert np.abs(numeric - dense[:, k]).max() < 1e-6 * scale[k]
+    gauge = adjustment.gauge(scene, readings, problem.place)
+    assert np.abs(dense @ gauge).max() < 1e-10 * np.abs(dense).max()
+    pixels, by_joint = adjustment.joint_derivative(scene, readings, problem.q)
+    for i in range(len(robot.joint_types)):
+        dq = 1e-5 * np.eye(len(robot.joint_types))[i]
+        ahead, behind = (adjustment.predict_pixels(scene, readings, problem.q + d)[0] for d in (dq, -dq))
+        assert np.abs((ahead - behind) / 2e-5 - by_joint[..., i]).max() < 1e-4
+    assert np.array_equal(pixels, adjustment.predict_pixels(scene, readings, problem.q)[0])
+
+
+def test_known_distortion_is_recovered_within_its_uncertainty(fitted):
+    off = (fitted.lens[:, 3:] - LENS[:, 3:]).ravel()
+    spread = fitted.covariance[-4:, -4:]
+    assert np.array_equal(fitted.lens[:, :3], LENS[:, :3])
+    # χ² of four degrees of freedom: beyond 18.5 once in a thousand draws.
+    assert off @ np.linalg.solve(spread, off) < 18.5
+    # … and the uncertainty is small beside what is found.
+    assert np.sqrt(np.diag(spread))[[0, 2]].max() < 0.005
+    # 2000 readings: χ² per degree of freedom to 3.5 %, four of that.
+    assert fitted.chi2_per_dof == pytest.approx(1.0, abs=0.14)
+    assert fitted.outlier.size == 0
+
+
+def test_predictions_are_as_good_as_their_variance_says(robot, fitted):
+    q = around(robot, 60, np.random.default_rng(8), angle=0.6, length=0.2)
+    true = lensed(robot.images(q), LENS)
+    inside = ((true >= 0.0) & (true <= np.array(IMAGE_SIZE))).all(axis=-1)
+    off = (predict(fitted, q) - true)[inside]
+    expected = prediction_variance(fitted, q)[inside]
+    # Errors of all predictions are made of some 90 parameters: their ratio spreads by about 1/√(2·30).
+    assert 0.6 < np.sqrt(np.mean(off**2) / np.mean(expected)) < 1.4
+    assert np.sqrt(np.mean(off**2)) < SIGMA
+
+
+def test_without_the_lens_the_fit_says_what_would_explain_it(robot, poses):
+    weak = LENS * [1.0, 1.0, 1.0, 0.3, 0.3]
+    calibration = calibrate(
+        observed(robot, poses, weak), robot.joint_types, source="recorded", image_size=IMAGE_SIZE
+    )
+    assert any("try --lens" in text for text in calibration.advice)
+    assert "limited by lens" in calibration.reason
+    assert calibration.lens is None
+
+
+def test_joint_readings_in_error_are_not_blamed_on_the_lens(robot, poses):
+    straight = observed(robot, poses, LENS * [1.0, 1.0, 1.0, 0.0, 0.0])
+    q = straight.q + 0.002 * np.random.default_rng(6).standard_normal(straight.q.shape)
+    calibration = calibrate(
+        dataclasses.replace(straight, q=q), robot.joint_types, source="recorded", image_size=IMAGE_SIZE
+    )
+    assert "limited by joint readings" in calibration.reason
+    assert not any("lens" in text for text in calibration.advice)
+
+
+def test_a_fit_that_a_lens_spoils_is_refused_with_the_remedy(robot, poses):
+    strong = observed(robot, poses, LENS * [1.0, 1.0, 1.0, 3.0, 3.0])
+    with pytest.raises(WorkFailed, match="try --lens"):
+        calibrate(strong, robot.joint_types, source="recorded", image_size=IMAGE_SIZE)
+
+
+def test_straight_images_show_no_lens_and_lose_little(robot, poses):
+    straight = observed(robot, poses, LENS * [1.0, 1.0, 1.0, 0.0, 0.0])
+    without, with_lens = (
+        calibrate(
+            straight, robot.joint_types, sigma_px=SIGMA, source="simulated", image_size=IMAGE_SIZE, lens=lens
+        )
+        for lens in (False, True)
+    )
+    k = with_lens.lens[:, 3:].ravel()
+    assert k @ np.linalg.solve(with_lens.covariance[-4:, -4:], k) < 18.5
+    assert any("leave out --lens" in text for text in with_lens.advice)
+    assert not any("lens" in text for text in without.advice)
+    q = around(robot, 60, np.random.default_rng(8), angle=0.6, length=0.2)
+    for calibration in (without, with_lens):
+        off = predict(calibration, q) - robot.images(q)
+        variance = prediction_variance(calibration, q)
+        assert np.sqrt(np.mean(off**2) / np.mean(variance)) < 1.4
+    # Four parameters more cost certainty, by the Cramér–Rao bound, and never add any.
+    assert (prediction_variance(with_lens, q) >= 0.999 * prediction_variance(without, q)).mean() > 0.99
+
+
+def test_outliers_are_told_from_distortion(robot, bent):
+    rng = np.random.default_rng(5)
+    seen = np.argwhere(np.isfinite(bent.images[..., 0]))
+    chosen = seen[rng.choice(len(seen), 60, replace=False)]
+    images = bent.images.copy()
+    for k, v, j in chosen:
+        images[k, v, j] += rng.uniform(20.0, 50.0) * rng.choice([-1.0, 1.0], 2)
+    calibration = calibrate(
+        dataclasses.replace(bent, images=images),
+        robot.joint_types,
+        sigma_px=SIGMA,
+        source="recorded",
+        image_size=IMAGE_SIZE,
+        lens=True,
+    )
+    listed = {(p, m, v) for p, m, view in calibration.outlier for v in ((view,) if view < 2 else (0, 1))}
+    wrong = {(bent.pose[k], bent.marker[j], v) for k, v, j in chosen}
+    assert wrong <= listed
+    # Beyond 5σ lies none of the good readings.
+    assert len(listed - wrong) <= 1
+    assert calibration.lens[:, 3] == pytest.approx(LENS[:, 3], abs=0.01)
+
+
+def test_what_cannot_be_asked_for(robot, bent):
+    with pytest.raises(InputError, match="linear"):
+        calibrate(bent, robot.joint_types, method="linear", lens=True)
+    with pytest.raises(InputError, match="width before height"):
+        calibrate(bent, robot.joint_types, image_size=(500, 1024), lens=True)
