@@ -1,0 +1,94 @@
+"""Cramér–Rao bound of predictions, by complex steps through a model of its own."""
+
+import numpy as np
+
+from tests.calibration.simulated_robot import Robot
+
+STEP = 1e-30  # of the complex differentiation: exact to round-off, nothing cancels
+
+
+def images(x, joint_types, m, dq):
+    """Pixels (K, 2, m, 2) from cameras, axes, directions and markers ravelled in x; holds for complex x.
+
+    A screw is any (w, v): w is scaled to one and v freed of its part along w, so that the redundant
+    directions of x change no image. A direction is scaled to one.
+    """
+    n = len(joint_types)
+    P, x = x[:24].reshape(2, 3, 4), x[24:]
+    screws, X = x[: 6 * n].reshape(n, 6), x[6 * n :].reshape(m, 3)
+    points = np.broadcast_to(X, (len(dq), m, 3))
+    for i in range(n - 1, -1, -1):
+        w, v, theta = screws[i, :3], screws[i, 3:], dq[:, i, None, None]
+        if joint_types[i] == "P":
+            points = points + theta * v / np.sqrt(v @ v)
+            continue
+        w = w / np.sqrt(w @ w)
+        v = v - w * (w @ v)
+        velocity = np.cross(w, points) + v
+        points = points + np.sin(theta) * velocity + (1.0 - np.cos(theta)) * np.cross(w, velocity)
+    p = np.einsum("vrc,kmc->kvmr", P[..., :3], points) + P[:, None, :, 3]
+    return p[..., :2] / p[..., 2:]
+
+
+def parameters(robot):
+    twists = robot.twists
+    w = np.stack([twists[:, 2, 1], twists[:, 0, 2], twists[:, 1, 0]], axis=1)
+    screws = np.hstack([w, twists[:, :3, 3]])
+    return np.concatenate([robot.cameras.ravel(), screws.ravel(), robot.markers[:, :3].ravel()])
+
+
+def derivative(robot, q):
+    """Derivative (pixels, parameters) at the truth."""
+    x, dq = parameters(robot), q - robot.q_reference
+    columns = []
+    for k in range(len(x)):
+        moved = x.astype(complex)
+        moved[k] += 1j * STEP
+        columns.append(images(moved, robot.joint_types, len(robot.markers), dq).imag.ravel() / STEP)
+    return np.array(columns).T
+
+
+def spread(J, ahead):
+    """Factor (rows, rank) of the covariance of predictions of derivative ``ahead``, at one pixel of noise."""
+    scale = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    _, s, Vt = np.linalg.svd(np.linalg.qr(J / scale, mode="r"))
+    rank = int((s > 1e-10 * s[0]).sum())
+    # A clear gap: what is left beyond the rank is the gauge and round-off.
+    assert s[rank - 1] > 1e-7 * s[0]
+    return (ahead / scale) @ (Vt[:rank].T / s[:rank])
+
+
+class Bound:
+    """Cramér–Rao bound of predictions: covariance factor @ factor.T per px² of noise, for visible rows."""
+
+    def __init__(self, robot, trained, q):
+        x, dq = parameters(robot), q - robot.q_reference
+        # The other model is the same robot.
+        np.testing.assert_allclose(
+            images(x, robot.joint_types, len(robot.markers), dq), robot.images(q), atol=1e-8
+        )
+        J = derivative(robot, trained)
+        self.factor = spread(J, derivative(robot, q))
+        self.rank = self.factor.shape[1]
+        self.coordinates = J.shape[0]
+
+    def mean_square(self):
+        """Mean variance of a coordinate."""
+        return float((self.factor**2).sum()) / len(self.factor)
+
+    def relative_error(self, draws):
+        """Standard error of the mean square over independent draws of normal errors, relative."""
+        spectrum = np.linalg.svd(self.factor, compute_uv=False) ** 2
+        return float(np.sqrt(2.0 * (spectrum**2).sum() / draws) / spectrum.sum())
+
+
+def robot_of(truth):
+    screws = truth["screws"]
+    twists = np.zeros((len(screws), 4, 4))
+    for twist, screw in zip(twists, screws, strict=True):
+        twist[:3, :3] = np.cross(np.eye(3), screw["w"])
+        twist[:3, 3] = screw["v"]
+    tool = np.array(truth["T_base_tool_at_reference"])
+    markers = np.c_[np.array(truth["markers_tool"]), np.ones(len(truth["markers_tool"]))] @ tool.T
+    cameras = np.array([truth["camera_left"], truth["camera_right"]])
+    return Robot(truth["joint_types"], twists, cameras, markers, np.array(truth["q_reference"]))

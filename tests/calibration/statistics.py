@@ -1,0 +1,186 @@
+"""Statistics of the calibration over many draws, for the tests in small and by hand in full.
+
+``python -m tests.calibration.statistics draws 100`` takes some ten minutes, ``… robots 200`` as long.
+"""
+
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.records import BoolArray, FloatArray, Observation, WorkFailed
+from projservo_cli.tables import read_table
+from tests.calibration.bound import derivative, spread
+from tests.calibration.simulated_robot import Robot, around, random_robot, trials
+
+SHARED = Path(__file__).parents[3] / "shared" / "data"
+# What is drawn on the noise-free UR5 table: frames, noise in px, share of rows removed.
+CASES = {
+    "within 20 deg, 0.5 px": ("within", 0.5, 0.0),
+    "within 20 deg, 1.0 px": ("within", 1.0, 0.0),
+    "4 frames a joint, 0.5 px": ("four", 0.5, 0.0),
+    "4 frames a joint, 1.0 px": ("four", 1.0, 0.0),
+    "40 % of rows removed, 0.5 px": ("all", 0.5, 0.4),
+}
+SIGMA = 0.5
+NEAREST = 0.3  # m; a robot that brings a marker nearer to a camera is not drawn
+
+
+@dataclass
+class Draws:
+    """Mean squared held-out errors of the draws and their Cramér–Rao bounds, px² a coordinate."""
+
+    square: list[float] = field(default_factory=list)
+    bound: list[float] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+
+    @property
+    def ratio(self) -> float:
+        """Root mean square over the draws ÷ its bound."""
+        return float(np.sqrt(np.mean(self.square) / np.mean(self.bound)))
+
+    @property
+    def error(self) -> float:
+        """Bootstrap standard error of the ratio."""
+        square, bound = np.array(self.square), np.array(self.bound)
+        again = np.random.default_rng(0).integers(0, len(square), (2000, len(square)))
+        return float(np.sqrt(square[again].mean(axis=1) / bound[again].mean(axis=1)).std())
+
+    @property
+    def worst(self) -> float:
+        """Largest error of a draw ÷ its bound."""
+        return float(np.sqrt(np.max(np.array(self.square) / self.bound)))
+
+
+def frames(q: FloatArray, reference: FloatArray, which: str) -> BoolArray:
+    """Poses (K,) of single-joint trials: all, those within 20°, or four a joint from end to end."""
+    offset = q - reference
+    if which == "within":
+        return np.asarray(np.abs(offset).max(axis=1) <= np.radians(20.0) + 1e-9)
+    if which == "all":
+        return np.ones(len(q), dtype=np.bool_)
+    keep = np.abs(offset).max(axis=1) < 1e-9
+    for i in range(q.shape[1]):
+        rows = np.flatnonzero(np.abs(offset[:, i]) > 1e-9)
+        rows = rows[np.argsort(offset[rows, i])]
+        keep[rows[np.linspace(0, len(rows) - 1, 4).round().astype(int)]] = True
+    return keep
+
+
+def noise_draws(case: str, robot: Robot, count: int, first: int = 0) -> Draws:
+    """Fresh noise on the noise-free table, calibrated from scratch as a recorded one.
+
+    Parameters
+    ----------
+    case : name in ``CASES``.
+    robot : the true UR5.
+    count, first : draws and the seed of the first.
+    """
+    which, sigma, removed = CASES[case]
+    table = read_table(SHARED / "ur5" / "trials_0.0px.csv", robot.joint_types)
+    validation = read_table(SHARED / "ur5" / "validation.csv", robot.joint_types)
+    kept = frames(table.q, robot.q_reference, which)
+    pose, q, images = table.pose[kept], table.q[kept], table.images[kept]
+    J, ahead = derivative(robot, q), derivative(robot, validation.q)
+    shape = images.shape
+    draws = Draws()
+    for seed in range(first, first + count):
+        rng = np.random.default_rng([seed, 4])
+        noisy = images + sigma * rng.standard_normal(shape)
+        gone = rng.random((shape[0], 1, shape[2], 1)) < removed
+        noisy[np.broadcast_to(gone, shape)] = np.nan
+        try:
+            found = calibrate(
+                Observation(pose, table.marker, q, noisy), robot.joint_types, source="recorded", seed=seed
+            )
+        except WorkFailed as error:
+            draws.refused.append(f"{seed}: {error}")
+            continue
+        used = ~np.broadcast_to(gone, shape).ravel()
+        draws.square.append(float(np.mean((predict(found, validation.q) - validation.images) ** 2)))
+        draws.bound.append(sigma**2 * float((spread(J[used], ahead) ** 2).sum()) / len(ahead))
+    return draws
+
+
+@dataclass
+class Robots:
+    """Random robots: errors ÷ bounds of those calibrated, χ² as probabilities, and the others."""
+
+    ratio: list[float] = field(default_factory=list)
+    probability: list[float] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    rejected: int = 0
+
+    @property
+    def good(self) -> int:
+        """Robots with χ² within its 1e-4 quantiles and an error up to 1.5 times its bound."""
+        within = np.abs(np.array(self.probability) - 0.5) < 0.5 - 1e-4
+        return int((within & (np.array(self.ratio) <= 1.5)).sum())
+
+
+def random_robots(count: int, first: int = 1000) -> Robots:
+    """Six joints, up to three prismatic, 10 markers, 0.5 px, 8 frames a joint within ±30° or ±0.15 m.
+
+    Screws are drawn by the rule of ``random_robot``; a robot is rejected where a marker comes nearer
+    than 0.3 m to a camera in its trials or the validation poses.
+
+    Parameters
+    ----------
+    count, first : robots to calibrate and the seed of the first.
+    """
+    found = Robots()
+    seed = first
+    while len(found.ratio) + len(found.refused) < count:
+        rng = np.random.default_rng(seed)
+        seed += 1
+        letters = np.array(list("RRRRRR"))
+        letters[rng.choice(6, rng.integers(0, 4), replace=False)] = "P"
+        robot = random_robot("".join(letters), rng)
+        q, ahead = trials(robot), around(robot, 60, rng)
+        if min(robot.depths(q).min(), robot.depths(ahead).min()) < NEAREST:
+            found.rejected += 1
+            continue
+        try:
+            calibration = calibrate(robot.observe(q, SIGMA, rng), robot.joint_types, sigma_px=SIGMA)
+        except WorkFailed as error:
+            found.refused.append(f"{seed - 1}: {error}")
+            continue
+        J = derivative(robot, ahead)
+        square = float(np.mean((predict(calibration, ahead) - robot.images(ahead)) ** 2))
+        limit = float((spread(derivative(robot, q), J) ** 2).sum()) / len(J)
+        found.ratio.append(float(np.sqrt(square / limit) / SIGMA))
+        dof = calibration.dof
+        found.probability.append(float(chi2.cdf(calibration.chi2_per_dof * dof, dof)))
+    return found
+
+
+def main(what: str, count: str) -> None:
+    """Print the statistics of so many draws or robots."""
+    if what == "robots":
+        robots = random_robots(int(count))
+        total = len(robots.ratio) + len(robots.refused)
+        print(f"{robots.good} of {total} good, {len(robots.refused)} refused, {robots.rejected} rejected")
+        print("error ÷ bound:", np.percentile(robots.ratio, [50, 95, 99, 100]).round(3))
+        print(*robots.refused, sep="\n")
+        return
+    import json
+
+    from tests.calibration.bound import robot_of
+
+    robot = robot_of(json.loads((SHARED / "ur5" / "truth.json").read_text(encoding="utf-8")))
+    for case in CASES:
+        draws = noise_draws(case, robot, int(count))
+        print(
+            f"{case}: {draws.ratio:.4f} ± {draws.error:.4f}, worst {draws.worst:.2f}, "
+            f"{len(draws.refused)} of {count} refused",
+            *draws.refused,
+            sep="\n  ",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
