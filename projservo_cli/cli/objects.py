@@ -25,7 +25,11 @@ def stage_object(stage: str, run: Run, config: Config, laws: Sequence[str]) -> d
         return path | _plan(run)
     if stage == "servo":
         return path | {"laws": [_scalars(run.traces[law]) for law in laws]}
-    return path | _scalars(run.results["report"].records[""])
+    from projservo_cli.page import PAGE_FILE
+
+    page = run.path.parent / PAGE_FILE
+    report = run.results["report"].records[""]
+    return path | {"page": page.resolve() if page.is_file() else None} | _scalars(report)
 
 
 def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
@@ -127,9 +131,9 @@ def _held_out_words(value: dict[str, Any] | None) -> list[str]:
         return []
     numbers = ("rms_px", "median_px", "p95_px", "predicted_rms_px")
     rms, median, p95, predicted = (_number(value[name]) for name in numbers)
+    text = f"held out, {value['folds']} parts of {value['unit']}: rms {rms} px (predicted {predicted})"
     return [
-        f"  held out, {value['folds']} parts of {value['unit']}: rms {rms} px (predicted {predicted}), "
-        f"median {median}, p95 {p95}",
+        wrapped(f"{text}, median {median}, p95 {p95}", "  "),
         wrapped(value["reason"], "  "),
     ]
 
@@ -173,6 +177,7 @@ def _report_words(value: dict[str, Any]) -> list[str]:
     return [
         f"report: {len(value['figures'])} files of figures; {holding} of {len(claims)} claims hold",
         *(wrapped(text, "  ") for text in (*claims, *left_out)),
+        *([f"page: {value['page']}"] if value["page"] else []),
     ]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from projservo_cli.files import replacing
-from projservo_cli.page.content import View, claim_rows, differences, view_of
+from projservo_cli.page.content import View, claim_rows, differences, picture_rows, view_of
 from projservo_cli.page.words import number, short
 from projservo_cli.store import Run
 
@@ -55,7 +55,9 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
 
 
 def _write(path: Path, views: list[View]) -> None:
-    text = _template().render(views=views, claims=claim_rows(views), differences=differences(views))
+    text = _template().render(
+        views=views, claims=claim_rows(views), differences=differences(views), pictures=picture_rows(views)
+    )
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 

@@ -12,8 +12,8 @@ from projservo_cli.config import Config, load_config
 from projservo_cli.figures.drift import drift_rows
 from projservo_cli.figures.material import VIEWS
 from projservo_cli.page.pictures import SECTIONS, Picture, pictures
-from projservo_cli.page.words import calibration_words, law_words, title
-from projservo_cli.records import Calibration, Plan, Report, Trace
+from projservo_cli.page.words import calibration_words, held_out_words, law_words, title
+from projservo_cli.records import Plan, Report, Trace
 from projservo_cli.store import Run
 
 # What made a run: key in the provenance, and what the page calls it.
@@ -81,7 +81,7 @@ def view_of(run: Run, *, folder: str = "", prefix: str = "") -> View:
         config,
         run.configuration,
         list(_made(run, config)),
-        calibration=_calibration(run.calibration, config) if "calibrate" in run.results else None,
+        calibration=_calibration(run, config) if "calibrate" in run.results else None,
         plan=_plan(run.plan) if "plan" in run.results else None,
         laws=[_law(trace, config) for trace in run.traces.values()],
     )
@@ -134,7 +134,8 @@ def _values(label: str, told: dict[str, str]) -> Iterator[tuple[str, str]]:
         yield label, value if len(by_value) == 1 else f"{value} ({', '.join(dict.fromkeys(names))})"
 
 
-def _calibration(calibration: Calibration, config: Config) -> dict[str, Any]:
+def _calibration(run: Run, config: Config) -> dict[str, Any]:
+    calibration, held_out = run.calibration, run.cross_validation
     given = config.robot.joints if config.robot is not None else ()
     joints = []
     for i, letter in enumerate(calibration.joint_types):
@@ -152,7 +153,7 @@ def _calibration(calibration: Calibration, config: Config) -> dict[str, Any]:
         )
     return {
         "usable": calibration.usable,
-        "words": calibration_words(calibration),
+        "words": calibration_words(calibration) + ([] if held_out is None else [held_out_words(held_out)]),
         "advice": calibration.advice,
         "numbers": [
             ("method", calibration.method, ""),
@@ -227,18 +228,31 @@ def _drift(report: Report) -> dict[str, Any] | None:
 
 def differences(views: list[View]) -> list[tuple[str, list[str]]]:
     """Settings in which runs differ: the key, and what each run has; empty where it lacks the key."""
-    flat = [dict(_leaves("", view.config.model_dump(mode="json"))) for view in views]
+    flat = [dict(_leaves("", view.config.model_dump(mode="json", exclude_none=True))) for view in views]
     keys = dict.fromkeys(key for settings in flat for key in settings)
     rows = [(key, [settings.get(key, "") for settings in flat]) for key in keys]
     return [(key, values) for key, values in rows if len(set(values)) > 1]
 
 
 def _leaves(path: str, value: Any) -> Iterator[tuple[str, str]]:
+    """Every value by its key, with positions for lists of mappings; other lists stay whole."""
+    if isinstance(value, list) and any(isinstance(inner, dict) for inner in value):
+        value = {str(position): inner for position, inner in enumerate(value)}
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from _leaves(f"{path}.{key}" if path else key, inner)
     else:
         yield path, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def picture_rows(views: list[View]) -> dict[str, list[list[Picture | None]]]:
+    """Figures by section, a row for each, an entry for each run; None where a run lacks it."""
+    rows: dict[str, list[list[Picture | None]]] = {}
+    for section in SECTIONS:
+        numbered = [{picture.number: picture for picture in view.pictures[section]} for view in views]
+        names = sorted({number for own in numbered for number in own}, key=int)
+        rows[section] = [[own.get(number) for own in numbered] for number in names]
+    return rows
 
 
 def claim_rows(views: list[View]) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from markupsafe import Markup
 from projservo_cli.calibration.excitation import REACH_M, REACH_RAD, WEAK_NOISE
 from projservo_cli.calibration.quality import chi2_band
 from projservo_cli.figures.material import TITLES
-from projservo_cli.records import Calibration, Trace
+from projservo_cli.records import Calibration, CrossValidation, Trace
 
 MINUS = "\N{MINUS SIGN}"
 NONE = "\N{EN DASH}"
@@ -74,6 +74,16 @@ def _worst_joint(calibration: Calibration) -> str:
         f"times the pixel noise to predicted images; a joint is weak above {WEAK_NOISE:g}, so this one is "
         f"{weak}."
     )
+
+
+def held_out_words(value: CrossValidation) -> str:
+    """How well poses were predicted that the fit had not seen, in a sentence or two."""
+    text = (
+        f"Held out, in {value.folds} parts of {value.unit}: rms {short(value.rms_px)} px where noise and "
+        f"covariance predict {short(value.predicted_rms_px)} px, median {short(value.median_px)} px, 95th "
+        f"percentile {short(value.p95_px)} px. {value.reason[:1].upper()}{value.reason[1:]}."
+    )
+    return text.replace("..", ".")
 
 
 def law_words(trace: Trace) -> str:

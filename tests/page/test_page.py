@@ -12,7 +12,7 @@ from projservo_cli.figures import FIGURES
 from projservo_cli.page import PAGE_FILE, write_comparison, write_page
 from projservo_cli.page.vector import inline
 from projservo_cli.page.words import number, short
-from projservo_cli.records import Report
+from projservo_cli.records import CrossValidation, Report
 from projservo_cli.store import Result
 from tests.fake_records import fake
 from tests.figures.cases import case
@@ -233,6 +233,18 @@ def test_a_report_of_a_recording_has_no_drift(run, tmp_path):
     assert "No drift was measured." in words(read(write_page(other)).text)
 
 
+def test_a_figure_that_one_run_lacks_leaves_its_place_empty(run, tmp_path):
+    few = with_report(run, figures=tuple(f"figures/{name}.svg" for name in SOME[1:]))
+    write_comparison([run, few], tmp_path / "both.html")
+    page = read(tmp_path / "both.html")
+    assert words(page.text).count("lacks the figure") == 1
+    rows = [
+        div for div in page.all("div") if div.attributes.get("class") == "runs" and list(div.all("figure"))
+    ]
+    named = [[figure.attributes["id"].partition("-")[2] for figure in row.all("figure")] for row in rows]
+    assert {tuple(names) for names in named} == {(SOME[0],), *((name, name) for name in SOME[1:])}
+
+
 def test_runs_stand_side_by_side(run, tmp_path):
     other = dataclasses.replace(run, configuration=run.configuration.replace("seed: 1", "seed: 22"))
     path = tmp_path / "both.html"
@@ -266,3 +278,13 @@ def test_numbers_for_the_eye(value, text):
 
 def test_numbers_carry_all_their_digits():
     assert number(np.float64(1 / 3)) == f'<data value="{1 / 3!r}">0.333</data>'
+
+
+def test_a_held_out_error_is_told(run, tmp_path):
+    held_out = fake(CrossValidation, folds=5, unit="poses", rms_px=0.321, reason="as predicted")
+    result = run.results["calibrate"]
+    result = dataclasses.replace(result, records={**result.records, "cross_validation": held_out})
+    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
+    text = words(read(write_page(other)).text)
+    assert "Held out, in 5 parts of poses: rms 0.321 px" in text
+    assert "As predicted." in text
