@@ -21,6 +21,7 @@ FREE = 2  # a twist of a free-flying rig: its operator does not move with the ot
 
 LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact")
 METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
+POINT_LAWS = ("stacked", "blockwise", "euclidean_points")  # laws that need the points of the face themselves
 
 
 def array(*dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
@@ -229,6 +230,7 @@ class Trace:
     reason: str = scalar(about="why, in a sentence")
     steps: int = scalar(about="commands sent")
     period: float = scalar(units="s", about="control period")
+    observation: str = scalar(about="how the face is measured: points or body")
     position_error_mm: float | None = scalar(units="mm", about="true centre to true goal at the end")
     rotation_error_deg: float | None = scalar(units="deg", about="true rotation to the goal at the end")
     self_occluded_steps_left: int = scalar(about="instants at which the left camera is behind the face")
@@ -254,6 +256,15 @@ class Trace:
     theta_r: FloatArray = array("instant", units="rad", about="rotation error onto the plane")
     theta_p: FloatArray = array("instant", units="rad", about="rotation error within the plane")
     theta_s: FloatArray = array("instant", units="rad", about="rotation error of both together")
+    prediction_px: FloatArray = array(
+        "instant",
+        units="px",
+        about="observed less predicted from the joints, rms per coordinate; NaN for points",
+    )
+    fit_px: FloatArray = array(
+        "instant", units="px", about="noise per coordinate that the fit of the body leaves; NaN for points"
+    )
+    views_used: FloatArray = array("instant", about="markers the body was fitted to, counted once a view")
     q_dot: FloatArray = array("step", "joint", units="rad/s or m/s", about="commands after the limit")
     speed_factor: FloatArray = array("step", about="factor of the joint-speed limit")
     self_occluded: BoolArray = array("instant", "view", about="true self-occlusion of the face")

@@ -1,8 +1,9 @@
 """What every control law gets and gives.
 
 A compiled law is ``law(model, task, gains, s, q, state) -> status``: it sees the model, the task,
-the pixels ``s`` of the face and the joint readings ``q``, never the truth; it writes joint
-velocities to ``state.q_dot`` (rad/s or m/s) and its control errors to ``state.errors``.
+the pixels ``s`` of the face, and after them of further markers of its body, and the joint readings
+``q``, never the truth; it writes joint velocities to ``state.q_dot`` (rad/s or m/s) and its control
+errors to ``state.errors``.
 """
 
 import math
@@ -10,13 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import dot, put_vec, sub
+from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub
 from projservo_cli.geometry.composition import composed_angle
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import Work, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, carry, fit_body
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
 from projservo_cli.task.visibility import limited_translation
@@ -74,6 +76,8 @@ class State(NamedTuple):
     errors : (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad.
     memory : what is carried to the next step.
     limited : (1,) how often visibility limited the translation.
+    fit : (3,) sums of squared residuals of the predicted and of the fitted body, px², and the markers
+        used, counted once a view; NaN where the face is measured point by point.
     newton : (n,) one Newton step.
     path : (129, n) joints at the ends of the parts of a step, the current ones first.
     share : (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the
@@ -90,6 +94,7 @@ class State(NamedTuple):
     errors: FloatArray
     memory: Memory
     limited: FloatArray
+    fit: FloatArray
     newton: FloatArray
     path: FloatArray
     share: FloatArray
@@ -108,6 +113,7 @@ def new_state(n: int, m: int) -> State:
         np.full(len(ERRORS), np.nan),
         Memory(np.zeros((2, n))),
         np.zeros(1),
+        np.full(3, np.nan),
         np.zeros(n),
         np.zeros((MOST_PARTS + 1, n)),
         np.full(1, -1.0),
@@ -117,10 +123,16 @@ def new_state(n: int, m: int) -> State:
 
 @njit
 def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> bool:
-    """Triangulate the face and move the operators to the current joints, [RH00] eq. (19).
+    """Measure the face, with the body or point by point, and move the operators to the current joints.
 
-    Returns False where a marker is unseen in a view or has no finite point.
+    Returns False where too little was seen: point by point every marker of the face must be, and have
+    a finite point.
+
+    Source: [RH00] eq. (19) for the operators.
     """
+    H = operators_at(model, q, state.work.H_hat)
+    if task.body.M.shape[0] > 0:
+        return measure_body(model, task, s, H, state)
     for k in range(state.A.shape[0]):
         if not (
             math.isfinite(s[0, k, 0])
@@ -133,7 +145,19 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
         if not found:
             return False
         put_vec(state.A[k], M)
-    operators_at(model, q, state.work.H_hat)
+    return True
+
+
+@njit
+def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State) -> bool:
+    """Measure the face by all markers of the body, predicted at the displacement H of the joints."""
+    fit = fit_body(model.P, task.body, s, H, SETTLED_PX, MOST_STEPS)
+    state.fit[0] = fit.before
+    state.fit[1] = fit.after
+    state.fit[2] = fit.views
+    if not fit.found:
+        return False
+    carry(task.body, fit.H, state.A)
     return True
 
 

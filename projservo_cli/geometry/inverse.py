@@ -7,7 +7,7 @@ enters.
 from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, sub, vec
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kernels import least_squares
-from projservo_cli.geometry.kinematics import forward, operators_at
+from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray, Model
 
@@ -36,8 +36,7 @@ def reach(
     n = q.shape[0]
     m = A.shape[0]
     for _ in range(MOST_NEWTON_STEPS):
-        operators_at(model, q, work.H_hat)
-        H = mul(forward(model, q), H_back)
+        H = mul(operators_at(model, q, work.H_hat), H_back)
         for k in range(m):
             reached = apply(H, vec(A[k]))
             miss = sub(apply(goal, vec(A[k])), reached)

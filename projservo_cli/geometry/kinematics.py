@@ -45,8 +45,8 @@ def start_pose(model: Model, q: FloatArray) -> Mat4:
 
 
 @njit
-def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> None:
-    """Joint operators at q, [RH00] eq. (19) with the truncated product H̄_i of (6).
+def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
+    """Joint operators at q, [RH00] eq. (19) with the truncated product H̄_i of (6); returns the whole product.
 
     Each joint is undone, moved about its reference and redone: Ĥ_i(q) = H̄_i Ĥ_i⁰ H̄_i⁻¹, where the
     joint's own factor of H̄_i commutes with Ĥ_i⁰ and is left out.
@@ -57,15 +57,19 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> None:
     for i in range(n):
         operator = mat(model.H_hat_0[i])
         put_mat(H_hat[i], mul(mul(H, operator), H_inverse))
-        if i < n - 1 and model.joint_types[i] != FREE:
-            amount = float(q[i]) - float(model.q_reference[i])
-            if model.joint_types[i] == PRISMATIC:
-                H = mul(H, translation(operator, amount))
-                H_inverse = mul(translation(operator, -amount), H_inverse)
-            else:
-                squared = mul(operator, operator)
-                H = mul(H, rotation(operator, squared, amount))
-                H_inverse = mul(rotation(operator, squared, -amount), H_inverse)
+        if model.joint_types[i] == FREE:
+            continue
+        amount = float(q[i]) - float(model.q_reference[i])
+        if i == n - 1:
+            H = mul(H, joint_displacement(operator, model.joint_types[i], amount))
+        elif model.joint_types[i] == PRISMATIC:
+            H = mul(H, translation(operator, amount))
+            H_inverse = mul(translation(operator, -amount), H_inverse)
+        else:
+            squared = mul(operator, operator)
+            H = mul(H, rotation(operator, squared, amount))
+            H_inverse = mul(rotation(operator, squared, -amount), H_inverse)
+    return H
 
 
 @njit

@@ -16,7 +16,6 @@ from projservo_cli.loop.step import (
     RUNNING,
     Instant,
     Limits,
-    all_seen,
     beyond_limits,
     finite,
     image_error,
@@ -37,7 +36,7 @@ class Log(NamedTuple):
     ----------
     q : (k, n) joints, rad or m.
     H : (k, 4, 4) true displacement of the face from the reference.
-    s : (k, 2, m, 2) measured pixels.
+    s : (k, 2, m, 2) measured pixels of the face and, after them, of the pins.
     hidden : (k, 2) 1 where a view is self-occluded.
     error : (k,) image error, px rms per marker and view.
     errors : (k, 5) control errors of the law.
@@ -45,6 +44,7 @@ class Log(NamedTuple):
     factor : (k,) factor of the joint-speed limit.
     path : (k, parts + 1, n) joints at the ends of the parts of each step.
     parts : (k,) parts each step was sent in; 0 where the joints went straight to the end.
+    fit : (k, 3) what measuring with the body left, as in the state of the law.
     events : (4,) first instant outside an image, first beyond a joint limit, that joint, and how
         often visibility limited the translation; −1 for never.
     """
@@ -59,11 +59,12 @@ class Log(NamedTuple):
     factor: FloatArray
     path: FloatArray
     parts: IntArray
+    fit: FloatArray
     events: FloatArray
 
 
 def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
-    """Empty log for n joints, m markers, at most ``max_steps`` commands and ``parts`` parts of one."""
+    """Empty log for n joints, m markers seen, at most ``max_steps`` commands and ``parts`` parts of one."""
     rows = max_steps + 1
     return Log(
         np.zeros((rows, n)),
@@ -76,6 +77,7 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
         np.ones(rows),
         np.zeros((rows, parts + 1, n)),
         np.zeros(rows, dtype=np.int64),
+        np.full((rows, 3), np.nan),
         np.full(4, -1.0),
     )
 
@@ -99,7 +101,7 @@ def run(
     ----------
     code : of the law.
     model : what the law believes; its frame is that of the task.
-    noise : (≥ max_steps + 1, 2, m, 2) added to the true pixels, px.
+    noise : (≥ max_steps + 1, 2, m + p, 2) added to the true pixels, px.
     q_start : (n,) first joints, rad or m.
     log : filled up to the last instant.
 
@@ -125,20 +127,22 @@ def run(
         distance = rig_distance(plant, M)
         if k == 0:
             first_distance = distance
-        left = outside(s, plant.image_size)
+        left = outside(s, task.s_star.shape[1], plant.image_size)
         if left and log.events[0] < 0.0:
             log.events[0] = k
         log.error[k] = image_error(s, task.s_star)
-        seen = all_seen(s)
+        seen = True
         singular = False
         sound = True
-        if in_front and seen:
+        if in_front:
             status = command(code, model, task, gains, s, log.q[k], state)
             seen = status != LOST
             singular = status == SINGULAR
             sound = finite(state.q_dot)
             for i in range(log.errors.shape[1]):
                 log.errors[k, i] = state.errors[i]
+            for i in range(3):
+                log.fit[k, i] = state.fit[i]
         error, first_error = log.error[k], log.error[0]
         now = Instant(in_front, seen, left, error, first_error, distance, first_distance, sound, singular)
         verdict = verdict_at(now, limits)

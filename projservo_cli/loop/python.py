@@ -14,7 +14,6 @@ from projservo_cli.loop.step import (
     RUNNING,
     Instant,
     Limits,
-    all_seen,
     beyond_limits,
     finite,
     image_error,
@@ -28,19 +27,24 @@ from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
 LEFT_TO_THE_LOOP = (-1.0,)
+NOT_FITTED = (np.nan, np.nan, np.nan)
 
 
 class LoopLaw(Protocol):
     """What the Python loop asks of a law.
 
     A law that keeps the joint-speed limit itself has an attribute ``share`` (1,), the share of the
-    amplitude its limit left; the limit is else up to the loop.
+    amplitude its limit left; the limit is else up to the loop. One that fits a body has an attribute
+    ``fit`` (3,), which the log keeps.
     """
 
     errors: FloatArray
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
-        """Status and joint velocity (n,), rad/s or m/s, for pixels (2, m, 2) and joints (n,)."""
+        """Status and joint velocity (n,), rad/s or m/s, for pixels (2, m, 2) and joints (n,).
+
+        Pixels are NaN where a marker was not seen; the status is LOST where too little was.
+        """
 
 
 class BuiltInLaw:
@@ -59,6 +63,7 @@ class BuiltInLaw:
         self.state = new_state(len(model.H_hat_0), len(task.A_star))
         self.errors = self.state.errors
         self.share = self.state.share
+        self.fit = self.state.fit
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
@@ -83,7 +88,7 @@ def run(
     -------
     verdict, steps, log : as of the compiled loop, to the bit for the built-in laws.
     """
-    log = new_log(len(plant.joints()), s_star.shape[1], limits.max_steps, len(ERRORS))
+    log = new_log(len(plant.joints()), plant.markers, limits.max_steps, len(ERRORS))
     try:
         verdict, steps = _run(law, plant, s_star, period, limits, log)
     finally:
@@ -103,15 +108,15 @@ def _run(
         log.hidden[k] = plant.hidden
         distance = plant.distance()
         first_distance = distance if k == 0 else first_distance
-        left = outside(log.s[k], truth.image_size)
+        left = outside(log.s[k], s_star.shape[1], truth.image_size)
         if left and log.events[0] < 0.0:
             log.events[0] = k
         log.error[k] = image_error(log.s[k], s_star)
-        seen, singular, sound, q_dot = all_seen(log.s[k]), False, True, np.zeros_like(log.q[k])
-        if plant.in_front and seen:
+        seen, singular, sound, q_dot = True, False, True, np.zeros_like(log.q[k])
+        if plant.in_front:
             status, q_dot = law(log.s[k], log.q[k])
             seen, singular, sound = status != LOST, status == SINGULAR, finite(q_dot)
-            log.errors[k] = law.errors
+            log.errors[k], log.fit[k] = law.errors, getattr(law, "fit", NOT_FITTED)
         error, first_error = log.error[k], log.error[0]
         now = Instant(
             plant.in_front, seen, left, error, first_error, distance, first_distance, sound, singular

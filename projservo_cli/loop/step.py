@@ -18,6 +18,7 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.geometry.jit import njit
+from projservo_cli.plants.plant import inside
 from projservo_cli.records import FloatArray
 
 RUNNING = -1
@@ -95,36 +96,30 @@ class Instant(NamedTuple):
 
 @njit
 def image_error(s: FloatArray, s_star: FloatArray) -> float:
-    """Root mean square over markers and views of the Euclidean pixel error; NaN where unseen."""
+    """Root mean square of the Euclidean pixel error over the markers and views of the face seen.
+
+    NaN where none is. Further markers in ``s`` do not count.
+    """
     total = 0.0
-    m = s.shape[1]
+    seen = 0
     for view in range(2):
-        for k in range(m):
+        for k in range(s_star.shape[1]):
             du = s[view, k, 0] - s_star[view, k, 0]
             dv = s[view, k, 1] - s_star[view, k, 1]
-            total += du * du + dv * dv
-    return math.sqrt(total / (2 * m))
+            if math.isfinite(du) and math.isfinite(dv):
+                total += du * du + dv * dv
+                seen += 1
+    return math.sqrt(total / seen) if seen > 0 else math.nan
 
 
 @njit
-def all_seen(s: FloatArray) -> bool:
-    """Whether every marker was seen in both views."""
+def outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
+    """Whether one of the first m markers was seen outside an image."""
     for view in range(2):
-        for k in range(s.shape[1]):
-            if not (math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])):
-                return False
-    return True
-
-
-@njit
-def outside(s: FloatArray, image_size: FloatArray) -> bool:
-    """Whether a seen marker lies outside an image; pixel centres reach from −½ to size − ½."""
-    for view in range(2):
-        for k in range(s.shape[1]):
-            for j in range(2):
-                x = s[view, k, j]
-                if math.isfinite(x) and not -0.5 <= x <= image_size[j] - 0.5:
-                    return True
+        for k in range(m):
+            seen = math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])
+            if seen and not inside(s[view, k], image_size):
+                return True
     return False
 
 

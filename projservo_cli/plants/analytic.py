@@ -15,11 +15,12 @@ class AnalyticPlant:
     ----------
     plant : the truth.
     q_start : (n,) first joints, rad or m.
-    noise : (k, 2, m, 2) added to the pixels of each observation in turn, px.
+    noise : (k, 2, markers, 2) added to the pixels of each observation in turn, px.
 
     Attributes
     ----------
     in_front : whether every marker was in front of both cameras when last observed.
+    markers : how many are observed, those of the face first.
     hidden : (2,) 1 where the face was self-occluded when last observed.
     """
 
@@ -32,14 +33,15 @@ class AnalyticPlant:
         self.hidden = np.zeros(2)
         self.in_front = True
         self.observations = 0
+        self.markers = len(plant.M) + len(plant.pins)
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
         return self.q.copy()
 
     def observe(self) -> FloatArray:
-        """Noisy pixels (2, m, 2) of the face, NaN where unseen."""
-        s = np.zeros((2, len(self.M), 2))
+        """Noisy pixels (2, markers, 2), NaN where unseen."""
+        s = np.zeros((2, self.markers, 2))
         self.in_front = observe(self.plant, as_mat(self.H), self.M, s, self.hidden)
         s += self.noise[self.observations]
         self.observations += 1

@@ -7,6 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import (
     Mat4,
+    Vec4,
     apply,
     axpy,
     combine,
@@ -21,6 +22,8 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import forward, row
 from projservo_cli.records import FREE, FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
+
+NO_PINS = np.zeros((0, 4))
 
 
 class Plant(NamedTuple):
@@ -37,6 +40,7 @@ class Plant(NamedTuple):
     image_size : (2,) width and height, px; infinite where an image has no border.
     lower, upper : (n,) joint limits, rad or m.
     opaque : whether the face hides its markers from a camera behind it.
+    pins : (p, 4) further markers of the body at the reference, m; a camera sees those within its image.
     """
 
     model: Model
@@ -49,6 +53,7 @@ class Plant(NamedTuple):
     lower: FloatArray
     upper: FloatArray
     opaque: bool
+    pins: FloatArray = NO_PINS
 
 
 @njit
@@ -75,7 +80,7 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
     Parameters
     ----------
     M : (m, 4) on return the points of the face.
-    s : (2, m, 2) on return the pixels, NaN where an opaque face hides them.
+    s : (2, m + p, 2) on return the pixels of face and pins, NaN where unseen.
     hidden : (2,) on return 1 where the face is self-occluded in a view.
 
     Returns
@@ -93,18 +98,44 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
         camera = plant.model.P[view]
         for k in range(m):
             A = vec(M[k])
-            depth = row(camera, 2, A)
-            if not depth > 0.0:
+            if not put_pixel(camera, A, s[view, k]):
                 in_front = False
-                s[view, k, 0] = math.nan
-                s[view, k, 1] = math.nan
             elif plant.opaque and not seen:
-                s[view, k, 0] = math.nan
-                s[view, k, 1] = math.nan
-            else:
-                s[view, k, 0] = row(camera, 0, A) / depth
-                s[view, k, 1] = row(camera, 1, A) / depth
+                put_unseen(s[view, k])
+        for k in range(plant.pins.shape[0]):
+            pixel = s[view, m + k]
+            A = apply(H, vec(plant.pins[k]))
+            if put_pixel(camera, A, pixel) and not inside(pixel, plant.image_size):
+                put_unseen(pixel)
     return in_front
+
+
+@njit
+def put_pixel(camera: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
+    """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
+    depth = row(camera, 2, A)
+    if not depth > 0.0:
+        put_unseen(pixel)
+        return False
+    pixel[0] = row(camera, 0, A) / depth
+    pixel[1] = row(camera, 1, A) / depth
+    return True
+
+
+@njit
+def put_unseen(pixel: FloatArray) -> None:
+    """Write what stands for an unseen marker, NaN."""
+    pixel[0] = math.nan
+    pixel[1] = math.nan
+
+
+@njit
+def inside(pixel: FloatArray, image_size: FloatArray) -> bool:
+    """Whether a pixel lies within an image; pixel centres reach from −½ to size − ½."""
+    for j in range(2):
+        if not -0.5 <= pixel[j] <= image_size[j] - 0.5:
+            return False
+    return True
 
 
 @njit

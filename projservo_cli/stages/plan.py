@@ -16,9 +16,12 @@ from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import CONVERGED, Limits
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed
+from projservo_cli.stages.sight import Sight, sight_of
 from projservo_cli.stages.truth import center_index, face_numbers, reach_of, truth_of
+from projservo_cli.task.body import NO_BODY
 from projservo_cli.task.face import Task, center_of, face_plane, task_from_images
 from projservo_cli.task.partition import Parts, partition
+from projservo_cli.task.target import task_from_body
 from projservo_cli.task.trajectory import profile_shares, trajectory_displacement
 from projservo_cli.task.visibility import (
     arc_minimum,
@@ -31,7 +34,16 @@ from projservo_cli.task.visibility import (
 if TYPE_CHECKING:
     from projservo_cli.config import Config
 
-DEPENDS_ON = ("seed", "robot", "rig", "markers", "noise.servo_px", "task", "trajectory")
+DEPENDS_ON = (
+    "seed",
+    "robot",
+    "rig",
+    "markers",
+    "noise.servo_px",
+    "task",
+    "trajectory",
+    "control.observation",
+)
 VIEWS = ("left", "right")
 TASK_DIMENSION = 6
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
@@ -70,6 +82,7 @@ def run(config: "Config", calibration: Calibration) -> Plan:
         config.trajectory.delta,
         config.trajectory.samples,
         (truth.robot.lower, truth.robot.upper),
+        sight_of(config, calibration, truth, reach),
     )
 
 
@@ -83,6 +96,7 @@ def plan_task(
     delta: float,
     samples: int,
     bounds: tuple[FloatArray, FloatArray],
+    sight: Sight | None = None,
 ) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
@@ -94,6 +108,7 @@ def plan_task(
     center : index of the centre marker, or ``MIDPOINT``.
     profile, delta, samples : which part is driven when, share of τ_0, points of the path.
     bounds : (n,) lower and upper joint limits, rad or m.
+    sight : the body to measure with; without it the face is measured point by point.
 
     Raises
     ------
@@ -105,9 +120,14 @@ def plan_task(
             f"the partition of a task needs a robot of six joints, this one has {len(q_start)}: "
             "its motions are then no unique kernels"
         )
-    task = task_from_images(model, s_start, s_star, center)
-    state = new_state(len(q_start), s_start.shape[1])
-    if not measure(model, task, np.ascontiguousarray(s_start), q_start, state):
+    m = s_start.shape[1]
+    state = new_state(len(q_start), m)
+    if sight is None:
+        task, seen = task_from_images(model, s_start, s_star, center), s_start
+    else:
+        task = task_from_body(model, sight.body, q_start, sight.s_start, sight.s_star, center, m)
+        seen = sight.s_start
+    if not measure(model, task, np.ascontiguousarray(seen), q_start, state):
         raise WorkFailed(
             "the face cannot be triangulated at the start: both cameras must see all its markers"
         )
@@ -199,6 +219,7 @@ def half_turn_sense(
     # Cameras have no sign of their own; the plant tells front from back by positive depths.
     depth = model.P[:, 2] @ A.mean(axis=0)
     model = model._replace(P=model.P * np.sign(depth)[:, None, None])
+    task = task._replace(body=NO_BODY)
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
     endless = np.full(2, np.inf)
     plant = Plant(

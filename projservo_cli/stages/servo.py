@@ -7,13 +7,25 @@ import numpy as np
 
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, new_state
+from projservo_cli.geometry.normal import COORDINATES
 from projservo_cli.loop.compiled import Log, new_log, path_deviation
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import VERDICTS, Limits
 from projservo_cli.plants.plant import Plant
-from projservo_cli.records import METRIC_LAWS, Calibration, FloatArray, Model, Plan, Trace
-from projservo_cli.stages.truth import SERVO_NOISE, Reach, Truth, generator, plant_of, reach_of, truth_of
+from projservo_cli.records import METRIC_LAWS, POINT_LAWS, Calibration, FloatArray, Model, Plan, Trace
+from projservo_cli.stages.sight import Sight, sight_of
+from projservo_cli.stages.truth import (
+    PIN_NOISE,
+    SERVO_NOISE,
+    Reach,
+    Truth,
+    generator,
+    plant_of,
+    reach_of,
+    truth_of,
+)
 from projservo_cli.task.face import task_from_images
+from projservo_cli.task.target import task_from_body
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -88,7 +100,8 @@ def run(
     truth = truth_of(config)
     reach = reach_of(config, truth)
     model = truth.model if law in METRIC_LAWS else calibration.model()
-    noise = servo_noise(config, len(truth.face))
+    sight = None if law in POINT_LAWS else sight_of(config, calibration, truth, reach)
+    noise = servo_noise(config, len(truth.face), 0 if sight is None else len(sight.pins))
     return drive(
         law,
         model,
@@ -99,15 +112,18 @@ def run(
         limits_of(config),
         noise,
         plan.rotation_sense(),
+        sight,
     )
 
 
-def servo_noise(config: "Config", m: int) -> FloatArray:
-    """Pixel noise of every instant, the same for every law, px."""
-    shape = (config.stop.max_steps + 1, 2, m, 2)
-    if config.noise.servo_px == 0.0:
-        return np.zeros(shape)
-    return config.noise.servo_px * generator(config, SERVO_NOISE).standard_normal(shape)
+def servo_noise(config: "Config", m: int, pins: int = 0) -> FloatArray:
+    """Pixel noise of m face markers and of pins at every instant, the same for every law, px."""
+    parts = []
+    for count, stream in ((m, SERVO_NOISE), (pins, PIN_NOISE)):
+        shape = (config.stop.max_steps + 1, 2, count, 2)
+        drawn = config.noise.servo_px > 0.0
+        parts.append(generator(config, stream).standard_normal(shape) if drawn else np.zeros(shape))
+    return config.noise.servo_px * np.concatenate(parts, axis=2)
 
 
 def drive(
@@ -120,6 +136,7 @@ def drive(
     limits: Limits,
     noise: FloatArray,
     sense: FloatArray | None = None,
+    sight: Sight | None = None,
 ) -> Trace:
     """Run one law with one model on the simulated robot.
 
@@ -127,15 +144,21 @@ def drive(
     ----------
     law : name of the law.
     model : what the law believes.
-    noise : (≥ max_steps + 1, 2, m, 2) px.
+    noise : (≥ max_steps + 1, 2, m, 2) px, with a sight m + p markers.
     sense : (2, n) joint motions of the planned rotations r and p, which decide the sense of a half turn.
+    sight : the body to measure with; without it the face is measured point by point.
     """
-    n, m = len(reach.q_start), len(truth.face)
-    task = task_from_images(model, reach.s_start, reach.s_star, truth.center)
+    n, m, observed = len(reach.q_start), len(truth.face), len(truth.face)
+    if sight is None:
+        task = task_from_images(model, reach.s_start, reach.s_star, truth.center)
+    else:
+        task = task_from_body(model, sight.body, reach.q_start, sight.s_start, sight.s_star, truth.center, m)
+        plant = plant._replace(pins=sight.pins)
+        observed += len(sight.pins)
     state = new_state(n, m)
     if sense is not None:
         state.memory.rotation[:] = sense
-    log = new_log(n, m, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
+    log = new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
     code, steps = run_loop(
         CODES[law], model, task, gains, limits, plant, noise, reach.q_start.copy(), state, log
     )
@@ -159,6 +182,7 @@ def trace_of(
     """Record of a finished run, with its errors against the truth."""
     rows = steps + 1
     H = log.H[:rows]
+    before, after, views = log.fit[:rows].T
     middle = plant.M.mean(axis=0) if plant.center < 0 else plant.M[plant.center]
     center = (H @ middle)[:, :3]
     pose = H @ truth.robot.base_tool
@@ -179,6 +203,7 @@ def trace_of(
         reason=reason_of(verdict, log, steps, limits, joint),
         steps=steps,
         period=gains.period,
+        observation="points" if np.isnan(views).all() else "body",
         position_error_mm=position,
         rotation_error_deg=rotation,
         self_occluded_steps_left=int(hidden[:, 0].sum()),
@@ -192,7 +217,7 @@ def trace_of(
         first_beyond_limit=beyond,
         limit_joint=joint,
         q=log.q[:rows],
-        s=log.s[:rows],
+        s=np.ascontiguousarray(log.s[:rows, :, : len(truth.face)]),
         s_star=reach.s_star,
         image_error=log.error[:rows],
         tau=errors[:, 0],
@@ -200,6 +225,9 @@ def trace_of(
         theta_r=errors[:, 2],
         theta_p=errors[:, 3],
         theta_s=errors[:, 4],
+        prediction_px=rms(before, 2.0 * views),
+        fit_px=rms(after, 2.0 * views - COORDINATES),
+        views_used=views,
         q_dot=log.q_dot[:steps],
         speed_factor=log.factor[:steps],
         self_occluded=hidden,
@@ -207,6 +235,13 @@ def trace_of(
         goal_pose=np.full((4, 4), np.nan) if reach.goal_pose is None else reach.goal_pose,
         center=center,
     )
+
+
+def rms(squares: FloatArray, count: FloatArray) -> FloatArray:
+    """Root of the mean of sums of squares; NaN where the count is not positive."""
+    mean = np.full(squares.shape, math.nan)
+    np.divide(squares, count, out=mean, where=count > 0.0)
+    return np.asarray(np.sqrt(mean))
 
 
 def rotation_between(pose: FloatArray, goal: FloatArray) -> float:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,7 +98,8 @@ def bench_of(config: "Config", calibrated: Model, plan: Plan) -> Bench:
     s_star = reach.s_star
     if reach.goal_pose is not None:
         s_star = project(truth.P, truth.M_face @ (reach.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T)
-    clean = Reach(reach.q_start, reach.goal_pose, truth.images(reach.q_start, truth.M_face), s_star)
+    s_start = truth.images(reach.q_start, truth.M_face)
+    clean = replace(reach, s_start=s_start, s_star=s_star)
     limits = limits_of(config)._replace(
         image_px=config.stop.image_px, stop_at_joint_limit=False, stop_at_border=False
     )

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from projservo_cli.config.robot import Camera
 
 # Independent streams of random numbers, each a child of the configuration's seed.
-CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS = range(4)
+CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +65,11 @@ class Truth:
     def M_face(self) -> FloatArray:
         """Face markers (k, 4) at the robot's reference, m."""
         return np.ascontiguousarray(self.M[list(self.face)])
+
+    @property
+    def pins(self) -> tuple[int, ...]:
+        """Indices of the markers that are not on the face."""
+        return tuple(i for i in range(len(self.M)) if i not in self.face)
 
     def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
         """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
@@ -174,12 +179,15 @@ class Reach:
     q_start : (n,) rad or m.
     goal_pose : (4, 4) true pose of the tool at the goal, m; None where only images are known.
     s_start, s_star : (2, m, 2) measured pixels of the face, px.
+    pins_start, pins_star : (2, p, 2) measured pixels of the other markers, px, NaN where unknown.
     """
 
     q_start: FloatArray
     goal_pose: FloatArray | None
     s_start: FloatArray
     s_star: FloatArray
+    pins_start: FloatArray
+    pins_star: FloatArray
 
 
 @lru_cache(maxsize=4)
@@ -203,9 +211,14 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     clean = truth.images(q_start, truth.M_face)
     sigma = config.noise.servo_px
     s_start = clean + sigma * rng.standard_normal(clean.shape)
+    M_pins = truth.M[list(truth.pins)]
+    pins_start = truth.images(q_start, M_pins)
+    pins_noise = generator(config, PIN_TARGET_NOISE).standard_normal((2, *pins_start.shape))
+    pins_start = pins_start + sigma * pins_noise[0]
     goal = config.task.goal
     if goal.images is not None:
-        return Reach(q_start, None, s_start, np.array([goal.images.left, goal.images.right]))
+        s_star = np.array([goal.images.left, goal.images.right])
+        return Reach(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
     if goal.joints is not None:
         q_goal = np.array(goal.joints.values(types))
     else:
@@ -213,9 +226,9 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
         q_goal = _turned(truth, q_start, goal.turn_deg, goal.perturbation)
     _require_limits(truth.robot, q_goal, "task.goal")
     s_star = truth.images(q_goal, truth.M_face)
-    return Reach(
-        q_start, truth.robot.pose(q_goal), s_start, s_star + sigma * rng.standard_normal(s_star.shape)
-    )
+    s_star = s_star + sigma * rng.standard_normal(s_star.shape)
+    pins_star = truth.images(q_goal, M_pins) + sigma * pins_noise[1]
+    return Reach(q_start, truth.robot.pose(q_goal), s_start, s_star, pins_start, pins_star)
 
 
 def _turned(

@@ -8,6 +8,7 @@ from projservo_cli.geometry.algebra import Vec4, add, meet, scale, unit, vec
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, triangulate_points
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
+from projservo_cli.task.body import NO_BODY, Body
 
 MIDPOINT = -1
 
@@ -24,6 +25,7 @@ class Task(NamedTuple):
     F : (3, 3) fundamental matrix.
     O : (2, 4) optical centres, a_inf·O = 1.
     visible : (2,) sign of a·O on the visible side of the face, one a camera.
+    body : all markers of the body, by which the face is measured; none for point by point.
     """
 
     s_star: FloatArray
@@ -33,6 +35,7 @@ class Task(NamedTuple):
     F: FloatArray
     O: FloatArray
     visible: FloatArray
+    body: Body = NO_BODY
 
 
 @njit

@@ -16,7 +16,6 @@ from projservo_cli.loop.step import (
     SINGULAR_VERDICT,
     VERDICTS,
     Instant,
-    all_seen,
     beyond_limits,
     finite,
     image_error,
@@ -123,25 +122,26 @@ def test_image_error_is_the_rms_over_markers_and_views():
     s, s_star = np.zeros((2, 3, 2)), np.zeros((2, 3, 2))
     s[0, 1] = [3.0, 4.0]
     assert image_error(s, s_star) == pytest.approx(5.0 / math.sqrt(6.0))
-    s[1, 2, 0] = math.nan
-    assert math.isnan(image_error(s, s_star))
+    s[1, 2, 0] = math.nan  # unseen: it does not count
+    assert image_error(s, s_star) == pytest.approx(5.0 / math.sqrt(5.0))
+    further = np.concatenate([s, np.full((2, 2, 2), 1e3)], axis=1)
+    assert image_error(further, s_star) == image_error(s, s_star)
+    assert math.isnan(image_error(np.full((2, 3, 2), math.nan), s_star))
 
 
-def test_seen_outside_and_finite():
+def test_outside_and_finite():
     s = np.full((2, 3, 2), 100.0)
     size = np.array([640.0, 480.0])
-    assert all_seen(s)
-    assert not outside(s, size)
+    assert not outside(s, 3, size)
     for place, value in [((0, 0, 0), -0.51), ((1, 2, 0), 639.51), ((1, 1, 1), 479.51), ((0, 2, 1), -0.51)]:
         there = s.copy()
         there[place] = value
-        assert outside(there, size)
+        assert outside(there, 3, size)
         there[place] = np.sign(value) * (abs(value) - 0.02)
-        assert not outside(there, size)
-        assert not outside(there, np.full(2, math.inf)) or value < 0
+        assert not outside(there, 3, size)
+        assert not outside(there, 3, np.full(2, math.inf)) or value < 0
         there[place] = math.nan
-        assert not all_seen(there)
-        assert not outside(there, size)
+        assert not outside(there, 3, size)
     assert finite(np.zeros(3))
     assert not finite(np.array([0.0, math.nan]))
     assert not finite(np.array([math.inf, 0.0]))

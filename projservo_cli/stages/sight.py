@@ -1,0 +1,52 @@
+"""How the face is watched: point by point, or with the whole body it belongs to."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from projservo_cli.records import Calibration, FloatArray
+from projservo_cli.stages.truth import Reach, Truth
+from projservo_cli.task.body import Body, body_of
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """The body as it is watched: the markers of the face first, then the pins.
+
+    Attributes
+    ----------
+    body : as calibrated.
+    pins : (p, 4) true pins at the robot's reference, m.
+    s_start, s_star : (2, m + p, 2) measured pixels at the start and at the goal, NaN where unseen.
+    """
+
+    body: Body
+    pins: FloatArray
+    s_start: FloatArray
+    s_star: FloatArray
+
+
+def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Reach) -> Sight | None:
+    """The body of the markers that the calibration knows; None where the face is measured point by point.
+
+    Raises
+    ------
+    WorkFailed
+        If the displacements of the body cannot be told from the calibration.
+    """
+    if config.control.observation == "points":
+        return None
+    known = calibration.marker.tolist()
+    pins = [i for i, index in enumerate(truth.pins) if truth.number[index] in known]
+    indices = [*truth.face, *(truth.pins[i] for i in pins)]
+    M = calibration.M[[known.index(truth.number[index]) for index in indices]]
+    return Sight(
+        body_of(calibration.model(), M),
+        np.ascontiguousarray(truth.M[indices[len(truth.face) :]]),
+        np.concatenate([reach.s_start, reach.pins_start[:, pins]], axis=1),
+        np.concatenate([reach.s_star, reach.pins_star[:, pins]], axis=1),
+    )

@@ -1,0 +1,259 @@
+"""The body the face belongs to: where all its markers together say it is.
+
+The markers' structure and the displacements a robot can make are known from the calibration. What is
+left to measure is one displacement, six coordinates, by all markers either camera sees.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import (
+    Mat4,
+    add,
+    apply,
+    apply_transposed,
+    combine,
+    dot,
+    mat,
+    mul,
+    outer,
+    put_vec,
+    scale,
+    vec,
+)
+from projservo_cli.geometry.displacement import twist_exponential
+from projservo_cli.geometry.jit import inline, njit
+from projservo_cli.geometry.normal import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
+from projservo_cli.records import FloatArray, Model, WorkFailed
+
+Vec3 = tuple[float, float, float]
+# A step that moves the images by less than this, px rms a coordinate, is the last: what it leaves is
+# its square over the size of the body in the image, a few thousandths of a pixel.
+SETTLED_PX = 0.5
+MOST_STEPS = 2
+# A coordinate of which the others leave less than this share, squared, is not determined.
+RANK_TOLERANCE = 1e-7
+
+
+class Body(NamedTuple):
+    """Markers that move as one, and a basis of the displacements they can make.
+
+    The coordinates of a displacement are three translations and three rotations about the middle of
+    the markers; the translations have a_inf for their plane at infinity.
+
+    Attributes
+    ----------
+    M : (m, 4) markers at the reference, a_inf·M = 1, those of the face first; none where the face is
+        measured point by point.
+    D : (3, 4) points at infinity along which the translations go.
+    H_hat : (3, 4, 4) operators of the rotations, per rad.
+    turn : (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation.
+    a_inf : (4,) plane at infinity.
+    normal : (6, 7) workspace of the normal equations.
+    """
+
+    M: FloatArray
+    D: FloatArray
+    H_hat: FloatArray
+    turn: FloatArray
+    a_inf: FloatArray
+    normal: FloatArray
+
+
+class Fit(NamedTuple):
+    """Displacement that markers say, and how well they agree.
+
+    Attributes
+    ----------
+    found : False where the markers that were seen do not determine it.
+    H : displacement from the reference.
+    before, after : sum of squared residuals of the prediction and of the fit, px².
+    views : markers used, counted once a view.
+    """
+
+    found: bool
+    H: Mat4
+    before: float
+    after: float
+    views: int
+
+
+# The face measured point by point.
+NO_BODY = Body(
+    np.zeros((0, 4)),
+    np.zeros((3, 4)),
+    np.zeros((3, 4, 4)),
+    np.zeros((0, 3, 3)),
+    np.zeros(4),
+    np.zeros((COORDINATES, COORDINATES + 1)),
+)
+
+
+def body_of(model: Model, M: FloatArray) -> Body:
+    """Body of calibrated markers.
+
+    The rotations are those of the joints: the three directions in which their actions on the plane at
+    infinity spread most, orthonormal in the invariant form −½ trace(L L'), hence per rad.
+
+    Parameters
+    ----------
+    model : calibrated model.
+    M : (m, 4) its markers at the reference, those of the face first.
+
+    Raises
+    ------
+    WorkFailed
+        If the joints do not turn the body about three independent directions.
+    """
+    M = M / (M @ model.a_inf)[:, None]
+    D = np.linalg.svd(model.a_inf[None])[2][1:]
+    actions = D @ model.H_hat_0 @ D.T
+    brackets = np.array([A @ B - B @ A for A in actions for B in actions])
+    _, sizes, rows = np.linalg.svd(np.concatenate([actions, brackets]).reshape(-1, 9))
+    L = rows[:3].reshape(3, 3, 3)
+    form = -0.5 * np.einsum("iab,jba->ij", L, L)
+    if not (sizes[2] > 1e-6 * sizes[0] and np.linalg.eigvalsh(form)[0] > 1e-6):
+        raise WorkFailed(
+            "the joints do not turn the body about three directions, so that its displacements are not "
+            "known: measure point by point with control.observation: points"
+        )
+    L = np.linalg.solve(np.linalg.cholesky(form), L.reshape(3, 9)).reshape(3, 3, 3)
+    offset = M - M.mean(axis=0)
+    carry = np.eye(4) - np.outer(M.mean(axis=0), model.a_inf)
+    return Body(
+        np.ascontiguousarray(M),
+        np.ascontiguousarray(D),
+        np.ascontiguousarray(D.T @ L @ D @ carry),
+        np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
+        np.ascontiguousarray(model.a_inf),
+        np.zeros((COORDINATES, COORDINATES + 1)),
+    )
+
+
+@inline
+def image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float) -> Row:
+    """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
+
+    Parameters
+    ----------
+    t, t_depth : numerator and denominator of the coordinate under the translations.
+    turn : (3, 3) rotations of the marker as translations.
+    """
+    x = (t[0] - pixel * t_depth[0]) * inverse_depth
+    y = (t[1] - pixel * t_depth[1]) * inverse_depth
+    z = (t[2] - pixel * t_depth[2]) * inverse_depth
+    return (
+        x,
+        y,
+        z,
+        (float(turn[0, 0]) * x + float(turn[0, 1]) * y) + float(turn[0, 2]) * z,
+        (float(turn[1, 0]) * x + float(turn[1, 1]) * y) + float(turn[1, 2]) * z,
+        (float(turn[2, 0]) * x + float(turn[2, 1]) * y) + float(turn[2, 2]) * z,
+        e,
+    )
+
+
+@njit
+def normal_equations(P: FloatArray, body: Body, s: FloatArray, H: Mat4) -> tuple[float, int]:
+    """Normal equations of the displacement exp(ξ) after which H carries the markers to their images.
+
+    Parameters
+    ----------
+    P : (2, 3, 4) cameras.
+    body : the equations are written to its workspace.
+    s : (2, k, 2) pixels of the first k markers, NaN where unseen.
+    H : displacement from the reference about which the images are linear in ξ.
+
+    Returns
+    -------
+    Sum of squared residuals, px², and the number of markers seen, counted once a view.
+    """
+    N = NOTHING
+    squares = 0.0
+    views = 0
+    D_0, D_1, D_2 = vec(body.D[0]), vec(body.D[1]), vec(body.D[2])
+    for view in range(2):
+        # Rows of the camera carried back to the body: its image of what stands still there.
+        p_u = apply_transposed(H, vec(P[view, 0]))
+        p_v = apply_transposed(H, vec(P[view, 1]))
+        p_w = apply_transposed(H, vec(P[view, 2]))
+        t_u = (dot(p_u, D_0), dot(p_u, D_1), dot(p_u, D_2))
+        t_v = (dot(p_v, D_0), dot(p_v, D_1), dot(p_v, D_2))
+        t_w = (dot(p_w, D_0), dot(p_w, D_1), dot(p_w, D_2))
+        for k in range(min(body.M.shape[0], s.shape[1])):
+            M = vec(body.M[k])
+            depth = dot(p_w, M)
+            if depth == 0.0 or not (math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])):
+                continue
+            inverse = 1.0 / depth
+            u = dot(p_u, M) * inverse
+            v = dot(p_v, M) * inverse
+            e_u = float(s[view, k, 0]) - u
+            e_v = float(s[view, k, 1]) - v
+            row_u = image_row(t_u, t_w, u, inverse, body.turn[k], e_u)
+            row_v = image_row(t_v, t_w, v, inverse, body.turn[k], e_v)
+            N = accumulate(N, row_u, row_v)
+            squares += e_u * e_u + e_v * e_v
+            views += 1
+    put_sums(body.normal, N)
+    return squares, views
+
+
+@njit
+def displaced(body: Body, H: Mat4) -> Mat4:
+    """Displacement H exp(ξ), with the coordinates ξ in the last column of the workspace."""
+    xi = body.normal[:, COORDINATES]
+    direction = add(
+        scale(float(xi[0]), vec(body.D[0])),
+        add(scale(float(xi[1]), vec(body.D[1])), scale(float(xi[2]), vec(body.D[2]))),
+    )
+    X = outer(direction, vec(body.a_inf))
+    for i in range(3):
+        X = combine(1.0, X, float(xi[3 + i]), mat(body.H_hat[i]))
+    return mul(H, twist_exponential(X))
+
+
+@njit
+def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, settled_px: float, most_steps: int) -> Fit:
+    """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
+
+    Any markers do that determine six coordinates: three that one camera sees, in general position.
+
+    Parameters
+    ----------
+    P : (2, 3, 4) cameras.
+    s : (2, k, 2) pixels of the first k markers, NaN where unseen.
+    H : predicted displacement from the reference.
+    settled_px : a step that moves the images by no more, px rms a coordinate, is the last.
+    most_steps : the fit after so many steps is taken as it is.
+    """
+    before = 0.0
+    after = 0.0
+    views = 0
+    for step in range(most_steps):
+        squares, views = normal_equations(P, body, s, H)
+        if step == 0:
+            before = squares
+        gradient = (
+            body.normal[0, 6], body.normal[1, 6], body.normal[2, 6],
+            body.normal[3, 6], body.normal[4, 6], body.normal[5, 6],
+        )  # fmt: skip
+        if not solve_normal(body.normal, RANK_TOLERANCE):
+            return Fit(False, H, before, before, views)
+        fall = 0.0
+        for i in range(COORDINATES):
+            fall += gradient[i] * body.normal[i, COORDINATES]
+        H = displaced(body, H)
+        after = max(0.0, squares - fall)
+        if fall <= settled_px * settled_px * (2 * views):
+            break
+    return Fit(True, H, before, after, views)
+
+
+@njit
+def carry(body: Body, H: Mat4, A: FloatArray) -> None:
+    """Points (m, 4) of the face, the first of the body, after the displacement H."""
+    for k in range(A.shape[0]):
+        put_vec(A[k], apply(H, vec(body.M[k])))
