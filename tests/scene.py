@@ -12,7 +12,9 @@ from projservo_cli.loop.compiled import new_log, run
 from projservo_cli.loop.step import VERDICTS, Limits
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.body import body_of
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane, task_from_images
+from projservo_cli.task.target import task_from_body
 from tests.samples import METRIC_A_INF, arm, face, in_frame, pixels, poe
 
 GAINS = Gains(2.5, 2.5, 2.5, 2.5, 1.0, 2.5, 0.04, 0.9)
@@ -41,6 +43,14 @@ class Scene(NamedTuple):
         """Model in another frame."""
         return self.model if G is None else in_frame(self.model, G)
 
+    def body_task(self, G=None) -> Task:
+        """The same task measured with face and pins; images of the pins are the true ones."""
+        model = self.seen(G)
+        M = np.concatenate([self.plant.M, self.plant.pins])
+        body = body_of(model, M if G is None else M @ G.T)
+        s = [pixels(self.model.P, M @ poe(self.model, q).T) for q in (self.q_start, self.q_goal)]
+        return task_from_body(model, body, self.q_start, *s, self.plant.center, len(self.plant.M))
+
     def images(self, q) -> FloatArray:
         """True pixels of the face at the joints q."""
         return pixels(self.model.P, self.plant.M @ poe(self.model, q).T)
@@ -67,6 +77,14 @@ def scene(step=STEP, types="RRRRRR", m=4, center=MIDPOINT, opaque=False) -> Scen
     return Scene(plant, q_start, q_goal, s[0], s[1])
 
 
+def with_pins(scene) -> Scene:
+    """Scene whose face is part of a body: five pins behind and around it."""
+    offsets = [[0.1, 0.02, 0.06], [-0.09, 0.05, 0.08], [-0.02, -0.11, 0.05], [0.05, 0.09, 0.1], [0, 0, 0.12]]
+    middle = scene.plant.M.mean(axis=0)
+    pins = np.ascontiguousarray(middle + np.c_[np.array(offsets), np.zeros(5)])
+    return scene._replace(plant=scene.plant._replace(pins=pins))
+
+
 def limits(n=6, **given) -> Limits:
     """Limits that end a run only at its goal, or as given."""
     values = {
@@ -87,8 +105,9 @@ class Run:
     def __init__(self, scene, law, gains=GAINS, bounds=None, noise=None, G=None, memory=None, task=None):
         bounds = limits(len(scene.q_start)) if bounds is None else bounds
         n, m = len(scene.q_start), len(scene.plant.M)
-        noise = np.zeros((bounds.max_steps + 1, 2, m, 2)) if noise is None else noise
-        self.state, self.full = new_state(n, m), new_log(n, m, bounds.max_steps, len(ERRORS))
+        seen = m + len(scene.plant.pins)
+        noise = np.zeros((bounds.max_steps + 1, 2, seen, 2)) if noise is None else noise
+        self.state, self.full = new_state(n, m), new_log(n, seen, bounds.max_steps, len(ERRORS))
         if memory is not None:
             self.state.memory.rotation[:] = memory
         task = scene.task(G) if task is None else task

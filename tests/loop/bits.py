@@ -10,7 +10,18 @@ import numpy as np
 
 from projservo_cli.records import LAWS
 from tests.samples import frame
-from tests.scene import GAINS, Run, limits, scene
+from tests.scene import GAINS, Run, limits, scene, with_pins
+
+# Pixel noise of four markers on the face and five pins.
+WHOLE_NOISE = 0.5 * np.random.default_rng(8).standard_normal((16, 2, 9, 2))
+
+
+def hash_of(run):
+    """Hash of everything a run logged."""
+    digest = hashlib.sha256(f"{run.verdict} {run.steps}".encode())
+    for rows in run.full:
+        digest.update(rows.tobytes())
+    return digest.hexdigest()
 
 
 def hashes():
@@ -22,10 +33,12 @@ def hashes():
             G = None if law == "euclidean_points" else frame(1)
             bounds = limits(speed=np.full(6, 0.8), max_steps=15)
             run = Run(scene(types=types), law, GAINS._replace(ratio_rp=2.0), bounds, noise, G)
-            digest = hashlib.sha256(f"{run.verdict} {run.steps}".encode())
-            for rows in run.full:
-                digest.update(rows.tobytes())
-            found[f"{law} {types}"] = digest.hexdigest()
+            found[f"{law} {types}"] = hash_of(run)
+        sc = with_pins(scene(types=types))
+        run = Run(
+            sc, "exact", GAINS, limits(max_steps=15), WHOLE_NOISE, frame(1), task=sc.body_task(frame(1))
+        )
+        found[f"exact, body, {types}"] = hash_of(run)
     return found
 
 

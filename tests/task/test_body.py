@@ -1,0 +1,239 @@
+"""Measuring with the body: the fit against finite differences, exact images and its own bound."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from projservo_cli.geometry.displacement import as_array, as_mat
+from projservo_cli.geometry.normal import COORDINATES, solve_normal
+from projservo_cli.records import WorkFailed
+from projservo_cli.task.body import (
+    MOST_STEPS,
+    RANK_TOLERANCE,
+    SETTLED_PX,
+    body_of,
+    fit_body,
+    normal_equations,
+)
+from tests.samples import arm, displacement, frame, in_frame, pixels, poe, revolute
+
+FRAMES = [None, 1, 2]
+SIGMA = 0.5
+
+
+def markers(seed=0, m=10):
+    """Markers of a body of 0.2 m before the rig, the first four on a face."""
+    rng = np.random.default_rng(seed)
+    flat = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) * 0.05
+    offsets = np.concatenate([flat, rng.uniform(-0.1, 0.1, (m - 4, 3))])
+    return np.c_[offsets, np.ones(m)] @ displacement([0.3, -0.2, 0.4], [0.02, -0.03, 1.4]).T
+
+
+def seen_from(seed):
+    """Model, markers and the map from metric points, in the metric frame or a projective one."""
+    model, M = arm(), markers()
+    if seed is None:
+        return model, M, np.eye(4)
+    G = frame(seed)
+    scaled = M @ G.T
+    model = in_frame(model, G)
+    return model, scaled / (scaled @ model.a_inf)[:, None], G
+
+
+def twist_of(body, xi):
+    """Element of the algebra with coordinates ξ."""
+    return np.outer(xi[:3] @ body.D, body.a_inf) + np.einsum("r,rij->ij", xi[3:], body.H_hat)
+
+
+def fitted(model, body, s, H, steps=MOST_STEPS, settled=SETTLED_PX):
+    return fit_body(model.P, body, np.ascontiguousarray(s), as_mat(H), settled, steps)
+
+
+@pytest.mark.parametrize("seed", FRAMES)
+def test_the_basis_is_one_of_rigid_displacements(seed):
+    model, M, G = seen_from(seed)
+    body = body_of(model, M)
+    forms = -0.5 * np.einsum("iab,jba->ij", body.H_hat, body.H_hat)
+    assert forms == pytest.approx(np.eye(3), abs=1e-10)
+    for k, operator in enumerate(body.H_hat):
+        assert expm(2 * math.pi * operator) == pytest.approx(np.eye(4), abs=1e-9)
+        assert body.a_inf @ operator == pytest.approx(np.zeros(4), abs=1e-10)
+        assert operator @ body.M.mean(axis=0) == pytest.approx(np.zeros(4), abs=1e-10)
+        assert body.turn[:, k] @ body.D == pytest.approx(body.M @ operator.T, abs=1e-10)
+        rotation = np.linalg.solve(G, expm(0.7 * operator) @ G)[:3, :3]
+        assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-9)
+        assert math.acos((np.trace(rotation) - 1) / 2) == pytest.approx(0.7, abs=1e-8)
+    assert body.D @ model.a_inf == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_a_robot_that_turns_about_one_direction_has_no_known_body():
+    parallel = np.array([revolute([0.1 * i, 0.2, 0.0], [0.0, 0.0, 1.0]) for i in range(6)])
+    with pytest.raises(WorkFailed, match=r"control\.observation: points"):
+        body_of(arm()._replace(H_hat_0=parallel), markers())
+
+
+def test_two_directions_of_turning_imply_the_third():
+    axes = [[0, 0, 1.0], [0, 1.0, 0]] * 3
+    twists = np.array([revolute([0.1 * i, 0.2, 0.3 * i], axis) for i, axis in enumerate(axes)])
+    body = body_of(arm()._replace(H_hat_0=twists), markers())
+    assert body.H_hat[:, :3, :3] == pytest.approx(-np.swapaxes(body.H_hat[:, :3, :3], 1, 2), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", FRAMES)
+def test_jacobian_and_gradient_by_finite_differences(seed, rng):
+    model, M, _ = seen_from(seed)
+    body = body_of(model, M)
+    H = poe(model, model.q_reference + 0.1)
+    s = pixels(model.P, M @ poe(model, model.q_reference + 0.12).T)
+    s[0, 3] = s[1, 7] = math.nan
+    squares, views = normal_equations(model.P, body, s, as_mat(H))
+
+    def residual(xi):
+        e = s - pixels(model.P, M @ (H @ expm(twist_of(body, xi))).T)
+        return e[np.isfinite(s)]
+
+    step = 1e-5
+    J = np.stack([(residual(-step * x) - residual(step * x)) / (2 * step) for x in np.eye(6)], axis=1)
+    N = np.triu(body.normal[:, :6])
+    e = residual(np.zeros(6))
+    assert views == 18
+    assert squares == pytest.approx(e @ e, rel=1e-12)
+    # Central differences of 1e-5 rad: 1e-10 of the third derivative, round-off 1e-13 px over 1e-5.
+    assert np.triu(J.T @ J) == pytest.approx(N, rel=1e-6, abs=1e-6 * np.abs(N).max())
+    assert J.T @ e == pytest.approx(body.normal[:, 6], rel=1e-6, abs=1e-6 * np.abs(J.T @ e).max())
+
+
+def test_normal_equations_are_solved(rng):
+    for _ in range(20):
+        J = rng.normal(size=(9, 6)) * 10.0 ** rng.uniform(-3, 3, 6)
+        e = rng.normal(size=9)
+        N = np.concatenate([np.triu(J.T @ J), (J.T @ e)[:, None]], axis=1)
+        assert solve_normal(N, RANK_TOLERANCE)
+        assert N[:, 6] == pytest.approx(np.linalg.lstsq(J, e)[0], rel=1e-6)
+    J[:, 5] = J[:, :5] @ rng.normal(size=5)
+    assert not solve_normal(np.concatenate([J.T @ J, np.zeros((6, 1))], axis=1), RANK_TOLERANCE)
+    assert not solve_normal(np.zeros((6, 7)), RANK_TOLERANCE)
+
+
+@pytest.mark.parametrize("seed", FRAMES)
+def test_exact_images_give_the_exact_displacement(seed, rng):
+    """From 3° and centimetres off: two steps to a ten-millionth, ten to round-off."""
+    model, M, _ = seen_from(seed)
+    body = body_of(model, M)
+    q = model.q_reference + rng.uniform(-0.3, 0.3, 6)
+    H, away = poe(model, q), poe(model, q + 0.02 * rng.normal(size=6))
+    s = pixels(model.P, M @ H.T)
+    two, ten = fitted(model, body, s, away), fitted(model, body, s, away, 10, 1e-9)
+    assert two.found
+    assert two.views == 20
+    assert as_array(two.H) == pytest.approx(H, abs=1e-5)
+    assert as_array(ten.H) == pytest.approx(H, abs=1e-11)
+    assert two.before == pytest.approx(np.sum((s - pixels(model.P, M @ away.T)) ** 2), rel=1e-10)
+    assert ten.after < 1e-15 * two.before
+
+
+SUBSETS = {
+    "left only": np.s_[1, :],
+    "three in one view": (np.s_[1, :], np.s_[0, 3:]),
+    "two and two others": (np.s_[0, 2:], np.s_[1, :2], np.s_[1, 4:]),
+    "two and one seen by one camera": (np.s_[:, 3:], np.s_[1, 2]),
+}
+
+
+@pytest.mark.parametrize("hidden", SUBSETS.values(), ids=SUBSETS)
+def test_any_sufficient_markers_do(hidden, rng):
+    model, M, _ = seen_from(1)
+    body = body_of(model, M)
+    H = poe(model, model.q_reference + 0.2)
+    s = pixels(model.P, M @ H.T)
+    for where in hidden if isinstance(hidden[0], tuple) else [hidden]:
+        s[where] = math.nan
+    away = poe(model, model.q_reference + 0.2 + 0.003 * rng.normal(size=6))
+    fit = fitted(model, body, s, away, 10, 1e-9)
+    assert fit.found
+    assert fit.views == np.isfinite(s[..., 0]).sum()
+    assert as_array(fit.H) == pytest.approx(H, abs=1e-8)
+
+
+def test_too_few_markers_are_told():
+    model, M, _ = seen_from(1)
+    M = M.copy()
+    M[2] = 0.5 * (M[0] + M[1])
+    body = body_of(model, M)
+    s = pixels(model.P, M)
+    for seen in ([], [0], [0, 5], [0, 1, 2]):  # the last on one line
+        some = np.full_like(s, math.nan)
+        some[:, seen] = s[:, seen]
+        fit = fitted(model, body, some, np.eye(4))
+        assert not fit.found
+        assert fit.views == 2 * len(seen)
+        assert as_array(fit.H) == pytest.approx(np.eye(4), abs=0)
+
+
+def test_the_fit_does_not_depend_on_the_frame(rng):
+    noise = SIGMA * rng.normal(size=(2, 10, 2))
+    found = []
+    for seed in FRAMES:
+        model, M, G = seen_from(seed)
+        s = pixels(model.P, M @ poe(model, model.q_reference + 0.1).T) + noise
+        fit = fitted(model, body_of(model, M), s, poe(model, model.q_reference + 0.1), 10, 1e-9)
+        found.append((np.linalg.solve(G, as_array(fit.H) @ G), fit.after))
+    for moved, after in found[1:]:
+        assert moved == pytest.approx(found[0][0], abs=1e-9)
+        assert after == pytest.approx(found[0][1], rel=1e-8)
+
+
+def draws(count, rng, prediction=0.0):
+    """Errors (count, 6) of one-shot fits, their Fisher information by finite differences, and the fits."""
+    model, M, _ = seen_from(None)
+    body = body_of(model, M)
+    q = model.q_reference + 0.1
+    H = poe(model, q)
+    clean = pixels(model.P, M @ H.T)
+    step = 1e-5
+    images = [
+        pixels(model.P, M @ (H @ expm(twist_of(body, sign * step * x))).T).ravel()
+        for x in np.eye(6)
+        for sign in (1, -1)
+    ]
+    J = (np.array(images[::2]) - np.array(images[1::2])).T / (2 * step)
+    errors, after = np.empty((count, 6)), np.empty(count)
+    back = np.linalg.inv(H)
+    for i in range(count):
+        guess = poe(model, q + prediction * rng.normal(size=6)) if prediction else H
+        fit = fitted(model, body, clean + SIGMA * rng.normal(size=clean.shape), guess)
+        X = back @ as_array(fit.H) - np.eye(4)  # the logarithm but for its square, 1e-6
+        errors[i, :3] = body.D[:, :3] @ (X @ body.M.mean(axis=0))[:3]
+        errors[i, 3:] = -0.5 * np.einsum("rab,ba->r", body.H_hat[:, :3, :3], X[:3, :3])
+        after[i] = fit.after
+    return errors, J.T @ J / SIGMA**2, after
+
+
+def efficiency(errors, F):
+    """Rms over the bound: all six coordinates, the translations, the rotations."""
+    bound = np.linalg.inv(F)
+    whole = math.sqrt(np.mean(np.einsum("ni,ij,nj->n", errors, F, errors)) / 6)
+    rms = np.sqrt(np.mean(errors**2, axis=0) @ np.array([[1, 1, 1, 0, 0, 0], [0, 0, 0, 1, 1, 1]]).T)
+    limit = np.sqrt([np.trace(bound[:3, :3]), np.trace(bound[3:, 3:])])
+    return np.array([whole, *(rms / limit)])
+
+
+def test_the_fit_is_efficient_and_its_residual_has_the_right_size(rng):
+    errors, F, after = draws(300, rng)
+    # The relative error of an rms of 300 draws of three coordinates is 0.04 at most if one dominates.
+    assert efficiency(errors, F) == pytest.approx(np.ones(3), abs=0.13)
+    dof = 40 - COORDINATES
+    assert np.mean(after) / SIGMA**2 == pytest.approx(dof, abs=4 * math.sqrt(2 * dof / 300))
+
+
+@pytest.mark.volume
+@pytest.mark.parametrize("prediction", [0.0, 0.01], ids=["true prediction", "off by 0.6°"])
+def test_ten_thousand_draws_reach_the_bound(prediction):
+    errors, F, _ = draws(10_000, np.random.default_rng(5), prediction)
+    found = efficiency(errors, F)
+    print(f"rms over the Cramér–Rao bound: six coordinates {found[0]:.4f}, position {found[1]:.4f}, "
+          f"rotation {found[2]:.4f}")  # fmt: skip
+    assert (found <= 1.05).all()
+    assert np.abs(errors.mean(axis=0) * np.sqrt(np.diag(F))).max() < 0.1  # hardly a bias
