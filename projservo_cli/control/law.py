@@ -150,8 +150,14 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
 
 @njit
 def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State) -> bool:
-    """Measure the face by all markers of the body, predicted at the displacement H of the joints."""
-    fit = fit_body(model.P, task.body, s, H, SETTLED_PX, MOST_STEPS)
+    """Measure the face by all markers of the body, predicted at the displacement H of the joints.
+
+    At the goal the errors of the calibration cancel between what is seen and what was shown where both
+    are fitted to the same views; others serve only where these do not determine the body.
+    """
+    fit = fit_body(model.P, task.body, s, H, True, SETTLED_PX, MOST_STEPS)
+    if not fit.found:
+        fit = fit_body(model.P, task.body, s, H, False, SETTLED_PX, MOST_STEPS)
     state.fit[0] = fit.before
     state.fit[1] = fit.after
     state.fit[2] = fit.views

@@ -26,7 +26,7 @@ from projservo_cli.geometry.algebra import (
 from projservo_cli.geometry.displacement import twist_exponential
 from projservo_cli.geometry.jit import inline, njit
 from projservo_cli.geometry.normal import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
-from projservo_cli.records import FloatArray, Model, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, Model, WorkFailed
 
 Vec3 = tuple[float, float, float]
 # A step that moves the images by less than this, px rms a coordinate, is the last: what it leaves is
@@ -51,6 +51,7 @@ class Body(NamedTuple):
     H_hat : (3, 4, 4) operators of the rotations, per rad.
     turn : (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation.
     a_inf : (4,) plane at infinity.
+    shown : (2, m) views of the markers that the goal showed.
     normal : (6, 7) workspace of the normal equations.
     """
 
@@ -59,6 +60,7 @@ class Body(NamedTuple):
     H_hat: FloatArray
     turn: FloatArray
     a_inf: FloatArray
+    shown: BoolArray
     normal: FloatArray
 
 
@@ -87,6 +89,7 @@ NO_BODY = Body(
     np.zeros((3, 4, 4)),
     np.zeros((0, 3, 3)),
     np.zeros(4),
+    np.zeros((2, 0), dtype=np.bool_),
     np.zeros((COORDINATES, COORDINATES + 1)),
 )
 
@@ -128,6 +131,7 @@ def body_of(model: Model, M: FloatArray) -> Body:
         np.ascontiguousarray(D.T @ L @ D @ carry),
         np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
         np.ascontiguousarray(model.a_inf),
+        np.ones((2, len(M)), dtype=np.bool_),
         np.zeros((COORDINATES, COORDINATES + 1)),
     )
 
@@ -156,7 +160,9 @@ def image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: 
 
 
 @njit
-def normal_equations(P: FloatArray, body: Body, s: FloatArray, H: Mat4) -> tuple[float, int]:
+def normal_equations(
+    P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool = False
+) -> tuple[float, int]:
     """Normal equations of the displacement exp(ξ) after which H carries the markers to their images.
 
     Parameters
@@ -165,6 +171,7 @@ def normal_equations(P: FloatArray, body: Body, s: FloatArray, H: Mat4) -> tuple
     body : the equations are written to its workspace.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : displacement from the reference about which the images are linear in ξ.
+    shown_only : leave out views that the goal did not show.
 
     Returns
     -------
@@ -183,6 +190,8 @@ def normal_equations(P: FloatArray, body: Body, s: FloatArray, H: Mat4) -> tuple
         t_v = (dot(p_v, D_0), dot(p_v, D_1), dot(p_v, D_2))
         t_w = (dot(p_w, D_0), dot(p_w, D_1), dot(p_w, D_2))
         for k in range(min(body.M.shape[0], s.shape[1])):
+            if shown_only and not body.shown[view, k]:
+                continue
             M = vec(body.M[k])
             depth = dot(p_w, M)
             if depth == 0.0 or not (math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])):
@@ -216,7 +225,9 @@ def displaced(body: Body, H: Mat4) -> Mat4:
 
 
 @njit
-def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, settled_px: float, most_steps: int) -> Fit:
+def fit_body(
+    P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool, settled_px: float, most_steps: int
+) -> Fit:
     """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
 
     Any markers do that determine six coordinates: three that one camera sees, in general position.
@@ -226,6 +237,7 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, settled_px: floa
     P : (2, 3, 4) cameras.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : predicted displacement from the reference.
+    shown_only : leave out views that the goal did not show.
     settled_px : a step that moves the images by no more, px rms a coordinate, is the last.
     most_steps : the fit after so many steps is taken as it is.
     """
@@ -233,7 +245,7 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, settled_px: floa
     after = 0.0
     views = 0
     for step in range(most_steps):
-        squares, views = normal_equations(P, body, s, H)
+        squares, views = normal_equations(P, body, s, H, shown_only)
         if step == 0:
             before = squares
         gradient = (

@@ -62,7 +62,8 @@ def task_from_body(
     amplitudes = (parts.tau, parts.theta_r, parts.theta_p)
     H_guess = trajectory_displacement(H_hat, amplitudes, np.ones(3)) @ H_start
     H_star = settled(model, body, s_star, H_guess, "goal")
-    return task._replace(A_star=np.ascontiguousarray(body.M[:m] @ H_star.T), body=body)
+    shown = np.isfinite(s_star[..., 0]) & np.isfinite(s_star[..., 1])
+    return task._replace(A_star=np.ascontiguousarray(body.M[:m] @ H_star.T), body=body._replace(shown=shown))
 
 
 def settled(model: Model, body: Body, s: FloatArray, H: FloatArray, where: str) -> FloatArray:
@@ -82,7 +83,7 @@ def settled(model: Model, body: Body, s: FloatArray, H: FloatArray, where: str) 
     s = np.ascontiguousarray(s, dtype=np.float64)
     fit = Fit(False, as_mat(H), 0.0, 0.0, 0)
     for _ in range(MOST_STEPS):
-        fit = fit_body(model.P, body, s, fit.H, SETTLED_PX, 1)
+        fit = fit_body(model.P, body, s, fit.H, False, SETTLED_PX, 1)
         if not fit.found:
             raise WorkFailed(
                 f"the images at the {where} show too few markers, {fit.views} in both views together, to "

@@ -39,17 +39,29 @@ def test_the_last_residual_is_that_of_the_noise(rng):
     assert np.sum(before) / np.sum(2 * views) == pytest.approx(0.25, rel=4 * np.sqrt(1 / np.sum(views)))
 
 
-def test_an_opaque_face_is_measured_by_the_pins():
+@pytest.mark.parametrize("shown", [9, 4], ids=["pins shown at the goal", "pins not shown at the goal"])
+def test_an_opaque_face_is_measured_by_the_pins(shown):
     """The face looks away all along: its markers are hidden, the body is not."""
     sc = with_pins(scene(opaque=True))
     hidden = sc._replace(plant=sc.plant._replace(visible=-sc.plant.visible))
-    run = Run(hidden, "exact", task=sc.body_task(), bounds=limits(max_steps=150))
+    task = sc.body_task()
+    task.body.shown[:, shown:] = False
+    run = Run(hidden, "exact", task=task, bounds=limits(max_steps=150))
     assert np.isnan(run.log.s[:, :, :4]).all()
     assert (run.log.fit[:, 2] == 10).all()
     # No marker of the face was seen, hence no image error; the body arrives all the same.
     assert np.isnan(run.log.error).all()
     assert run.verdict == "max steps"
     assert run.log.q[-1] == pytest.approx(sc.q_goal, abs=1e-5)
+
+
+def test_views_that_the_goal_did_not_show_are_left_out():
+    sc = with_pins(scene())
+    task = sc.body_task()
+    task.body.shown[0, 4:] = task.body.shown[1, 7:] = False
+    run = Run(sc, "exact", task=task)
+    assert run.verdict == "converged"
+    assert (run.log.fit[:, 2] == 4 + 7).all()
 
 
 def test_markers_lost_one_after_the_other(rng):

@@ -48,7 +48,7 @@ def twist_of(body, xi):
 
 
 def fitted(model, body, s, H, steps=MOST_STEPS, settled=SETTLED_PX):
-    return fit_body(model.P, body, np.ascontiguousarray(s), as_mat(H), settled, steps)
+    return fit_body(model.P, body, np.ascontiguousarray(s), as_mat(H), False, settled, steps)
 
 
 @pytest.mark.parametrize("seed", FRAMES)
