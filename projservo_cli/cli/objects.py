@@ -173,7 +173,10 @@ def _report_words(value: dict[str, Any]) -> list[str]:
     words = {True: "holds", False: "does not hold", None: "not measured"}
     holding = sum(row["holds"] is True for row in value["claims"])
     claims = [f"{words[row['holds']]}: {row['claim']}: {row['measured']}" for row in value["claims"]]
-    left_out = [f"left out: {row['what']}: {row['reason']}" for row in value["left_out"]]
+    reasons: dict[str, list[str]] = {}
+    for row in value["left_out"]:
+        reasons.setdefault(row["reason"], []).append(row["what"])
+    left_out = [f"left out: {', '.join(what)}: {reason}" for reason, what in reasons.items()]
     return [
         f"report: {len(value['figures'])} files of figures; {holding} of {len(claims)} claims hold",
         *(wrapped(text, "  ") for text in (*claims, *left_out)),

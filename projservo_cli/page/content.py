@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -40,7 +40,7 @@ class View:
     config : settings, and ``configuration`` the same as YAML with all defaults.
     made : (property, value) of what the run was made with.
     calibration, plan, laws : of each stage.
-    claims, drift, left_out : of the report.
+    claims, drift, left_out : of the report; what was left out for each reason.
     pictures : the figures by section.
     """
 
@@ -54,7 +54,7 @@ class View:
     laws: list[dict[str, Any]] = field(default_factory=list)
     claims: tuple[dict[str, Any], ...] = ()
     drift: dict[str, Any] | None = None
-    left_out: tuple[dict[str, str], ...] = ()
+    left_out: dict[str, list[str]] = field(default_factory=dict)
     reported: bool = False
     pictures: dict[str, list[Picture]] = field(default_factory=lambda: {name: [] for name in SECTIONS})
 
@@ -91,10 +91,18 @@ def view_of(run: Run, *, folder: str = "", prefix: str = "") -> View:
         shown,
         claims=report.claims,
         drift=_drift(report),
-        left_out=report.left_out,
+        left_out=_by_reason(report.left_out),
         reported=True,
         pictures=pictures(run.path.parent, report.figures, folder, prefix),
     )
+
+
+def _by_reason(left_out: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
+    """What was left out, gathered for each reason."""
+    gathered: dict[str, list[str]] = {}
+    for entry in left_out:
+        gathered.setdefault(entry["reason"], []).append(entry["what"])
+    return gathered
 
 
 def _made(run: Run, config: Config) -> Iterator[tuple[str, str]]:
@@ -136,6 +144,7 @@ def _values(label: str, told: dict[str, str]) -> Iterator[tuple[str, str]]:
 
 def _calibration(run: Run, config: Config) -> dict[str, Any]:
     calibration, held_out = run.calibration, run.cross_validation
+    words = calibration_words(calibration, estimated=config.data is not None and config.data.noise_px is None)
     given = config.robot.joints if config.robot is not None else ()
     joints = []
     for i, letter in enumerate(calibration.joint_types):
@@ -153,7 +162,7 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
         )
     return {
         "usable": calibration.usable,
-        "words": calibration_words(calibration) + ([] if held_out is None else [held_out_words(held_out)]),
+        "words": words if held_out is None else [*words, held_out_words(held_out)],
         "advice": calibration.advice,
         "numbers": [
             ("method", calibration.method, ""),

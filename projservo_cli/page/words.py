@@ -40,8 +40,14 @@ def number(value: Any, digits: int = 3) -> Markup:
     return Markup('<data value="{}">{}</data>').format(repr(plain), short(plain, digits))
 
 
-def calibration_words(calibration: Calibration) -> list[str]:
-    """Whether a calibration is good, why, and which joint is known worst, a sentence each."""
+def calibration_words(calibration: Calibration, *, estimated: bool) -> list[str]:
+    """Whether a calibration is good, why, and which joint is known worst, a sentence each.
+
+    Parameters
+    ----------
+    calibration : the calibration.
+    estimated : whether the noise was estimated from the same images, so that χ² alone decides nothing.
+    """
     found = [f"{'Usable' if calibration.usable else 'Not usable'}: {calibration.reason}."]
     if math.isfinite(calibration.chi2_per_dof) and calibration.dof > 0:
         low, high = chi2_band(calibration.dof)
@@ -49,6 +55,7 @@ def calibration_words(calibration: Calibration) -> list[str]:
             f"χ² per degree of freedom is {short(calibration.chi2_per_dof)} at "
             f"{short(calibration.sigma_px)} px of noise per coordinate, with {calibration.dof} degrees of "
             f"freedom; where model and noise are true it stays within {short(low)} and {short(high)}."
+            + (" The noise is itself an estimate from these images." if estimated else "")
         )
     found.append(_worst_joint(calibration))
     left_out = (
