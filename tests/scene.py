@@ -117,5 +117,5 @@ class Run:
             self.state, self.full,
         )  # fmt: skip
         self.verdict = VERDICTS[verdict]
-        self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-1]), self.full.events)
+        self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-3]), *self.full[-3:])
         self.center = (self.log.H @ np.array(center_of(scene.plant.M, scene.plant.center)))[:, :3]

@@ -209,10 +209,13 @@ def outer(A: Vec4, a: Vec4) -> Mat4:
 @inline
 def inner(A: Mat4, B: Mat4) -> float:
     """Sum of the products of all entries."""
-    total = 0.0
-    for i in range(16):
-        total += A[i] * B[i]
-    return total
+    return (
+        ((A[0] * B[0] + A[1] * B[1]) + (A[2] * B[2] + A[3] * B[3]))
+        + ((A[4] * B[4] + A[5] * B[5]) + (A[6] * B[6] + A[7] * B[7]))
+    ) + (
+        ((A[8] * B[8] + A[9] * B[9]) + (A[10] * B[10] + A[11] * B[11]))
+        + ((A[12] * B[12] + A[13] * B[13]) + (A[14] * B[14] + A[15] * B[15]))
+    )
 
 
 @inline
@@ -247,15 +250,17 @@ def dual_pencil(A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
     u = unit(A)
     v = unit(axpy(-dot(u, D), u, D))
     v = unit(axpy(-dot(u, v), u, v))
-    k = 0
     least = u[0] * u[0] + v[0] * v[0]
-    for i in range(1, 4):
-        size = u[i] * u[i] + v[i] * v[i]
-        if size < least:
-            least = size
-            k = i
-    e = (1.0 if k == 0 else 0.0, 1.0 if k == 1 else 0.0, 1.0 if k == 2 else 0.0, 1.0 if k == 3 else 0.0)
-    w = unit(axpy(-u[k], u, axpy(-v[k], v, e)))
+    e = (1.0, 0.0, 0.0, 0.0)
+    if u[1] * u[1] + v[1] * v[1] < least:
+        least = u[1] * u[1] + v[1] * v[1]
+        e = (0.0, 1.0, 0.0, 0.0)
+    if u[2] * u[2] + v[2] * v[2] < least:
+        least = u[2] * u[2] + v[2] * v[2]
+        e = (0.0, 0.0, 1.0, 0.0)
+    if u[3] * u[3] + v[3] * v[3] < least:
+        e = (0.0, 0.0, 0.0, 1.0)
+    w = unit(axpy(-dot(e, u), u, axpy(-dot(e, v), v, e)))
     return w, meet(u, v, w)
 
 

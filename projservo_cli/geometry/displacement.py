@@ -17,9 +17,27 @@ LEAST_SINE = 1e-6
 @inline
 def rotation(H_hat: Mat4, H_hat_squared: Mat4, theta: float) -> Mat4:
     """Projective rotation I + sin θ Ĥ + (1 − cos θ) Ĥ² of [RH00] eq. (4), θ in rad."""
+    sine, versine = sine_and_versine(theta)
+    return turned(H_hat, H_hat_squared, sine, versine)
+
+
+@inline
+def sine_and_versine(theta: float) -> tuple[float, float]:
+    """The coefficients sin θ and 1 − cos θ of [RH00] eq. (4), from half the angle, θ in rad."""
     half = math.sin(0.5 * theta)
-    H = combine(math.sin(theta), H_hat, 2.0 * half * half, H_hat_squared)
-    return combine(1.0, IDENTITY, 1.0, H)
+    return 2.0 * half * math.cos(0.5 * theta), 2.0 * half * half
+
+
+@inline
+def turned(H_hat: Mat4, H_hat_squared: Mat4, sine: float, versine: float) -> Mat4:
+    """Sum I + sin θ Ĥ + (1 − cos θ) Ĥ²; with −sin θ its inverse."""
+    H = combine(sine, H_hat, versine, H_hat_squared)
+    return (
+        1.0 + H[0], H[1], H[2], H[3],
+        H[4], 1.0 + H[5], H[6], H[7],
+        H[8], H[9], 1.0 + H[10], H[11],
+        H[12], H[13], H[14], 1.0 + H[15],
+    )  # fmt: skip
 
 
 @inline

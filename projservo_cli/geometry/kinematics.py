@@ -3,7 +3,14 @@
 import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, mat, mul, put_mat, vec
-from projservo_cli.geometry.displacement import IDENTITY, as_array, rotation, translation
+from projservo_cli.geometry.displacement import (
+    IDENTITY,
+    as_array,
+    rotation,
+    sine_and_versine,
+    translation,
+    turned,
+)
 from projservo_cli.geometry.jit import njit
 from projservo_cli.records import FREE, PRISMATIC, FloatArray, Model
 
@@ -67,8 +74,9 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
             H_inverse = mul(translation(operator, -amount), H_inverse)
         else:
             squared = mul(operator, operator)
-            H = mul(H, rotation(operator, squared, amount))
-            H_inverse = mul(rotation(operator, squared, -amount), H_inverse)
+            sine, versine = sine_and_versine(amount)
+            H = mul(H, turned(operator, squared, sine, versine))
+            H_inverse = mul(turned(operator, squared, -sine, versine), H_inverse)
     return H
 
 

@@ -64,10 +64,11 @@ class Mechanism(NamedTuple):
 
 def workspace(n: int, rows: int) -> Work:
     """Arrays for n joints and matrices of at most ``rows`` rows."""
+    width = max(n, 8, (rows + 3) // 4 * 4)
     return Work(
         np.zeros((n, 4, 4)),
-        np.zeros((n, max(rows, 8))),
-        np.zeros(max(rows, 8)),
+        np.zeros((n, width)),
+        np.zeros(width),
         np.zeros(n),
         np.zeros(n, dtype=np.int64),
     )
@@ -80,6 +81,12 @@ def put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
     work.B[i, first + 1] = A[1]
     work.B[i, first + 2] = A[2]
     work.B[i, first + 3] = A[3]
+
+
+@njit
+def kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
+    """Kernel of the eight rows in ``work.B``, compiled once for that number."""
+    return kernel_vector(work.B, 8, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
 
 
 @njit
@@ -110,7 +117,7 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
         operator = mat(work.H_hat[i])
         put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
         put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
-    if not kernel_vector(work.B, 8, n, q_hat, work.pivot, work.z, work.rhs):
+    if not kernel_of_eight(work, q_hat):
         return False, NO_OPERATOR
     return moving(work, q_hat)
 
@@ -123,7 +130,7 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
         operator = mat(work.H_hat[i])
         put_rows(work, i, 0, apply(operator, A_1))
         put_rows(work, i, 4, apply(operator, A_2))
-    if not kernel_vector(work.B, 8, n, q_hat, work.pivot, work.z, work.rhs):
+    if not kernel_of_eight(work, q_hat):
         return False, NO_OPERATOR
     return to_radians(work, q_hat)
 
@@ -136,7 +143,7 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
         operator = mat(work.H_hat[i])
         put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
         put_rows(work, i, 4, apply(operator, A))
-    if not kernel_vector(work.B, 8, n, q_hat, work.pivot, work.z, work.rhs):
+    if not kernel_of_eight(work, q_hat):
         return False, NO_OPERATOR
     return to_radians(work, q_hat)
 
@@ -164,10 +171,10 @@ def to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     found, H = moving(work, q_hat)
     if not found:
         return False, NO_OPERATOR
-    trace = 0.0
-    for i in range(4):
-        for k in range(4):
-            trace += H[4 * i + k] * H[4 * k + i]
+    # Entries with dynamic indices would have to be looked up: the sum is written out.
+    trace = (H[0] * H[0] + H[5] * H[5]) + (H[10] * H[10] + H[15] * H[15])
+    trace += 2.0 * ((H[1] * H[4] + H[2] * H[8]) + (H[3] * H[12] + H[6] * H[9]))
+    trace += 2.0 * (H[7] * H[13] + H[11] * H[14])
     size = inner(H, H)
     if not -trace > 1e-12 * size:
         return False, NO_OPERATOR

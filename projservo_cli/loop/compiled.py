@@ -47,6 +47,7 @@ class Log(NamedTuple):
     fit : (k, 3) what measuring with the body left, as in the state of the law.
     events : (4,) first instant outside an image, first beyond a joint limit, that joint, and how
         often visibility limited the translation; −1 for never.
+    M, scratch : (m, 4) and (4, n) workspaces of the simulated robot.
     """
 
     q: FloatArray
@@ -61,6 +62,8 @@ class Log(NamedTuple):
     parts: IntArray
     fit: FloatArray
     events: FloatArray
+    M: FloatArray
+    scratch: FloatArray
 
 
 def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
@@ -79,6 +82,8 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
         np.zeros(rows, dtype=np.int64),
         np.full((rows, 3), np.nan),
         np.full(4, -1.0),
+        np.zeros((m, 4)),
+        np.zeros((4, n)),
     )
 
 
@@ -111,8 +116,8 @@ def run(
     steps : commands sent; the log has one instant more.
     """
     n = q_start.shape[0]
-    M = np.empty_like(plant.M)
-    dq = np.empty(n)
+    M = log.M[: plant.M.shape[0]]
+    dq = log.scratch[0]
     for i in range(n):
         log.q[0, i] = q_start[i]
     put_mat(log.H[0], start_pose(plant.model, q_start))
@@ -183,8 +188,9 @@ def path_deviation(
 
     Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
     """
-    dq = np.empty(log.q.shape[1])
-    part = np.empty(log.q.shape[1])
+    M = log.M[: plant.M.shape[0]]
+    dq = log.scratch[2]
+    part = log.scratch[3]
     most = 0.0
     at_samples = 0.0
     for k in range(steps):
@@ -192,11 +198,14 @@ def path_deviation(
             dq[i] = log.q_dot[k, i] * period
         H = mat(log.H[k])
         if log.parts[k] == 0:
-            most = max(most, center_deviation(plant, H, log.q[k], dq, start, goal, samples))
+            stray = center_deviation(plant, H, log.q[k], dq, start, goal, samples, M, log.scratch)
+            most = max(most, stray)
         for j in range(log.parts[k]):
             for i in range(dq.shape[0]):
                 part[i] = log.path[k, j + 1, i] - log.path[k, j, i]
             share = max(1, samples // log.parts[k])
-            most = max(most, center_deviation(plant, H, log.path[k, j], part, start, goal, share))
-        at_samples = max(at_samples, center_deviation(plant, H, log.q[k], dq, start, goal, 1))
+            stray = center_deviation(plant, H, log.path[k, j], part, start, goal, share, M, log.scratch)
+            most = max(most, stray)
+        stray = center_deviation(plant, H, log.q[k], dq, start, goal, 1, M, log.scratch)
+        at_samples = max(at_samples, stray)
     return most, at_samples

@@ -148,15 +148,23 @@ def rig_distance(plant: Plant, M: FloatArray) -> float:
 
 @njit
 def center_deviation(
-    plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, start: FloatArray, goal: FloatArray, samples: int
+    plant: Plant,
+    H: Mat4,
+    q: FloatArray,
+    dq: FloatArray,
+    start: FloatArray,
+    goal: FloatArray,
+    samples: int,
+    M: FloatArray,
+    scratch: FloatArray,
 ) -> float:
     """Largest distance of the centre from the line start–goal during one joint step, m.
 
     The joints move linearly; the step is sampled at ``samples`` equal parts, its end included.
+    ``M`` (m, 4) and ``scratch`` (≥2, n) are overwritten.
     """
-    M = np.empty_like(plant.M)
-    part = np.empty_like(dq)
-    reached = np.empty_like(dq)
+    part = scratch[0]
+    reached = scratch[1]
     most = 0.0
     for j in range(1, samples + 1):
         for i in range(dq.shape[0]):
