@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import click
 import numpy as np
 
 from projservo_cli.cli.options import wrapped
+
+TICK_S = 0.5
 
 
 def plain(value: Any) -> Any:
@@ -40,13 +43,20 @@ class Console:
         self.quiet = quiet
         self.verbose = verbose
         self._bar: Any = None
+        self._what = ""
+        self._lock = threading.RLock()
+        self._ended = threading.Event()
 
     def say(self, text: str) -> None:
         """A message on standard error."""
-        if not self.quiet:
+        if self.quiet:
+            return
+        with self._lock:
             if self._bar is not None:
                 self._bar.clear()
             click.echo(wrapped(text), err=True)
+            if self._bar is not None:
+                self._bar.refresh()
 
     def detail(self, text: str) -> None:
         """A message that only -v shows."""
@@ -62,18 +72,34 @@ class Console:
         """Move a progress bar; silent where standard error is not a terminal."""
         if self.quiet or not sys.stderr.isatty():
             return
-        if self._bar is None or self._bar.desc != f"{what}: ":
-            from tqdm import tqdm
-
-            self.finish()
-            self._bar = tqdm(total=total, desc=what, leave=False, ncols=80)
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-        if done >= total:
-            self.finish()
+        with self._lock:
+            if self._bar is None or self._what != what:
+                self._begin(what, total)
+            self._bar.total = total
+            self._bar.update(done - self._bar.n)
+            if done >= total:
+                self.finish()
 
     def finish(self) -> None:
         """Remove the progress bar."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
+        with self._lock:
+            self._ended.set()
+            if self._bar is not None:
+                self._bar.close()
+                self._bar = None
+
+    def _begin(self, what: str, total: int) -> None:
+        from tqdm import tqdm
+
+        self.finish()
+        self._what = what
+        self._bar = tqdm(total=total, desc=what, leave=False, ncols=80)
+        self._ended = threading.Event()
+        threading.Thread(target=self._tick, args=(self._bar, self._ended), daemon=True).start()
+
+    def _tick(self, bar: Any, ended: threading.Event) -> None:
+        """Let the clock of a bar go on while its work reports nothing."""
+        while not ended.wait(TICK_S):
+            with self._lock:
+                if not ended.is_set():
+                    bar.refresh()

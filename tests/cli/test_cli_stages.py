@@ -1,9 +1,11 @@
 """Chaining, what is up to date, what is made first, JSON objects and exit codes."""
 
 import sys
+import time
 
 import pytest
 
+from projservo_cli.cli import output
 from projservo_cli.cli.output import Console
 from projservo_cli.store import load
 
@@ -260,3 +262,24 @@ def test_progress_shows_only_to_someone_who_watches(capsys, monkeypatch):
     shown = capsys.readouterr().err
     assert "work" in shown
     assert "other" in shown
+
+
+def test_progress_tells_the_time_left_and_its_clock_goes_on(capsys, monkeypatch):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(output, "TICK_S", 0.01)
+    console = Console(quiet=False, verbose=False)
+    console.progress("work", 0, 4)
+    bar = console._bar
+    bar.start_t -= 30.0  # as if it had begun half a minute ago
+    console.progress("work", 1, 4)
+    assert console._bar is bar
+    console.say("a word between")
+    time.sleep(0.1)
+    shown = capsys.readouterr().err
+    assert "00:30<01:30" in shown  # a quarter is done
+    assert "a word between\n" in shown
+    assert shown.count("1/4") > 2
+    console.finish()
+    capsys.readouterr()
+    time.sleep(0.05)
+    assert capsys.readouterr().err == ""
