@@ -152,6 +152,8 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
         return "outdated"
     if remade:
         return "what it is made from is made anew"
+    if step.stage == "report" and stage_module("report").missing(run):
+        return "a file of it is missing"
     return "asked for by --force" if forced else ""
 
 

@@ -14,7 +14,7 @@ from projservo_cli.figures import FIGURES, FigureSpec, style
 from projservo_cli.figures.drift import converged, drift_rows, table
 from projservo_cli.figures.material import DIRECT, Fit, Material, Studies
 from projservo_cli.files import replacing
-from projservo_cli.page import write_page
+from projservo_cli.page import PAGE_FILE, write_page
 from projservo_cli.records import Report, WorkFailed
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task
@@ -75,6 +75,12 @@ def _told(report: Report, run: "Run", directory: Path) -> Report:
     made = Result("", run.configuration, provenance.collect(seed=config.seed), {}, {"": report})
     write_page(replace(run, results={**run.results, "report": made}))
     return report
+
+
+def missing(run: "Run") -> bool:
+    """Whether a file that the stored report wrote is not there any more."""
+    figures = run.results["report"].records[""].figures
+    return not all((run.path.parent / name).is_file() for name in (*figures, CLAIMS_FILE, PAGE_FILE))
 
 
 def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progress: Progress) -> Material:

@@ -44,6 +44,7 @@ class Stages:
     fails: dict[str, Exception] = field(default_factory=dict)
     verdicts: dict[str, str] = field(default_factory=dict)
     reported: list[tuple[list[str], str]] = field(default_factory=list)
+    gone: bool = False
 
     def module(self, stage: str) -> Any:
         depends = {
@@ -52,7 +53,9 @@ class Stages:
             "servo": ("seed", "control", "stop"),
             "report": ("report",),
         }
-        return SimpleNamespace(DEPENDS_ON=depends[stage], run=getattr(self, stage))
+        return SimpleNamespace(
+            DEPENDS_ON=depends[stage], run=getattr(self, stage), missing=lambda run: self.gone
+        )
 
     def _make(self, name: str) -> None:
         if name in self.fails:

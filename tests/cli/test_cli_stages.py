@@ -249,6 +249,13 @@ def test_a_failure_of_the_program_itself_is_one_line_and_verbose_shows_where(pro
     assert "Traceback" in projservo("plan", "-o", "out", "-v").err
 
 
+def test_a_report_whose_files_are_gone_is_made_again(projservo, stages):
+    assert projservo("report", "-c", "tiny.yaml", "-o", "out", "-q").code == 0
+    stages.gone = True
+    assert "report: making it (a file of it is missing)" in projservo("report", "-o", "out").err
+    assert stages.made[len(ALL) :] == ["report"]
+
+
 def test_progress_shows_only_to_someone_who_watches(capsys, monkeypatch):
     Console(quiet=False, verbose=False).progress("work", 1, 2)
     assert capsys.readouterr().err == ""

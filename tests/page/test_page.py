@@ -13,6 +13,7 @@ from projservo_cli.page import PAGE_FILE, write_comparison, write_page
 from projservo_cli.page.vector import inline
 from projservo_cli.page.words import number, short
 from projservo_cli.records import CrossValidation, Report
+from projservo_cli.stages import report
 from projservo_cli.store import Result
 from tests.fake_records import fake
 from tests.figures.cases import case
@@ -142,6 +143,11 @@ def test_the_same_run_gives_the_same_bytes(run):
         write_page(run)
         texts.append(path.read_bytes())
     assert texts[0] == texts[1]
+
+
+def test_a_report_misses_a_file_that_was_deleted(run, tmp_path):
+    assert not report.missing(run)
+    assert report.missing(dataclasses.replace(run, path=tmp_path / "run.h5"))
 
 
 HOSTILE = "<script>alert(1)</script>\"'&{{ 7*7 }}"
