@@ -167,6 +167,14 @@ COMMANDS = {
             force="Replace what is there.",
         ),
     ),
+    "bench": Command(
+        "Measure the speed of a control step and of a run.",
+        "Times a step of every law in 256 states of a noisy run, a call from Python, a traced run of 150 "
+        "steps and runs in two threads, in turn with one numpy.linalg.svd of an 8x6 matrix.",
+        ("config", "sets"),
+        variants=_variants(config="Configuration (YAML) with a simulated task. Default: paper.yaml."),
+        example="projservo bench --json",
+    ),
     "equations": Command(
         "List the equations of the paper and the code of each.",
         "Prints number, title, function, test and erratum of every equation.",

@@ -1,0 +1,228 @@
+"""Speed of control steps and whole runs, beside one SVD of NumPy in the same process.
+
+Everything is timed in turn, round by round, in pieces of about a millisecond. Ratios are between the
+least times, which a busy machine disturbs the least.
+"""
+
+import importlib.util
+import itertools
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from projservo_cli.control import CODES, command
+from projservo_cli.control.law import ERRORS, Gains, State, new_state
+from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kinematics import operators_at
+from projservo_cli.geometry.mechanisms import workspace
+from projservo_cli.loop.compiled import new_log
+from projservo_cli.loop.compiled import run as run_loop
+from projservo_cli.loop.step import Limits, limit_speed
+from projservo_cli.loop.threads import Job, run_all
+from projservo_cli.plants.plant import Plant
+from projservo_cli.records import LAWS, FloatArray, Model
+from projservo_cli.stages.servo import gains_of, limits_of
+from projservo_cli.stages.truth import plant_of, reach_of, truth_of
+from projservo_cli.task.body import body_of
+from projservo_cli.task.face import Task, task_from_images
+from projservo_cli.task.target import task_from_body
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+
+STATES = 256
+STEPS = 150
+PIECE = 64
+NOISE_PX = 0.5
+ROUNDS = 200
+RUNS = 64
+BODY = "exact, body"
+
+
+@njit
+def many_steps(
+    code: int,
+    model: Model,
+    task: Task,
+    gains: Gains,
+    S: FloatArray,
+    Q: FloatArray,
+    state: State,
+    speed: FloatArray,
+) -> float:
+    """Measure, partition, command and limit, once in each recorded state."""
+    total = 0.0
+    for k in range(S.shape[0]):
+        command(code, model, task, gains, S[k], Q[k], state)
+        total += limit_speed(state.q_dot, speed)
+    return total
+
+
+class Times(NamedTuple):
+    """Least, median and both quartiles of what one call takes, in µs, and the least over one SVD's."""
+
+    least: float
+    median: float
+    lower: float
+    upper: float
+    over_svd: float
+
+
+class Case:
+    """A noisy run of 256 states and everything a step of it needs, with the true model.
+
+    Parameters
+    ----------
+    config : a simulated task.
+    """
+
+    def __init__(self, config: "Config") -> None:
+        truth = truth_of(config)
+        reach = reach_of(config, truth)
+        self.truth, self.q_start, self.model = truth, reach.q_start, truth.model
+        self.gains, self.bounds = gains_of(config), limits_of(config)
+        self.bounds = self.bounds._replace(
+            image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
+        )
+        self.plant = plant_of(config, truth, reach.q_start)
+        self.task = task_from_images(self.model, reach.s_start, reach.s_star, truth.center)
+        pins = np.ascontiguousarray(truth.M[list(truth.pins)])
+        self.body_plant = self.plant._replace(pins=pins)
+        self.body_task = task_from_body(
+            self.model,
+            body_of(self.model, truth.M[[*truth.face, *truth.pins]]),
+            reach.q_start,
+            np.concatenate([reach.s_start, reach.pins_start], axis=1),
+            np.concatenate([reach.s_star, reach.pins_star], axis=1),
+            truth.center,
+            len(truth.face),
+        )
+        seen = len(truth.face) + len(truth.pins)
+        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, seen, 2))
+        self.points = self.drive(self.task, self.plant)
+        self.whole = self.drive(self.body_task, self.body_plant)
+        self.state = new_state(len(self.q_start), len(truth.face))
+
+    def job(self, law: str, task: Task, plant: Plant, bounds: Limits) -> Job:
+        """One run with a state and a log of its own."""
+        n, m = len(self.q_start), len(self.truth.face)
+        seen = m + len(plant.pins)
+        log = new_log(n, seen, bounds.max_steps, len(ERRORS))
+        noise = np.ascontiguousarray(self.noise[:, :, :seen])
+        start = self.q_start.copy()
+        return Job(
+            CODES[law], self.model, task, self.gains, bounds, plant, noise, start, new_state(n, m), log
+        )
+
+    def drive(self, task: Task, plant: Plant) -> tuple[FloatArray, FloatArray]:
+        """Pixels and joints of the states that are cycled through."""
+        job = self.job("direct_three", task, plant, self.bounds)
+        run_loop(*job)
+        return job.log.s, job.log.q
+
+    def steps(self, law: str, *, body: bool = False) -> float:
+        """One step of a law in each state."""
+        task, (S, Q) = (self.body_task, self.whole) if body else (self.task, self.points)
+        return many_steps(CODES[law], self.model, task, self.gains, S, Q, self.state, self.bounds.speed)
+
+    def one_step(self) -> int:
+        """One step of direct_three, called from Python."""
+        S, Q = self.points
+        return command(CODES["direct_three"], self.model, self.task, self.gains, S[0], Q[0], self.state)
+
+    def whole_run(self) -> Job:
+        """A run of 150 steps, traced."""
+        return self.job("direct_three", self.task, self.plant, self.bounds._replace(max_steps=STEPS))
+
+    def matrices(self) -> FloatArray:
+        """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
+        _, Q = self.points
+        work = workspace(len(self.q_start), 8)
+        found = np.empty((STATES, 8, len(self.q_start)))
+        for k in range(STATES):
+            operators_at(self.model, Q[k], work.H_hat)
+            A = self.task.A_star
+            found[k] = np.concatenate([(work.H_hat @ A[0]).T, (work.H_hat @ A[1]).T])
+        return found
+
+
+def seconds(function: Callable[[], object]) -> float:
+    """Time of one call, s."""
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def measure(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
+    """Time everything; see the schema of ``projservo bench --json``.
+
+    Parameters
+    ----------
+    case : what is timed.
+    rounds : how often each is timed.
+    """
+    matrices = itertools.cycle(case.matrices())
+    whole = case.whole_run()
+    timed: dict[str, tuple[Callable[[], object], int]] = {
+        "numpy.linalg.svd": (lambda: [np.linalg.svd(next(matrices)) for _ in range(PIECE)], PIECE),
+        **{law: (lambda law=law: case.steps(law), STATES) for law in LAWS},  # type: ignore[misc]
+        BODY: (lambda: case.steps("exact", body=True), STATES),
+        "one call from Python": (lambda: [case.one_step() for _ in range(PIECE)], PIECE),
+        "run of 150 steps": (lambda: run_loop(*whole), 1),
+    }
+    toolbox = toolbox_step(case)
+    if toolbox is not None:
+        timed["machinevision-toolbox-python"] = (toolbox, 1)
+    with threadpool_limits(1):
+        for function, _ in timed.values():
+            function()
+        table = np.array(
+            [[seconds(function) / count for function, count in timed.values()] for _ in range(rounds)]
+        )
+        speedup, same = threads(case)
+    times = {name: _times(1e6 * table[:, i], 1e6 * table[:, 0]) for i, name in enumerate(timed)}
+    return {
+        "step_over_svd": max(times["direct_three"].over_svd, times["direct_two"].over_svd),
+        "exact_over_svd": times[BODY].over_svd,
+        "run_150_ms": 1e-3 * times["run of 150 steps"].least,
+        "python_call_us": times["one call from Python"].least,
+        "two_threads_speedup": speedup,
+        "threads_equal_to_serial": same,
+        "times_us": {name: value._asdict() for name, value in times.items()},
+    }
+
+
+def _times(values: FloatArray, svd: FloatArray) -> Times:
+    least, lower, median, upper = (float(x) for x in np.percentile(values, [0, 25, 50, 75]))
+    return Times(least, median, lower, upper, least / float(svd.min()))
+
+
+def threads(case: Case, count: int = 2) -> tuple[float, bool]:
+    """How many times faster many runs are in two threads than in one, and whether their bits agree."""
+    serial = [case.whole_run() for _ in range(RUNS)]
+    parallel = [case.whole_run() for _ in range(RUNS)]
+    rounds = [
+        (seconds(lambda: run_all(serial, 1)), seconds(lambda: run_all(parallel, count))) for _ in range(15)
+    ]
+    alone, together = np.min(rounds, axis=0)
+    same = all(
+        left.tobytes() == right.tobytes()
+        for one, other in zip(serial, parallel, strict=True)
+        for left, right in zip(one.log, other.log, strict=True)
+    )
+    return float(alone / together), same
+
+
+def toolbox_step(case: Case) -> Callable[[], object] | None:
+    """One step of image-based control of one camera by machinevision-toolbox-python, where installed."""
+    if importlib.util.find_spec("machinevisiontoolbox") is None:
+        return None
+    from machinevisiontoolbox import CentralCamera
+
+    camera = CentralCamera.Default()
+    pixels = case.points[0][0, 0, :4].T
+    error = np.ones(pixels.size)
+    return lambda: np.linalg.pinv(camera.visjac_p(pixels, 1.0)) @ error
