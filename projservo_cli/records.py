@@ -22,6 +22,7 @@ FREE = 2  # a twist of a free-flying rig: its operator does not move with the ot
 LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact")
 METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
 POINT_LAWS = ("stacked", "blockwise", "euclidean_points")  # laws that need the points of the face themselves
+BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)  # laws that can measure with the body
 
 
 def array(*dims: str, units: str = "1", about: str = "", **default: Any) -> Any:

@@ -115,6 +115,12 @@ class ImageModel(Calibration):
         return np.atleast_2d(readings), readings.ndim == 1
 
 
+def image_model(calibration: Calibration) -> ImageModel:
+    """A calibration with its functions."""
+    fields = dataclasses.fields(calibration)
+    return ImageModel(**{field.name: getattr(calibration, field.name) for field in fields})
+
+
 @dataclasses.dataclass(frozen=True)
 class Experiment(store.Run):
     """All that a run file holds."""
@@ -122,8 +128,7 @@ class Experiment(store.Run):
     @property
     def calibration(self) -> ImageModel:
         """The calibration, with functions that predict images."""
-        record = super().calibration
-        return ImageModel(**{field.name: getattr(record, field.name) for field in dataclasses.fields(record)})
+        return image_model(super().calibration)
 
 
 def read(run: Path | str) -> Experiment:

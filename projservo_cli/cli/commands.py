@@ -70,8 +70,11 @@ COMMANDS = {
     "servo": Command(
         "Run the control laws in closed loop.",
         "Runs each law of control.laws (or of --law) to its verdict. Calibrates and plans first where "
-        "needed. Exit code 1 when a law of control.must_converge does not converge.",
-        (*_OF_STAGES, "laws"),
+        "needed. Exit code 1 when a law of control.must_converge does not converge.\n\n"
+        "With --set plant=module:Class (or plant in the configuration) a robot of yours takes the place of "
+        "the simulated one. It is driven to the start of the task and from there by each law, and stopped on "
+        "every way out.",
+        (*_OF_STAGES, "laws", "speed_scale", "confirm"),
         stage=True,
         example="projservo servo -o results/ur5 --law direct_two --law stacked",
     ),
@@ -86,12 +89,15 @@ COMMANDS = {
     ),
     "record": Command(
         "Drive the robot through trial motions and write a table.",
-        "Drives the simulated robot of a configuration through its trial motions (and those of --motions), "
+        "Drives the robot of a configuration, simulated or yours, through its trial motions (and --motions), "
         "in steps that the joint-speed limit allows, and writes what both cameras see into an observation "
         "table for calibrate --data.\n\n"
         "The table grows as the robot goes. After an interruption the same command continues it; a table of "
         "another configuration is refused, unless --force begins anew.",
-        ("config", "sets", "output", "motions", "joint_unit", "force", "dry_run"),
+        (
+            *("config", "sets", "output", "motions", "joint_unit", "force", "dry_run"),
+            *("speed_scale", "confirm"),
+        ),
         variants=_variants(
             config="Configuration (YAML). Default: paper.yaml.",
             output="Observation table to write (CSV).",

@@ -54,7 +54,7 @@ def shipped(name: str) -> Path:
 
 
 def given_overrides(options: dict[str, Any]) -> list[Override]:
-    """Options that stand for values of the configuration, then ``--set``, which has the last word."""
+    """Options that stand for values of the configuration, then ``--set``, then ``--speed-scale``."""
     found = []
     if options["data"] is not None:
         table = os.path.abspath(options["data"])
@@ -78,7 +78,11 @@ def given_overrides(options: dict[str, Any]) -> list[Override]:
         found.append(Override("--lens", ("calibration", "lens"), True))
     if options["image_size"] is not None:
         found.append(_image_size(options["image_size"]))
-    return [*found, *map(Override.parse, options["sets"])]
+    found += map(Override.parse, options["sets"])
+    if options["speed_scale"] is not None:  # after --set plant=…, which would else make a robot faster again
+        scale = options["speed_scale"]
+        found.append(Override.parse(f"plant.speed_scale={scale}", f"--speed-scale {scale}"))
+    return found
 
 
 def _image_size(text: str) -> Override:

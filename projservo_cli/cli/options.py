@@ -113,7 +113,17 @@ OPTIONS: dict[str, click.Option] = {
             metavar="NAME",
             multiple=True,
             shell_complete=_laws,
-            help="On servo: this law instead of control.laws. Repeatable.",
+            help="On servo: this law, or law of yours (module:Class), instead of control.laws. Repeatable.",
+        ),
+        click.Option(
+            ["--speed-scale"],
+            metavar="S",
+            help="On servo and record: scale every command by S, above 0 and at most 1.",
+        ),
+        click.Option(
+            ["--confirm"],
+            is_flag=True,
+            help="On servo and record: ask on the terminal before the first motion.",
         ),
         click.Option(
             ["--to"],

@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from projservo_cli.cli.foreign import confirm, require_terminal
 from projservo_cli.cli.output import Console, print_json
 
 
@@ -15,6 +16,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         raise click.UsageError("record needs a table to write: --output TABLE")
     if options["joint_unit"] is not None and options["motions"] is None:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
+    require_terminal(options)
     from projservo_cli.cli.configuration import SHIPPED, given_overrides, shipped
     from projservo_cli.config import load_config
     from projservo_cli.stages.record import prepare, record
@@ -30,6 +32,8 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     recording = prepare(config, path, motions=motions, force=options["force"])
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
     if not options["dry_run"]:
+        if recording.pending:
+            confirm(options, config, "record", console)
         if recording.found and recording.pending:
             console.say(f"{path}: continued after {recording.found} of {len(recording.targets)} poses")
         try:

@@ -7,8 +7,9 @@ from typing import Any
 
 import click
 
+from projservo_cli.cli.foreign import confirm, law_names, require_asked, require_named, require_terminal
 from projservo_cli.cli.output import Console, print_json
-from projservo_cli.records import LAWS, WorkFailed
+from projservo_cli.records import WorkFailed
 
 
 @dataclass
@@ -32,24 +33,25 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     del rest  # stages take no arguments
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
-    for law in options["laws"]:
-        if law not in LAWS:
-            raise click.UsageError(f"--law {law}: no such law; laws: {', '.join(LAWS)}")
+    require_terminal(options)
+    given = law_names(options["laws"])
     from projservo_cli.cli.configuration import resolve
     from projservo_cli.cli.suggested import require_covariance, suggested
     from projservo_cli.stages.chain import steps_for
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
     config, stored = resolve(options)
-    laws = tuple(dict.fromkeys(options["laws"] or config.control.laws))
+    laws = given or tuple(dict.fromkeys(config.control.laws))
     if options["suggest"] is not None:
         require_covariance(config)
     steps = steps_for(config, stored, names, laws=laws, force=options["force"])
     call = _Call(names, laws, config, stored, steps, console)
     if options["dry_run"]:
         return _dry(call, as_json=options["json"])
+    require_named(config, steps, names)
+    require_asked(options, config, steps)
     try:
-        _work(call)
+        _work(call, options)
         if options["suggest"] is not None and not _lacking(call, "calibrate"):
             call.suggested = suggested(config, call.run, options["suggest"])
     finally:
@@ -68,7 +70,7 @@ def _dry(call: _Call, *, as_json: bool) -> int:
     return 0
 
 
-def _work(call: _Call) -> None:
+def _work(call: _Call, options: dict[str, Any]) -> None:
     """Make what has to be made, stop at the first failure, keep what was made until then."""
     from projservo_cli.files import require_writable
     from projservo_cli.stages.chain import make
@@ -76,6 +78,7 @@ def _work(call: _Call) -> None:
     if any(step.why for step in call.steps):
         require_writable(call.run.path)
     _announce_compilation(call)
+    motion = next((step for step in call.steps if step.law and step.why), None)
     for done, step in enumerate(call.steps):
         call.console.progress("results", done, len(call.steps))
         if not step.why:
@@ -83,6 +86,8 @@ def _work(call: _Call) -> None:
             tell(f"{step.name}: up to date")
         else:
             needed = "" if step.stage in call.names else f", needed by {call.names[-1]}"
+            if step is motion:
+                confirm(options, call.config, "servo", call.console)
             call.console.say(f"{step.name}: making it ({step.why}{needed})")
             try:
                 call.run, dropped = make(step, call.config, call.run, call.laws, call.console.progress)
@@ -156,11 +161,17 @@ def _verdict(call: _Call) -> int:
     if call.suggested.get("suggestions") == []:
         click.echo(f"projservo: calibrate: {call.suggested['suggestions_reason']}", err=True)
         missed_calibration = True
-    ends = {law: call.run.traces[law] for law in call.laws_done if law in call.config.control.must_converge}
-    missed = [trace for trace in ends.values() if trace.verdict != "converged"]
+    must = call.config.control.must_converge
+    ends = [call.run.traces[law] for law in call.laws_done]
+    missed = [
+        trace
+        for trace in ends
+        if trace.verdict == "disturbed" or (trace.law in must and trace.verdict != "converged")
+    ]
     for trace in missed:
         reason = f": {trace.reason}" if trace.reason else ""
-        click.echo(f"projservo: {trace.law} must converge, but ended in {trace.verdict}{reason}", err=True)
+        must_converge = " must converge, but" if trace.law in must else ""
+        click.echo(f"projservo: {trace.law}{must_converge} ended in {trace.verdict}{reason}", err=True)
     return 1 if missed or missed_calibration else 0
 
 

@@ -13,6 +13,7 @@ from pydantic import ValidationError, create_model
 
 from projservo_cli.config.checks import problems
 from projservo_cli.config.fields import Section
+from projservo_cli.config.foreign import written_out
 from projservo_cli.config.messages import nearest, translated
 from projservo_cli.config.models import Config
 from projservo_cli.config.yaml_source import Document, Path, Problem
@@ -48,6 +49,8 @@ class Override:
         if document.problems:
             raise InputError(f"{flag}: the value is {document.problems[0].what}")
         path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(steps))
+        if path == ("law",):
+            return cls(flag, ("control", "laws"), [document.values])
         return cls(flag, path, document.values)
 
 
@@ -86,8 +89,10 @@ def load_config(
     if path is not None and not values and not found:
         found.append(Problem((), "the configuration is empty; start from one of the shipped ones"))
     for change in changes:
+        written_out(values)
         problem = _apply(values, change, document)
         found += [problem] if problem else []
+    written_out(values)
     if not any(problem.path == () for problem in found):
         found += _defects(_defaults(values, path))
     if found:
@@ -158,8 +163,15 @@ def _defects(values: dict[str, Any]) -> Iterable[Problem]:
             found += translated(Config, error.errors(include_url=False), part)
     for key in values:
         if key not in Config.model_fields:
-            found.append(Problem((key,), f"unknown key; {nearest(key, sorted(Config.model_fields))}"))
+            found.append(Problem((key,), _unknown(key, values)))
     return found + [Problem(path, what) for path, what in problems(good, frozenset(broken))]
+
+
+def _unknown(key: str, values: dict[str, Any]) -> str:
+    if key == "law":  # else it would have been written out
+        text = isinstance(values[key], str)
+        return "control.laws is set as well; keep one" if text else "must be the name of one law"
+    return f"unknown key; {nearest(key, sorted(Config.model_fields))}"
 
 
 @cache

@@ -15,9 +15,9 @@ from projservo_cli.config.fields import (
     Vector3,
     Whole,
 )
+from projservo_cli.config.foreign import Law, Options, PlantClass
 from projservo_cli.config.robot import Markers, Rig, Robot
 
-Law = Literal["direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact"]
 Profile = Literal["linear", "exponential", "rotation_first", "translation_first", "planar_first"]
 
 
@@ -110,8 +110,16 @@ class Control(Section):
 
 
 class PlantSettings(Section):
-    """What the simulated plant does at its borders."""
+    """What is driven, and what the simulated robot does at its borders.
 
+    ``use`` names the class of a robot that is not simulated, ``options`` are what it is made with;
+    such a robot is never sent beyond its joint limits.
+    """
+
+    use: PlantClass | None = None
+    options: Options = Options()
+    timeout_s: Positive = 1.0
+    speed_scale: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
     self_occlusion: Literal["transparent", "opaque"] = "transparent"
     joint_limits: Literal["report", "stop"] = "report"
     image_border: Literal["report", "stop"] = "report"
@@ -125,6 +133,8 @@ class Stop(Section):
     max_steps: Count = 2000
     diverged_factor: Annotated[float, Strict(), Field(gt=1, allow_inf_nan=False)] = 10.0
     plateau_steps: Count = 20
+    lost_steps: Whole = 25
+    innovation_factor: NotNegative = 1.0
 
 
 class ReportSettings(Section):

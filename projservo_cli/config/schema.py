@@ -15,6 +15,9 @@ def json_schema() -> dict[str, Any]:
     """The schema of a configuration file; what must hold between values, only loading it tells."""
     schema: dict[str, Any] = _plain(Config.model_json_schema())
     schema["required"].remove("name")  # by default that of the file
+    keys = schema["properties"]
+    keys["plant"] = {"anyOf": [keys["plant"], {"type": "string"}]}  # the short forms of plant.use
+    keys["law"] = schema["$defs"]["Control"]["properties"]["laws"]["items"]  # and of control.laws
     return {"$schema": DRAFT, **schema, "title": "Configuration of projservo"}
 
 

@@ -1,5 +1,6 @@
 """The whole closed loop of a built-in law and an analytic plant, compiled."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
+    MARKERS_LOST,
     MAX_STEPS,
     PLATEAU,
     RUNNING,
@@ -122,6 +124,8 @@ def run(
         log.q[0, i] = q_start[i]
     put_mat(log.H[0], start_pose(plant.model, q_start))
     first_distance = 0.0
+    first_error = math.nan
+    waited = 0
     for k in range(limits.max_steps + 1):
         s = log.s[k]
         in_front = observe(plant, mat(log.H[k]), M, s, log.hidden[k])
@@ -148,13 +152,22 @@ def run(
                 log.errors[k, i] = state.errors[i]
             for i in range(3):
                 log.fit[k, i] = state.fit[i]
-        error, first_error = log.error[k], log.error[0]
+        error = log.error[k]
+        if math.isnan(first_error):
+            first_error = error
         now = Instant(in_front, seen, left, error, first_error, distance, first_distance, sound, singular)
         verdict = verdict_at(now, limits)
+        if verdict == MARKERS_LOST and waited < min(limits.lost_steps, limits.max_steps - k):
+            waited += 1
+            for i in range(n):
+                log.q[k + 1, i] = log.q[k, i]
+            put_mat(log.H[k + 1], mat(log.H[k]))
+            continue
         if verdict != RUNNING:
             return verdict, k
         if k == limits.max_steps:
             break
+        waited = 0
         if state.share[0] >= 0.0:
             log.factor[k] = state.share[0]
         else:

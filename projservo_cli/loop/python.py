@@ -1,5 +1,6 @@
-"""The closed loop in Python: any law on the simulated plant, the same limits, counting and verdicts."""
+"""The closed loop in Python: any law on any plant, the same limits, counting and verdicts."""
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -8,7 +9,9 @@ from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, new_state
 from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.step import (
+    DISTURBED,
     JOINT_LIMIT,
+    MARKERS_LOST,
     MAX_STEPS,
     PLATEAU,
     RUNNING,
@@ -22,7 +25,7 @@ from projservo_cli.loop.step import (
     outside,
     verdict_at,
 )
-from projservo_cli.plants.analytic import AnalyticPlant
+from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
@@ -35,7 +38,8 @@ class LoopLaw(Protocol):
 
     A law that keeps the joint-speed limit itself has an attribute ``share`` (1,), the share of the
     amplitude its limit left; the limit is else up to the loop. One that fits a body has an attribute
-    ``fit`` (3,), which the log keeps.
+    ``fit`` (3,), which the log keeps. One that wants its step sent in parts has an attribute ``path``
+    (parts + 1, n), the joints between them.
     """
 
     errors: FloatArray
@@ -45,6 +49,43 @@ class LoopLaw(Protocol):
 
         Pixels are NaN where a marker was not seen; the status is LOST where too little was.
         """
+
+
+class LoopPlant(Protocol):
+    """What the Python loop asks of a plant.
+
+    Attributes
+    ----------
+    plant : the truth, or what the calibration takes for it: image size, joint limits.
+    H : (4, 4) displacement of the face from the reference.
+    hidden, in_front : as of ``plants.plant.observe``, when last observed.
+    markers : how many are observed, those of the face first.
+    disturbance : why the images no longer agree with the calibration; empty where they do.
+    takes_parts : whether a long step is sent in the parts that the law split it into.
+    """
+
+    plant: Plant
+    H: FloatArray
+    hidden: FloatArray
+    in_front: bool
+    markers: int
+    disturbance: str
+    takes_parts: bool
+
+    def joints(self) -> FloatArray:
+        """Joint readings (n,), rad or m."""
+
+    def observe(self) -> FloatArray:
+        """Pixels (2, markers, 2), NaN where unseen."""
+
+    def distance(self) -> float:
+        """Distance of the face from the rig when last observed, m; constant where it is unknown."""
+
+    def command(self, step: FloatArray, period: float) -> None:
+        """Move by the joint step (n,), rad or m, within one period, s."""
+
+    def stop(self) -> None:
+        """Come to rest."""
 
 
 class BuiltInLaw:
@@ -65,6 +106,11 @@ class BuiltInLaw:
         self.share = self.state.share
         self.fit = self.state.fit
 
+    @property
+    def path(self) -> FloatArray:
+        """Joints (parts + 1, n) between the parts of the last step; one row where it has none."""
+        return self.state.path[: self.state.parts[0] + 1] if self.gains.substeps else self.state.path[:1]
+
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
         status = command(self.code, self.model, self.task, self.gains, s, q, self.state)
@@ -72,68 +118,101 @@ class BuiltInLaw:
 
 
 def run(
-    law: LoopLaw, plant: AnalyticPlant, s_star: FloatArray, period: float, limits: Limits
+    law: LoopLaw, plant: LoopPlant, s_star: FloatArray, period: float, limits: Limits, scale: float = 1.0
 ) -> tuple[int, int, Log]:
     """Drive a law on a plant to its verdict.
 
     Parameters
     ----------
     law : any law.
-    plant : the simulated robot.
+    plant : any plant; it is stopped however the run ends.
     s_star : (2, m, 2) target pixels.
     period : control period, s.
     limits : when the run ends.
+    scale : factor of every command.
 
     Returns
     -------
     verdict, steps, log : as of the compiled loop, to the bit for the built-in laws.
     """
-    log = new_log(len(plant.joints()), plant.markers, limits.max_steps, len(ERRORS))
     try:
-        verdict, steps = _run(law, plant, s_star, period, limits, log)
+        log = new_log(len(plant.joints()), plant.markers, limits.max_steps, len(ERRORS))
+        verdict, steps = _run(law, plant, s_star, period, limits, scale, log)
     finally:
         plant.stop()
     return verdict, steps, log
 
 
 def _run(
-    law: LoopLaw, plant: AnalyticPlant, s_star: FloatArray, period: float, limits: Limits, log: Log
+    law: LoopLaw,
+    plant: LoopPlant,
+    s_star: FloatArray,
+    period: float,
+    limits: Limits,
+    scale: float,
+    log: Log,
 ) -> tuple[int, int]:
     """Fill the log and return verdict and steps."""
-    truth = plant.plant
-    first_distance = 0.0
+    first_distance, first_error, waited = 0.0, math.nan, 0
     for k in range(limits.max_steps + 1):
         log.q[k], log.H[k] = plant.joints(), plant.H
         log.s[k] = plant.observe()
         log.hidden[k] = plant.hidden
         distance = plant.distance()
         first_distance = distance if k == 0 else first_distance
-        left = outside(log.s[k], s_star.shape[1], truth.image_size)
+        left = outside(log.s[k], s_star.shape[1], plant.plant.image_size)
         if left and log.events[0] < 0.0:
             log.events[0] = k
-        log.error[k] = image_error(log.s[k], s_star)
+        error = log.error[k] = image_error(log.s[k], s_star)
+        first_error = error if math.isnan(first_error) else first_error
+        if plant.disturbance:
+            return DISTURBED, k
         seen, singular, sound, q_dot = True, False, True, np.zeros_like(log.q[k])
         if plant.in_front:
             status, q_dot = law(log.s[k], log.q[k])
             seen, singular, sound = status != LOST, status == SINGULAR, finite(q_dot)
             log.errors[k], log.fit[k] = law.errors, getattr(law, "fit", NOT_FITTED)
-        error, first_error = log.error[k], log.error[0]
         now = Instant(
             plant.in_front, seen, left, error, first_error, distance, first_distance, sound, singular
         )
         verdict = verdict_at(now, limits)
+        if verdict == MARKERS_LOST and waited < min(limits.lost_steps, limits.max_steps - k):
+            waited += 1
+            plant.command(np.zeros_like(q_dot), period)
+            continue
         if verdict != RUNNING:
             return verdict, k
         if k == limits.max_steps:
             break
+        waited = 0
         share = float(getattr(law, "share", LEFT_TO_THE_LOOP)[0])
         log.factor[k] = share if share >= 0.0 else limit_speed(q_dot, limits.speed)
-        joint = beyond_limits(log.q[k] + q_dot * period, truth.lower, truth.upper)
+        q_dot = q_dot * scale
+        joint = beyond_limits(log.q[k] + q_dot * period, plant.plant.lower, plant.plant.upper)
         if joint >= 0 and log.events[1] < 0.0:
             log.events[1], log.events[2] = k + 1, joint
         if joint >= 0 and limits.stop_at_joint_limit:
             return JOINT_LIMIT, k
-        plant.command(q_dot * period, period)
+        steps = _steps(plant, law, q_dot, period, scale)
+        for step in steps:
+            plant.command(step, time_for(step, period / len(steps), limits.speed * scale))
         log.q_dot[k] = q_dot
     last = limits.max_steps
     return (PLATEAU if on_plateau(log.error, last, limits.plateau_steps) else MAX_STEPS), last
+
+
+def _steps(plant: LoopPlant, law: LoopLaw, q_dot: FloatArray, period: float, scale: float) -> FloatArray:
+    """The joint steps (parts, n) to send: one, or the parts of a long one that is not scaled down."""
+    path = getattr(law, "path", None)
+    if path is None or len(path) < 3 or scale < 1.0 or not plant.takes_parts:
+        return (q_dot * period)[None]
+    return np.asarray(np.diff(path, axis=0))
+
+
+def time_for(step: FloatArray, period: float, speed: FloatArray) -> float:
+    """Time, s, for a joint step (n,): the period, or longer where a joint would be too fast.
+
+    A law that keeps to its path bounds its joint steps to first order only; what it exceeds the limit
+    by costs time instead of leaving the path.
+    """
+    return max(period, float(np.max(np.abs(step) / speed)))

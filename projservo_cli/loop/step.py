@@ -12,6 +12,10 @@ Precedence of the verdicts at one instant, first match wins:
 7. ``plateau``, ``max steps``: no step is left; plateau where the error fell by less than 1 % in
    the last window.
 8. ``joint limit``: the command would pass a joint limit and ``joint_limits`` is stop.
+
+While markers are lost the robot is held where it is for up to ``lost_steps`` periods in a row; the run
+goes on when they are seen again. ``disturbed`` is what the loop of a robot that is not simulated ends
+in, before all others, where the images no longer agree with the calibration.
 """
 
 import math
@@ -32,7 +36,8 @@ RUNNING = -1
     PLATEAU,
     MAX_STEPS,
     JOINT_LIMIT,
-) = range(9)
+    DISTURBED,
+) = range(10)
 VERDICTS = (
     "behind camera",
     "left image",
@@ -43,6 +48,7 @@ VERDICTS = (
     "plateau",
     "max steps",
     "joint limit",
+    "disturbed",
 )
 PLATEAU_FALL = 0.01
 
@@ -58,6 +64,7 @@ class Limits(NamedTuple):
     plateau_steps : window of the plateau test.
     max_steps : most commands.
     stop_at_joint_limit, stop_at_border : end the run, or only record.
+    lost_steps : periods in a row that lost markers are waited for.
     """
 
     speed: FloatArray
@@ -67,6 +74,7 @@ class Limits(NamedTuple):
     max_steps: int
     stop_at_joint_limit: bool
     stop_at_border: bool
+    lost_steps: int = 0
 
 
 class Instant(NamedTuple):

@@ -8,7 +8,6 @@ import numpy as np
 from projservo_cli.calibration import calibrate, cross_validate
 from projservo_cli.calibration.refined import Solution
 from projservo_cli.records import (
-    PRISMATIC,
     Calibration,
     CrossValidation,
     FloatArray,
@@ -16,6 +15,7 @@ from projservo_cli.records import (
     Observation,
 )
 from projservo_cli.stages import Progress, silent
+from projservo_cli.stages.motion import joints_of, reference_of
 from projservo_cli.stages.truth import CALIBRATION_NOISE, Truth, generator, truth_of
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DEPENDS_ON = ("seed", "robot", "rig", "markers", "noise.calibration_px", "calibration", "data", "task.start")
 
 
-def trial_motions(config: "Config", truth: Truth) -> FloatArray:
+def trial_motions(config: "Config") -> FloatArray:
     """Joint readings (k, n) of the reference and of every single-joint trial, rad or m.
 
     Raises
@@ -33,22 +33,21 @@ def trial_motions(config: "Config", truth: Truth) -> FloatArray:
         If a trial would pass a joint limit, or no reference is set.
     """
     settings = config.calibration
-    vector = settings.reference or (config.task.start if config.task is not None else None)
+    vector = reference_of(config)
     if vector is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
-    robot = truth.robot
-    types = config.robot.joint_types if config.robot is not None else ""
-    reference = np.array(vector.values(types))
+    joints = joints_of(config)
+    reference = np.array(vector.values(joints.types))
     rows = [reference]
-    for i, kind in enumerate(robot.joint_types):
-        amplitude = settings.amplitude_m if kind == PRISMATIC else np.radians(settings.amplitude_deg)
+    for i, kind in enumerate(joints.types):
+        amplitude = settings.amplitude_m if kind == "P" else np.radians(settings.amplitude_deg)
         for offset in np.linspace(-amplitude, amplitude, settings.frames_per_joint):
             q = reference.copy()
             q[i] += offset
-            if not robot.lower[i] <= q[i] <= robot.upper[i]:
+            if not joints.lower[i] <= q[i] <= joints.upper[i]:
                 raise InputError(
                     f"calibration: a trial would move joint {i + 1} to {q[i]:.4g}, beyond its limits "
-                    f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose another "
+                    f"{joints.lower[i]:.4g} to {joints.upper[i]:.4g} (rad or m): choose another "
                     "calibration.reference or a smaller amplitude"
                 )
             rows.append(q)
@@ -57,7 +56,7 @@ def trial_motions(config: "Config", truth: Truth) -> FloatArray:
 
 def simulate(config: "Config", truth: Truth) -> Observation:
     """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
-    q = trial_motions(config, truth)
+    q = trial_motions(config)
     rng = generator(config, CALIBRATION_NOISE)
     noise = config.noise.calibration_px * rng.standard_normal((len(q), 2, len(truth.number), 2))
     images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])

@@ -16,8 +16,10 @@ from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import CONVERGED, Limits
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed
-from projservo_cli.stages.sight import Sight, sight_of
-from projservo_cli.stages.truth import center_index, face_numbers, reach_of, truth_of
+from projservo_cli.stages.motion import joints_of
+from projservo_cli.stages.reach import reach_for, sight_for
+from projservo_cli.stages.sight import Sight
+from projservo_cli.stages.truth import center_index, face_numbers
 from projservo_cli.task.body import NO_BODY
 from projservo_cli.task.face import Task, center_of, face_plane, task_from_images
 from projservo_cli.task.partition import Parts, partition
@@ -43,6 +45,7 @@ DEPENDS_ON = (
     "task",
     "trajectory",
     "control.observation",
+    "plant.use",
 )
 VIEWS = ("left", "right")
 TASK_DIMENSION = 6
@@ -70,8 +73,7 @@ def run(config: "Config", calibration: Calibration) -> Plan:
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    truth = truth_of(config)
-    reach = reach_of(config, truth)
+    reach, joints = reach_for(config, calibration), joints_of(config, calibration.joint_types)
     return plan_task(
         calibration.model(),
         reach.q_start,
@@ -81,8 +83,8 @@ def run(config: "Config", calibration: Calibration) -> Plan:
         config.trajectory.profile,
         config.trajectory.delta,
         config.trajectory.samples,
-        (truth.robot.lower, truth.robot.upper),
-        sight_of(config, calibration, truth, reach),
+        (joints.lower, joints.upper),
+        sight_for(config, calibration, reach),
     )
 
 

@@ -1,17 +1,18 @@
 """Record: drive a robot through trial motions and write what both cameras saw into a table."""
 
-import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from projservo_cli.config import digest
-from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, Observation, WorkFailed
+from projservo_cli.plants.foreign import Robot, at_rest_after
+from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.calibrate import images_at, trial_motions
+from projservo_cli.stages.motion import drive, foreign_robot, joints_of, near
 from projservo_cli.stages.truth import CALIBRATION_NOISE, Truth, generator, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
@@ -19,26 +20,11 @@ if TYPE_CHECKING:
     from projservo_cli.config import Config
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
-DEPENDS_ON = ("seed", "robot", "rig", "markers.positions_m", "markers.numbers", "noise.calibration_px")
-ARRIVED = 1e-3  # rad or m: a robot this near to where it was sent is there
-SETTLE = 10  # further commands for what rounding or a controller left at the end of a motion
+DEPENDS_ON = (
+    *("seed", "robot", "rig", "markers.positions_m", "markers.numbers", "noise.calibration_px"),
+    *("plant.use", "plant.options"),
+)
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
-
-
-class RecordedRobot(Protocol):
-    """What recording asks of a robot with its two cameras."""
-
-    def joints(self) -> FloatArray:
-        """Joint readings (n,), rad or m."""
-
-    def observe(self) -> FloatArray:
-        """Pixels (2, m, 2) of all markers, NaN where unseen."""
-
-    def command(self, step: FloatArray, period: float) -> None:
-        """Move by the joint step (n,), rad or m, within one control period, s."""
-
-    def stop(self) -> None:
-        """Come to rest."""
 
 
 class SimulatedRobot:
@@ -134,26 +120,22 @@ def prepare(
         If the configuration does not describe a robot and its trial motions, a pose lies beyond the
         joint limits, or the table at ``path`` was not recorded with this configuration.
     """
-    truth = truth_of(config)
-    targets = trial_motions(config, truth)
+    if config.plant.use is None:
+        truth_of(config)  # refuses what lacks a part of the simulation
+    targets = trial_motions(config)
+    numbers = config.markers.known if config.markers is not None else None
+    if numbers is None:
+        raise InputError("record needs to know which markers the robot observes: set markers.numbers")
     if motions is not None:
-        _require_limits(motions, truth)
+        joints = joints_of(config)
+        for pose, q in zip(motions.pose, motions.q, strict=True):
+            joints.require_inside(q, f"motions: pose {pose}")
         targets = np.vstack([targets, motions.q])
     key = digest(config, DEPENDS_ON)[:16]
-    recording = Recording(path, key, targets, np.array(truth.number, dtype=np.int64))
+    recording = Recording(path, key, targets, np.array(numbers, dtype=np.int64))
     if path.exists() and not force:
         _resume(recording)
     return recording
-
-
-def _require_limits(motions: JointList, truth: Truth) -> None:
-    robot = truth.robot
-    for pose, q in zip(motions.pose, motions.q, strict=True):
-        for i in np.flatnonzero((q < robot.lower) | (q > robot.upper)):
-            raise InputError(
-                f"motions: pose {pose} puts joint {i + 1} at {q[i]:.6g}, beyond its limits "
-                f"{robot.lower[i]:.6g} to {robot.upper[i]:.6g} (rad or m): leave it out"
-            )
 
 
 def _resume(recording: Recording) -> None:
@@ -167,20 +149,16 @@ def _resume(recording: Recording) -> None:
         raise InputError(f"{path}: has other markers than the configuration; {remedy}")
     column = np.searchsorted(table.marker, recording.marker)
     for k, pose in enumerate(table.pose.tolist()):
-        if not 0 <= pose < len(recording.targets) or not _near(table.q[k], recording.targets[pose]):
+        if not 0 <= pose < len(recording.targets) or not near(table.q[k], recording.targets[pose]):
             raise InputError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
         recording.q[pose], recording.images[pose] = table.q[k], table.images[k][:, column]
     recording.found = len(recording.q)
 
 
-def _near(q: FloatArray, target: FloatArray) -> bool:
-    return bool(np.abs(q - target).max() <= ARRIVED)
-
-
 def record(
     config: "Config",
     recording: Recording,
-    robot: RecordedRobot | None = None,
+    robot: Robot | None = None,
     *,
     progress: Progress = silent,
 ) -> None:
@@ -190,7 +168,7 @@ def record(
     ----------
     config : with the control period and the joint-speed limits.
     recording : what is to be done; on return, or on an interruption, what was done.
-    robot : what is driven; None simulates the robot of the configuration.
+    robot : what is driven; None takes that of ``plant.use``, or simulates the robot of the configuration.
     progress : told after each pose.
 
     Raises
@@ -198,26 +176,28 @@ def record(
     InputError
         If the table cannot be written.
     WorkFailed
-        If the robot does not arrive where it was sent.
+        If the robot fails or does not arrive where it was sent.
     """
+    if robot is None and config.plant.use is not None:
+        robot = foreign_robot(config, joints_of(config), len(recording.marker))
     driven = robot or simulated(config, recording)
     limit = step_limit(config)
     total, saved, took = len(recording.targets), time.monotonic(), 0.0
     unsaved = False
     try:
-        for pose in recording.pending:
-            recording.commands += drive(driven, recording.targets[pose], limit, config.control.period_s)
-            recording.q[pose], recording.images[pose] = driven.joints(), driven.observe()
-            unsaved = True
-            progress("record", len(recording.q), total)
-            # A long table takes long to write: most of the time must stay for recording.
-            if time.monotonic() - saved >= max(SAVE_EVERY, 10.0 * took):
-                start = time.monotonic()
-                recording.save()
-                saved, unsaved = time.monotonic(), False
-                took = saved - start
+        with at_rest_after(driven):
+            for pose in recording.pending:
+                recording.commands += drive(driven, recording.targets[pose], limit, config.control.period_s)
+                recording.q[pose], recording.images[pose] = driven.joints(), driven.observe()
+                unsaved = True
+                progress("record", len(recording.q), total)
+                # A long table takes long to write: most of the time must stay for recording.
+                if time.monotonic() - saved >= max(SAVE_EVERY, 10.0 * took):
+                    start = time.monotonic()
+                    recording.save()
+                    saved, unsaved = time.monotonic(), False
+                    took = saved - start
     finally:
-        driven.stop()
         if unsaved:
             recording.save()
 
@@ -232,44 +212,4 @@ def simulated(config: "Config", recording: Recording) -> SimulatedRobot:
 
 def step_limit(config: "Config") -> FloatArray:
     """Largest joint step (n,) in one control period, rad or m; infinite without a speed limit."""
-    control = config.control
-    turn, slide = control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s
-    types = truth_of(config).robot.joint_types
-    speed = [
-        (math.inf if slide is None else slide)
-        if kind == PRISMATIC
-        else (math.inf if turn is None else math.radians(turn))
-        for kind in types
-    ]
-    return np.array(speed) * control.period_s
-
-
-def drive(robot: RecordedRobot, target: FloatArray, limit: FloatArray, period: float) -> int:
-    """Move along a straight line in joint space, each command within the limit; the number of commands.
-
-    Parameters
-    ----------
-    robot : what is driven.
-    target : (n,) joints to arrive at, rad or m.
-    limit : (n,) largest step of each joint, rad or m.
-    period : control period, s.
-
-    Raises
-    ------
-    WorkFailed
-        If the robot is farther than ``ARRIVED`` from the target in the end.
-    """
-    gap = target - robot.joints()
-    most = math.ceil(float(np.max(np.abs(gap) / limit))) + SETTLE
-    count = 0
-    while gap.any() and count < most:
-        robot.command(gap / max(1.0, float(np.max(np.abs(gap) / limit))), period)
-        count += 1
-        gap = target - robot.joints()
-    if not _near(target - gap, target):
-        i = int(np.argmax(np.abs(gap)))
-        raise WorkFailed(
-            f"record: joint {i + 1} was sent to {target[i]:.6g} and stands at {target[i] - gap[i]:.6g} (rad "
-            "or m): look what holds the robot, then run the command again to continue"
-        )
-    return count
+    return joints_of(config).speed * config.control.period_s * config.plant.speed_scale

@@ -219,16 +219,23 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     if goal.images is not None:
         s_star = np.array([goal.images.left, goal.images.right])
         return Reach(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
-    if goal.joints is not None:
-        q_goal = np.array(goal.joints.values(types))
-    else:
-        assert goal.turn_deg is not None
-        q_goal = _turned(truth, q_start, goal.turn_deg, goal.perturbation)
+    q_goal = goal_joints(config, truth, q_start)
     _require_limits(truth.robot, q_goal, "task.goal")
     s_star = truth.images(q_goal, truth.M_face)
     s_star = s_star + sigma * rng.standard_normal(s_star.shape)
     pins_star = truth.images(q_goal, M_pins) + sigma * pins_noise[1]
     return Reach(q_start, truth.robot.pose(q_goal), s_start, s_star, pins_start, pins_star)
+
+
+def goal_joints(config: "Config", truth: Truth, q_start: FloatArray) -> FloatArray:
+    """Joints (n,) of a goal that is given by them or by a turn of the true robot, rad or m."""
+    assert config.task is not None
+    assert config.robot is not None
+    goal = config.task.goal
+    if goal.joints is not None:
+        return np.array(goal.joints.values(config.robot.joint_types))
+    assert goal.turn_deg is not None
+    return _turned(truth, q_start, goal.turn_deg, goal.perturbation)
 
 
 def _turned(

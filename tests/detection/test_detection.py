@@ -124,7 +124,7 @@ def scene():
     path = Path(__file__).parents[2] / "configs" / "ur5.yaml"
     config = load_config(path, ["calibration.frames_per_joint=2", "calibration.amplitude_deg=12"])
     truth = truth_of(config)
-    q = trial_motions(config, truth)
+    q = trial_motions(config)
     points = tool_points().reshape(12, 4) @ truth.robot.base_tool.T
     return q, np.array([truth.images(row, points) for row in q])
 
@@ -173,7 +173,7 @@ def test_images_alone_calibrate_a_robot_to_hundredths_of_a_pixel(projservo, rng)
     path = Path(__file__).parents[2] / "configs" / "ur5.yaml"
     config = load_config(path, ["calibration.frames_per_joint=4", "calibration.amplitude_deg=20"])
     truth = truth_of(config)
-    trials = trial_motions(config, truth)
+    trials = trial_motions(config)
     others = trials[0] + rng.uniform(-0.25, 0.25, (5, 6))
     points = tool_points().reshape(12, 4) @ truth.robot.base_tool.T
     for q, table in ((trials, "trials.csv"), (others, "others.csv")):

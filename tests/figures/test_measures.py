@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from projservo_cli.figures import measures
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.stages.servo import longest_plateau
+from projservo_cli.stages.traces import longest_plateau
 from tests.figures.cases import case, geometric
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.stages.servo import longest_plateau, rotation_between
+from projservo_cli.stages.traces import longest_plateau, rotation_between
 from tests.samples import displacement
 from tests.stages.cases import Case, case
 
@@ -52,7 +52,9 @@ def test_opaque_face_loses_its_markers():
     trace = example.trace("stacked")
     assert trace.verdict == "markers lost"
     assert trace.self_occluded[-1].any()
-    assert not trace.self_occluded[:-1].any()
+    waited = example.config.stop.lost_steps
+    assert not trace.self_occluded[: -1 - waited].any()
+    assert (trace.q_dot[-waited:] == 0.0).all()
     assert str(trace.steps) in trace.reason
 
 

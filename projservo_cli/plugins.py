@@ -1,0 +1,136 @@
+"""Robots and laws of others: from the name a user gives to the object that is driven.
+
+A name is ``module:Class``, or one that an installed package registers under the entry point groups
+``projservo.plants`` and ``projservo.laws``. Looking a name up reads metadata alone; only ``make``
+imports, so that reading a configuration or a run file never starts code.
+"""
+
+import difflib
+import importlib
+import inspect
+import os
+import re
+import sys
+import traceback
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from projservo_cli.records import InputError, WorkFailed
+
+GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
+DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
+TARGET = rf"^{DOTTED}:{DOTTED}$"
+
+
+def registered(kind: str) -> dict[str, str]:
+    """Names that installed packages register for a ``plant`` or ``law``, and the class of each."""
+    return {point.name: point.value for point in metadata.entry_points(group=GROUPS[kind])}
+
+
+def target_of(kind: str, name: str) -> str | None:
+    """The class ``module:Class`` that a name stands for; None where it stands for none."""
+    return name if re.match(TARGET, name) else registered(kind).get(name)
+
+
+def find(kind: str, target: str, methods: Sequence[str]) -> Any:
+    """Import a class, or a function that makes objects.
+
+    Parameters
+    ----------
+    kind : ``plant`` or ``law``, for messages.
+    target : ``module:Class``; modules are sought on the Python path, then in the working directory.
+    methods : names of the methods its objects must have.
+
+    Raises
+    ------
+    InputError
+        If there is no such class or it lacks a method.
+    """
+    where = f"{kind} {target}"
+    found = _found(where, *target.split(":"))
+    if isinstance(found, type):
+        _require_methods(where, found, methods)
+    return found
+
+
+def make(
+    kind: str, target: str, methods: Sequence[str], arguments: Sequence[Any], options: Mapping[str, Any]
+) -> Any:
+    """Import a class and make an object of it.
+
+    Parameters
+    ----------
+    kind, target, methods : as for ``find``.
+    arguments, options : what the class is called with.
+
+    Raises
+    ------
+    InputError
+        If there is no such class, it lacks a method or does not take the arguments.
+    WorkFailed
+        If the class fails when called.
+    """
+    where = f"{kind} {target}"
+    found = find(kind, target, methods)
+    try:
+        inspect.signature(found).bind(*arguments, **options)
+    except TypeError as error:
+        given = f"{kind}.options" if kind == "plant" else "the setting it is given"
+        raise InputError(f"{where}: does not take {given}: {error}") from error
+    except ValueError:
+        pass  # a class in C tells nothing about its arguments; the call itself will
+    try:
+        result = found(*arguments, **options)
+    except Exception as error:
+        raise WorkFailed(f"{where}: cannot be made: {what_failed(error)}") from error
+    _require_methods(where, result, methods)
+    return result
+
+
+def _found(where: str, module: str, name: str) -> Any:
+    if os.getcwd() not in sys.path:  # last, so that a file there never stands in for an installed module
+        sys.path.append(os.getcwd())
+    try:
+        found: Any = importlib.import_module(module)
+    except (Exception, SystemExit) as error:
+        if (
+            isinstance(error, ModuleNotFoundError)
+            and error.name
+            and f"{module}.".startswith(f"{error.name}.")
+        ):
+            place = f"on the Python path or in {os.getcwd()}"
+            raise InputError(f"{where}: there is no module {error.name} {place}") from error
+        raise InputError(f"{where}: importing {module} failed: {what_failed(error)}") from error
+    for step in name.split("."):
+        if not hasattr(found, step):
+            classes = [
+                key for key, value in vars(found).items() if getattr(value, "__module__", "") == module
+            ]
+            near = difflib.get_close_matches(step, classes, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"classes: {', '.join(classes) or 'none'}"
+            raise InputError(f"{where}: {module} has no {step}; {hint}")
+        found = getattr(found, step)
+    if not callable(found):
+        raise InputError(f"{where}: is no class, but of type {type(found).__name__}")
+    return found
+
+
+def _require_methods(where: str, found: Any, methods: Sequence[str]) -> None:
+    lacking = [name for name in methods if not callable(getattr(found, name, None))]
+    if lacking:
+        raise InputError(
+            f"{where}: lacks {', '.join(f'{name}()' for name in lacking)}; needed: {', '.join(methods)}"
+        )
+
+
+def what_failed(error: BaseException) -> str:
+    """An exception of somebody else's code in one line, with the place that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    if isinstance(error, SyntaxError) and error.filename:
+        place = f" ({Path(error.filename).name}:{error.lineno})"
+        error = SyntaxError(error.msg)
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}{f': {text}' if text else ''}{place}"

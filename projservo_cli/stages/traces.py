@@ -1,0 +1,173 @@
+"""From the log of a run to its record: errors where the truth is known, the verdict in words."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.control.law import Gains
+from projservo_cli.geometry.normal import COORDINATES
+from projservo_cli.loop.compiled import Log, path_deviation
+from projservo_cli.loop.step import Limits
+from projservo_cli.plants.plant import Plant
+from projservo_cli.records import FloatArray, Trace
+from projservo_cli.stages.truth import Reach, Truth
+
+# Points of a joint step at which the deviation between samples is measured.
+SUBSAMPLES = 50
+
+
+class Outcome(NamedTuple):
+    """How a run of the Python loop ended.
+
+    Attributes
+    ----------
+    verdict, disturbance : the verdict, and why the images no longer agree where that is it.
+    steps : commands sent.
+    log : what was recorded.
+    limited : how often visibility limited the translation.
+    """
+
+    verdict: str
+    disturbance: str
+    steps: int
+    log: Log
+    limited: float
+
+
+class Known(NamedTuple):
+    """What is known of the truth of a run, by instant; NaN or None where nothing is.
+
+    Attributes
+    ----------
+    pose, goal_pose : (k, 4, 4), (4, 4) true pose of the tool, m.
+    center : (k, 3) true centre of the face, m.
+    position_mm, rotation_deg : errors at the end.
+    between_mm, at_samples_mm : largest distance of the centre from its line.
+    """
+
+    pose: FloatArray
+    goal_pose: FloatArray
+    center: FloatArray
+    position_mm: float | None = None
+    rotation_deg: float | None = None
+    between_mm: float | None = None
+    at_samples_mm: float | None = None
+
+
+def unknown(instants: int) -> Known:
+    """What is known of a robot that is not simulated."""
+    return Known(np.full((instants, 4, 4), np.nan), np.full((4, 4), np.nan), np.full((instants, 3), np.nan))
+
+
+def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gains) -> Known:
+    """What is known of the simulated robot."""
+    H = outcome.log.H[: outcome.steps + 1]
+    middle = plant.M.mean(axis=0) if plant.center < 0 else plant.M[plant.center]
+    center = (H @ middle)[:, :3]
+    pose = H @ truth.robot.base_tool
+    if reach.goal_pose is None:
+        return Known(pose, np.full((4, 4), np.nan), center)
+    goal = reach.goal_pose @ np.linalg.solve(truth.robot.base_tool, middle)
+    start = np.append(center[0], 1.0)
+    deviations = path_deviation(plant, outcome.log, outcome.steps, gains.period, start, goal, SUBSAMPLES)
+    return Known(
+        pose,
+        reach.goal_pose,
+        center,
+        1e3 * float(np.linalg.norm(center[-1] - goal[:3])),
+        rotation_between(pose[-1], reach.goal_pose),
+        1e3 * deviations[0],
+        1e3 * deviations[1],
+    )
+
+
+def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Limits, truth: Known) -> Trace:
+    """Record of a finished run."""
+    verdict, steps, log = outcome.verdict, outcome.steps, outcome.log
+    rows = steps + 1
+    before, after, views = log.fit[:rows].T
+    errors = log.errors[:rows]
+    hidden = log.hidden[:rows] > 0.5
+    outside, beyond, joint = (int(x) for x in log.events[:3])
+    return Trace(
+        law=law,
+        verdict=verdict,
+        reason=outcome.disturbance or reason_of(verdict, log, steps, limits, joint),
+        steps=steps,
+        period=gains.period,
+        observation="points" if np.isnan(views).all() else "body",
+        position_error_mm=truth.position_mm,
+        rotation_error_deg=truth.rotation_deg,
+        self_occluded_steps_left=int(hidden[:, 0].sum()),
+        self_occluded_steps_right=int(hidden[:, 1].sum()),
+        center_deviation_mm=truth.between_mm,
+        center_deviation_at_samples_mm=truth.at_samples_mm,
+        plateau_steps=longest_plateau(log.error[:rows], limits.plateau_steps),
+        speed_limited_steps=int((log.factor[:steps] < 1.0).sum()),
+        visibility_limited_steps=int(outcome.limited),
+        first_outside_image=outside,
+        first_beyond_limit=beyond,
+        limit_joint=joint,
+        q=log.q[:rows],
+        s=np.ascontiguousarray(log.s[:rows, :, : reach.s_star.shape[1]]),
+        s_star=reach.s_star,
+        image_error=log.error[:rows],
+        tau=errors[:, 0],
+        tau_affine=errors[:, 1],
+        theta_r=errors[:, 2],
+        theta_p=errors[:, 3],
+        theta_s=errors[:, 4],
+        prediction_px=rms(before, 2.0 * views),
+        fit_px=rms(after, 2.0 * views - COORDINATES),
+        views_used=views,
+        q_dot=log.q_dot[:steps],
+        speed_factor=log.factor[:steps],
+        self_occluded=hidden,
+        pose=truth.pose,
+        goal_pose=truth.goal_pose,
+        center=truth.center,
+    )
+
+
+def rms(squares: FloatArray, count: FloatArray) -> FloatArray:
+    """Root of the mean of sums of squares; NaN where the count is not positive."""
+    mean = np.full(squares.shape, math.nan)
+    np.divide(squares, count, out=mean, where=count > 0.0)
+    return np.asarray(np.sqrt(mean))
+
+
+def rotation_between(pose: FloatArray, goal: FloatArray) -> float:
+    """Angle between the rotations of two poses (4, 4), deg."""
+    R = pose[:3, :3].T @ goal[:3, :3]
+    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return math.degrees(math.atan2(float(sine), float(np.trace(R)) - 1.0))
+
+
+def longest_plateau(image_error: FloatArray, window: int) -> int:
+    """Longest stretch, in steps, in which the image error falls by less than 1 % in ``window`` steps."""
+    flat = image_error[window:] > 0.99 * image_error[:-window]
+    longest = current = 0
+    for value in flat:
+        current = current + 1 if value else 0
+        longest = max(longest, current)
+    return longest + window - 1 if longest else 0
+
+
+def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int) -> str:
+    """Why a run ended, in a sentence."""
+    error, first = float(log.error[steps]), float(log.error[0])
+    return {
+        "converged": f"image error {error:.3g} px is within {limits.image_px:.3g} px",
+        "plateau": f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
+        f"{limits.plateau_steps} steps: a local minimum",
+        "max steps": f"no step left; image error {error:.3g} px was still changing",
+        "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
+        f"{limits.diverged_factor:g}-fold",
+        "left image": f"a face marker left an image at step {steps}",
+        "behind camera": f"a face marker passed behind a camera at step {steps}",
+        "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
+        + (f", {limits.lost_steps} periods after the last that was" if limits.lost_steps else ""),
+        "joint limit": f"the command of step {steps} would take joint {joint + 1} beyond its limit",
+        "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
+    }[verdict]

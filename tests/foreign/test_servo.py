@@ -1,0 +1,364 @@
+"""Servo and record with robots and laws of others, on the command line."""
+
+import io
+import shutil
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from projservo_cli import files
+from projservo_cli.config import load_config
+from projservo_cli.stages.driven import adapted
+from projservo_cli.stages.servo import gains_of, limits_of
+from projservo_cli.store import load
+from tests.foreign import robots
+from tests.foreign.robots import CALLS
+
+pytestmark = pytest.mark.volume  # a calibration and many steps
+
+UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
+HERE = "tests.foreign.robots"
+OPTIONS = f"options: {{config: {UR5}"
+NEAR = ["--set", "task.goal.joints.joints=[3, -1.7, -0.9, -2, 2, 1]"]
+SOUND = ["--set", f"plant={{use: '{HERE}:Sound', {OPTIONS}}}}}"]
+
+
+def faulty(fault, after=0, **more):
+    settings = "".join(f", {name}: {value}" for name, value in more.items())
+    return ["--set", f"plant={{use: '{HERE}:Faulty', {OPTIONS}, fault: {fault}, after: {after}}}{settings}}}"]
+
+
+@pytest.fixture(autouse=True)
+def no_disk(monkeypatch):
+    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A run with a calibration and nothing else."""
+    from projservo_cli import cli
+
+    folder = tmp_path_factory.mktemp("calibrated")
+    assert cli.run(["calibrate", "-c", str(UR5), "-o", str(folder), "-q"]) == 0
+    return folder
+
+
+@pytest.fixture
+def servo(projservo, calibrated, monkeypatch, tmp_path):
+    """Servo with the calibration, the configuration given anew."""
+    monkeypatch.chdir(tmp_path)
+    CALLS.clear()
+    shutil.copytree(calibrated, "run")
+
+    def call(*arguments, law="direct_three"):
+        laws = ["--law", law] if law else []
+        return projservo("servo", "-c", UR5, "-o", "run", *laws, *arguments)
+
+    return call
+
+
+def commands():
+    return [call for call in CALLS if isinstance(call, tuple)]
+
+
+def test_a_robot_of_others_reaches_the_goal_as_the_simulated_one_does(servo):
+    answer = servo(*SOUND, "--json")
+    assert answer.code == 0, answer.err
+    (told,) = answer.json["laws"]
+    assert told["verdict"] == "converged"
+    assert [told[name] for name in ("position_error_mm", "rotation_error_deg", "center_deviation_mm")] == [
+        None
+    ] * 3
+    trace = load("run").traces["direct_three"]
+    # True goal: that of the configuration, less what the calibration mispredicts there.
+    truth = robots.Sound(UR5).truth.robot
+    goal = truth.pose(np.array([4.143219, -2.507909, -1.233571, 2.549498, 1.251226, 3.700267]))
+    reached = truth.pose(trace.q[-1])
+    assert 1e3 * np.linalg.norm(reached[:3, 3] - goal[:3, 3]) < 5.0
+    assert np.isnan(trace.pose).all()
+    assert servo("--set", "noise.servo_px=0.5", "--json", "--force").json["laws"][0][
+        "steps"
+    ] == pytest.approx(told["steps"], abs=25)
+
+
+@pytest.mark.parametrize("law", ["direct_three", "exact"])
+def test_every_command_keeps_the_limit_and_the_robot_is_stopped_last(servo, law):
+    assert servo(*SOUND, "-q", law=law).code == 0
+    speeds = np.array([np.abs(step).max() / period for _, step, period in commands()])
+    assert speeds.max() == pytest.approx(np.radians(125.0))
+    longer = max(period for _, _, period in commands())
+    assert (longer > 0.041) == (law == "exact")  # keeps to its path, to first order to the limit
+    assert CALLS.count("stop") == 1
+    assert CALLS[-1] == "stop"
+    moved = next(i for i, call in enumerate(CALLS) if isinstance(call, tuple))
+    assert CALLS[:moved].count("observe") == 3  # nothing moves before the images were seen to fit
+
+
+def test_speed_scale_scales_every_command(servo):
+    assert servo(*SOUND, "-q").code == 0
+    whole, trace = commands(), load("run").traces["direct_three"]
+    assert servo(*SOUND, "--speed-scale", "0.25", "-q").code == 0
+    quarter, slow = commands(), load("run").traces["direct_three"]
+    assert load("run").configuration.count("speed_scale: 0.25") == 1
+    np.testing.assert_allclose(quarter[0][1], 0.25 * whole[0][1], rtol=1e-12)  # to the start of the task
+    assert slow.steps > 3 * trace.steps
+    limit = np.radians(125.0) * 0.04
+    assert max(np.abs(step).max() for _, step, _ in quarter) <= 0.25 * limit * (1 + 1e-12)
+
+
+def test_speed_scale_of_the_simulated_robot(servo):
+    assert servo("-q").code == 0
+    whole = load("run").traces["direct_three"]
+    assert servo("--speed-scale", "0.5", "-q").code == 0
+    half = load("run").traces["direct_three"]
+    np.testing.assert_array_equal(half.q_dot[0], 0.5 * whole.q_dot[0])
+    assert half.position_error_mm < 1.0
+
+
+@pytest.mark.parametrize(
+    ("fault", "after", "message"),
+    [
+        ("raises", 30, r"observe() failed: OSError: camera 2 is unplugged (robots.py:"),
+        ("too few", 30, "observe() gave numbers of shape (2, 4, 2), expected (2, 10, 2)"),
+        ("command raises", 30, "command() failed: RuntimeError: protective stop"),
+        ("hangs", 30, "observe() did not return within 0.5 s"),
+    ],
+)
+def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, message):
+    answer = servo(*faulty(fault, after, timeout_s=0.5))
+    assert answer.code == 1
+    assert answer.err.splitlines()[-1].startswith(
+        "projservo: servo/direct_three: plant tests.foreign.robots:Faulty"
+    )
+    assert message in answer.err
+    assert CALLS.count("stop") == 1
+    assert "Traceback" not in answer.err
+
+
+def test_ctrl_c_stops_the_robot(servo):
+    answer = servo(*faulty("interrupted", 30))
+    assert answer.code == 130
+    assert CALLS[-1] == "stop"
+
+
+def test_a_robot_that_does_not_stop_is_said(servo):
+    answer = servo(*faulty("does not stop"))
+    assert answer.code == 1
+    assert "stop() failed: OSError: no answer from the controller" in answer.err
+    assert "see to it that the robot is at rest" in answer.err
+
+
+@pytest.mark.parametrize(
+    ("fault", "culprit"),
+    [
+        ("bumped camera", "those of the left camera alone: it was moved; recalibrate"),
+        ("moved marker", "marker 6 was moved on the tool; put it back, or recalibrate"),
+        ("frozen readings", "in both cameras alike: the joint readings are wrong"),
+    ],
+)
+def test_a_disturbance_ends_the_run_with_what_moved(servo, fault, culprit):
+    answer = servo(*faulty(fault, 60), "--json", law="exact")  # no law that must converge
+    assert answer.code == 1
+    (told,) = answer.json["laws"]
+    assert told["verdict"] == "disturbed"
+    assert culprit in told["reason"]
+    assert culprit in answer.err
+    started = sum(1 for call in CALLS if call == "observe") - told["steps"] - 1
+    assert told["steps"] <= 60 - started + 8  # the third observation in a row, a few more for what is small
+    assert CALLS[-1] == "stop"
+
+
+def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
+    answer = servo(*faulty("bumped camera"))
+    assert answer.code == 1
+    assert "nothing was moved, since where the robot stands images are" in answer.err
+    assert commands() == []
+    assert CALLS[-1] == "stop"
+    assert servo(*faulty("bumped camera"), "--set", "stop.innovation_factor=0", "-q").code in (0, 1)
+    assert commands()
+
+
+def test_single_bad_frames_are_no_disturbance(servo):
+    answer = servo(*faulty("one bad frame", 80), "--json")
+    assert answer.json["laws"][0]["verdict"] != "disturbed"
+
+
+def test_lost_markers_are_waited_for(servo):
+    answer = servo(*faulty("lost for a while", 40), "--json")
+    assert answer.json["laws"][0]["verdict"] == "converged"
+    trace = load("run").traces["direct_three"]
+    unseen = np.isnan(trace.s).any(axis=(1, 2, 3))
+    assert unseen.sum() == 9
+    np.testing.assert_array_equal(trace.q_dot[unseen[:-1]], 0.0)
+    answer = servo(*faulty("lost", 40), "--set", "stop.lost_steps=7", "--json")
+    (told,) = answer.json["laws"]
+    assert (answer.code, told["verdict"]) == (1, "markers lost")
+    assert "7 periods after the last that was" in told["reason"]
+    assert np.isnan(load("run").traces["direct_three"].s).any(axis=(1, 2, 3)).sum() == 8
+
+
+def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
+    config = load_config(UR5, ["plant.joint_limits=report", "noise.servo_px=0.1"])
+    calibration = load(calibrated).calibration
+    gains, limits = adapted(config, calibration, gains_of(config), limits_of(config))
+    assert limits.stop_at_joint_limit
+    assert limits.image_px == 0.01 + 2.0 * calibration.sigma_fitted_px
+    np.testing.assert_array_equal(gains.speed, np.full(6, np.radians(125.0)))
+
+
+def test_a_robot_without_speed_limit_is_refused(servo):
+    answer = servo(*SOUND, "--set", "control.joint_speed_limit_deg_s=null")
+    assert answer.code == 2
+    assert "set control.joint_speed_limit_deg_s" in answer.err
+    assert commands() == []
+
+
+@pytest.mark.parametrize(
+    ("setting", "code", "message"),
+    [
+        ("plant=no_such_robot:A", 2, "plant no_such_robot:A: there is no module no_such_robot"),
+        (f"plant={HERE}:NoStop", 2, "lacks stop()"),
+        (f"plant={HERE}:Sound", 2, "does not take plant.options"),
+        (f"plant={HERE}:Unmakeable", 1, "cannot be made: ConnectionError"),
+    ],
+)
+def test_a_robot_that_cannot_be_had(servo, setting, code, message):
+    answer = servo("--set", setting)
+    assert answer.code == code
+    assert message in answer.err.splitlines()[-1]
+
+
+def test_a_law_of_others_equals_the_built_in_one_it_calls(servo):
+    points = ["--set", "control.observation=points"]
+    assert servo("-q", *points).code == 0
+    built_in = load("run").traces["direct_three"]
+    assert servo("-q", *points, law=f"{HERE}:DirectThree").code == 0
+    theirs = load("run").traces[f"{HERE}:DirectThree"]
+    assert theirs.verdict == "converged"
+    for name in ("q", "s", "q_dot", "pose"):
+        np.testing.assert_array_equal(getattr(theirs, name), getattr(built_in, name), err_msg=name)
+    assert np.isnan(theirs.tau).all()
+
+
+def test_a_law_and_a_robot_of_others(servo):
+    answer = servo(*SOUND, "--set", f"law={HERE}:ByImage", *NEAR, "--json", law=None)
+    assert answer.code == 0, answer.err
+    assert answer.json["laws"][0]["verdict"] == "converged"
+
+
+@pytest.mark.parametrize(
+    ("law", "code", "message"),
+    [
+        (
+            f"{HERE}:Wrong",
+            1,
+            "law tests.foreign.robots:Wrong: gave (1.0, 2.0): expected 6 finite joint velocities",
+        ),
+        (f"{HERE}:Infinite", 1, "expected 6 finite joint velocities"),
+        (f"{HERE}:Raising", 1, "failed: IndexError: list index out of range (robots.py:"),
+        (f"{HERE}:Nobody", 2, "tests.foreign.robots has no Nobody"),
+        ("direct_thre", 2, "no such law; laws: direct_three"),
+    ],
+)
+def test_a_law_that_fails(servo, law, code, message):
+    answer = servo(*SOUND, law=law)
+    assert answer.code == code
+    assert message in answer.err
+    assert "Traceback" not in answer.err
+
+
+def test_a_law_that_waits_is_waited_for(servo):
+    answer = servo("--set", "stop.lost_steps=3", "--json", law=f"{HERE}:Silent")
+    assert answer.code == 0
+    assert (answer.json["laws"][0]["verdict"], answer.json["laws"][0]["steps"]) == ("markers lost", 3)
+
+
+def test_confirm_needs_a_terminal(servo, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    answer = servo(*SOUND, "--confirm")
+    assert answer.code == 2
+    assert "--confirm: standard input is no terminal" in answer.err
+    assert commands() == []
+
+
+@pytest.mark.parametrize(("answered", "code"), [("y", 0), ("n", 130), ("", 130)])
+def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    asked = []
+
+    def answer_it(prompt):
+        asked.append((prompt, len(commands())))
+        return answered
+
+    CALLS.clear()
+    monkeypatch.setattr(click.termui, "visible_prompt_func", answer_it)
+    answer = servo(*SOUND, "--confirm", "--speed-scale", "0.5")
+    assert answer.code == code
+    ((_, moved),) = asked
+    assert moved == 0
+    assert ("servo will move tests.foreign.robots:Sound, speeds times 0.5" in answer.err) or asked[0][0]
+    assert bool(commands()) == (code == 0)
+
+
+def test_a_stored_run_starts_no_code(servo, projservo, monkeypatch):
+    Path("mine_marks.py").write_text(
+        "import pathlib\npathlib.Path('imported').touch()\nfrom tests.foreign.robots import *\n"
+    )
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    robot = ["--set", f"plant={{use: 'mine_marks:Sound', {OPTIONS}}}}}"]
+    law = ["--set", "control.laws=['mine_marks:ByImage', direct_three]"]
+    assert servo(*robot, *law, *NEAR, "-q", law=None).code == 0
+    Path("imported").unlink()
+    sys.modules.pop("mine_marks")
+    for words in (
+        ("show", "run"), ("servo", "-o", "run"), ("servo", "-o", "run", "-n", "--force"),
+        ("calibrate", "-o", "run", "--set", "seed=9", "-n"), ("validate", "run", "--data", "t.csv"),
+    ):  # fmt: skip
+        projservo(*words)
+    refused = projservo("servo", "-o", "run", "--force")
+    assert refused.code == 2
+    assert "law mine_marks:ByImage is named by the stored run alone, which starts no code" in refused.err
+    refused = projservo("servo", "-o", "run", "--force", "--law", "mine_marks:ByImage")
+    assert "plant mine_marks:Sound is named by the stored run alone" in refused.err
+    assert not Path("imported").exists()
+    assert "mine_marks" not in sys.modules
+    asked = projservo("servo", "-o", "run", "--force", "--law", "direct_three", *robot)
+    assert asked.code == 0, asked.err
+    assert Path("imported").exists()
+
+
+def test_a_report_never_moves_a_robot(servo, projservo):
+    CALLS.clear()
+    answer = projservo("report", "-c", UR5, "-o", "run", *SOUND)
+    assert answer.code == 2
+    assert "which moves tests.foreign.robots:Sound: run projservo servo first" in answer.err
+    assert CALLS == []
+
+
+def test_registered_names_on_the_command_line(servo, monkeypatch):
+    points = [metadata.EntryPoint("mine", f"{HERE}:DirectThree", "projservo.laws")]
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points)
+    assert servo("--json", law="mine").json["laws"][0]["law"] == f"{HERE}:DirectThree"
+
+
+def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    few = ["--set", "calibration.frames_per_joint=2"]
+    answer = projservo("record", "-c", UR5, *SOUND, *few, "-o", "t.csv", "--speed-scale", "0.5", "--json")
+    assert answer.code == 0, answer.err
+    assert (answer.json["recorded"], answer.json["markers"]) == (13, 10)
+    assert max(np.abs(step).max() for _, step, _ in commands()) <= 0.5 * np.radians(125.0) * 0.04 * (
+        1 + 1e-12
+    )
+    assert CALLS[-1] == "stop"
+    answer = projservo("record", "-c", UR5, *few, "-o", "t.csv")
+    assert answer.code == 2  # those poses are of another robot
+    answer = projservo("record", "-c", UR5, *faulty("raises", 5), *few, "-o", "u.csv")
+    assert answer.code == 1
+    assert "camera 2 is unplugged" in answer.err
+    assert CALLS[-1] == "stop"
+    assert len(Path("u.csv").read_text().splitlines()) == 1 + 5 * 10  # what was seen until then is kept
