@@ -13,7 +13,7 @@ from projservo_cli.figures.drift import drift_rows
 from projservo_cli.figures.material import VIEWS
 from projservo_cli.page.pictures import SECTIONS, Picture, pictures
 from projservo_cli.page.words import calibration_words, held_out_words, law_words, title
-from projservo_cli.records import Plan, Report, Trace
+from projservo_cli.records import Calibration, Plan, Report, Trace
 from projservo_cli.store import Run
 
 # What made a run: key in the provenance, and what the page calls it.
@@ -174,10 +174,18 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
             ("degrees of freedom", calibration.dof, ""),
             ("poses", calibration.merged_poses, ""),
             ("markers", calibration.merged_markers, ""),
+            *_lens(calibration),
             ("time", calibration.seconds, "s"),
         ],
         "joints": joints,
     }
+
+
+def _lens(calibration: Calibration) -> Iterator[tuple[str, float, str]]:
+    """Coefficients of radial distortion, where they were estimated."""
+    for name, lens in zip(VIEWS, [] if calibration.lens is None else calibration.lens, strict=False):
+        for k in (1, 2):
+            yield f"lens of the {name} camera, k{k}", float(lens[2 + k]), ""
 
 
 def _plan(plan: Plan) -> dict[str, Any]:

@@ -75,7 +75,7 @@ def _worst_joint(calibration: Calibration) -> str:
         return f"The method {calibration.method} states no uncertainty, so no joint can be called the worst."
     worst = int(np.nanargmax(noise))
     reach = f"{REACH_M:g} m" if calibration.joint_types[worst] == "P" else f"{REACH_RAD:g} rad"
-    weak = "and therefore weak" if noise[worst] > WEAK_NOISE else "well determined"
+    weak = "weak" if noise[worst] > WEAK_NOISE else "well determined"
     return (
         f"Joint {worst + 1} is known worst: {reach} from the reference it adds {short(float(noise[worst]))} "
         f"times the pixel noise to predicted images; a joint is weak above {WEAK_NOISE:g}, so this one is "

@@ -11,7 +11,7 @@ from projservo_cli.columns import to_csv
 from projservo_cli.figures import FIGURES
 from projservo_cli.page import PAGE_FILE, write_comparison, write_page
 from projservo_cli.page.vector import inline
-from projservo_cli.page.words import number, short
+from projservo_cli.page.words import calibration_words, number, short
 from projservo_cli.records import CrossValidation, Report
 from projservo_cli.stages import report
 from projservo_cli.store import Result
@@ -294,3 +294,30 @@ def test_a_held_out_error_is_told(run, tmp_path):
     text = words(read(write_page(other)).text)
     assert "Held out, in 5 parts of poses: rms 0.321 px" in text
     assert "As predicted." in text
+
+
+def test_a_weak_joint_and_what_was_left_out_are_named(run, tmp_path):
+    calibration = dataclasses.replace(
+        run.calibration,
+        usable=False,
+        prediction_noise=np.array([0.5, 7.25, 1.0, 1.0, 1.0, 1.0]),
+        outlier=np.zeros((2, 3), dtype=np.int64),
+        suspect=np.zeros((1, 2), dtype=np.int64),
+        advice=("move joint 2",),
+        lens=np.array([[640, 512, 800, -0.0625, 0.5], [640, 512, 800, 0.25, 0.0]]),
+    )
+    text = " ".join(calibration_words(calibration, estimated=True))
+    assert text.startswith("Not usable: ")
+    assert "an estimate from these images" in text
+    assert "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times" in text
+    assert "so this one is weak." in text
+    assert "2 readings left out as outliers. 1 joint reading contradicts the images." in text
+    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan), method="linear")
+    assert "The method linear states no uncertainty" in " ".join(calibration_words(unknown, estimated=False))
+    result = run.results["calibrate"]
+    result = dataclasses.replace(result, records={**result.records, "calibration": calibration})
+    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
+    shown = words(read(write_page(other)).text)
+    assert "✗ not usable" in shown
+    assert "What to do next: move joint 2" in shown
+    assert "lens of the left camera, k1 −0.0625" in shown
