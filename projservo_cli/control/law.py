@@ -18,7 +18,7 @@ from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import Work, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
-from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, carry, fit_body
+from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, carry, fit_body, new_normal
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
 from projservo_cli.task.visibility import limited_translation
@@ -78,6 +78,7 @@ class State(NamedTuple):
     limited : (1,) how often visibility limited the translation.
     fit : (3,) sums of squared residuals of the predicted and of the fitted body, px², and the markers
         used, counted once a view; NaN where the face is measured point by point.
+    normal : (6, 7) workspace of the fit of the body.
     newton : (n,) one Newton step.
     path : (129, n) joints at the ends of the parts of a step, the current ones first.
     share : (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the
@@ -95,6 +96,7 @@ class State(NamedTuple):
     memory: Memory
     limited: FloatArray
     fit: FloatArray
+    normal: FloatArray
     newton: FloatArray
     path: FloatArray
     share: FloatArray
@@ -114,6 +116,7 @@ def new_state(n: int, m: int) -> State:
         Memory(np.zeros((2, n))),
         np.zeros(1),
         np.full(3, np.nan),
+        new_normal(),
         np.zeros(n),
         np.zeros((MOST_PARTS + 1, n)),
         np.full(1, -1.0),
@@ -155,9 +158,9 @@ def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State)
     At the goal the errors of the calibration cancel between what is seen and what was shown where both
     are fitted to the same views; others serve only where these do not determine the body.
     """
-    fit = fit_body(model.P, task.body, s, H, True, SETTLED_PX, MOST_STEPS)
+    fit = fit_body(model.P, task.body, s, H, True, SETTLED_PX, MOST_STEPS, state.normal)
     if not fit.found:
-        fit = fit_body(model.P, task.body, s, H, False, SETTLED_PX, MOST_STEPS)
+        fit = fit_body(model.P, task.body, s, H, False, SETTLED_PX, MOST_STEPS, state.normal)
     state.fit[0] = fit.before
     state.fit[1] = fit.after
     state.fit[2] = fit.views

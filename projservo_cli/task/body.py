@@ -52,7 +52,6 @@ class Body(NamedTuple):
     turn : (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation.
     a_inf : (4,) plane at infinity.
     shown : (2, m) views of the markers that the goal showed.
-    normal : (6, 7) workspace of the normal equations.
     """
 
     M: FloatArray
@@ -61,7 +60,6 @@ class Body(NamedTuple):
     turn: FloatArray
     a_inf: FloatArray
     shown: BoolArray
-    normal: FloatArray
 
 
 class Fit(NamedTuple):
@@ -90,7 +88,6 @@ NO_BODY = Body(
     np.zeros((0, 3, 3)),
     np.zeros(4),
     np.zeros((2, 0), dtype=np.bool_),
-    np.zeros((COORDINATES, COORDINATES + 1)),
 )
 
 
@@ -132,8 +129,12 @@ def body_of(model: Model, M: FloatArray) -> Body:
         np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
         np.ascontiguousarray(model.a_inf),
         np.ones((2, len(M)), dtype=np.bool_),
-        np.zeros((COORDINATES, COORDINATES + 1)),
     )
+
+
+def new_normal() -> FloatArray:
+    """Workspace of the normal equations, for one fit at a time."""
+    return np.zeros((COORDINATES, COORDINATES + 1))
 
 
 @inline
@@ -161,17 +162,18 @@ def image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: 
 
 @njit
 def normal_equations(
-    P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool = False
+    P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool, normal: FloatArray
 ) -> tuple[float, int]:
     """Normal equations of the displacement exp(ξ) after which H carries the markers to their images.
 
     Parameters
     ----------
     P : (2, 3, 4) cameras.
-    body : the equations are written to its workspace.
+    body : as calibrated.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : displacement from the reference about which the images are linear in ξ.
     shown_only : leave out views that the goal did not show.
+    normal : (6, 7) on return the equations.
 
     Returns
     -------
@@ -206,14 +208,14 @@ def normal_equations(
             N = accumulate(N, row_u, row_v)
             squares += e_u * e_u + e_v * e_v
             views += 1
-    put_sums(body.normal, N)
+    put_sums(normal, N)
     return squares, views
 
 
 @njit
-def displaced(body: Body, H: Mat4) -> Mat4:
-    """Displacement H exp(ξ), with the coordinates ξ in the last column of the workspace."""
-    xi = body.normal[:, COORDINATES]
+def displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
+    """Displacement H exp(ξ), with the coordinates ξ in the last column of the solved equations."""
+    xi = normal[:, COORDINATES]
     direction = add(
         scale(float(xi[0]), vec(body.D[0])),
         add(scale(float(xi[1]), vec(body.D[1])), scale(float(xi[2]), vec(body.D[2]))),
@@ -226,7 +228,14 @@ def displaced(body: Body, H: Mat4) -> Mat4:
 
 @njit
 def fit_body(
-    P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool, settled_px: float, most_steps: int
+    P: FloatArray,
+    body: Body,
+    s: FloatArray,
+    H: Mat4,
+    shown_only: bool,
+    settled_px: float,
+    most_steps: int,
+    normal: FloatArray,
 ) -> Fit:
     """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
 
@@ -240,24 +249,25 @@ def fit_body(
     shown_only : leave out views that the goal did not show.
     settled_px : a step that moves the images by no more, px rms a coordinate, is the last.
     most_steps : the fit after so many steps is taken as it is.
+    normal : (6, 7) workspace of the normal equations.
     """
     before = 0.0
     after = 0.0
     views = 0
     for step in range(most_steps):
-        squares, views = normal_equations(P, body, s, H, shown_only)
+        squares, views = normal_equations(P, body, s, H, shown_only, normal)
         if step == 0:
             before = squares
         gradient = (
-            body.normal[0, 6], body.normal[1, 6], body.normal[2, 6],
-            body.normal[3, 6], body.normal[4, 6], body.normal[5, 6],
+            normal[0, 6], normal[1, 6], normal[2, 6],
+            normal[3, 6], normal[4, 6], normal[5, 6],
         )  # fmt: skip
-        if not solve_normal(body.normal, RANK_TOLERANCE):
+        if not solve_normal(normal, RANK_TOLERANCE):
             return Fit(False, H, before, before, views)
         fall = 0.0
         for i in range(COORDINATES):
-            fall += gradient[i] * body.normal[i, COORDINATES]
-        H = displaced(body, H)
+            fall += gradient[i] * normal[i, COORDINATES]
+        H = displaced(body, H, normal)
         after = max(0.0, squares - fall)
         if fall <= settled_px * settled_px * (2 * views):
             break

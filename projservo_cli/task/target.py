@@ -6,7 +6,7 @@ from projservo_cli.geometry.displacement import as_array, as_mat
 from projservo_cli.geometry.kinematics import forward, operators_at
 from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.records import FloatArray, Model, WorkFailed
-from projservo_cli.task.body import Body, Fit, fit_body
+from projservo_cli.task.body import Body, Fit, fit_body, new_normal
 from projservo_cli.task.face import Task, task_from_images
 from projservo_cli.task.partition import Memory, partition
 from projservo_cli.task.trajectory import trajectory_displacement
@@ -81,9 +81,9 @@ def settled(model: Model, body: Body, s: FloatArray, H: FloatArray, where: str) 
         If too few markers were seen, or the steps do not settle.
     """
     s = np.ascontiguousarray(s, dtype=np.float64)
-    fit = Fit(False, as_mat(H), 0.0, 0.0, 0)
+    fit, normal = Fit(False, as_mat(H), 0.0, 0.0, 0), new_normal()
     for _ in range(MOST_STEPS):
-        fit = fit_body(model.P, body, s, fit.H, False, SETTLED_PX, 1)
+        fit = fit_body(model.P, body, s, fit.H, False, SETTLED_PX, 1, normal)
         if not fit.found:
             raise WorkFailed(
                 f"the images at the {where} show too few markers, {fit.views} in both views together, to "
