@@ -123,6 +123,7 @@ class Calibration:
     swapped: IntArray = array(
         "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
     )
+    worst_determined: str | None = scalar(about="direction the data determine worst, in words", default=None)
     lens: FloatArray | None = array(
         "view",
         "lens_term",

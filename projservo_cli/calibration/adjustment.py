@@ -270,20 +270,20 @@ def _clean(H_hat: FloatArray, before: FloatArray, slides: bool) -> FloatArray:
     return result
 
 
-def gauge(scene: Scene, readings: Readings, place: Layout) -> FloatArray:
+def gauge(scene: Scene, readings: Readings, place: Layout, *, scaled: bool = False) -> FloatArray:
     """Directions (size, g) of the parameters that change no image, of unit norm each.
 
     Six rigid motions of the frame, its scale unless a prismatic joint sets it, and the scales of both
     cameras.
 
-    Parameters are those of ``retract``.
+    Parameters are those of ``retract``; ``scaled`` takes in the scale, though it changes prismatic speeds.
     """
     motions = np.zeros((7, 4, 4))
     for k, e in enumerate(np.eye(3)):
         motions[k, :3, :3] = cross(e)
         motions[3 + k, :3, 3] = e
     motions[6, :3, :3] = np.eye(3)
-    if readings.prismatic.any():
+    if readings.prismatic.any() and not scaled:
         motions = motions[:6]
     bases = generators(scene, readings.prismatic)
     result = np.zeros((place.size, len(motions) + 2))

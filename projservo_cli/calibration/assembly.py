@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration import excitation, quality
+from projservo_cli.calibration import excitation, quality, reach
 from projservo_cli.calibration.culprits import Culprits
 from projservo_cli.calibration.frame import ProjectiveScene
-from projservo_cli.calibration.prediction import marker_pixels, prediction_derivative
 from projservo_cli.calibration.quality import Agreement, Expected
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.records import (
@@ -61,13 +60,16 @@ def assemble(
     span = excitation.require_motion(readings)
     size = 24 + 16 * len(types) + 4 * len(scene.M) + (0 if scene.lens is None else 4)
     # NaN, not zero: a method without covariance does not claim certainty.
-    noise, covariance = np.full(len(types), np.nan), np.full((size, size), np.nan)
+    noise = needed = np.full(len(types), np.nan)
+    covariance = np.full((size, size), np.nan)
     # Residuals of a method without covariance are its own doing, not noise of the images.
     sigma = expected.sigma_px if factor is None else expected.noise_px(agreement)
     excitation.require_moved(image_motion(model, scene.M, span), sigma, span, readings.prismatic)
     if factor is not None:
-        noise = reach_noise(model, scene.M, factor, _surroundings(readings))
-        excitation.require_determined(noise, span, readings.prismatic)
+        around = reach.surroundings(readings)
+        noise = reach.reach_noise(model, scene.M, factor, around)
+        needed = reach.needed_spans(model, scene.M, factor, around, noise)
+        excitation.require_determined(noise, span, needed, readings.prismatic)
         covariance = sigma**2 * (factor @ factor.T)
     if found is None:
         found = Culprits(
@@ -75,7 +77,9 @@ def assemble(
         )
     outlier = outlier_list(readings, agreement.used | found.explained)
     counts = (len(outlier), len(found.suspect), len(found.swapped))
-    reason, advice = quality.verdict(agreement, expected, noise, span, readings.prismatic, counts, suspicion)
+    reason, advice = quality.verdict(
+        agreement, expected, noise, span, needed, readings.prismatic, counts, suspicion
+    )
     shortfall = quality.shortfall(method, agreement, expected)
     used_rows = agreement.used.any(axis=0)
     return Calibration(
@@ -111,46 +115,6 @@ def assemble(
         ),
         lens=scene.lens,
     )
-
-
-def _surroundings(readings: Readings) -> FloatArray:
-    """Lower and upper corner of twice the image region in which markers were seen, (2, 2, 2) per view."""
-    corners = np.empty((2, 2, 2))
-    for v in (0, 1):
-        seen = readings.pixels[v][readings.seen[v]]
-        low, high = seen.min(axis=0), seen.max(axis=0)
-        corners[v] = np.array([low - 0.5 * (high - low), high + 0.5 * (high - low)])
-    return corners
-
-
-def reach_noise(model: Model, M: FloatArray, factor: FloatArray, surroundings: FloatArray) -> FloatArray:
-    """Noise of predicted images (n,) with each joint at its reach, in units of the pixel noise.
-
-    Images that leave the surroundings of the data do not count; where all do, the reach is halved.
-
-    Parameters
-    ----------
-    model : projective robot and rig.
-    M : (m, 4) markers at the reference.
-    factor : (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel.
-    surroundings : (2, 2, 2) lower and upper corner of the image region that counts, per view, px.
-    """
-    noise = np.zeros(len(model.joint_types))
-    for i, kind in enumerate(model.joint_types):
-        reach = excitation.REACH_M if kind == PRISMATIC else excitation.REACH_RAD
-        for _ in range(10):
-            q = np.tile(model.q_reference, (2, 1))
-            q[:, i] += (reach, -reach)
-            pixels = marker_pixels(model, M, q)
-            counts = np.all(
-                (pixels >= surroundings[:, None, 0]) & (pixels <= surroundings[:, None, 1]), axis=-1
-            )
-            if counts.any():
-                break
-            reach *= 0.5
-        spread = prediction_derivative(model, M, q)[counts] @ factor
-        noise[i] = np.sqrt((spread**2).sum() / max(2 * int(counts.sum()), 1))
-    return noise
 
 
 def image_motion(model: Model, M: FloatArray, span: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from projservo_cli.calibration import (
     excitation,
     linear,
     quality,
+    reach,
 )
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.assembly import assemble
@@ -36,6 +37,7 @@ from projservo_cli.calibration.readings import Readings, gather, reference_joint
 from projservo_cli.calibration.reconstruction import Frame, image_frame
 from projservo_cli.calibration.refined import Solution, solve
 from projservo_cli.calibration.shown import require_images
+from projservo_cli.calibration.weakest import worst_determined
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 
 METHODS = ("refined", "linear", "closed_form")
@@ -154,6 +156,7 @@ def _refined(
     _, J = adjustment.derivative(scene, readings, problem.q)
     used = agreement.used.astype(np.float64)
     factor = spread_factor(problem.dense(J, used), adjustment.gauge(scene, readings, problem.place))
+    adjusted = factor
     factor = output_derivative(scene, readings, problem.place, result) @ factor
     gauge = output_gauge(result)
     factor -= gauge @ (gauge.T @ factor)
@@ -163,7 +166,9 @@ def _refined(
         "refined", result, readings, problem.q_reference, agreement, expected, factor, found, suspicion
     )
     advice = (*record.advice, *distortion.advice(record, share, frame.known))
-    return dataclasses.replace(record, advice=advice)
+    spread = reach.all_spreads(record.model(), result.M, factor, reach.surroundings(readings))
+    worst = worst_determined(problem, scene, adjusted, spread, expected.noise_px(agreement))
+    return dataclasses.replace(record, advice=advice, worst_determined=worst)
 
 
 def _projective(problem: Problem, scene: Scene) -> ProjectiveScene:

@@ -9,6 +9,8 @@ from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 # noise: above the first a joint is weak, above the second undetermined.
 REACH_RAD, REACH_M = 0.5, 0.15
 WEAK_NOISE, UNDETERMINED_NOISE = 3.0, 1000.0
+# Farthest trial motion that is advised, in reaches.
+MOST_REACHES = 4.0
 # Least motion of the images over the range of a joint, in units of the pixel noise.
 LEAST_MOTION = 5.0
 # Share of the reach beyond which a joint that moves no image stands still; below, it moved too little.
@@ -46,14 +48,28 @@ def require_motion(readings: Readings) -> FloatArray:
     return span
 
 
-def describe_joint(i: int, span: float, prismatic: bool) -> str:
-    """Advice for a joint that moved too little, or never apart from the others."""
+def describe_joint(i: int, span: float, prismatic: bool, needed: float | None = None) -> str:
+    """Advice for a joint that moved too little, or never apart from the others.
+
+    Parameters
+    ----------
+    i : index of the joint.
+    span : its range in the data, rad or m.
+    prismatic : its type.
+    needed : range of a trial motion that determines it, rad or m; NaN where none does, None where it
+        is not known.
+    """
     reach = REACH_M if prismatic else REACH_RAD
     moved = amount(span, prismatic)
+    if needed is not None and not needed <= MOST_REACHES * reach:
+        return f"joint {i + 1} moved {moved}; no motion of it alone would do: record trials of every joint"
     if span >= reach:
-        return f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone"
-    more = amount(min(2.0 * reach, max(4.0 * span, 0.5 * reach)), prismatic)
-    return f"joint {i + 1} moved only {moved}: move it at least {more}"
+        far = "" if needed is None else f", by {amount(needed, prismatic)} or more"
+        return f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone{far}"
+    if needed is None:
+        needed = min(2.0 * reach, max(4.0 * span, 0.5 * reach))
+    alone = "" if needed > span else " alone"
+    return f"joint {i + 1} moved only {moved}: move it{alone} at least {amount(needed, prismatic)}"
 
 
 def describe_still(i: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> str:
@@ -91,13 +107,14 @@ def require_moved(motion_px: FloatArray, sigma_px: float, span: FloatArray, pris
         raise WorkFailed(describe_still(i, float(span[i]), bool(prismatic[i]), float(motion_px[i]), sigma_px))
 
 
-def require_determined(noise: FloatArray, span: FloatArray, prismatic: BoolArray) -> None:
+def require_determined(noise: FloatArray, span: FloatArray, needed: FloatArray, prismatic: BoolArray) -> None:
     """Refuse a joint whose operator the data leave open.
 
     Parameters
     ----------
     noise : (n,) predicted noise of images at the reach of each joint, in units of the pixel noise.
     span : (n,) range of each joint in the data, rad or m.
+    needed : (n,) range of a trial motion that would determine it, rad or m, NaN where none does.
     prismatic : (n,) types of the joints.
 
     Raises
@@ -109,5 +126,6 @@ def require_determined(noise: FloatArray, span: FloatArray, prismatic: BoolArray
     if noise[i] > UNDETERMINED_NOISE:
         raise WorkFailed(
             f"joint {i + 1} is not determined: near the reference its images would be wrong by "
-            f"{noise[i]:.3g} times the pixel noise; {describe_joint(i, float(span[i]), bool(prismatic[i]))}"
+            f"{noise[i]:.3g} times the pixel noise; "
+            + describe_joint(i, float(span[i]), bool(prismatic[i]), float(needed[i]))
         )

@@ -5,14 +5,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from projservo_cli.calibration.excitation import WEAK_NOISE, describe_joint
-from projservo_cli.records import BoolArray, FloatArray, WorkFailed
+from projservo_cli.calibration.excitation import REACH_M, REACH_RAD, WEAK_NOISE, describe_joint
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Fitted noise over the noise expected: above the first more than pixel noise is left, above the
 # second the model does not describe the data.
 WARN_RATIO, REFUSE_RATIO = 1.15, 3.0
 # Shares of sightings both views agree on, and of poses, that may be left out of a fit.
 MOST_UNEXPLAINED, MOST_SUSPECT = 0.02, 0.4
+# Share of sightings beyond which outliers are what limits a fit.
+MOST_OUTLIERS = 0.05
 CHI2_TAIL = 1e-4
 LEAST_SIGMA = 1e-4
 # Least distance of the markers from their best line, in units of its own noise.
@@ -180,11 +182,22 @@ def shortfall(method: str, agreement: Agreement, expected: Expected) -> str | No
     )
 
 
+def _limit(
+    agreement: Agreement, weak: IntArray, span: FloatArray, prismatic: BoolArray, outliers: int
+) -> str:
+    """What limits a calibration that leaves no more than pixel noise, in a word."""
+    if weak.size:
+        short = span[weak] < np.where(prismatic[weak], REACH_M, REACH_RAD)
+        return "amplitude" if short.any() else "geometry"
+    return "outliers" if outliers > MOST_OUTLIERS * agreement.used.shape[1] else "noise"
+
+
 def verdict(
     agreement: Agreement,
     expected: Expected,
     noise: FloatArray,
     span: FloatArray,
+    needed: FloatArray,
     prismatic: BoolArray,
     left_out: tuple[int, int, int],
     suspicion: str,
@@ -194,15 +207,16 @@ def verdict(
     Parameters
     ----------
     agreement, expected : what the fit leaves, and what it should.
-    noise, span, prismatic : (n,) as in ``require_determined``.
+    noise, span, needed, prismatic : (n,) as in ``require_determined``.
     left_out : number of outliers, of suspect joint readings and of exchanged markers.
     suspicion : what may be to blame for more than pixel noise.
     """
     sigma, ratio = agreement.sigma_px, expected.ratio(agreement)
-    advice = [
-        describe_joint(int(i), float(span[i]), bool(prismatic[i])) for i in np.flatnonzero(noise > WEAK_NOISE)
-    ]
-    limit = "lens" if suspicion == "lens" else "amplitude" if advice else "noise"
+    weak = np.flatnonzero(noise > WEAK_NOISE)
+    advice = [describe_joint(int(i), float(span[i]), bool(prismatic[i]), float(needed[i])) for i in weak]
+    limit = _limit(agreement, weak, span, prismatic, left_out[0])
+    if suspicion == "lens":
+        limit = suspicion
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
     reason = f"residuals of {sigma:.3g} px a coordinate agree with {wanted}"
     if ratio > WARN_RATIO:

@@ -120,6 +120,7 @@ def _calibrate_words(value: dict[str, Any]) -> list[str]:
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s",
         *(_lens_words(value["lens"]) if value["lens"] else []),
         wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
+        *([wrapped(f"worst determined: {worst}", "  ")] if (worst := value["worst_determined"]) else []),
         *_held_out_words(value.get("cross_validation")),
         *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),
         *suggested_words(value),

@@ -58,6 +58,8 @@ def calibration_words(calibration: Calibration, *, estimated: bool) -> list[str]
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
     found.append(_worst_joint(calibration))
+    if calibration.worst_determined:
+        found.append(f"Worst determined of all is {calibration.worst_determined}.")
     left_out = (
         (len(calibration.outlier), "reading", "left out as an outlier", "left out as outliers"),
         (len(calibration.suspect), "joint reading", "contradicts the images", "contradict the images"),

@@ -1,0 +1,144 @@
+"""What the verdict says: how far to move a joint, what is determined worst, what limits."""
+
+import re
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import calibrate
+from projservo_cli.calibration.adjustment import Scene
+from projservo_cli.calibration.excitation import WEAK_NOISE, describe_joint
+from projservo_cli.calibration.weakest import _left_camera
+from projservo_cli.records import Observation
+from tests.calibration.simulated_robot import random_robot, trials
+
+SIGMA = 0.1
+WEAK = 1  # the joint that moves too little
+
+
+@pytest.fixture(scope="module", params=["RRR", "RPR"])
+def robot(request):
+    return random_robot(request.param, np.random.default_rng(3), markers=6)
+
+
+def short(robot, span):
+    """Trials in which one joint moves over a small range."""
+    q = trials(robot, 6)
+    q[:, WEAK] = robot.q_reference[WEAK] + (q[:, WEAK] - robot.q_reference[WEAK]) * span / np.ptp(q[:, WEAK])
+    return q
+
+
+def calibrated(robot, q, sigma=SIGMA, scale=1.0):
+    found = robot.observe(q, sigma, np.random.default_rng(1))
+    images = scale * found.images
+    return calibrate(
+        Observation(found.pose, found.marker, q, images), robot.joint_types, sigma_px=scale * sigma
+    )
+
+
+def least_span(robot):
+    return 0.004 if robot.joint_types[WEAK] == "P" else np.radians(0.6)
+
+
+@pytest.fixture(scope="module")
+def weak(robot):
+    found = calibrated(robot, short(robot, least_span(robot)))
+    assert found.weak.tolist() == [False, True, False]
+    return found
+
+
+def advised(found):
+    """Range in the advice about the weak joint, rad or m."""
+    text = next(text for text in found.advice if text.startswith("joint 2 moved only"))
+    number, unit = re.search(r"at least ([\d.]+)(°| mm)$", text).groups()
+    return np.radians(float(number)) if unit == "°" else 1e-3 * float(number)
+
+
+def test_the_range_advised_is_the_one_that_suffices(robot, weak):
+    """An oracle that knows nothing of how it was found: calibrate with the trial, look at the noise."""
+    q = short(robot, least_span(robot))
+    noise = {}
+    for share in (1.0, 0.5):
+        trial = np.tile(robot.q_reference, (8, 1))
+        trial[:, WEAK] += share * advised(weak) * np.linspace(-0.5, 0.5, 8)
+        noise[share] = calibrated(robot, np.vstack([q, trial])).prediction_noise[WEAK]
+    # Found to a twentieth of the range; the noise falls with its square root at least.
+    assert noise[1.0] == pytest.approx(WEAK_NOISE, rel=0.15)
+    assert noise[0.5] > 1.3 * WEAK_NOISE
+
+
+def test_the_worst_direction_is_one_of_the_joint_that_hardly_moved(robot, weak):
+    kind = "direction: its" if robot.joint_types[WEAK] == "P" else "axis: its place"
+    assert weak.worst_determined.startswith(f"joint 2's {kind}")
+    share = int(re.search(r"(\d+) % of the variance", weak.worst_determined)[1])
+    # Two directions of nearly one size: across the axis either way.
+    assert share >= 40
+
+
+def amount(found):
+    return float(re.search(r"±([\d.e-]+)", found.worst_determined)[1])
+
+
+def test_its_uncertainty_grows_with_the_noise_and_not_with_the_unit_of_pixels(robot, weak):
+    q = short(robot, least_span(robot))
+    if robot.joint_types[WEAK] == "R":  # of the other two directions are near a tie, which the noise decides
+        # Two digits of rounding; other noise, another estimate.
+        assert amount(calibrated(robot, q, 0.5 * SIGMA)) == pytest.approx(0.5 * amount(weak), rel=0.25)
+    assert amount(calibrated(robot, q, scale=3.0)) == pytest.approx(amount(weak), rel=1e-6)
+
+
+def test_what_limits_is_said(robot, weak):
+    assert "limited by amplitude" in weak.reason
+    assert "limited by noise" in calibrated(robot, trials(robot, 6)).reason
+
+
+def test_a_joint_that_never_moves_apart_is_limited_by_geometry():
+    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
+    q = trials(robot, 6)
+    # The second joint follows the first, but for a trace; the third not at all apart from it.
+    q[:, 1] = robot.q_reference[1] + q[:, 0] - robot.q_reference[0]
+    q[3, 1] += 0.002
+    q = q[:9]
+    q[6:, 2] = robot.q_reference[2] + [0.3, 0.4, 0.5]
+    found = calibrated(robot, q)
+    assert "limited by geometry" in found.reason
+    assert any("hardly apart from the other joints: move it alone, by" in text for text in found.advice)
+
+
+def test_many_outliers_limit():
+    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
+    q = trials(robot, 8)
+    rng = np.random.default_rng(8)
+    found = robot.observe(q, SIGMA, rng)
+    hit = rng.random(found.images.shape[:3]) < 0.05
+    found.images[hit] += rng.uniform(20.0, 60.0, (int(hit.sum()), 2))
+    assert "limited by outliers" in calibrate(found, "RRR", source="recorded").reason
+
+
+def test_the_left_camera_gives_the_directions():
+    robot = random_robot("R", np.random.default_rng(3))
+    for sign in (1.0, -2.0):
+        sight, distance = _left_camera(Scene(sign * robot.cameras, robot.twists, robot.markers))
+        center = np.array([-0.15, 0.0, -1.4])
+        ahead = -center / np.linalg.norm(center)
+        np.testing.assert_allclose(sight @ sight.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(np.abs(sight[2] @ ahead), 1.0, atol=1e-12)
+        np.testing.assert_allclose(np.abs(sight[1]), [0.0, 1.0, 0.0], atol=1e-12)
+        assert distance == pytest.approx(np.linalg.norm(robot.markers[:, :3].mean(axis=0) - center))
+
+
+@pytest.mark.parametrize(
+    ("span", "prismatic", "needed", "text"),
+    [
+        (0.05, False, 0.2, "joint 4 moved only 2.86°: move it at least 11.5°"),
+        (0.05, False, 0.03, "joint 4 moved only 2.86°: move it alone at least 1.72°"),
+        (0.01, True, 0.05, "joint 4 moved only 10 mm: move it at least 50 mm"),
+        (1.0, False, 0.2, "joint 4 moved 57.3° but hardly apart from the other joints: move it "
+         "alone, by 11.5° or more"),
+        (1.0, False, np.nan, "joint 4 moved 57.3°; no motion of it alone would do: record trials of "
+         "every joint"),
+        (0.05, False, None, "joint 4 moved only 2.86°: move it at least 14.3°"),
+    ],
+)  # fmt: skip
+def test_advice_in_words(span, prismatic, needed, text):
+    assert describe_joint(3, span, prismatic, needed) == text
