@@ -194,7 +194,7 @@ def _words(rms: float | None, expected: float | None, failed: int) -> str:
     """How the held-out error compares with the predicted one, and what that means."""
     if rms is None or expected is None:
         return "no part could be predicted from the others: record more poses"
-    lost = f"; {failed} parts could not be predicted from the others: record more poses" if failed else ""
+    lost = f"; {failed} of the parts not predicted from the others: record more poses" if failed else ""
     ratio = rms / expected
     if ratio > WARN_RATIO:
         return (

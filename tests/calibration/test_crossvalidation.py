@@ -148,7 +148,7 @@ def test_a_part_that_alone_moves_a_joint_is_named_not_predicted():
     found = cross_validate(*solved(robot.observe(q, SIGMA, rng), "RR"), 5, seed=0)
     assert [int(text[5]) - 1 for text in found.failed] == [found.fold[9]]
     assert np.isnan(found.residual[found.fold == found.fold[9]]).all()
-    assert "1 parts could not be predicted" in found.reason
+    assert "1 of the parts not predicted" in found.reason
 
 
 @pytest.mark.volume
