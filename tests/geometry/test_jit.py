@@ -1,7 +1,11 @@
 """Where machine code is cached: keyed by every source it depends on, or not at all."""
 
+import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -56,3 +60,53 @@ def test_no_cache_where_nothing_can_be_written(copy, tmp_path, monkeypatch):
     (tmp_path / "occupied").write_text("a file, not a folder", encoding="utf-8")
     monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "occupied"))
     assert cache_folder(copy) is None
+
+
+CALL = """
+import json
+from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.task.visibility import margin_coefficients
+values = margin_coefficients((1.0, 2.0, 3.0, 4.0), (0.5,) * 16, (1.0, 1.0, 0.0, 2.0))
+print(json.dumps([values, CACHE_FOLDER is not None, sum(margin_coefficients.stats.cache_hits.values())]))
+"""
+
+
+def called(root, **environment):
+    """Values of a kernel, whether there is a cache and whether it served, in a fresh interpreter."""
+    kept = {k: v for k, v in os.environ.items() if k not in ("PROJSERVO_CACHE_DIR", "XDG_CACHE_HOME")}
+    environment = {**kept, "PYTHONPATH": str(root.parent), "PYTHONDONTWRITEBYTECODE": "1", **environment}
+    done = subprocess.run(
+        [sys.executable, "-c", CALL],
+        env=environment,
+        cwd=root.parent,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout)
+
+
+@pytest.mark.volume
+def test_installed_read_only_with_an_edit_and_without_a_home(copy):
+    """Cached from a read-only install; an edit in another file is never missed; no home, no cache."""
+    root = copy.rename(copy.parent / "projservo_cli")
+    writable = {path: path.stat().st_mode for path in [root, *root.rglob("*")]}
+    for path, mode in writable.items():
+        path.chmod(mode & ~0o222)
+    home = root.parent / "home"
+    try:
+        first = called(root, HOME=str(home))
+        assert first == [[51.0, -20.0, -40.0], True, 0]
+        assert called(root, HOME=str(home)) == [first[0], True, 1]
+    finally:
+        for path, mode in writable.items():
+            path.chmod(mode)
+    algebra = root / "geometry" / "algebra.py"
+    text = algebra.read_text(encoding="utf-8")
+    edited = text.replace("return (a[0] * A[0] + a[1] * A[1])", "return 7.0 + (a[0] * A[0] + a[1] * A[1])")
+    assert edited != text
+    algebra.write_text(edited, encoding="utf-8")
+    values, _, hits = called(root, HOME=str(home))
+    assert values != first[0]
+    assert hits == 0
+    assert called(root, HOME=os.devnull) == [values, False, 0]
