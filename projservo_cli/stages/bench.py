@@ -14,16 +14,16 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.control import CODES, command
-from projservo_cli.control.law import ERRORS, Gains, State, new_state
-from projservo_cli.geometry.jit import njit
+from projservo_cli.control.law import ERRORS, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.loop.compiled import new_log
 from projservo_cli.loop.compiled import run as run_loop
-from projservo_cli.loop.step import Limits, limit_speed
+from projservo_cli.loop.repeated import many_steps
+from projservo_cli.loop.step import Limits
 from projservo_cli.loop.threads import Job, run_all
 from projservo_cli.plants.plant import Plant
-from projservo_cli.records import LAWS, FloatArray, Model
+from projservo_cli.records import LAWS, FloatArray
 from projservo_cli.stages.servo import gains_of, limits_of
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
 from projservo_cli.task.body import body_of
@@ -40,25 +40,6 @@ NOISE_PX = 0.5
 ROUNDS = 200
 RUNS = 64
 BODY = "exact, body"
-
-
-@njit
-def many_steps(
-    code: int,
-    model: Model,
-    task: Task,
-    gains: Gains,
-    S: FloatArray,
-    Q: FloatArray,
-    state: State,
-    speed: FloatArray,
-) -> float:
-    """Measure, partition, command and limit, once in each recorded state."""
-    total = 0.0
-    for k in range(S.shape[0]):
-        command(code, model, task, gains, S[k], Q[k], state)
-        total += limit_speed(state.q_dot, speed)
-    return total
 
 
 class Times(NamedTuple):
