@@ -89,6 +89,7 @@ def test_what_is_promised_is_what_the_covariance_with_the_poses_says(robot, few,
     assert before / after > 3.0
 
 
+@pytest.mark.volume
 def test_suggested_poses_do_better_than_random_ones(robot, few, suggested):
     rng = np.random.default_rng(9)
     targets = visible(robot, around(robot, 150, rng))
