@@ -157,7 +157,7 @@ def run(
             first_error = error
         now = Instant(in_front, seen, left, error, first_error, distance, first_distance, sound, singular)
         verdict = verdict_at(now, limits)
-        if verdict == MARKERS_LOST and waited < min(limits.lost_steps, limits.max_steps - k):
+        if verdict == MARKERS_LOST and waited < limits.lost_steps and k < limits.max_steps:
             waited += 1
             for i in range(n):
                 log.q[k + 1, i] = log.q[k, i]

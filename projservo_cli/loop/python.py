@@ -176,7 +176,7 @@ def _run(
             plant.in_front, seen, left, error, first_error, distance, first_distance, sound, singular
         )
         verdict = verdict_at(now, limits)
-        if verdict == MARKERS_LOST and waited < min(limits.lost_steps, limits.max_steps - k):
+        if verdict == MARKERS_LOST and waited < limits.lost_steps and k < limits.max_steps:
             waited += 1
             plant.command(np.zeros_like(q_dot), period)
             continue
