@@ -9,7 +9,7 @@ from projservo_cli import store
 from projservo_cli.calibration import predict
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.geometry.kinematics import project as pixels_of
-from projservo_cli.geometry.lens import bent_derivative, through
+from projservo_cli.geometry.lens import bent_derivative
 from projservo_cli.records import Calibration, FloatArray, InputError
 
 AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
@@ -70,7 +70,7 @@ class ImageModel(Calibration):
             ]
         )
         straight = np.array([pixels_of(model.P, self.M @ forward_kinematics(model, row).T) for row in rows])
-        J = bent_derivative(self._lens(1), straight)[0] @ J
+        J = bent_derivative(model.lens[:, None], straight)[0] @ J
         J[np.isnan(predict(self, rows)[..., 0])] = np.nan
         return np.asarray(J[0] if single else J)
 
@@ -97,13 +97,8 @@ class ImageModel(Calibration):
         side = A @ self.a_inf
         norms = np.linalg.norm(A, axis=-1) * np.linalg.norm(self.a_inf)
         ahead = np.where(np.abs(side) > AT_INFINITY * norms, depth * side > 0.0, depth != 0.0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            straight = np.where(ahead[..., None], pixels_of(self.P, A), np.nan)
-        return through(self._lens(A.ndim - 1), straight)
-
-    def _lens(self, dims: int) -> FloatArray:
-        """Lenses (2, ..., 5) to go with pixels (2, ..., 2) of so many dimensions of points."""
-        return self.model().lens.reshape(2, *(1,) * dims, 5)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return np.where(ahead[..., None], pixels_of(self.P, A, self.model().lens), np.nan)
 
     def _rows(self, q: FloatArray) -> tuple[FloatArray, bool]:
         readings = np.asarray(q, dtype=np.float64)

@@ -101,6 +101,7 @@ def in_frame(model, G):
         model.joint_types,
         model.q_reference,
         model.a_inf @ back,
+        model.lens,
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, new_state
+from projservo_cli.geometry.lens import bent
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.compiled import new_log, run
 from projservo_cli.loop.step import VERDICTS, Limits
@@ -48,7 +49,8 @@ class Scene(NamedTuple):
         model = self.seen(G)
         M = np.concatenate([self.plant.M, self.plant.pins])
         body = body_of(model, M if G is None else M @ G.T)
-        s = [pixels(self.model.P, M @ poe(self.model, q).T) for q in (self.q_start, self.q_goal)]
+        lens = self.model.lens[:, None]
+        s = [bent(lens, pixels(self.model.P, M @ poe(self.model, q).T)) for q in (self.q_start, self.q_goal)]
         return task_from_body(model, body, self.q_start, *s, self.plant.center, len(self.plant.M))
 
     def images(self, q) -> FloatArray:
@@ -107,7 +109,7 @@ class Run:
         n, m = len(scene.q_start), len(scene.plant.M)
         seen = m + len(scene.plant.pins)
         noise = np.zeros((bounds.max_steps + 1, 2, seen, 2)) if noise is None else noise
-        self.state, self.full = new_state(n, m), new_log(n, seen, bounds.max_steps, len(ERRORS))
+        self.state, self.full = new_state(n, m, seen), new_log(n, seen, bounds.max_steps, len(ERRORS))
         if memory is not None:
             self.state.memory.rotation[:] = memory
         task = scene.task(G) if task is None else task

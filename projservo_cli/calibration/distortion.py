@@ -21,7 +21,7 @@ from projservo_cli.calibration.refined import (
     hopeless_px,
     least_squares,
 )
-from projservo_cli.geometry.lens import FIRST, straightened, within
+from projservo_cli.geometry.lens import FIRST, straight_views, within
 from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, WorkFailed
 
 COEFFICIENTS = 2 * LENS
@@ -166,7 +166,7 @@ def straight_readings(readings: Readings, lens: FloatArray | None) -> Readings:
     """
     if lens is None:
         return readings
-    pixels = np.stack([straightened(lens[v], readings.pixels[v]) for v in (0, 1)])
+    pixels = straight_views(lens, readings.pixels)
     seen = readings.seen & np.isfinite(pixels).all(axis=2)
     return dataclasses.replace(readings, pixels=np.where(seen[..., None], pixels, 0.0), seen=seen)
 

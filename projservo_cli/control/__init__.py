@@ -5,9 +5,10 @@ from projservo_cli.control.direct_three import direct_three
 from projservo_cli.control.direct_two import direct_two
 from projservo_cli.control.euclidean_points import euclidean_points
 from projservo_cli.control.exact import exact
-from projservo_cli.control.law import Gains, State
+from projservo_cli.control.law import LOST, Gains, State
 from projservo_cli.control.stacked import stacked
 from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.task.face import Task
 
@@ -18,7 +19,29 @@ CODES = {law: code for code, law in enumerate(LAWS)}
 def command(
     code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
 ) -> int:
-    """Run the law of a code: the only place that tells the laws apart."""
+    """Run the law of a code on images as projective cameras would have seen them.
+
+    Parameters
+    ----------
+    s : (2, b, 2) pixels as the cameras report them, NaN where unseen.
+
+    Returns
+    -------
+    Status of the law; ``LOST`` for a state made for another number of markers.
+    """
+    if bends(model.lens):
+        if state.straight.shape[1] != s.shape[1]:
+            return LOST
+        straight(model.lens, s, state.straight)
+        return chosen(code, model, task, gains, state.straight, q, state)
+    return chosen(code, model, task, gains, s, q, state)
+
+
+@njit
+def chosen(
+    code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """The only place that tells the laws apart."""
     if code == 0:
         return direct_three(model, task, gains, s, q, state)
     if code == 1:

@@ -4,6 +4,7 @@ from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import apply, mat, put_vec, vec
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import image_velocity
+from projservo_cli.geometry.lens import straighten
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
@@ -20,5 +21,7 @@ def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, f
             work.B[i, first + 2 * k] = u_dot
             work.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):
-        work.rhs[first + 2 * k] = s[view, k, 0] - task.s_star[view, k, 0]
-        work.rhs[first + 2 * k + 1] = s[view, k, 1] - task.s_star[view, k, 1]
+        target = task.s_star[view, k]
+        u, v = straighten(model.lens[view], float(target[0]), float(target[1]))
+        work.rhs[first + 2 * k] = s[view, k, 0] - u
+        work.rhs[first + 2 * k + 1] = s[view, k, 1] - v

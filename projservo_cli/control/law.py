@@ -1,9 +1,9 @@
 """What every control law gets and gives.
 
 A compiled law is ``law(model, task, gains, s, q, state) -> status``: it sees the model, the task,
-the pixels ``s`` of the face, and after them of further markers of its body, and the joint readings
-``q``, never the truth; it writes joint velocities to ``state.q_dot`` (rad/s or m/s) and its control
-errors to ``state.errors``.
+the pixels ``s`` of the face, and after them of further markers of its body, as projective cameras would
+see them, and the joint readings ``q``, never the truth; it writes joint velocities to ``state.q_dot``
+(rad/s or m/s) and its control errors to ``state.errors``.
 """
 
 import math
@@ -84,6 +84,7 @@ class State(NamedTuple):
     share : (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the
         limit to the loop.
     parts : (1,) parts of the step in ``path``; 0 where the joints go straight to the end.
+    straight : (2, b, 2) pixels as projective cameras would see them, where a lens bends them.
     """
 
     work: Work
@@ -101,10 +102,11 @@ class State(NamedTuple):
     path: FloatArray
     share: FloatArray
     parts: IntArray
+    straight: FloatArray
 
 
-def new_state(n: int, m: int) -> State:
-    """Fresh state for n joints and m face markers."""
+def new_state(n: int, m: int, observed: int = 0) -> State:
+    """Fresh state for n joints, m face markers and so many observed, at least those of the face."""
     return State(
         workspace(n, 4 * m),
         np.zeros((m, 4)),
@@ -121,6 +123,7 @@ def new_state(n: int, m: int) -> State:
         np.zeros((MOST_PARTS + 1, n)),
         np.full(1, -1.0),
         np.zeros(1, dtype=np.int64),
+        np.zeros((2, max(m, observed), 2)),
     )
 
 

@@ -32,7 +32,7 @@ def data(material: Material) -> Data:
     axis = _axis(plan.H_hat[1], plan.A_c, plan.A)
 
     def seen(points: FloatArray) -> FloatArray:
-        return np.asarray(project(material.calibrated.P[:1], points)[0])
+        return np.asarray(project(material.calibrated.P[:1], points, material.calibrated.lens[:1])[0])
 
     return {
         "A": seen(plan.A[order]),

@@ -33,7 +33,7 @@ def data_steep(material: Material) -> Data:
     mu = np.stack([np.minimum(plan.sigma / STEEP, 1.0), plan.sigma, plan.sigma], axis=1)
     amplitudes = (plan.tau, plan.theta_r, plan.theta_p)
     H_d = np.array([trajectory_displacement(plan.H_hat, amplitudes, row) for row in mu])
-    s = np.array([project(material.calibrated.P, plan.A @ H.T) for H in H_d])
+    s = np.array([project(material.calibrated.P, plan.A @ H.T, material.calibrated.lens) for H in H_d])
     carried = np.array([np.linalg.solve(H.T, plan.a) for H in H_d])
     margin = carried @ plan.optical_center.T / (plan.optical_center @ plan.a)
     return _rendered(material, mu, s, margin, "steep translation")

@@ -32,7 +32,7 @@ def data(material: Material) -> Data:
     for i, arc in enumerate(arcs):
         for j, theta in enumerate(arc):
             H = exp_rotation(plan.H_hat[1], theta)
-            images[i, j] = project(material.calibrated.P, plan.A[order] @ H.T)
+            images[i, j] = project(material.calibrated.P, plan.A[order] @ H.T, material.calibrated.lens)
     tau_0 = plan.tau_0 / plan.tau if plan.tau > 0 else np.full(2, np.nan)
     used = tau_0[np.isfinite(tau_0)]
     reach = np.concatenate([[-0.2, 1.2], 1.1 * used[np.abs(used) < 5]])

@@ -12,7 +12,8 @@ from projservo_cli.geometry.displacement import (
     turned,
 )
 from projservo_cli.geometry.jit import njit
-from projservo_cli.records import FREE, PRISMATIC, FloatArray, Model
+from projservo_cli.geometry.lens import through
+from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
 
 
 @njit
@@ -133,13 +134,14 @@ def joint_operators(model: Model, q: FloatArray) -> FloatArray:
     return H_hat
 
 
-def project(P: FloatArray, M: FloatArray) -> FloatArray:
+def project(P: FloatArray, M: FloatArray, lens: FloatArray = NO_LENS) -> FloatArray:
     """Pixels of points in both views, [RH00] eq. (1).
 
     Parameters
     ----------
     P : (2, 3, 4) cameras.
     M : (..., 4) points.
+    lens : (2, 5) radial distortion of both views.
 
     Returns
     -------
@@ -147,7 +149,7 @@ def project(P: FloatArray, M: FloatArray) -> FloatArray:
     """
     m = np.einsum("vij,...j->v...i", P, M)
     pixels: FloatArray = m[..., :2] / m[..., 2:]
-    return pixels
+    return through(lens.reshape(len(lens), *(1,) * (m.ndim - 2), 5), pixels)
 
 
 def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArray:

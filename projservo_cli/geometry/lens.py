@@ -101,6 +101,25 @@ def straighten(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
 
 
 @njit
+def bends(lens: FloatArray) -> bool:
+    """Whether any of the lenses (2, 5) distorts."""
+    for view in range(lens.shape[0]):
+        if float(lens[view, 3]) != 0.0 or float(lens[view, 4]) != 0.0:
+            return True
+    return False
+
+
+@njit
+def straight(lens: FloatArray, s: FloatArray, found: FloatArray) -> None:
+    """Write the straight pixels (2, N, 2) of bent ones by the lenses (2, 5); NaN as of ``straighten``."""
+    for view in range(s.shape[0]):
+        for k in range(s.shape[1]):
+            pixel = straighten(lens[view], float(s[view, k, 0]), float(s[view, k, 1]))
+            found[view, k, 0] = pixel[0]
+            found[view, k, 1] = pixel[1]
+
+
+@njit
 def bend(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Bent pixel of a straight one; NaN beyond the turning point."""
     k1, k2 = float(lens[3]), float(lens[4])
@@ -134,9 +153,20 @@ def bent(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     return result
 
 
-def straightened(lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Straight pixels (N, 2) of bent ones in one view, NaN as of ``straighten``."""
-    return np.array([straighten(lens, u, v) for u, v in pixels]).reshape(-1, 2)
+def straight_views(lens: FloatArray, s: FloatArray) -> FloatArray:
+    """Straight pixels (2, N, 2) of bent ones, all at once; the same without a lens.
+
+    Parameters
+    ----------
+    lens : (2, 5) lenses.
+    s : (2, N, 2) px, NaN where unseen.
+    """
+    s = np.ascontiguousarray(s, dtype=np.float64)
+    if not bends(lens):
+        return s
+    found = np.empty_like(s)
+    straight(lens, s, found)
+    return found
 
 
 def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:

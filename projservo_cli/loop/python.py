@@ -101,7 +101,7 @@ class BuiltInLaw:
 
     def __init__(self, code: int, model: Model, task: Task, gains: Gains) -> None:
         self.code, self.model, self.task, self.gains = code, model, task, gains
-        self.state = new_state(len(model.H_hat_0), len(task.A_star))
+        self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M))
         self.errors = self.state.errors
         self.share = self.state.share
         self.fit = self.state.fit

@@ -20,6 +20,7 @@ from projservo_cli.geometry.algebra import (
 from projservo_cli.geometry.displacement import twist_exponential
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import forward, row
+from projservo_cli.geometry.lens import bend
 from projservo_cli.records import FREE, FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
 
@@ -95,30 +96,29 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
     for view in range(2):
         seen = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
         hidden[view] = 0.0 if seen else 1.0
-        camera = plant.model.P[view]
+        camera, lens = plant.model.P[view], plant.model.lens[view]
         for k in range(m):
             A = vec(M[k])
-            if not put_pixel(camera, A, s[view, k]):
+            if not put_pixel(camera, lens, A, s[view, k]):
                 in_front = False
             elif plant.opaque and not seen:
                 put_unseen(s[view, k])
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]
             A = apply(H, vec(plant.pins[k]))
-            if put_pixel(camera, A, pixel) and not inside(pixel, plant.image_size):
+            if put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
                 put_unseen(pixel)
     return in_front
 
 
 @njit
-def put_pixel(camera: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
+def put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
     """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
     depth = row(camera, 2, A)
     if not depth > 0.0:
         put_unseen(pixel)
         return False
-    pixel[0] = row(camera, 0, A) / depth
-    pixel[1] = row(camera, 1, A) / depth
+    pixel[0], pixel[1] = bend(lens, row(camera, 0, A) / depth, row(camera, 1, A) / depth)
     return True
 
 

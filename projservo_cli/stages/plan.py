@@ -11,6 +11,7 @@ from projservo_cli.geometry.algebra import vec
 from projservo_cli.geometry.composition import composed_angle
 from projservo_cli.geometry.displacement import as_array, as_mat
 from projservo_cli.geometry.kinematics import forward_kinematics, project
+from projservo_cli.geometry.lens import straight_views
 from projservo_cli.loop.compiled import new_log
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import CONVERGED, Limits
@@ -129,7 +130,7 @@ def plan_task(
     else:
         task = task_from_body(model, sight.body, q_start, sight.s_start, sight.s_star, center, m)
         seen = sight.s_start
-    if not measure(model, task, np.ascontiguousarray(seen), q_start, state):
+    if not measure(model, task, straight_views(model.lens, seen), q_start, state):
         raise WorkFailed(
             "the face cannot be triangulated at the start: both cameras must see all its markers"
         )
@@ -151,7 +152,7 @@ def plan_task(
     tau_limit = min((delta * t for t in tau_0 if t > 0.0), default=math.inf)
     mu = profile_shares(profile, sigma, tau_limit / parts.tau if parts.tau > 0.0 else 1.0)
     H_d = np.array([trajectory_displacement(H_hat, amplitudes, row) for row in mu])
-    images = np.array([project(model.P, state.A @ H.T) for H in H_d])
+    images = np.array([project(model.P, state.A @ H.T, model.lens) for H in H_d])
     a = np.array(parts.a)
     carried = np.array([np.linalg.solve(H.T, a) for H in H_d])
     margins = margin(carried, task.O, task.visible)

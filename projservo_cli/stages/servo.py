@@ -151,7 +151,7 @@ def drive(
         task = task_from_body(model, sight.body, reach.q_start, sight.s_start, sight.s_star, truth.center, m)
         plant = plant._replace(pins=sight.pins)
         observed += len(sight.pins)
-    state = new_state(n, m)
+    state = new_state(n, m, observed)
     if sense is not None:
         state.memory.rotation[:] = sense
     log = new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)

@@ -82,6 +82,7 @@ def projective_twin(model: Model) -> Model:
         model.joint_types,
         model.q_reference,
         model.a_inf @ H_PE,
+        model.lens,
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Vec4, add, meet, scale, unit, vec
 from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, triangulate_points
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
@@ -111,8 +112,8 @@ def task_from_images(model: Model, s_start: FloatArray, s_star: FloatArray, cent
     WorkFailed
         If a marker cannot be triangulated, the face is degenerate, or a camera looks along it.
     """
-    A = triangulate_points(model.P, model.a_inf, s_start)
-    A_star = triangulate_points(model.P, model.a_inf, s_star)
+    A = triangulate_points(model.P, model.a_inf, straight_views(model.lens, s_start))
+    A_star = triangulate_points(model.P, model.a_inf, straight_views(model.lens, s_star))
     order = cyclic_order(A_star)
     O = optical_centers(model.P, model.a_inf)
     start = O @ np.array(face_plane(A, order, center_of(A, center)))

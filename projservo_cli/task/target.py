@@ -4,6 +4,7 @@ import numpy as np
 
 from projservo_cli.geometry.displacement import as_array, as_mat
 from projservo_cli.geometry.kinematics import forward, operators_at
+from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.task.body import Body, Fit, fit_body, new_normal
@@ -80,7 +81,7 @@ def settled(model: Model, body: Body, s: FloatArray, H: FloatArray, where: str) 
     WorkFailed
         If too few markers were seen, or the steps do not settle.
     """
-    s = np.ascontiguousarray(s, dtype=np.float64)
+    s = straight_views(model.lens, s)
     fit, normal = Fit(False, as_mat(H), 0.0, 0.0, 0), new_normal()
     for _ in range(MOST_STEPS):
         fit = fit_body(model.P, body, s, fit.H, False, SETTLED_PX, 1, normal)
