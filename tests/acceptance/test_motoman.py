@@ -1,0 +1,130 @@
+"""A real arm, with and without lens: held-out images, geometry, culprits. In full: ``motoman.py``."""
+
+import numpy as np
+import pytest
+
+from projservo_cli import cli, store
+from projservo_cli.calibration import residual_statistics
+from tests.acceptance import motoman
+
+
+@pytest.fixture(scope="module")
+def tables(shared_data):
+    return motoman.tables(shared_data)
+
+
+@pytest.fixture(scope="module")
+def fitted(shared_data, tmp_path_factory):
+    """Calibrations without and with lens from the command line, and what it prints of them."""
+    found = {}
+    for lens in (False, True):
+        folder = tmp_path_factory.mktemp("motoman")
+        words = [
+            "calibrate",
+            "--data",
+            str(shared_data / "motoman" / "arm2_train.csv"),
+            "-o",
+            str(folder),
+            "-q",
+        ]
+        assert cli.run([*words, *(["--lens", "--image-size", "6000x4000"] if lens else [])]) == 0
+        found[lens] = store.load(folder).calibration
+    return found
+
+
+def held_out(calibration, tables):
+    value = residual_statistics(calibration, tables[1])
+    assert value["count"] == 802
+    assert value["skipped"]["behind_camera"] == value["skipped"]["unknown_marker"] == 0
+    return value
+
+
+@pytest.mark.parametrize(("lens", "rms", "median"), [(False, 0.92, 0.80), (True, 0.79, 0.66)])
+def test_held_out_images_are_predicted(tables, fitted, lens, rms, median):
+    """The limits are what a research prototype reached on the same split, a little widened."""
+    value = held_out(fitted[lens], tables)
+    assert value["rms_px"] <= rms
+    assert value["median_px"] <= median
+    # More than pixel noise is left, and the verdict says so.
+    assert fitted[lens].usable
+    assert fitted[lens].chi2_per_dof > 1.5
+    assert "more than pixel noise is left" in fitted[lens].reason
+    assert fitted[lens].outlier.size == 0
+
+
+def test_the_lens_is_suspected_before_it_is_sought(fitted):
+    without, with_lens = fitted[False], fitted[True]
+    assert without.lens is None
+    assert "limited by lens" in without.reason
+    assert "limited by joint readings" in with_lens.reason
+    assert not any("lens" in text for text in with_lens.advice)
+    # What the score test promises is what the fit then gains, 31 % of the squares; the lens of the first
+    # is centred on what was seen, which costs two of them.
+    (promised,) = (text for text in without.advice if "try --lens" in text)
+    gained = 100.0 * (1.0 - (with_lens.sigma_fitted_px / without.sigma_fitted_px) ** 2)
+    assert gained == pytest.approx(31.0, abs=0.5)
+    assert "28 %" in promised
+
+
+def consecutive_angles(calibration):
+    """Angles between consecutive axes, deg, through the gauge in which all operators are twists.
+
+    In coordinates whose last is a_inf the left 3×3 blocks A_i are conjugate to skew ones by one matrix S:
+    A_i Q + Q A_iᵀ = 0 with Q = S Sᵀ, linear in Q.
+    """
+    W = np.vstack([np.linalg.svd(calibration.a_inf[None])[2][1:], calibration.a_inf])
+    A = (W @ calibration.H_hat_0 @ np.linalg.inv(W))[:, :3, :3]
+    basis = np.zeros((6, 3, 3))
+    for k, (i, j) in enumerate(zip(*np.triu_indices(3), strict=True)):
+        basis[k, i, j] = basis[k, j, i] = 1.0
+    rows = np.stack([(A @ B + B @ np.swapaxes(A, 1, 2)).ravel() for B in basis], axis=1)
+    Q = np.tensordot(np.linalg.svd(rows)[2][-1], basis, axes=1)
+    S = np.linalg.cholesky(Q * np.sign(np.trace(Q)))
+    turn = np.linalg.inv(S) @ A @ S
+    w = np.stack([turn[:, 2, 1], turn[:, 0, 2], turn[:, 1, 0]], axis=1)
+    w /= np.linalg.norm(w, axis=1, keepdims=True)
+    return np.degrees(np.arccos(np.clip((w[:-1] * w[1:]).sum(axis=1), -1.0, 1.0)))
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_axes_stand_as_the_maker_built_them(fitted, lens):
+    assert consecutive_angles(fitted[lens]) == pytest.approx([90.0, 180.0, 90.0, 90.0, 90.0], abs=1.0)
+
+
+def test_thirty_poses_are_enough_from_every_start(tables):
+    values = [held_out(motoman.fit(motoman.few(tables[0], 8), seed), tables) for seed in (0, 1)]
+    assert values[0]["median_px"] <= 1.15
+    for name in ("rms_px", "median_px", "p95_px"):
+        assert values[1][name] == pytest.approx(values[0][name], abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def half(tables):
+    """Every other pose, which is quicker."""
+    return motoman.some(tables[0], slice(1, None, 2))
+
+
+def test_shifted_readings_are_listed(tables, half):
+    observation, wrong = motoman.shifted(half, 0.15)
+    calibration = motoman.fit(observation)
+    assert held_out(calibration, tables)["median_px"] <= 0.70
+    found = motoman.listed(calibration)[0]
+    assert len(wrong & found) >= 0.97 * len(wrong)
+    assert len(found - wrong) <= 0.01 * np.isfinite(half.images[..., 0]).sum()
+
+
+def test_exchanged_numbers_are_listed(tables, half):
+    observation, wrong = motoman.exchanged(half)
+    calibration = motoman.fit(observation)
+    assert held_out(calibration, tables)["median_px"] <= 0.70
+    assert motoman.listed(calibration)[1] == wrong
+
+
+def test_wrong_joint_readings_are_listed(tables, half):
+    observation, wrong = motoman.misread(half)
+    calibration = motoman.fit(observation)
+    assert held_out(calibration, tables)["median_px"] <= 0.70
+    found = motoman.listed(calibration)[2]
+    assert found <= wrong
+    # A pose with three wrong joints or few markers is left out without a culprit.
+    assert len(found) >= 0.8 * len(wrong)
