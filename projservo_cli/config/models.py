@@ -106,7 +106,7 @@ class Control(Section):
     joint_speed_limit_deg_s: Positive | None = 125.0
     prismatic_speed_limit_m_s: Positive | None = None
     substeps: Literal["none", "auto"] = "auto"
-    observation: Literal["points", "body"] = "body"
+    observation: Literal["points", "body"] | None = None  # None: body, if the calibration is usable
 
 
 class PlantSettings(Section):

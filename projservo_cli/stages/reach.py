@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.calibration import predict
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.stages.motion import joints_of
-from projservo_cli.stages.sight import Sight, sight_of
+from projservo_cli.stages.sight import Sight, by_points, sight_of
 from projservo_cli.stages.truth import Reach, face_numbers, goal_joints, reach_of, truth_of
 from projservo_cli.task.body import body_of
 
@@ -52,7 +52,7 @@ def sight_for(config: "Config", calibration: Calibration, reach: Reach) -> Sight
     """The body to measure with, of the simulated robot or of the one in ``plant.use``."""
     if config.plant.use is None:
         return sight_of(config, calibration, truth_of(config), reach)
-    if config.control.observation == "points":
+    if by_points(config, calibration):
         return None
     M = calibration.M[_indices(calibration, watched(config, calibration))]
     return Sight(

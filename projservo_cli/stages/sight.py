@@ -30,6 +30,16 @@ class Sight:
     s_star: FloatArray
 
 
+def by_points(config: "Config", calibration: Calibration) -> bool:
+    """Whether the face is measured point by point: as configured, else where no body is calibrated well.
+
+    A body of a calibration that is not usable is worse than no body.
+    """
+    if config.control.observation is None:
+        return not calibration.usable
+    return config.control.observation == "points"
+
+
 def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Reach) -> Sight | None:
     """The body of the markers that the calibration knows; None where the face is measured point by point.
 
@@ -38,7 +48,7 @@ def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Re
     WorkFailed
         If the displacements of the body cannot be told from the calibration.
     """
-    if config.control.observation == "points":
+    if by_points(config, calibration):
         return None
     known = calibration.marker.tolist()
     pins = [i for i, index in enumerate(truth.pins) if truth.number[index] in known]

@@ -136,6 +136,14 @@ def test_points_measure_the_face_alone():
     assert sight_of(example.config, calibration, example.truth, example.reach) is None
 
 
+def test_a_calibration_that_is_not_usable_has_no_body_unless_one_is_asked_for():
+    example, calibration, _ = calibrated()
+    poor = replace(calibration, usable=False)
+    assert sight_of(example.config, poor, example.truth, example.reach) is None
+    asked = Case("paper", ["control.observation=body"])
+    assert sight_of(asked.config, poor, asked.truth, asked.reach) is not None
+
+
 def test_only_markers_that_the_calibration_knows_are_used():
     example, calibration, _ = calibrated()
     keep = np.array([9, 3, 1, 0, 2, 5])
