@@ -153,7 +153,7 @@ REGISTER = (
     _entry(
         "17",
         "Displacement along the planned trajectory",
-        "task.trajectory.trajectory_displacement",
+        "task.trajectory.trajectory_displacement task.trajectory.displaced",
         "task/test_trajectory.py::test_planned_displacement_is_the_product_in_the_order_of_the_paper",
     ),
     _entry(
@@ -224,7 +224,7 @@ REGISTER = (
         "Visibility and the motions that do not change it",
         "task.visibility.margin task.visibility.visibility_translation "
         "task.visibility.visibility_angles task.visibility.choose_sense "
-        "task.visibility.limited_translation",
+        "task.visibility.limited_translation task.margins.visibility_margin task.planning.turning_sense",
         "task/test_visibility.py::test_neutral_along_the_ray_of_a_point_of_the_face "
         "task/test_visibility.py::test_neutral_parallel_to_the_face "
         "task/test_visibility.py::test_neutral_about_any_axis_through_the_optical_center "
@@ -237,8 +237,9 @@ REGISTER = (
     ),
     _entry(
         "§4.3",
-        "Profiles of the trajectory",
-        "task.trajectory.profile_shares",
+        "Profiles of the trajectory, and the coupled constraint on translation and rotation",
+        "task.trajectory.profile_shares task.planning.plan_path",
+        "planning/test_planning.py::test_the_shipped_task_needs_coupled_parts "
         "task/test_trajectory.py::test_linear_and_exponential "
         "task/test_trajectory.py::test_what_comes_first_is_done_before_the_rest_begins",
         "1 − exp(−σ/t_*) reaches 0.632 at σ = t_* and is normalised to reach 1. H_r(θ_P(σ)) is "

@@ -183,18 +183,40 @@ class Plan:
     """
 
     profile: str = scalar(about="which part is driven when")
-    feasible: bool = scalar(about="whether both cameras see the face all along")
+    feasible: bool = scalar(
+        about="whether both cameras see the face all along; in the profile constrained, whether all "
+        "constraints hold"
+    )
     reason: str = scalar(about="what makes the plan feasible or not, in words")
     tau: float = scalar(about="amplitude of the translation, unit-norm kernel of (8)")
     theta_r: float = scalar(units="rad", about="angle onto the target plane, in the sense chosen")
     theta_p: float = scalar(units="rad", about="angle within the plane")
     theta_s: float = scalar(units="rad", about="angle of both rotations together")
+    constraint: str = scalar(
+        about="what the motion comes nearest to failing, as a share of its ends' margins"
+    )
+    duration: float | None = scalar(
+        units="s", about="time at the joint-speed limit; none without a limit or where joints cannot follow"
+    )
     tau_limit: float = scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
     sigma: FloatArray = array("sample", about="path parameter from 0 to 1")
     mu: FloatArray = array("sample", "part", about="shares of t, r, p that are done")
     H_d: FloatArray = array("sample", "row", "coordinate", about="planned displacement of the face")
     s: FloatArray = array("sample", "view", "marker", "xy", units="px", about="predicted images of the face")
     margin: FloatArray = array("sample", "view", about="visibility margin a·O, 1 at the start")
+    border_distance: FloatArray = array(
+        "sample", "view", units="px", about="least distance of a marker from the image border"
+    )
+    q: FloatArray = array(
+        "sample", "joint", units="rad or m", about="joints that follow the motion, NaN where none can"
+    )
+    joint_margin: FloatArray = array("sample", about="least distance from a joint limit over half the range")
+    condition: FloatArray = array("sample", about="reciprocal condition of the image Jacobian of the face")
+    least: FloatArray = array(
+        "constraint",
+        about="smallest visibility margin, border distance in px, joint margin, reciprocal condition",
+    )
+    least_mu: FloatArray = array("constraint", "part", about="shares of t, r, p where that is")
     s_start: FloatArray = array("view", "marker", "xy", units="px", about="images at the start")
     s_star: FloatArray = array("view", "marker", "xy", units="px", about="images at the goal")
     A: FloatArray = array("marker", "coordinate", about="face at the start")

@@ -6,7 +6,17 @@ from typing import Any
 
 import numpy as np
 
-SIZES = {"view": 2, "xy": 2, "image_row": 3, "coordinate": 4, "row": 4, "axis": 3, "part": 3, "solution": 2}
+SIZES = {
+    "view": 2,
+    "xy": 2,
+    "image_row": 3,
+    "coordinate": 4,
+    "row": 4,
+    "axis": 3,
+    "part": 3,
+    "solution": 2,
+    "constraint": 4,
+}
 SCALARS = {float: 1.5, int: 3, str: "text ä", bool: True}
 
 

@@ -11,6 +11,7 @@ from projservo_cli.config import Config
 from projservo_cli.records import Calibration
 from projservo_cli.store import Run
 
+NEAREST = ("visibility", "border_px", "joints", "condition")  # smallest along the planned motion
 LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
 COUNTS = ("merged_poses", "merged_markers")
 NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
@@ -95,7 +96,12 @@ def _plan(run: Run) -> dict[str, Any]:
     angles = {f"{name}_deg": math.degrees(getattr(plan, name)) for name in ("theta_r", "theta_p", "theta_s")}
     radians = ("theta_r", "theta_p", "theta_s")
     rest = {name: value for name, value in _scalars(plan).items() if name not in radians}
-    return rest | angles | {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0)}
+    nearest = {
+        name: {"least": value, "mu": mu}
+        for name, value, mu in zip(NEAREST, plan.least, plan.least_mu, strict=True)
+    }
+    found = {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0), "margins": nearest}
+    return rest | angles | found
 
 
 def summary(stage: str, value: dict[str, Any]) -> str:
@@ -154,6 +160,8 @@ def _plan_words(value: dict[str, Any]) -> list[str]:
         wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}"),
         "  rotation {theta_s_deg:.2f} deg = {theta_r_deg:.2f} deg onto the plane, "
         "{theta_p_deg:.2f} deg within it".format_map(value),
+        "  least: " + ", ".join(f"{name} {_number(value['margins'][name]['least'])}" for name in NEAREST),
+        *([f"  duration {value['duration']:.3g} s at the joint-speed limit"] if value["duration"] else []),
     ]
 
 

@@ -153,7 +153,11 @@ def _lacking(call: _Call, name: str) -> bool:
 
 
 def _verdict(call: _Call) -> int:
-    """Exit code 1 when a stage failed, a calibration is not usable or a law that must converge did not."""
+    """Exit code 1 when a stage failed or what it made is not what was asked for.
+
+    That is a calibration that is not usable, a plan that keeps not all its constraints, or a law that
+    must converge and did not.
+    """
     if call.failed:
         click.echo(f"projservo: {call.failed}: {call.reason}", err=True)
         return 1
@@ -172,7 +176,16 @@ def _verdict(call: _Call) -> int:
         reason = f": {trace.reason}" if trace.reason else ""
         must_converge = " must converge, but" if trace.law in must else ""
         click.echo(f"projservo: {trace.law}{must_converge} ended in {trace.verdict}{reason}", err=True)
-    return 1 if missed or missed_calibration else 0
+    infeasible = _infeasible(call)
+    return 1 if missed or missed_calibration or infeasible else 0
+
+
+def _infeasible(call: _Call) -> bool:
+    """Say that no motion keeps the constraints asked for; True where the call was to plan one."""
+    if "plan" not in call.run.results or call.run.plan.profile != "constrained" or call.run.plan.feasible:
+        return False
+    click.echo(f"projservo: plan: {call.run.plan.reason}", err=True)
+    return "plan" in call.names
 
 
 def _unusable(call: _Call) -> bool:

@@ -18,7 +18,9 @@ from projservo_cli.config.fields import (
 from projservo_cli.config.foreign import Law, Options, PlantClass
 from projservo_cli.config.robot import Markers, Rig, Robot
 
-Profile = Literal["linear", "exponential", "rotation_first", "translation_first", "planar_first"]
+Profile = Literal[
+    "linear", "exponential", "rotation_first", "translation_first", "planar_first", "constrained"
+]
 
 
 class Noise(Section):
@@ -82,11 +84,13 @@ class Task(Section):
 
 
 class Trajectory(Section):
-    """How the planned motion is spread over σ in [0, 1]."""
+    """How the planned motion is spread over σ in [0, 1], and what the profile ``constrained`` keeps to."""
 
     profile: Profile = "linear"
     delta: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = 0.9
     samples: Annotated[int, Strict(), Field(ge=2, le=100_001)] = 101
+    border_px: NotNegative = 5.0
+    least_condition: Annotated[float, Strict(), Field(ge=0, lt=1, allow_inf_nan=False)] = 0.001
 
 
 class Control(Section):

@@ -15,6 +15,7 @@ from projservo_cli.figures import (
     joints,
     overview,
     partition,
+    path,
     planned,
     scene,
     visibility,
@@ -234,5 +235,13 @@ FIGURES = (
             "of each pose over its predicted error; range of each joint; eigenvalues of the information "
             "matrix."
         ),
+    ),
+    FigureSpec(
+        "fig14_path",
+        "Where each camera sees the face, and the planned path among it",
+        "beside the paper's, after section 4.3",
+        6.0,
+        path.data,
+        path.draw,
     ),
 )

@@ -18,7 +18,14 @@ SETTLED = 1e-8
 
 @njit
 def reach(
-    model: Model, H_back: Mat4, goal: Mat4, A: FloatArray, q: FloatArray, work: Work, newton: FloatArray
+    model: Model,
+    H_back: Mat4,
+    goal: Mat4,
+    A: FloatArray,
+    q: FloatArray,
+    work: Work,
+    newton: FloatArray,
+    settled: float = SETTLED,
 ) -> bool:
     """Newton steps on the joints ``q``, in place, until they displace the face A by ``goal``.
 
@@ -28,6 +35,7 @@ def reach(
     goal : displacement from there.
     A : (m, 4) points of the face.
     work, newton : workspaces of n joints and 4m rows; ``newton`` (n,) is left with the last step.
+    settled : Newton step that is the last, rad or m.
 
     Returns
     -------
@@ -52,6 +60,6 @@ def reach(
         for i in range(n):
             q[i] += newton[i]
             most = max(most, abs(newton[i]))
-        if most <= SETTLED:
+        if most <= settled:
             return True
     return False

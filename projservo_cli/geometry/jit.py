@@ -77,6 +77,11 @@ def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS)(function))
 
 
+def allocating(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Compile a function that makes arrays of its own, for sweeps that take milliseconds a call."""
+    return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": True})(function))
+
+
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     """Compile a small helper that is always merged into its caller by the optimiser."""
     return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS, forceinline=True)(function))

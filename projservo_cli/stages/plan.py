@@ -5,27 +5,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, Gains, measure, new_state
+from projservo_cli.control.law import measure, new_state
 from projservo_cli.geometry.algebra import vec
 from projservo_cli.geometry.composition import composed_angle
 from projservo_cli.geometry.displacement import as_array, as_mat
-from projservo_cli.geometry.kinematics import forward_kinematics, project
+from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.loop.compiled import new_log
-from projservo_cli.loop.compiled import run as run_loop
-from projservo_cli.loop.step import CONVERGED, Limits
-from projservo_cli.plants.plant import Plant
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed
-from projservo_cli.stages.motion import joints_of
+from projservo_cli.stages.constrained import (
+    CONSTRAINED,
+    VIEWS,
+    constrained_verdict,
+    demands_of,
+    motion_of,
+)
+from projservo_cli.stages.half_turn import half_turn_sense
 from projservo_cli.stages.reach import reach_for, sight_for
 from projservo_cli.stages.sight import Sight
 from projservo_cli.stages.truth import center_index, face_numbers
-from projservo_cli.task.body import NO_BODY
 from projservo_cli.task.face import Task, center_of, face_plane, task_from_images
+from projservo_cli.task.margins import CONSTRAINTS, Demands, Reaching
 from projservo_cli.task.partition import Parts, partition
 from projservo_cli.task.target import task_from_body
-from projservo_cli.task.trajectory import profile_shares, trajectory_displacement
+from projservo_cli.task.trajectory import trajectory_displacement
 from projservo_cli.task.visibility import (
     arc_minimum,
     margin,
@@ -47,14 +49,12 @@ DEPENDS_ON = (
     "trajectory",
     "control.observation",
     "plant.use",
+    "control.joint_speed_limit_deg_s",
+    "control.prismatic_speed_limit_m_s",
 )
-VIEWS = ("left", "right")
 TASK_DIMENSION = 6
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
 HALF_TURN_BAND = math.radians(2.0)
-REHEARSAL_STEPS = 300
-REHEARSAL_PX = 1.0
-REHEARSAL = Gains(0.1, 0.1, 0.1, 0.1, 1.0, 0.1, 1.0, 0.9)
 
 
 def run(config: "Config", calibration: Calibration) -> Plan:
@@ -74,7 +74,7 @@ def run(config: "Config", calibration: Calibration) -> Plan:
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    reach, joints = reach_for(config, calibration), joints_of(config, calibration.joint_types)
+    reach = reach_for(config, calibration)
     return plan_task(
         calibration.model(),
         reach.q_start,
@@ -84,7 +84,7 @@ def run(config: "Config", calibration: Calibration) -> Plan:
         config.trajectory.profile,
         config.trajectory.delta,
         config.trajectory.samples,
-        (joints.lower, joints.upper),
+        demands_of(config, calibration.joint_types),
         sight_for(config, calibration, reach),
     )
 
@@ -98,7 +98,7 @@ def plan_task(
     profile: str,
     delta: float,
     samples: int,
-    bounds: tuple[FloatArray, FloatArray],
+    demands: Demands,
     sight: Sight | None = None,
 ) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
@@ -110,7 +110,7 @@ def plan_task(
     s_start, s_star : (2, m, 2) pixels of the face.
     center : index of the centre marker, or ``MIDPOINT``.
     profile, delta, samples : which part is driven when, share of τ_0, points of the path.
-    bounds : (n,) lower and upper joint limits, rad or m.
+    demands : what the motion must keep to; profiles of the paper are only measured against it.
     sight : the body to measure with; without it the face is measured point by point.
 
     Raises
@@ -141,38 +141,62 @@ def plan_task(
             "or moves the face in fewer than six ways"
         )
     note = ""
-    if math.pi - abs(parts.theta_p) < HALF_TURN_BAND:
+    if profile != CONSTRAINED and math.pi - abs(parts.theta_p) < HALF_TURN_BAND:
         forward_sense = state.q_hat[2].copy()
+        bounds = (demands.lower, demands.upper)
         state.memory.rotation[1], note = half_turn_sense(model, task, state.A, q_start, forward_sense, bounds)
         parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
-    amplitudes = (parts.tau, parts.theta_r, parts.theta_p)
     sigma = np.linspace(0.0, 1.0, samples)
     tau_0, theta_0 = _changes(np.array(parts.a), H_hat, task)
     tau_limit = min((delta * t for t in tau_0 if t > 0.0), default=math.inf)
-    mu = profile_shares(profile, sigma, tau_limit / parts.tau if parts.tau > 0.0 else 1.0)
-    H_d = np.array([trajectory_displacement(H_hat, amplitudes, row) for row in mu])
-    images = np.array([project(model.P, state.A @ H.T, model.lens) for H in H_d])
+    reaching = Reaching(
+        model,
+        demands,
+        H_hat,
+        np.array([parts.tau, parts.theta_r, parts.theta_p]),
+        state.A,
+        np.array(parts.a),
+        task.O,
+        q_start,
+        np.ones(4),
+    )
+    motion = motion_of(profile, reaching, sigma, tau_limit / parts.tau if parts.tau > 0.0 else 1.0)
+    tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
+    H_d = np.array([trajectory_displacement(H_hat, (tau, theta_r, theta_p), row) for row in motion.mu])
+    images = np.moveaxis(project(model.P, state.A @ np.swapaxes(H_d, 1, 2), model.lens), 0, 1)
     a = np.array(parts.a)
-    carried = np.array([np.linalg.solve(H.T, a) for H in H_d])
+    carried = np.linalg.solve(np.swapaxes(H_d, 1, 2), a[:, None])[..., 0]
     margins = margin(carried, task.O, task.visible)
     margins = margins / margins[0]
     sense, sense_margin = _senses(parts, task)
-    feasible, reason = _verdict(profile, sigma, margins)
+    if profile == CONSTRAINED:
+        feasible, reason = constrained_verdict(motion)
+    else:
+        feasible, reason = _verdict(profile, sigma, margins)
+    least, least_mu = motion.least()
     return Plan(
         profile=profile,
         feasible=feasible,
         reason=reason + note,
-        tau=parts.tau,
-        theta_r=parts.theta_r,
-        theta_p=parts.theta_p,
-        theta_s=composed_angle(parts.theta_r, parts.theta_p)[0],
+        tau=tau,
+        theta_r=theta_r,
+        theta_p=theta_p,
+        theta_s=composed_angle(theta_r, theta_p)[0],
+        constraint=CONSTRAINTS[motion.nearest()[0]],
+        duration=motion.duration,
         tau_limit=tau_limit,
         sigma=sigma,
-        mu=mu,
+        mu=motion.mu,
         H_d=H_d,
         s=images,
         margin=margins,
+        border_distance=motion.along.distance,
+        q=motion.along.q,
+        joint_margin=motion.along.limit,
+        condition=motion.along.condition,
+        least=least,
+        least_mu=least_mu,
         s_start=s_start,
         s_star=s_star,
         A=state.A,
@@ -193,55 +217,6 @@ def plan_task(
         sense=sense,
         sense_margin=sense_margin,
     )
-
-
-def half_turn_sense(
-    model: Model,
-    task: Task,
-    A: FloatArray,
-    q_start: FloatArray,
-    q_hat_p: FloatArray,
-    bounds: tuple[FloatArray, FloatArray],
-) -> tuple[FloatArray, str]:
-    """Sense of a half turn within the plane, as the joint motion ±q̂_p that begins it.
-
-    Either sense reaches the goal, but they take the joints elsewhere. Both are rehearsed on the
-    calibrated model itself, at a tenth of the error and at most 5° a step; the sense that arrives
-    without passing a joint limit is taken, between equals the one that arrives in fewer steps.
-
-    Parameters
-    ----------
-    A : (m, 4) face at the start.
-    bounds : (n,) lower and upper joint limits, rad or m.
-
-    Returns
-    -------
-    The joint motion, and what to say of it where neither sense arrived.
-    """
-    n = len(q_start)
-    # Cameras have no sign of their own; the plant tells front from back by positive depths.
-    depth = model.P[:, 2] @ A.mean(axis=0)
-    model = model._replace(P=model.P * np.sign(depth)[:, None, None])
-    task = task._replace(body=NO_BODY)
-    M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
-    endless = np.full(2, np.inf)
-    plant = Plant(
-        model, M, task.order, task.center, task.O, task.visible, endless, bounds[0], bounds[1], False
-    )
-    rate = np.full(n, math.radians(5.0))
-    limits = Limits(rate, REHEARSAL_PX, math.inf, 20, REHEARSAL_STEPS, False, False)
-    noise = np.zeros((REHEARSAL_STEPS + 1, 2, len(A), 2))
-    outcomes = []
-    for sign in (1.0, -1.0):
-        state, log = new_state(n, len(A)), new_log(n, len(A), REHEARSAL_STEPS, len(ERRORS))
-        state.memory.rotation[1] = sign * q_hat_p
-        verdict, steps = run_loop(
-            CODES["direct_two"], model, task, REHEARSAL, limits, plant, noise, q_start.copy(), state, log
-        )
-        outcomes.append((verdict != CONVERGED, log.events[1] >= 0.0, steps, -sign))
-    best = min(outcomes)
-    note = "; neither sense of the half turn arrived when rehearsed" if best[0] else ""
-    return -best[3] * q_hat_p, note
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:

@@ -25,6 +25,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.servo import drive, gains_of, limits_of
 from projservo_cli.stages.truth import Reach, Truth, plant_of, reach_of, truth_of
+from projservo_cli.task.margins import within
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -181,7 +182,7 @@ def metric_plan(bench: Bench, delta: float) -> Plan:
         "linear",
         delta,
         2,
-        (robot.lower, robot.upper),
+        within(robot.lower, robot.upper),
     )
 
 

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from projservo_cli.geometry.displacement import exp_rotation, exp_translation
+from projservo_cli.geometry.algebra import Mat4, mat, mul
+from projservo_cli.geometry.displacement import as_array, rotation, translation
+from projservo_cli.geometry.jit import njit
 from projservo_cli.records import FloatArray
 
 # Share of the path that a part driven first, or last, has to itself.
@@ -50,6 +52,24 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
     return np.stack([t, r, p], axis=1)
 
 
+@njit
+def rotated(H_hat: FloatArray, amplitudes: FloatArray, mu_r: float, mu_p: float) -> Mat4:
+    """Rotations of the planned displacement, exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p) of [RH00] eq. (17)."""
+    H_r = mat(H_hat[1])
+    H_p = mat(H_hat[2])
+    return mul(
+        rotation(H_r, mul(H_r, H_r), mu_r * float(amplitudes[1])),
+        rotation(H_p, mul(H_p, H_p), mu_p * float(amplitudes[2])),
+    )
+
+
+@njit
+def displaced(H_hat: FloatArray, amplitudes: FloatArray, mu_t: float, mu_r: float, mu_p: float) -> Mat4:
+    """Planned displacement at shares of the parts, [RH00] eqs. (17), (18)."""
+    shift = translation(mat(H_hat[0]), mu_t * float(amplitudes[0]))
+    return mul(shift, rotated(H_hat, amplitudes, mu_r, mu_p))
+
+
 def trajectory_displacement(
     H_hat: FloatArray, amplitudes: tuple[float, float, float], mu: FloatArray
 ) -> FloatArray:
@@ -65,9 +85,5 @@ def trajectory_displacement(
     -------
     (4, 4) displacement exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p).
     """
-    tau, theta_r, theta_p = amplitudes
-    return (
-        exp_translation(H_hat[0], mu[0] * tau)
-        @ exp_rotation(H_hat[1], mu[1] * theta_r)
-        @ exp_rotation(H_hat[2], mu[2] * theta_p)
-    )
+    H_hat = np.ascontiguousarray(H_hat, dtype=np.float64)
+    return as_array(displaced(H_hat, np.array(amplitudes, dtype=np.float64), *(float(share) for share in mu)))

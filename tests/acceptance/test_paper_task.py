@@ -13,6 +13,7 @@ from projservo_cli.config import Config, load_config
 from projservo_cli.records import Calibration, FloatArray, Plan, Trace
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
+from projservo_cli.task.margins import within
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ARMS = ("paper", "ur5")
@@ -61,7 +62,7 @@ def true_run(arm: str, law: str, *overrides: str, frame: FloatArray | None = Non
         "linear",
         0.9,
         11,
-        (truth.robot.lower, truth.robot.upper),
+        within(truth.robot.lower, truth.robot.upper),
     )
     return servo.drive(
         law,

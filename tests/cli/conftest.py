@@ -78,7 +78,10 @@ class Stages:
 
     def plan(self, config: Any, calibration: Any) -> Any:
         self._make("plan")
-        return fake(Plan, config.seed, profile=config.trajectory.profile)
+        feasible = self.verdicts.get("plan") != "infeasible"
+        return fake(
+            Plan, config.seed, profile=config.trajectory.profile, feasible=feasible, reason="too near"
+        )
 
     def servo(self, config: Any, calibration: Any, plan: Any, law: str, *, progress: Any) -> Any:
         self._make(law)

@@ -58,6 +58,19 @@ def test_only_what_depends_on_a_change_is_redone(projservo, stages, change, rema
     assert stages.made == []
 
 
+def test_a_plan_that_fails_its_constraints_ends_in_1_with_the_reason(projservo, stages):
+    stages.verdicts = {"plan": "infeasible"}
+    wanted = ("--set", "trajectory.profile=constrained")
+    answer = projservo("plan", "-c", "tiny.yaml", "-o", "out", *wanted, "--json")
+    assert answer.code == 1
+    assert answer.err.strip().endswith("plan: too near")
+    assert answer.json["feasible"] is False
+    assert set(answer.json["margins"]) == {"visibility", "border_px", "joints", "condition"}
+    # What only measures the profile of the paper, or was made before, does not end the call.
+    assert projservo("servo", "-o", "out").code == 0
+    assert projservo("plan", "-c", "tiny.yaml", "-o", "linear").code == 0
+
+
 def test_an_interrupted_chain_goes_on_where_it_stopped(projservo, stages, refused):
     stages.fails["stacked"] = KeyboardInterrupt()
     answer = projservo("servo", "-c", "tiny.yaml", "-o", "out")

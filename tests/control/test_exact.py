@@ -9,6 +9,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.stages import plan, servo
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
+from projservo_cli.task.margins import within
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 
@@ -21,7 +22,7 @@ def exact_run(arm, gain, limit, *overrides):
     )
     truth = truth_of(config)
     reach = reach_of(config, truth)
-    bounds = (truth.robot.lower, truth.robot.upper)
+    bounds = within(truth.robot.lower, truth.robot.upper)
     sense = plan.plan_task(
         truth.model, reach.q_start, reach.s_start, reach.s_star, truth.center, "linear", 0.9, 3, bounds
     ).rotation_sense()

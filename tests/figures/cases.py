@@ -9,6 +9,7 @@ from projservo_cli.config import load_config
 from projservo_cli.figures.material import Material
 from projservo_cli.records import LAWS, METRIC_LAWS, Calibration
 from projservo_cli.stages import calibrate, plan, servo, studies, truth
+from projservo_cli.task.margins import within
 from tests.conftest import ROOT
 from tests.fake_records import fake
 
@@ -42,7 +43,7 @@ def case(name="paper", steps=SHORT, whole=False):
         "linear",
         config.trajectory.delta,
         21,
-        (true.robot.lower, true.robot.upper),
+        within(true.robot.lower, true.robot.upper),
     )
     bench = studies.bench_of(config, model, planned)
     noise = servo.servo_noise(config, len(true.face))

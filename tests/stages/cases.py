@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 
 from projservo_cli.config import load_config
+from projservo_cli.stages.constrained import demands_of
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.servo import drive, gains_of, limits_of
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
@@ -25,10 +26,9 @@ class Case:
         self.traces = {}
 
     def planned(self, model, profile="linear", samples=11):
-        bounds = (self.truth.robot.lower, self.truth.robot.upper)
         return plan_task(
             model, self.reach.q_start, self.reach.s_start, self.reach.s_star, self.truth.center, profile,
-            self.config.trajectory.delta, samples, bounds,
+            self.config.trajectory.delta, samples, demands_of(self.config),
         )  # fmt: skip
 
     def servo(self, law, model=None, gains=None, sense=None, **limits):

@@ -7,6 +7,7 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.task.margins import within
 from projservo_cli.task.trajectory import PROFILES
 from tests.samples import arm, face, frame, in_frame, pixels
 from tests.stages.cases import case
@@ -100,14 +101,22 @@ def test_a_robot_of_five_or_seven_joints_is_refused():
         n = len(types)
         with pytest.raises(WorkFailed, match="six joints"):
             plan_task(
-                model, model.q_reference, s, s, -1, "linear", 0.9, 3, (np.full(n, -9.0), np.full(n, 9.0))
+                model,
+                model.q_reference,
+                s,
+                s,
+                -1,
+                "linear",
+                0.9,
+                3,
+                within(np.full(n, -9.0), np.full(n, 9.0)),
             )
 
 
 def test_a_start_that_is_the_goal_is_a_plan_without_motion():
     example = case("ur5")
     reach = example.reach
-    bounds = (example.truth.robot.lower, example.truth.robot.upper)
+    bounds = within(example.truth.robot.lower, example.truth.robot.upper)
     plan = plan_task(
         example.truth.model, reach.q_start, reach.s_start, reach.s_start, -1, "linear", 0.9, 5, bounds
     )

@@ -1,0 +1,207 @@
+"""Paths of shares μ_t, μ_r, μ_p: what they are worth, their joints, and straighter ones."""
+
+import math
+
+import numpy as np
+
+from projservo_cli.geometry.inverse import SETTLED, reach
+from projservo_cli.geometry.jit import allocating, njit
+from projservo_cli.geometry.kinematics import backward, operators_at
+from projservo_cli.geometry.mechanisms import Work
+from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.task.lattice import stride
+from projservo_cli.task.margins import (
+    CONDITIONING,
+    JOINTS,
+    Reaching,
+    image_distance,
+    limit_margin,
+    reciprocal_condition,
+    view_share,
+    visibility_margin,
+)
+from projservo_cli.task.trajectory import displaced
+
+# A joint that moves more than this between neighbours on a path, rad or m, asks for points between.
+MOST_PART = 0.2
+MOST_PARTS = 256
+# A straight piece may take this much longer than the steps of the lattice that it replaces.
+DETOUR = 1.01
+ROUND_OFF = 1e-9
+
+
+@allocating
+def continued(
+    reaching: Reaching,
+    near: FloatArray,
+    far: FloatArray,
+    parts: int,
+    q: FloatArray,
+    work: Work,
+    newton: FloatArray,
+) -> bool:
+    """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
+
+    Returns
+    -------
+    False where a part does not settle or moves a joint by more than ``MOST_PART``.
+    """
+    H_back = backward(reaching.model, reaching.q_start)
+    before = np.empty_like(q)
+    for part in range(1, parts + 1):
+        x = part / parts
+        before[:] = q
+        mu_t = (1.0 - x) * near[0] + x * far[0]
+        mu_r = (1.0 - x) * near[1] + x * far[1]
+        mu_p = (1.0 - x) * near[2] + x * far[2]
+        goal = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
+        if not reach(reaching.model, H_back, goal, reaching.A, q, work, newton, SETTLED):
+            return False
+        for i in range(q.shape[0]):
+            if not abs(q[i] - before[i]) <= MOST_PART:
+                return False
+    return True
+
+
+@allocating
+def follow(
+    reaching: Reaching, mu: FloatArray, q: FloatArray, condition: FloatArray, work: Work, newton: FloatArray
+) -> int:
+    """Joints along a path and the reciprocal condition there, continued from the start.
+
+    Parameters
+    ----------
+    mu : (s, 3) shares, the first row zero.
+    q, condition : (s, n) and (s,) on return rad or m, and reciprocal conditions; NaN where the joints
+        cannot follow.
+
+    Returns
+    -------
+    How many rows they can follow.
+    """
+    rows = len(mu)
+    M = np.empty((2, 4))
+    q[:] = math.nan
+    condition[:] = math.nan
+    current = reaching.q_start.copy()
+    operators_at(reaching.model, current, work.H_hat)
+    for row in range(rows):
+        if row > 0:
+            parts = 1
+            while not continued(reaching, mu[row - 1], mu[row], parts, current, work, newton):
+                parts *= 2
+                current[:] = q[row - 1]
+                if parts > MOST_PARTS:
+                    return row
+        q[row] = current
+        H = displaced(reaching.H_hat, reaching.amplitudes, mu[row, 0], mu[row, 1], mu[row, 2])
+        condition[row] = reciprocal_condition(reaching, H, work, M, newton)
+    return rows
+
+
+@njit
+def view_path(reaching: Reaching, mu: FloatArray, visibility: FloatArray, distance: FloatArray) -> None:
+    """Margins of visibility (s, 2) and distances from the image border (s, 2), px, along a path."""
+    for row in range(mu.shape[0]):
+        H = displaced(reaching.H_hat, reaching.amplitudes, mu[row, 0], mu[row, 1], mu[row, 2])
+        for view in range(2):
+            visibility[row, view] = visibility_margin(reaching, view, mu[row, 0], mu[row, 1])
+            distance[row, view] = image_distance(reaching, view, H)
+
+
+@njit
+def interpolate(field: FloatArray, mu: FloatArray, x: FloatArray) -> None:
+    """Value (c,) of a field (a, a, a, c) between its nodes, linearly along each axis."""
+    last = field.shape[0] - 1
+    i = min(int(mu[0] * last), last - 1)
+    j = min(int(mu[1] * last), last - 1)
+    k = min(int(mu[2] * last), last - 1)
+    u, v, w = mu[0] * last - i, mu[1] * last - j, mu[2] * last - k
+    for l in range(x.shape[0]):
+        near = (1.0 - v) * field[i, j, k, l] + v * field[i, j + 1, k, l]
+        far = (1.0 - v) * field[i + 1, j, k, l] + v * field[i + 1, j + 1, k, l]
+        low = (1.0 - u) * near + u * far
+        near = (1.0 - v) * field[i, j, k + 1, l] + v * field[i, j + 1, k + 1, l]
+        far = (1.0 - v) * field[i + 1, j, k + 1, l] + v * field[i + 1, j + 1, k + 1, l]
+        x[l] = (1.0 - w) * low + w * ((1.0 - u) * near + u * far)
+
+
+@allocating
+def piece(
+    reaching: Reaching,
+    field: FloatArray,
+    weight: FloatArray,
+    near: FloatArray,
+    far: FloatArray,
+    parts: int,
+    work: FloatArray,
+) -> tuple[float, float]:
+    """Smallest share along a straight piece of path, and the time it takes, by interpolated joints.
+
+    Parameters
+    ----------
+    field : (a, a, a, n + 1) joints and margin of conditioning at coarse nodes.
+    weight : (n,) seconds a rad or m of each joint takes.
+    near, far : (3,) its ends.
+    work : (3, n + 1) workspace.
+    """
+    n = weight.shape[0]
+    least = math.inf
+    time = 0.0
+    mu = np.empty(3)
+    for part in range(parts + 1):
+        x = part / parts
+        for axis in range(3):
+            mu[axis] = (1.0 - x) * near[axis] + x * far[axis]
+        here = work[part % 2]
+        interpolate(field, mu, here)
+        least = min(least, view_share(reaching, mu[0], mu[1], mu[2]))
+        least = min(least, here[n] / reaching.scale[CONDITIONING])
+        least = min(least, limit_margin(here[:n], reaching.demands) / reaching.scale[JOINTS])
+        if part > 0:
+            time += stride(work[(part + 1) % 2, :n], here[:n], weight)
+    return least, time
+
+
+@allocating
+def straightened(
+    reaching: Reaching,
+    field: FloatArray,
+    weight: FloatArray,
+    path: IntArray,
+    last: int,
+    least: float,
+    kept: IntArray,
+) -> int:
+    """Corners of a path of lattice nodes that is left when straight pieces serve as well.
+
+    A piece grows as long as its shares stay at ``least`` and it takes no longer than the nodes.
+
+    Parameters
+    ----------
+    field, weight : as of ``piece``.
+    path : (count, 3) nodes, first to last.
+    last : index of the last node along each axis.
+    kept : (≥count,) on return the indices of the nodes that are corners, both ends among them.
+
+    Returns
+    -------
+    How many corners there are.
+    """
+    nodes = path / last
+    work = np.empty((3, field.shape[3]))
+    kept[0] = 0
+    corners = 1
+    time = 0.0
+    for j in range(1, path.shape[0]):
+        _, step = piece(reaching, field, weight, nodes[j - 1], nodes[j], 1, work)
+        time += step
+        anchor = kept[corners - 1]
+        if j - anchor > 1:
+            share, straight = piece(reaching, field, weight, nodes[anchor], nodes[j], 2 * (j - anchor), work)
+            if share < least - ROUND_OFF or straight > DETOUR * time + ROUND_OFF:
+                kept[corners] = j - 1
+                corners += 1
+                time = step
+    kept[corners] = path.shape[0] - 1
+    return corners + 1

@@ -1,0 +1,43 @@
+"""The shipped tasks as the planner sees them, with the true operators unless another model is given."""
+
+import numpy as np
+
+from projservo_cli.stages.constrained import demands_of
+from projservo_cli.stages.plan import plan_task
+from projservo_cli.task.margins import Reaching
+from tests.stages.cases import case
+
+
+def reaching_of(name, model=None, border_px=20.0):
+    """A shipped task, its partition taken from the linear plan of the model."""
+    example = case(name)
+    plan = example.plan if model is None else example.planned(model)
+    demands = demands_of(example.config)._replace(border_px=border_px)
+    return Reaching(
+        example.truth.model if model is None else model,
+        demands,
+        plan.H_hat,
+        np.array([plan.tau, plan.theta_r, plan.theta_p]),
+        plan.A,
+        plan.a,
+        plan.optical_center,
+        plan.q_start,
+        np.ones(4),
+    )
+
+
+def constrained(name, model=None, samples=101, **demands):
+    """A shipped task planned under constraints, some of them changed."""
+    example = case(name)
+    reach = example.reach
+    return plan_task(
+        example.truth.model if model is None else model,
+        reach.q_start,
+        reach.s_start,
+        reach.s_star,
+        example.truth.center,
+        "constrained",
+        0.9,
+        samples,
+        demands_of(example.config)._replace(**demands),
+    )

@@ -1,0 +1,187 @@
+"""Planned motions: what they keep to, what they are refused for, and random tasks against a grid search."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from projservo_cli.records import InputError
+from projservo_cli.stages.constrained import demands_of
+from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.random_tasks import STRATA, random_tasks
+from projservo_cli.task.planning import turning_sense
+from tests.planning.cases import constrained, reaching_of
+from tests.planning.oracle import TrueTask
+from tests.planning.study import outcome_of, study, tasks_of
+from tests.samples import frame, in_frame, pixels, poe
+from tests.stages.cases import case
+
+pytestmark = pytest.mark.volume
+
+# Tasks of the second robot in which neither order of the parts will do, deg.
+UR5_COUPLED = [
+    (
+        [-26.063, 239.847, -29.387, -161.766, 100.23, 127.437],
+        [273.368, -256.699, -104.375, 257.534, -262.457, -31.341],
+    ),
+    (
+        [-155.855, 186.159, -45.653, 136.252, 78.845, 129.443],
+        [-77.145, -49.485, -36.857, 17.883, 295.925, 289.367],
+    ),
+]
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5", "coupled"])
+def test_a_planned_motion_keeps_what_it_says(name):
+    """Images and limits from the joints alone, by the true robot; shares grow; times are even."""
+    example = case(name)
+    plan = constrained(name)
+    assert plan.feasible, plan.reason
+    assert (np.diff(plan.mu, axis=0) >= -1e-15).all()
+    np.testing.assert_array_equal(plan.mu[[0, -1]], [[0, 0, 0], [1, 1, 1]])
+    robot = example.truth.robot
+    assert ((plan.q > robot.lower) & (plan.q < robot.upper)).all()
+    start = np.linalg.inv(poe(example.truth.model, plan.q_start))
+    M = np.array([plan.A @ (poe(example.truth.model, q) @ start).T for q in plan.q])
+    s = np.stack([pixels(example.truth.P, points) for points in M])
+    np.testing.assert_allclose(s, plan.s, atol=1e-5)
+    np.testing.assert_allclose(s[-1], example.reach.s_star, atol=1e-5)
+    border = np.minimum(s + 0.5, example.truth.image_size - 0.5 - s).min(axis=(2, 3))
+    np.testing.assert_allclose(plan.border_distance, border, atol=1e-5)
+    assert plan.margin.min() > 0.0
+    steps = (np.abs(np.diff(plan.q, axis=0)) / math.radians(125)).max(axis=1)
+    assert steps.sum() == pytest.approx(plan.duration, rel=0.02)
+    # Corners of the path are cut between samples; away from them every step takes the same time.
+    assert np.median(steps) == pytest.approx(plan.duration / 100, rel=0.02)
+
+
+@pytest.mark.parametrize("name", ["coupled"])  # on the others several paths are as good
+def test_a_planned_motion_does_not_depend_on_the_frame(name):
+    here = constrained(name)
+    there = constrained(name, in_frame(case(name).truth.model, frame(2, mirrored=True)))
+    assert there.least == pytest.approx(here.least, rel=1e-2)
+    assert there.duration == pytest.approx(here.duration, rel=1e-2)
+
+
+def orders(true, senses):
+    """Smallest sight of translation first, and of the turn first, to the end each."""
+    x, zero, one = np.linspace(0, 1, 201), np.zeros(201), np.ones(201)
+    first, last = np.stack([x, zero, zero], axis=1), np.stack([zero, x, x], axis=1)
+    then_turn, then_go = np.stack([one, x, x], axis=1), np.stack([x, one, one], axis=1)
+    return [
+        min(true.along(first, *senses)[0].min(), true.along(then_turn, *senses)[0].min()),
+        min(true.along(last, *senses)[0].min(), true.along(then_go, *senses)[0].min()),
+    ]
+
+
+@pytest.mark.parametrize("task", [0, 1])
+def test_only_coupled_parts_keep_the_face_in_sight(task):
+    """Pure translation passes τ_0 and pure rotation θ_0; the planned motion keeps all constraints."""
+    config, truth, _ = tasks_of("ur5", 6, 1)
+    q_start, q_goal = np.radians(UR5_COUPLED[task])
+    _proves_coupling(config, truth, q_start, q_goal)
+
+
+def test_the_shipped_task_needs_coupled_parts():
+    example = case("coupled")
+    q_goal = np.array(example.config.task.goal.joints.values("RRRRRR"))
+    _proves_coupling(example.config, example.truth, example.reach.q_start, q_goal)
+    plan = example.plan
+    assert 0 < np.nanmin(plan.tau_0[plan.tau_0 > 0]) < plan.tau
+
+
+def _proves_coupling(config, truth, q_start, q_goal):
+    H = [truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool) for q in (q_start, q_goal)]
+    true = TrueTask(truth.P, truth.image_size, *((truth.M_face @ T.T)[:, :3] for T in H))
+    assert max(orders(true, true.senses()[0])) < -0.05
+    outcome = outcome_of(0, config, truth, truth.model, q_start, q_goal)
+    assert outcome.kept
+    assert outcome.feasible, outcome.reason
+    assert outcome.sight > 0.2
+
+
+def test_what_makes_a_task_infeasible_is_named():
+    example = case("paper")
+    plan = constrained("paper", border_px=470.0)
+    assert not plan.feasible
+    assert plan.constraint == "image"
+    assert "470 px asked for" in plan.reason
+    assert "mu_t" in plan.reason
+    upper = example.truth.robot.upper.copy()
+    upper[0] = example.reach.q_start[0] + 0.01
+    lower = example.truth.robot.lower.copy()
+    lower[0] = example.reach.q_start[0] - 0.01
+    plan = constrained("paper", lower=lower, upper=upper)
+    assert not plan.feasible
+    assert plan.constraint == "joints"
+    assert "joint 1 is at" in plan.reason
+    assert plan.margin.min() > 0.0  # in sight all the same
+    plan = constrained("paper", conditioning=0.5)
+    assert not plan.feasible
+    assert plan.constraint == "conditioning"
+    assert "0.5 allowed" in plan.reason
+
+
+def test_a_start_that_is_the_goal_is_planned_as_no_motion():
+    example = case("ur5")
+    reach = example.reach
+    demands = demands_of(example.config)
+    plan = plan_task(
+        example.truth.model, reach.q_start, reach.s_start, reach.s_start, -1, "constrained", 0.9, 5, demands
+    )
+    assert plan.feasible
+    assert plan.duration == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(plan.H_d - np.eye(4)).max() < 1e-7
+
+
+@pytest.mark.parametrize("arm", ["paper", "ur5"])
+def test_the_sense_of_the_turn_is_the_one_a_grid_search_finds(arm):
+    """Offered the rest of a whole turn as θ_r, the planner comes back to the sense that stays in sight."""
+    reaching = reaching_of(arm)
+    tau, theta, theta_p = reaching.amplitudes
+    wanted = turning_sense(reaching)
+    other = reaching._replace(amplitudes=np.array([tau, theta - math.copysign(2 * math.pi, theta), theta_p]))
+    assert turning_sense(other) == pytest.approx(wanted)
+
+
+@pytest.mark.parametrize("arm", ["paper", "ur5"])
+def test_random_tasks_stay_in_sight_wherever_a_grid_search_finds_a_way(arm):
+    """A small part of ``python -m tests.planning.study ARM 500``."""
+    found, tasks = study(arm, 12, seed=7)
+    assert [o for o in found.missed if not o.near] == []
+    assert sum(o.oracle for o in found.outcomes) >= 10
+    assert any(o.feasible for o in found.outcomes)
+    assert "rejected" in tasks.words()
+
+
+def test_random_tasks_are_what_they_say():
+    _, truth, tasks = tasks_of("ur5", 24, 3)
+    half = 0.5 * (truth.robot.upper - truth.robot.lower)
+    middle = 0.5 * (truth.robot.upper + truth.robot.lower)
+    strata = np.minimum((STRATA * tasks.angle / math.pi).astype(int), STRATA - 1)
+    np.testing.assert_array_equal(np.bincount(strata), 4)
+    for q in (*tasks.q_start, *tasks.q_goal):
+        assert (np.abs(q - middle) <= 0.9 * half).all()
+        H = poe(truth.model, q)
+        M = (truth.M_face @ H.T)[:, :3]
+        normal = np.cross(M[1] - M[0], M[2] - M[0])
+        for P in truth.P:
+            ray = -np.linalg.solve(P[:, :3], P[:, 3]) - M.mean(axis=0)
+            cosine = abs(ray @ normal) / np.linalg.norm(ray) / np.linalg.norm(normal)
+            assert cosine >= math.cos(math.radians(75)) - 1e-9
+            s = M @ P[:, :3].T + P[:, 3]
+            s = s[:, :2] / s[:, 2:]
+            assert ((s >= -0.5) & (s <= truth.image_size - 0.5)).all()
+    for q_start, q_goal, angle in zip(tasks.q_start, tasks.q_goal, tasks.angle, strict=True):
+        R = poe(truth.model, q_goal)[:3, :3] @ poe(truth.model, q_start)[:3, :3].T
+        assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(angle, abs=1e-6)
+    vectors = sum(count for reason, count in tasks.rejected.items() if reason != "stratum full")
+    assert 0 < vectors < tasks.drawn
+
+
+def test_random_tasks_need_limits():
+    _, truth, _ = tasks_of("ur5", 6, 1)
+    endless = replace(truth, robot=truth.robot._replace(upper=np.full(6, np.inf)))
+    with pytest.raises(InputError, match="joint limits"):
+        random_tasks(endless, np.zeros(6), 6, np.random.default_rng(0))
