@@ -3,10 +3,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.figures import drift, errors, images, joints, partition, planned, scene, visibility
+from projservo_cli.figures import drift, errors, images, joints, partition, path, planned, scene, visibility
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.plants.robot import camera_center, look_at_camera
 from projservo_cli.records import PRISMATIC, REVOLUTE
+from projservo_cli.task.trajectory import trajectory_displacement
 from tests.figures.cases import GAINS, case
 from tests.samples import prismatic, revolute
 
@@ -193,3 +194,20 @@ def test_image_errors_end_at_the_goal_by_definition():
     data = images.data_errors(dataclasses.replace(material, traces={"direct_three": trace}))
     np.testing.assert_allclose(data["center_e"], 0.0, atol=1e-9)
     np.testing.assert_allclose(data["e"], trace.s - trace.s_star)
+
+
+def test_the_map_of_sight_is_the_margin_of_the_displaced_face(material):
+    data, plan = path.data(material), material.plan
+    for i, j in ((0, 0), (20, 60), (80, 0), (80, 80)):
+        H = trajectory_displacement(
+            plan.H_hat, (plan.tau, plan.theta_r, plan.theta_p), np.array([i / 80, j / 80, 0.4])
+        )
+        sight = plan.optical_center @ np.linalg.solve(H.T, plan.a) / (plan.optical_center @ plan.a)
+        np.testing.assert_allclose(data["margin"][:, i, j], sight, atol=1e-10)
+    # No share μ_p does better for both images than the one shown, of 41.
+    H = trajectory_displacement(
+        plan.H_hat, (plan.tau, plan.theta_r, plan.theta_p), np.array([20 / 80, 60 / 80, 0.4])
+    )
+    s = project(material.calibrated.P, plan.A @ H.T)
+    border = np.minimum(s + 0.5, material.plant.image_size - 0.5 - s).min(axis=(1, 2))
+    assert data["border_px"][:, 20, 60].min() >= border.min() - 1e-9
