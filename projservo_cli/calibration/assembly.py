@@ -1,5 +1,6 @@
 """The calibration record of a fit: diagnostics, covariance, what was left out, verdict."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ from projservo_cli.calibration import excitation, quality, reach
 from projservo_cli.calibration.culprits import Culprits
 from projservo_cli.calibration.frame import ProjectiveScene
 from projservo_cli.calibration.quality import Agreement, Expected
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.readings import Readings, of_markers
 from projservo_cli.records import (
     NO_LENS,
     PRISMATIC,
@@ -173,6 +174,26 @@ def outlier_list(readings: Readings, used: BoolArray) -> IntArray:
     )
     result: IntArray = listed[np.lexsort(listed.T[::-1])].astype(np.int64)
     return result
+
+
+def with_lost_markers(record: Calibration, readings: Readings, kept: BoolArray) -> Calibration:
+    """Record that also lists the readings of markers that could not be kept, and says so.
+
+    Parameters
+    ----------
+    record : without these markers.
+    readings : of all markers.
+    kept : (m,) markers that are part of the model.
+    """
+    lost = outlier_list(
+        of_markers(readings, ~kept), np.zeros((2, int((~kept)[readings.marker_of].sum())), bool)
+    )
+    outlier = np.concatenate([record.outlier, lost])
+    names = ", ".join(str(number) for number in readings.marker[~kept])
+    advice = f"hardly any reading of marker {names} fits: it is not part of the model; see it more often"
+    return dataclasses.replace(
+        record, outlier=outlier[np.lexsort(outlier.T[::-1])], advice=(*record.advice, advice)
+    )
 
 
 def findings(calibration: Calibration) -> dict[str, Any]:

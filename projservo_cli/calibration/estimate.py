@@ -19,7 +19,7 @@ from projservo_cli.calibration import (
     reach,
 )
 from projservo_cli.calibration.adjustment import Scene
-from projservo_cli.calibration.assembly import assemble
+from projservo_cli.calibration.assembly import assemble, with_lost_markers
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
 from projservo_cli.calibration.frame import (
@@ -35,7 +35,7 @@ from projservo_cli.calibration.optimization import Problem, prepare
 from projservo_cli.calibration.quality import Agreement, Expected
 from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
 from projservo_cli.calibration.reconstruction import Frame, image_frame
-from projservo_cli.calibration.refined import Solution, solve
+from projservo_cli.calibration.refined import Solution, determined, solve
 from projservo_cli.calibration.shown import require_images
 from projservo_cli.calibration.weakest import worst_determined
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
@@ -138,10 +138,12 @@ def _refined(
 ) -> Calibration:
     """Record of the maximum likelihood in its projective frame, with its covariance."""
     share = distortion.share_explained(solution, frame) if solution.scene.lens is None else 0.0
+    solution, kept = determined(solution)
     refusal = expected.refusal(solution.agreement)
     if refusal is not None:
         raise WorkFailed(refusal + distortion.hint(share))
     problem, scene, agreement = solution.problem, solution.scene, solution.agreement
+    everything, readings = readings, problem.readings
     found = culprits.find(problem, scene, agreement.used, agreement.sigma_px)
     straight = distortion.straight_readings(readings, scene.lens)
     try:
@@ -168,7 +170,8 @@ def _refined(
     advice = (*record.advice, *distortion.advice(record, share, frame.known))
     spread = reach.all_spreads(record.model(), result.M, factor, reach.surroundings(readings))
     worst = worst_determined(problem, scene, adjusted, spread, expected.noise_px(agreement))
-    return dataclasses.replace(record, advice=advice, worst_determined=worst)
+    record = dataclasses.replace(record, advice=advice, worst_determined=worst)
+    return record if kept.all() else with_lost_markers(record, everything, kept)
 
 
 def _projective(problem: Problem, scene: Scene) -> ProjectiveScene:

@@ -12,7 +12,7 @@ from projservo_cli.calibration.body import LEAST, Alignment, merge
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.optimization import Fit, Problem, Weighting, fixed, minimize, prepare
 from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected
-from projservo_cli.calibration.readings import Readings, of_poses
+from projservo_cli.calibration.readings import Readings, of_markers, of_poses
 from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
 from projservo_cli.calibration.start import place, rotation_axes
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
@@ -241,6 +241,30 @@ def least_squares(problem: Problem, scene: Scene, sigma: float, hopeless: float)
     if not (np.sign(depth) == np.sign(depth.sum(axis=1))[:, None])[used].all():
         return None
     return Solution(problem, scene, Agreement(fit.residual, used, dof))
+
+
+def determined(solution: Solution) -> tuple[Solution, BoolArray]:
+    """The solution without markers of which hardly any reading counts, and which markers (m,) stay.
+
+    One reading is less than the three coordinates of a marker; it would spoil all that is said about the
+    body as a whole.
+
+    Parameters
+    ----------
+    solution : the fit.
+    """
+    problem, scene, agreement = solution.problem, solution.scene, solution.agreement
+    readings = problem.readings
+    keep = np.bincount(readings.marker_of, agreement.used.sum(axis=0), len(readings.marker)) >= 2
+    if keep.all():
+        return solution, keep
+    rows = keep[readings.marker_of]
+    lens = scene.lens is not None
+    smaller = prepare(of_markers(readings, keep), problem.q_reference, lens)
+    scene = Scene(scene.P, scene.H_hat, scene.M[keep], scene.lens)
+    used = agreement.used[:, rows]
+    dof = degrees_of_freedom(smaller, scene, used)
+    return Solution(smaller, scene, Agreement(agreement.residual[:, rows], used, dof)), keep
 
 
 def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:

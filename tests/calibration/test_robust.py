@@ -77,3 +77,25 @@ def test_wrong_joint_readings_are_named():
     assert found["merged_poses"] == 43
     assert error_of(calibration) < 1.5 * clean
     assert any("disagree with the images" in line for line in calibration.advice)
+
+
+@pytest.mark.parametrize("lost", ["swept away", "seen once, wrongly"])
+def test_a_marker_whose_readings_are_all_wrong_costs_that_marker_alone(lost):
+    rng = np.random.default_rng(6)
+    observation = observed(trials(ROBOT))
+    images = observation.images.copy()
+    column = 4
+    if lost == "swept away":
+        images[:, :, column] += rng.uniform(60, 200, (len(images), 2, 2))
+    else:
+        images[1:, :, column] = np.nan
+        images[0, 0, column] += 150.0
+    found = calibrate(dataclasses.replace(observation, images=images), "RRRRRR", source="recorded")
+    assert found.usable, found.reason
+    number = observation.marker[column]
+    assert number not in found.marker
+    assert len(found.marker) == len(found.M) == len(observation.marker) - 1
+    seen = np.isfinite(images[:, :, column, 0])
+    listed = found.outlier[found.outlier[:, 1] == number]
+    assert len(listed) == seen.any(axis=1).sum()
+    assert any(f"marker {number}" in text for text in found.advice)
