@@ -22,6 +22,8 @@ RAYLEIGH = 1.1774100225154747
 # Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
 CAUCHY = 2.385
 MASK_ROUNDS = 4
+# Least share of the readings of a marker that must count for it to be part of the model.
+LEAST_SHARE = 0.25
 # A start that leaves this many times the epipolar noise after the robust search is a wrong one.
 HOPELESS = 10.0
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a
@@ -246,8 +248,8 @@ def least_squares(problem: Problem, scene: Scene, sigma: float, hopeless: float)
 def determined(solution: Solution) -> tuple[Solution, BoolArray]:
     """The solution without markers of which hardly any reading counts, and which markers (m,) stay.
 
-    One reading is less than the three coordinates of a marker; it would spoil all that is said about the
-    body as a whole.
+    One reading is less than the three coordinates of a marker, and a few among many wrong ones agree by
+    chance; either would spoil what is said about the body as a whole.
 
     Parameters
     ----------
@@ -255,7 +257,8 @@ def determined(solution: Solution) -> tuple[Solution, BoolArray]:
     """
     problem, scene, agreement = solution.problem, solution.scene, solution.agreement
     readings = problem.readings
-    keep = np.bincount(readings.marker_of, agreement.used.sum(axis=0), len(readings.marker)) >= 2
+    count = [np.bincount(readings.marker_of, mask.sum(axis=0)) for mask in (agreement.used, readings.seen)]
+    keep = count[0] >= np.maximum(2, LEAST_SHARE * count[1])
     if keep.all():
         return solution, keep
     rows = keep[readings.marker_of]
