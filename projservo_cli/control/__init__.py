@@ -21,6 +21,8 @@ def command(
 ) -> int:
     """Run the law of a code on images as projective cameras would have seen them.
 
+    The only place that tells the laws apart.
+
     Parameters
     ----------
     s : (2, b, 2) pixels as the cameras report them, NaN where unseen.
@@ -29,27 +31,20 @@ def command(
     -------
     Status of the law; ``LOST`` for a state made for another number of markers.
     """
+    seen = s
     if bends(model.lens):
         if state.straight.shape[1] != s.shape[1]:
             return LOST
         straight(model.lens, s, state.straight)
-        return chosen(code, model, task, gains, state.straight, q, state)
-    return chosen(code, model, task, gains, s, q, state)
-
-
-@njit
-def chosen(
-    code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
-) -> int:
-    """The only place that tells the laws apart."""
+        seen = state.straight
     if code == 0:
-        return direct_three(model, task, gains, s, q, state)
+        return direct_three(model, task, gains, seen, q, state)
     if code == 1:
-        return direct_two(model, task, gains, s, q, state)
+        return direct_two(model, task, gains, seen, q, state)
     if code == 2:
-        return stacked(model, task, gains, s, q, state)
+        return stacked(model, task, gains, seen, q, state)
     if code == 3:
-        return blockwise(model, task, gains, s, q, state)
+        return blockwise(model, task, gains, seen, q, state)
     if code == 4:
-        return euclidean_points(model, task, gains, s, q, state)
-    return exact(model, task, gains, s, q, state)
+        return euclidean_points(model, task, gains, seen, q, state)
+    return exact(model, task, gains, seen, q, state)

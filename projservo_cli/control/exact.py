@@ -11,7 +11,7 @@ from projservo_cli.control.direct_two import single_rotation
 from projservo_cli.control.law import MOST_PARTS, OK, SINGULAR, Gains, State, partitioned, translation_rate
 from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
-from projservo_cli.geometry.inverse import reach
+from projservo_cli.geometry.inverse import SETTLED, reach
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.records import FloatArray, Model
@@ -76,7 +76,7 @@ def continued(
             state.path[j, i] = state.path[j - 1, i] + step
             predicted += step * step
         goal = desired(parts, H_s, tau, theta, j / count)
-        if not reach(model, H_back, goal, state.A, state.path[j], state.work, state.newton):
+        if not reach(model, H_back, goal, state.A, state.path[j], state.work, state.newton, SETTLED):
             return False
         taken = 0.0
         for i in range(n):

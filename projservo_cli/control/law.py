@@ -18,10 +18,14 @@ from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import Work, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
-from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, carry, fit_body, new_normal
+from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, carry, fit_body, new_normal
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
 from projservo_cli.task.visibility import limited_translation
+
+# Whether to fit only the views that the goal showed, and in how many steps; written as values of a loop,
+# for the compiler makes a function anew for each literal argument.
+ATTEMPTS = ((True, MOST_STEPS), (False, MOST_STEPS))
 
 # Parts a law may split one step into.
 MOST_PARTS = 128
@@ -161,9 +165,11 @@ def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State)
     At the goal the errors of the calibration cancel between what is seen and what was shown where both
     are fitted to the same views; others serve only where these do not determine the body.
     """
-    fit = fit_body(model.P, task.body, s, H, True, SETTLED_PX, MOST_STEPS, state.normal)
-    if not fit.found:
-        fit = fit_body(model.P, task.body, s, H, False, SETTLED_PX, MOST_STEPS, state.normal)
+    fit = Fit(False, H, 0.0, 0.0, 0)
+    for shown_only, most_steps in ATTEMPTS:
+        fit = fit_body(model.P, task.body, s, H, shown_only, SETTLED_PX, most_steps, state.normal)
+        if fit.found:
+            break
     state.fit[0] = fit.before
     state.fit[1] = fit.after
     state.fit[2] = fit.views

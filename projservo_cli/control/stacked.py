@@ -18,8 +18,8 @@ def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray
         return LOST
     n = q.shape[0]
     rows = 2 * state.A.shape[0]
-    put_view(model, task, s, state, 0, 0)
-    put_view(model, task, s, state, 1, rows)
+    for view in range(2):
+        put_view(model, task, s, state, view, view * rows)
     work = state.work
     if not least_squares(work.B, 2 * rows, n, state.q_dot, work.pivot, work.z, work.rhs):
         return SINGULAR

@@ -88,11 +88,14 @@ def follow(
     for row in range(rows):
         if row > 0:
             parts = 1
-            while not continued(reaching, mu[row - 1], mu[row], parts, current, work, newton):
-                parts *= 2
-                current[:] = q[row - 1]
-                if parts > MOST_PARTS:
-                    return row
+            settled = False
+            while not settled:
+                settled = continued(reaching, mu[row - 1], mu[row], parts, current, work, newton)
+                if not settled:
+                    parts *= 2
+                    current[:] = q[row - 1]
+                    if parts > MOST_PARTS:
+                        return row
         q[row] = current
         H = displaced(reaching.H_hat, reaching.amplitudes, mu[row, 0], mu[row, 1], mu[row, 2])
         condition[row] = reciprocal_condition(reaching, H, work, M, newton)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.sight import sight_of
+from projservo_cli.stages.traces import rotation_between
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
 from tests.stages.cases import Case, case
 
@@ -75,7 +76,7 @@ def steady(law, sigma, observation, runs):
         verdicts[trace.verdict] += 1
         assert trace.observation == observation
         gap = 1e3 * np.linalg.norm(trace.center[TAIL:] - example.goal_center, axis=1)
-        turn = [servo.rotation_between(pose, example.reach.goal_pose) for pose in trace.pose[TAIL:]]
+        turn = [rotation_between(pose, example.reach.goal_pose) for pose in trace.pose[TAIL:]]
         position.append(np.mean(gap**2))
         rotation.append(np.mean(np.square(turn)))
     return np.sqrt([np.mean(position), np.mean(rotation)]), verdicts
