@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -51,7 +52,8 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     require_named(config, steps, names)
     require_asked(options, config, steps)
     try:
-        _work(call, options)
+        with _compilation(call):
+            _work(call, options)
         if options["suggest"] is not None and not _lacking(call, "calibrate"):
             call.suggested = suggested(config, call.run, options["suggest"])
     finally:
@@ -72,12 +74,8 @@ def _dry(call: _Call, *, as_json: bool) -> int:
 
 def _work(call: _Call, options: dict[str, Any]) -> None:
     """Make what has to be made, stop at the first failure, keep what was made until then."""
-    from projservo_cli.files import require_writable
     from projservo_cli.stages.chain import make
 
-    if any(step.why for step in call.steps):
-        require_writable(call.run.path)
-    _announce_compilation(call)
     motion = next((step for step in call.steps if step.law and step.why), None)
     for done, step in enumerate(call.steps):
         call.console.progress("results", done, len(call.steps))
@@ -112,16 +110,26 @@ def _keep_configuration(call: _Call) -> None:
         save(call.run)
 
 
-def _announce_compilation(call: _Call) -> None:
-    """The first run on a machine is slower by the time of compilation; say so."""
-    if not any(step.why for step in call.steps) or os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        return
+def _compilation(call: _Call) -> AbstractContextManager[None]:
+    """The first run on a machine is slower by the time of compilation; say so, and use both processors."""
+    from projservo_cli.files import require_writable
+
+    if not any(step.why for step in call.steps):
+        return nullcontext()
+    require_writable(call.run.path)
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+        return nullcontext()
     from projservo_cli.geometry.jit import CACHE_FOLDER
 
     if CACHE_FOLDER is None:
         call.console.say("compiling kernels (in every run: no cache folder can be written)")
     elif not any(CACHE_FOLDER.rglob("*.nbi")):
         call.console.say("compiling kernels, once")
+        if any(step.stage == "plan" and step.why for step in call.steps):
+            from projservo_cli.stages.compilation import compiling_beside
+
+            return compiling_beside()
+    return nullcontext()
 
 
 def _tell(call: _Call, *, as_json: bool) -> int:
