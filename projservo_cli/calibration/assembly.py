@@ -9,7 +9,7 @@ from projservo_cli.calibration import excitation, quality, reach
 from projservo_cli.calibration.culprits import Culprits
 from projservo_cli.calibration.frame import ProjectiveScene
 from projservo_cli.calibration.quality import Agreement, Expected
-from projservo_cli.calibration.readings import Readings, of_markers
+from projservo_cli.calibration.readings import Readings, restrict
 from projservo_cli.records import (
     NO_LENS,
     PRISMATIC,
@@ -186,7 +186,7 @@ def with_lost_markers(record: Calibration, readings: Readings, kept: BoolArray) 
     kept : (m,) markers that are part of the model.
     """
     lost = outlier_list(
-        of_markers(readings, ~kept), np.zeros((2, int((~kept)[readings.marker_of].sum())), bool)
+        restrict(readings, ~kept), np.zeros((2, int((~kept)[readings.marker_of].sum())), bool)
     )
     outlier = np.concatenate([record.outlier, lost])
     names = ", ".join(str(number) for number in readings.marker[~kept])

@@ -145,25 +145,6 @@ def of_poses(readings: Readings, keep: BoolArray) -> Readings:
     )
 
 
-def of_markers(readings: Readings, keep: BoolArray) -> Readings:
-    """Readings of some of the markers, which are numbered anew; the list of poses stays.
-
-    Parameters
-    ----------
-    readings : what was seen.
-    keep : (m,) markers that stay.
-    """
-    rows = keep[readings.marker_of]
-    return dataclasses.replace(
-        readings,
-        marker=readings.marker[keep],
-        pose_of=readings.pose_of[rows],
-        marker_of=(np.cumsum(keep) - 1)[readings.marker_of[rows]],
-        pixels=readings.pixels[:, rows],
-        seen=readings.seen[:, rows],
-    )
-
-
 def reference_pose(q: FloatArray) -> int | None:
     """Row from which every other differs in at most one joint, or None: the pose of single-joint trials.
 

@@ -12,7 +12,7 @@ from projservo_cli.calibration.body import LEAST, Alignment, merge
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.optimization import Fit, Problem, Weighting, fixed, minimize, prepare
 from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected
-from projservo_cli.calibration.readings import Readings, of_markers, of_poses
+from projservo_cli.calibration.readings import Readings, of_poses, restrict
 from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
 from projservo_cli.calibration.start import place, rotation_axes
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
@@ -263,7 +263,7 @@ def determined(solution: Solution) -> tuple[Solution, BoolArray]:
         return solution, keep
     rows = keep[readings.marker_of]
     lens = scene.lens is not None
-    smaller = prepare(of_markers(readings, keep), problem.q_reference, lens)
+    smaller = prepare(restrict(readings, keep), problem.q_reference, lens)
     scene = Scene(scene.P, scene.H_hat, scene.M[keep], scene.lens)
     used = agreement.used[:, rows]
     dof = degrees_of_freedom(smaller, scene, used)
