@@ -121,7 +121,7 @@ def calibrate(
                 solution = distortion.with_lens(solution, frame, epipolar)
                 epipolar = distortion.straight_epipolar(solution, rng)
                 expected = expect(epipolar.sigma_px)
-            result = _refined(readings, epipolar, solution, expected, frame)
+            result = _refined(solution, epipolar, expected, frame)
             result = dataclasses.replace(result, advice=(*result.advice, *([note] if note else [])))
         elif method == "linear":
             result = _linear(readings, epipolar, expected)
@@ -133,17 +133,15 @@ def calibrate(
     return dataclasses.replace(result, source=source, seconds=seconds)
 
 
-def _refined(
-    readings: Readings, epipolar: Epipolar, solution: Solution, expected: Expected, frame: Frame
-) -> Calibration:
+def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Frame) -> Calibration:
     """Record of the maximum likelihood in its projective frame, with its covariance."""
-    share = distortion.share_explained(solution, frame) if solution.scene.lens is None else 0.0
-    solution, kept = determined(solution)
+    share = distortion.share_explained(whole, frame) if whole.scene.lens is None else 0.0
+    solution, kept = determined(whole)
     refusal = expected.refusal(solution.agreement)
     if refusal is not None:
         raise WorkFailed(refusal + distortion.hint(share))
     problem, scene, agreement = solution.problem, solution.scene, solution.agreement
-    everything, readings = readings, problem.readings
+    readings = problem.readings
     found = culprits.find(problem, scene, agreement.used, agreement.sigma_px)
     straight = distortion.straight_readings(readings, scene.lens)
     try:
@@ -171,7 +169,7 @@ def _refined(
     spread = reach.all_spreads(record.model(), result.M, factor, reach.surroundings(readings))
     worst = worst_determined(problem, scene, adjusted, spread, expected.noise_px(agreement))
     record = dataclasses.replace(record, advice=advice, worst_determined=worst)
-    return record if kept.all() else with_lost_markers(record, everything, kept)
+    return record if kept.all() else with_lost_markers(record, whole.problem.readings, kept)
 
 
 def _projective(problem: Problem, scene: Scene) -> ProjectiveScene:

@@ -38,6 +38,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     given = law_names(options["laws"])
     from projservo_cli.cli.configuration import resolve
     from projservo_cli.cli.suggested import require_covariance, suggested
+    from projservo_cli.files import require_writable
     from projservo_cli.stages.chain import steps_for
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
@@ -51,6 +52,8 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         return _dry(call, as_json=options["json"])
     require_named(config, steps, names)
     require_asked(options, config, steps)
+    if any(step.why for step in steps):
+        require_writable(stored.path)
     try:
         with _compilation(call):
             _work(call, options)
@@ -112,12 +115,7 @@ def _keep_configuration(call: _Call) -> None:
 
 def _compilation(call: _Call) -> AbstractContextManager[None]:
     """The first run on a machine is slower by the time of compilation; say so, and use both processors."""
-    from projservo_cli.files import require_writable
-
-    if not any(step.why for step in call.steps):
-        return nullcontext()
-    require_writable(call.run.path)
-    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+    if not any(step.why for step in call.steps) or os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         return nullcontext()
     from projservo_cli.geometry.jit import CACHE_FOLDER
 

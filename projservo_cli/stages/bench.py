@@ -8,6 +8,7 @@ import importlib.util
 import itertools
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -149,7 +150,7 @@ def measure(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
     whole = case.whole_run()
     timed: dict[str, tuple[Callable[[], object], int]] = {
         "numpy.linalg.svd": (lambda: [np.linalg.svd(next(matrices)) for _ in range(PIECE)], PIECE),
-        **{law: (lambda law=law: case.steps(law), STATES) for law in LAWS},  # type: ignore[misc]
+        **{law: (partial(case.steps, law), STATES) for law in LAWS},
         BODY: (lambda: case.steps("exact", body=True), STATES),
         "one call from Python": (lambda: [case.one_step() for _ in range(PIECE)], PIECE),
         "run of 150 steps": (lambda: run_loop(*whole), 1),

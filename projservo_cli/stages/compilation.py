@@ -12,10 +12,10 @@ from contextlib import contextmanager
 import numpy as np
 
 from projservo_cli.records import NO_LENS, Model
-from projservo_cli.task.margins import Reaching, within
+from projservo_cli.task.margins import CONSTRAINTS, Reaching, within
 from projservo_cli.task.planning import along
 
-JOINTS, FACE = 6, 4
+JOINTS = 6
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def compiling_beside() -> Iterator[None]:
 
 def compile_path() -> None:
     """Follow a path of no meaning, with arrays of the types that every task has."""
-    H_hat = np.tile(np.diag([0.0, 0.0, 0.0, 0.0]), (JOINTS, 1, 1))
+    H_hat = np.zeros((JOINTS, 4, 4))
     types = np.zeros(JOINTS, dtype=np.int64)
     a_inf = np.array([0.0, 0.0, 0.0, 1.0])
     P = np.tile(np.eye(3, 4), (2, 1, 1))
@@ -46,7 +46,7 @@ def compile_path() -> None:
     A = np.array([[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0], [0.0, 1.0, 2.0, 1.0]])
     O = np.tile(a_inf, (2, 1))
     reaching = Reaching(
-        model, demands, H_hat[:3].copy(), np.zeros(3), A, a_inf, O, np.zeros(JOINTS), np.ones(FACE)
+        model, demands, H_hat[:3], np.zeros(3), A, a_inf, O, np.zeros(JOINTS), np.ones(len(CONSTRAINTS))
     )
     along(reaching, np.zeros((2, 3)))
 
