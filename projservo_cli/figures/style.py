@@ -116,7 +116,7 @@ def arrange(figure: "Figure") -> None:
         engine.execute(figure)
         for axes in images:
             _equal_scales(axes)
-    figure.set_layout_engine("none")
+    figure.set_layout_engine()  # with an engine, even one that does nothing, saving draws twice
 
 
 def _equal_scales(axes: "Axes") -> None:

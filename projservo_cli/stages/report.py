@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from projservo_cli import provenance
-from projservo_cli.columns import to_csv
 from projservo_cli.config import load_config
-from projservo_cli.figures import FIGURES, FigureSpec, style
 from projservo_cli.figures.drift import converged, drift_rows, table
 from projservo_cli.figures.material import DIRECT, Fit, Material, Studies
 from projservo_cli.files import replacing
@@ -19,6 +17,7 @@ from projservo_cli.records import Report, WorkFailed
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task
 from projservo_cli.stages.claims import claims_of
+from projservo_cli.stages.drawing import draw_all, drawing_beside
 from projservo_cli.stages.studies import (
     LAMBDAS,
     STEP_LIMIT_DEG,
@@ -35,8 +34,6 @@ if TYPE_CHECKING:
     from projservo_cli.store import Run
 
 DEPENDS_ON = ("report",)
-FOLDER = "figures"
-NUMBERS = "csv"  # what is drawn, beside each figure
 CLAIMS_FILE = "claims.json"
 
 
@@ -56,13 +53,15 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     """
     config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
+    formats = config.report.formats
     if not has_task(config):
         fit = Fit(run.calibration, run.observation, held_out=run.cross_validation)
-        written = draw_all(fit, directory, config.report.formats, left_out, progress)
+        written = draw_all(fit, directory, formats, left_out, progress)
         return _told(_record(None, None, tuple(written), tuple(left_out), ()), run, directory)
-    bench = bench_of(config, run.calibration.model(), run.plan)
-    material = material_of(run, bench, left_out, progress)
-    written = draw_all(material, directory, config.report.formats, left_out, progress)
+    with drawing_beside() as beside:
+        bench = bench_of(config, run.calibration.model(), run.plan)
+        material = material_of(run, bench, left_out, progress)
+        written = draw_all(material, directory, formats, left_out, progress, beside)
     eq22 = _composition(bench, config, left_out)
     claims = tuple(claim.row() for claim in claims_of(material, eq22))
     return _told(_record(material.studies, eq22, tuple(written), tuple(left_out), claims), run, directory)
@@ -117,89 +116,6 @@ def _composition(
         left_out.append({"what": "equation (22)", "reason": " ".join(str(error).split())})
         return None
     return np.array(LAMBDAS), distance
-
-
-def draw_all(
-    material: Fit,
-    directory: Path,
-    formats: tuple[str, ...],
-    left_out: list[dict[str, str]],
-    progress: Progress = silent,
-) -> list[str]:
-    """Draw every figure that the material supports, in all formats; the others are named with the reason.
-
-    Files of figures that are left out now, from an earlier report, are removed.
-
-    Returns
-    -------
-    Files written, relative to the folder.
-    """
-    written: list[str] = []
-    with style.styled():
-        for done, spec in enumerate(FIGURES):
-            progress("figures", done, len(FIGURES))
-            reason = lacking(spec, material)
-            if reason:
-                left_out.append({"what": spec.name, "reason": reason})
-            partial = partly(spec, material)
-            if partial and not reason:
-                left_out.append({"what": f"{spec.name}, in part", "reason": partial})
-            written += _draw(spec, material, directory, () if reason else formats)
-    progress("figures", len(FIGURES), len(FIGURES))
-    return written
-
-
-def lacking(spec: FigureSpec, material: Fit) -> str:
-    """Why a figure cannot be drawn; empty where it can."""
-    if not spec.task:
-        return ""
-    if not isinstance(material, Material):
-        return "the run holds a calibration and no task: set robot, rig, markers and task"
-    missing = _without_run(spec, material)
-    if missing and (not spec.any_law or len(missing) == len(spec.laws)):
-        return f"no run of {', '.join(missing)} with a step to show; make it: projservo servo report"
-    if spec.studies and material.studies is None:
-        return f"the extra runs could not be made: {material.no_studies}"
-    if spec.goal and not _goal_known(material):
-        return "the pose of the goal is unknown, only its images are"
-    return ""
-
-
-def partly(spec: FigureSpec, material: Fit) -> str:
-    """What a figure that can be drawn is without; empty where it is whole."""
-    missing = _without_run(spec, material) if isinstance(material, Material) else []
-    return f"without {', '.join(missing)}: no run of it with a step to show" if missing else ""
-
-
-def _without_run(spec: FigureSpec, material: Material) -> list[str]:
-    return [law for law in spec.laws if law not in material.traces or material.traces[law].steps < 1]
-
-
-def _goal_known(material: Material) -> bool:
-    studies = material.studies
-    traces = [*material.traces.values(), *(studies.own.values() if studies is not None else ())]
-    return bool(traces) and all(np.isfinite(trace.goal_pose).all() for trace in traces)
-
-
-def _draw(spec: FigureSpec, material: Fit, directory: Path, formats: tuple[str, ...]) -> list[str]:
-    """Write one figure in the formats asked for, with its numbers, and remove it in all others."""
-    folder = directory / FOLDER
-    kinds = (*formats, NUMBERS) if formats else ()
-    for kind in (*style.FORMATS, NUMBERS):
-        if kind not in kinds:
-            (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
-    if not formats:
-        return []
-    data = spec.data(material)
-    with replacing(folder / f"{spec.name}.{NUMBERS}") as path:
-        path.write_text(to_csv(data), encoding="utf-8")
-    figure = style.new_figure(spec.height)
-    spec.draw(data, figure)
-    style.arrange(figure)
-    for kind in formats:
-        with replacing(folder / f"{spec.name}.{kind}") as path:
-            style.save(figure, path, kind)
-    return [f"{FOLDER}/{spec.name}.{kind}" for kind in formats]
 
 
 def _record(

@@ -8,7 +8,7 @@ from projservo_cli.config import to_yaml
 from projservo_cli.figures import FIGURES
 from projservo_cli.figures.material import DIRECT
 from projservo_cli.records import InputError, Report, WorkFailed
-from projservo_cli.stages import report, studies
+from projservo_cli.stages import drawing, report, studies
 from projservo_cli.stages.claims import claims_of
 from projservo_cli.stages.claims.claim import listed
 from projservo_cli.stages.claims.control import decay_ranges
@@ -58,7 +58,7 @@ def stored(tmp_path, material, *overrides):
 @pytest.mark.usefixtures("few")
 def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatch):
     specs = tuple(BY_NAME[name] for name in ("fig01_partition", "fig04_classical", "fig08_drift"))
-    monkeypatch.setattr(report, "FIGURES", specs)
+    monkeypatch.setattr(drawing, "FIGURES", specs)
     material = changed(case()[2], stacked=None, blockwise=None, euclidean_points=None)
     stale = tmp_path / "figures" / "fig04_classical.svg"
     stale.parent.mkdir()
@@ -73,7 +73,7 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     for name in record.figures:
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
     assert [entry["what"] for entry in record.left_out] == ["fig04_classical"]
-    assert steps[-1] == ("figures", 3, 3)
+    assert steps[-1] == ("figures", 2, 2)
     content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
     assert content["claims"] == list(record.claims)
     assert len(content["drift"]) == 2 * 2 * 2 * len(GAINS)
@@ -86,38 +86,38 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
 def test_every_figure_is_supported_by_a_whole_run():
     material = case()[2]
     for spec in FIGURES:
-        assert report.lacking(spec, material) == ""
-        assert report.partly(spec, material) == ""
+        assert drawing.lacking(spec, material) == ""
+        assert drawing.partly(spec, material) == ""
 
 
 @pytest.mark.parametrize("law", DIRECT)
 def test_a_figure_of_both_laws_needs_both(law):
     material = changed(case()[2], **{law: None})
-    assert law in report.lacking(BY_NAME["fig07_three_two"], material)
-    assert report.lacking(BY_NAME["fig01_partition"], material) == ""
+    assert law in drawing.lacking(BY_NAME["fig07_three_two"], material)
+    assert drawing.lacking(BY_NAME["fig01_partition"], material) == ""
 
 
 def test_a_missing_classical_law_is_named_and_the_others_are_drawn():
     material = changed(case()[2], blockwise=None)
     spec = BY_NAME["fig04_classical"]
-    assert report.lacking(spec, material) == ""
-    assert "blockwise" in report.partly(spec, material)
+    assert drawing.lacking(spec, material) == ""
+    assert "blockwise" in drawing.partly(spec, material)
 
 
 def test_a_run_without_a_step_has_nothing_to_show():
     material = case()[2]
     material = changed(material, direct_three=short(material.traces["direct_three"], 0))
-    assert "direct_three" in report.lacking(BY_NAME["fig11_image_errors"], material)
+    assert "direct_three" in drawing.lacking(BY_NAME["fig11_image_errors"], material)
 
 
 def test_a_run_that_ended_after_three_steps_is_drawn(tmp_path, monkeypatch):
     of_traces = tuple(spec for spec in FIGURES if spec.laws)
-    monkeypatch.setattr(report, "FIGURES", of_traces)
+    monkeypatch.setattr(drawing, "FIGURES", of_traces)
     material = case()[2]
     cut = {law: short(trace, 3) for law, trace in material.traces.items()}
     material = changed(material, **cut)
     left_out = []
-    written = report.draw_all(material, tmp_path, ("svg",), left_out)
+    written = drawing.draw_all(material, tmp_path, ("svg",), left_out)
     assert len(written) == len(of_traces) >= 3
     assert left_out == []
     assert any(claim.claim.startswith("No self-occlusion") for claim in claims_of(material, None))
@@ -148,9 +148,9 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
         ),
     )
     for spec in FIGURES:
-        assert ("pose of the goal is unknown" in report.lacking(spec, material)) == spec.goal
-    monkeypatch.setattr(report, "FIGURES", (BY_NAME["fig03_scene"], BY_NAME["fig12_joints"]))
-    assert len(report.draw_all(material, tmp_path, ("svg",), [])) == 2
+        assert ("pose of the goal is unknown" in drawing.lacking(spec, material)) == spec.goal
+    monkeypatch.setattr(drawing, "FIGURES", (BY_NAME["fig03_scene"], BY_NAME["fig12_joints"]))
+    assert len(drawing.draw_all(material, tmp_path, ("svg",), [])) == 2
     rows = [claim.row() for claim in claims_of(material, None)]
     json.dumps(rows, allow_nan=False)
     assert not any("drift" in row["claim"] or "nan" in row["measured"] for row in rows)
@@ -171,7 +171,7 @@ def test_failed_studies_are_named_and_their_figures_left_out(tmp_path, monkeypat
     assert made.studies is None
     assert left_out == [{"what": "studies", "reason": "the task cannot be partitioned"}]
     for spec in FIGURES:
-        assert ("cannot be partitioned" in report.lacking(spec, made)) == spec.studies
+        assert ("cannot be partitioned" in drawing.lacking(spec, made)) == spec.studies
     record = report._record(None, None, (), (), ())
     assert report.drift_rows(record) == []
 
@@ -317,7 +317,7 @@ class TestWholeTask:
     def test_all_figures_are_drawn_from_a_whole_run(self, name, tmp_path):
         material = case(name, 2000, whole=True)[2]
         left_out = []
-        written = report.draw_all(material, tmp_path, ("svg",), left_out)
+        written = drawing.draw_all(material, tmp_path, ("svg",), left_out)
         assert left_out == []
         assert len(written) == len(FIGURES)
 
