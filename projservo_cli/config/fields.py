@@ -34,8 +34,8 @@ class Section(BaseModel):
 class JointVector(Section):
     """Joint readings; ``unit`` is that of the revolute joints, prismatic ones are in metres."""
 
-    joints: tuple[Number, ...] = Field(min_length=1)
-    unit: Literal["deg", "rad"]
+    joints: tuple[Number, ...] = Field(min_length=1, description="a reading for each joint, base to tool")
+    unit: Literal["deg", "rad"] = Field(description="unit of the revolute joints")
 
     def values(self, joint_types: str) -> tuple[float, ...]:
         """Readings in rad (R) and m (P), one for each letter of ``joint_types``.

@@ -26,91 +26,136 @@ Profile = Literal[
 class Noise(Section):
     """Standard deviation of simulated pixel noise, per coordinate."""
 
-    calibration_px: NotNegative = 0.5
-    servo_px: NotNegative = 0.0
+    calibration_px: NotNegative = Field(0.5, description="in the images of trial motions")
+    servo_px: NotNegative = Field(0.0, description="in the images of the closed loop")
 
 
 class CalibrationSettings(Section):
     """Trial motions of one joint each around a reference, and the method that evaluates them."""
 
-    method: Literal["refined", "linear", "closed_form"] = "refined"
-    frames_per_joint: Annotated[int, Strict(), Field(ge=0, le=10_000)] = 8
-    amplitude_deg: Annotated[float, Strict(), Field(ge=0, lt=180, allow_inf_nan=False)] = 30.0
-    amplitude_m: NotNegative = 0.15
-    reference: JointVector | None = None
-    cross_validate: Annotated[int, Strict(), Field(ge=2, le=10_000)] | None = None
-    init: Annotated[str, StringConstraints(min_length=1)] | None = None
-    lens: Annotated[bool, Strict()] = False
+    method: Literal["refined", "linear", "closed_form"] = Field(
+        "refined", description="bundle adjustment; linear multi-frame; the paper's closed forms"
+    )
+    frames_per_joint: Annotated[int, Strict(), Field(ge=0, le=10_000)] = Field(
+        8, description="trial poses of each joint, beside the reference"
+    )
+    amplitude_deg: Annotated[float, Strict(), Field(ge=0, lt=180, allow_inf_nan=False)] = Field(
+        30.0, description="farthest trial to each side, revolute joints"
+    )
+    amplitude_m: NotNegative = Field(0.15, description="farthest trial to each side, prismatic joints")
+    reference: JointVector | None = Field(
+        None, description="joint readings at the reference pose; null for those of task.start"
+    )
+    cross_validate: Annotated[int, Strict(), Field(ge=2, le=10_000)] | None = Field(
+        None, description="parts into which poses are divided to predict each from the others; null for none"
+    )
+    init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+        None, description="JSON file of a robot and rig known beforehand, tried first as a start"
+    )
+    lens: Annotated[bool, Strict()] = Field(
+        False, description="whether to estimate two coefficients of radial distortion a camera"
+    )
 
 
 class Data(Section):
     """A recorded run: the observation table that stands in for simulated trial motions."""
 
-    table: Annotated[str, StringConstraints(min_length=1)]
-    joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = None
-    joint_unit: Literal["deg", "rad"] | None = None  # None: rad, unless readings look like degrees
-    noise_px: Positive | None = None
-    image_size_px: tuple[Count, Count] | None = None
+    table: Annotated[str, StringConstraints(min_length=1)] = Field(
+        description="file of the table, relative to the configuration"
+    )
+    joints: Annotated[str, StringConstraints(pattern=r"^[RrPp]+$"), AfterValidator(str.upper)] | None = Field(
+        None, description="one letter a column q1 ... qN, R or P; null for those of robot, else all R"
+    )
+    joint_unit: Literal["deg", "rad"] | None = Field(
+        None, description="unit of revolute joints; null for rad, unless readings look like degrees"
+    )
+    noise_px: Positive | None = Field(None, description="pixel noise per coordinate; null to estimate it")
+    image_size_px: tuple[Count, Count] | None = Field(
+        None, description="width and height of the images; null for that of rig, else from the readings"
+    )
 
 
 class Perturbation(Section):
     """A small displacement of the goal pose, in the tool frame."""
 
-    translation_m: Vector3 = (0.0, 0.0, 0.0)
-    rotation_rad: Vector3 = (0.0, 0.0, 0.0)
+    translation_m: Vector3 = Field((0.0, 0.0, 0.0), description="along the axes of the tool")
+    rotation_rad: Vector3 = Field((0.0, 0.0, 0.0), description="rotation vector in the axes of the tool")
 
 
 class GoalImages(Section):
     """Pixels of the face at the goal, in the order of ``markers.face``."""
 
-    left: tuple[Vector2, ...]
-    right: tuple[Vector2, ...]
+    left: tuple[Vector2, ...] = Field(description="u and v of each marker in the left image, px")
+    right: tuple[Vector2, ...] = Field(description="u and v of each marker in the right image, px")
 
 
 class Goal(Section):
     """The goal: joint readings, a turn about the rig's roll axis, or the face's goal images."""
 
-    joints: JointVector | None = None
-    turn_deg: Annotated[float, Strict(), Field(ge=-360, le=360, allow_inf_nan=False)] | None = None
-    perturbation: Perturbation | None = None
-    images: GoalImages | None = None
+    joints: JointVector | None = Field(None, description="joint readings at the goal")
+    turn_deg: Annotated[float, Strict(), Field(ge=-360, le=360, allow_inf_nan=False)] | None = Field(
+        None, description="turn from the start about the roll axis of the rig"
+    )
+    perturbation: Perturbation | None = Field(
+        None, description="small displacement of a goal given by turn_deg, in the tool frame"
+    )
+    images: GoalImages | None = Field(None, description="pixels of the face, recorded at the goal")
 
 
 class Task(Section):
     """A reaching task from ``start`` to ``goal``."""
 
-    start: JointVector
+    start: JointVector = Field(description="joint readings at the start")
     goal: Goal
 
 
 class Trajectory(Section):
     """How the planned motion is spread over σ in [0, 1], and what the profile ``constrained`` keeps to."""
 
-    profile: Profile = "linear"
-    delta: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = 0.9
-    samples: Annotated[int, Strict(), Field(ge=2, le=100_001)] = 101
-    border_px: NotNegative = 5.0
-    least_condition: Annotated[float, Strict(), Field(ge=0, lt=1, allow_inf_nan=False)] = 0.001
+    profile: Profile = Field("linear", description="which part is driven when")
+    delta: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = Field(
+        0.9, description="share of the translation at which visibility changes that is kept to"
+    )
+    samples: Annotated[int, Strict(), Field(ge=2, le=100_001)] = Field(
+        101, description="points of the path that are stored"
+    )
+    border_px: NotNegative = Field(
+        5.0, description="in the profile constrained: least distance of a marker from the border of an image"
+    )
+    least_condition: Annotated[float, Strict(), Field(ge=0, lt=1, allow_inf_nan=False)] = Field(
+        0.001,
+        description="in the profile constrained: least reciprocal condition of the face's image Jacobian",
+    )
 
 
 class Control(Section):
     """The laws to run, their gains in 1/s, and how fast the joints may move."""
 
     laws: tuple[Law, ...] = Field(
-        ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"), min_length=1
+        ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"),
+        min_length=1,
+        description="laws to run, each from the start; module:Class for a law of yours",
     )
-    must_converge: tuple[Law, ...] = ("direct_three", "direct_two")
-    period_s: Positive = 0.04
-    gain_t: Positive = 2.5
-    gain_r: Positive = 2.5
-    gain_p: Positive = 2.5
-    gain_s: Positive = 2.5
-    ratio_rp: Positive = 1.0
-    gain: Positive = 2.5
-    joint_speed_limit_deg_s: Positive | None = 125.0
-    prismatic_speed_limit_m_s: Positive | None = None
-    substeps: Literal["none", "auto"] = "auto"
-    observation: Literal["points", "body"] | None = None  # None: body, if the calibration is usable
+    must_converge: tuple[Law, ...] = Field(
+        ("direct_three", "direct_two"), description="laws whose failure is that of the call, exit code 1"
+    )
+    period_s: Positive = Field(0.04, description="control period")
+    gain_t: Positive = Field(2.5, description="gain of the translation, 1/s")
+    gain_r: Positive = Field(2.5, description="gain of the rotation onto the plane, 1/s")
+    gain_p: Positive = Field(2.5, description="gain of the rotation within the plane, 1/s")
+    gain_s: Positive = Field(2.5, description="gain of both rotations as one, in direct_two and exact, 1/s")
+    ratio_rp: Positive = Field(1.0, description="λ_r/λ_p, how direct_two composes both rotations into one")
+    gain: Positive = Field(2.5, description="gain of the classical laws, 1/s")
+    joint_speed_limit_deg_s: Positive | None = Field(125.0, description="of revolute joints; null for none")
+    prismatic_speed_limit_m_s: Positive | None = Field(None, description="of prismatic joints; null for none")
+    substeps: Literal["none", "auto"] = Field(
+        "auto", description="whether the law exact sends long steps in parts"
+    )
+    observation: Literal["points", "body"] | None = Field(
+        None,
+        description="what direct laws measure with: the face's points or all visible markers; "
+        "null for body where the calibration is usable",
+    )
 
 
 class PlantSettings(Section):
@@ -120,31 +165,49 @@ class PlantSettings(Section):
     such a robot is never sent beyond its joint limits.
     """
 
-    use: PlantClass | None = None
-    options: Options = Options()
-    timeout_s: Positive = 1.0
-    speed_scale: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = 1.0
-    self_occlusion: Literal["transparent", "opaque"] = "transparent"
-    joint_limits: Literal["report", "stop"] = "report"
-    image_border: Literal["report", "stop"] = "report"
+    use: PlantClass | None = Field(
+        None, description="class of a robot of yours, module:Class; null for the simulated one"
+    )
+    options: Options = Field(Options(), description="arguments that the class is made with")
+    timeout_s: Positive = Field(1.0, description="most time an answer of the robot may take")
+    speed_scale: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = Field(
+        1.0, description="factor of every command to the robot"
+    )
+    self_occlusion: Literal["transparent", "opaque"] = Field(
+        "transparent", description="whether the face hides its markers from a camera behind it"
+    )
+    joint_limits: Literal["report", "stop"] = Field(
+        "report", description="whether a joint limit is noted or ends the run"
+    )
+    image_border: Literal["report", "stop"] = Field(
+        "report", description="whether a marker beyond the image is noted or ends the run"
+    )
 
 
 class Stop(Section):
     """When a closed loop ends."""
 
-    image_px: Positive = 0.01
-    noise_factor: NotNegative = 2.0
-    max_steps: Count = 2000
-    diverged_factor: Annotated[float, Strict(), Field(gt=1, allow_inf_nan=False)] = 10.0
-    plateau_steps: Count = 20
-    lost_steps: Whole = 25
-    innovation_factor: NotNegative = 1.0
+    image_px: Positive = Field(0.01, description="converged within this image error, rms")
+    noise_factor: NotNegative = Field(2.0, description="widens image_px by so many times noise.servo_px")
+    max_steps: Count = Field(2000, description="commands after which a run ends")
+    diverged_factor: Annotated[float, Strict(), Field(gt=1, allow_inf_nan=False)] = Field(
+        10.0, description="diverged where the image error or the distance grows so many times"
+    )
+    plateau_steps: Count = Field(20, description="stands still where the error falls < 1 % in so many steps")
+    lost_steps: Whole = Field(25, description="periods for which lost markers are waited for")
+    innovation_factor: NotNegative = Field(
+        1.0,
+        description="a robot of yours is disturbed where images are off the prediction by more than chance "
+        "and so many times the noise; 0 tests nothing",
+    )
 
 
 class ReportSettings(Section):
     """What the report writes."""
 
-    formats: tuple[Literal["svg", "pdf", "png"], ...] = Field(("svg", "pdf", "png"), min_length=1)
+    formats: tuple[Literal["svg", "pdf", "png"], ...] = Field(
+        ("svg", "pdf", "png"), min_length=1, description="files of each figure"
+    )
 
 
 def _folder_name(name: str) -> str:
@@ -160,8 +223,10 @@ class Config(Section):
     far as the stages asked for do without them.
     """
 
-    name: Annotated[str, StringConstraints(max_length=100), AfterValidator(_folder_name)]
-    seed: Whole = 0
+    name: Annotated[str, StringConstraints(max_length=100), AfterValidator(_folder_name)] = Field(
+        description="of the run and its folder; by default that of the file"
+    )
+    seed: Whole = Field(0, description="of all random numbers; the same seed gives the same run")
     robot: Robot | None = None
     rig: Rig | None = None
     markers: Markers | None = None

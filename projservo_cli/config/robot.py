@@ -23,11 +23,11 @@ from projservo_cli.config.fields import (
 class Joint(Section):
     """What joints have in common: a type, perhaps a name, perhaps limits."""
 
-    type: JointType
-    name: str | None = None
-    limits_deg: Vector2 | None = None
-    limits_rad: Vector2 | None = None
-    limits_m: Vector2 | None = None
+    type: JointType = Field(description="R revolute, P prismatic")
+    name: str | None = Field(None, description="for messages and figures")
+    limits_deg: Vector2 | None = Field(None, description="lowest and highest reading of a revolute joint")
+    limits_rad: Vector2 | None = Field(None, description="the same in rad")
+    limits_m: Vector2 | None = Field(None, description="lowest and highest reading of a prismatic joint")
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -40,41 +40,41 @@ class Joint(Section):
 class DHJoint(Joint):
     """A row of a Denavit-Hartenberg table; the joint reading adds to theta (R) or d (P)."""
 
-    theta_deg: Number = 0.0
-    d_m: Number = 0.0
-    a_m: Number = 0.0
-    alpha_deg: Number = 0.0
+    theta_deg: Number = Field(0.0, description="turn about z")
+    d_m: Number = Field(0.0, description="shift along z")
+    a_m: Number = Field(0.0, description="shift along x")
+    alpha_deg: Number = Field(0.0, description="turn about x")
 
 
 class ScrewJoint(Joint):
     """A spatial twist (w, v) in the base frame at the reference, per rad or per m."""
 
-    w: Vector3
-    v: Vector3
+    w: Vector3 = Field(description="unit axis of a revolute joint, zero for a prismatic one")
+    v: Vector3 = Field(description="-w × a point of the axis, m; unit direction of a prismatic joint")
 
 
 class DH(Section):
     """A Denavit-Hartenberg table, standard or modified (Craig)."""
 
-    convention: Literal["standard", "modified"] = "standard"
-    joints: tuple[DHJoint, ...] = Field(min_length=1, max_length=64)
-    tool: Matrix44 = IDENTITY
+    convention: Literal["standard", "modified"] = Field("standard", description="of the table")
+    joints: tuple[DHJoint, ...] = Field(min_length=1, max_length=64, description="rows, base to tool")
+    tool: Matrix44 = Field(IDENTITY, description="pose of the tool in the last joint's frame, m")
 
 
 class Screws(Section):
     """Joint screws at a reference: T(q) = Π exp(screw_i (q_i − reference_i)) · base_tool."""
 
-    reference: JointVector
-    base_tool: Matrix44
-    joints: tuple[ScrewJoint, ...] = Field(min_length=1, max_length=64)
+    reference: JointVector = Field(description="joint readings at which the screws hold")
+    base_tool: Matrix44 = Field(description="pose of the tool in the base frame there, m")
+    joints: tuple[ScrewJoint, ...] = Field(min_length=1, max_length=64, description="screws, base to tool")
 
 
 class Robot(Section):
     """A serial arm, given by a DH table or by screws."""
 
-    name: str = ""
-    dh: DH | None = None
-    screws: Screws | None = None
+    name: str = Field("", description="for figures and reports")
+    dh: DH | None = Field(None, description="a Denavit-Hartenberg table")
+    screws: Screws | None = Field(None, description="joint screws at a reference, instead of dh")
 
     @property
     def joints(self) -> tuple[Joint, ...]:
@@ -95,29 +95,35 @@ class Robot(Section):
 class Camera(Section):
     """A pinhole camera: a 3×4 matrix from the base frame to pixels, or a look-at description."""
 
-    matrix: Matrix34 | None = None
-    focal_px: tuple[Positive, Positive] | None = None
-    principal_point_px: Vector2 | None = None
-    position_m: Vector3 | None = None
-    target_m: Vector3 | None = None
-    up: Vector3 = (0.0, 0.0, 1.0)
+    matrix: Matrix34 | None = Field(None, description="3×4 matrix from the base frame, m, to pixels")
+    focal_px: tuple[Positive, Positive] | None = Field(None, description="focal lengths along u and v")
+    principal_point_px: Vector2 | None = Field(None, description="where the optical axis meets the image")
+    position_m: Vector3 | None = Field(None, description="optical centre in the base frame")
+    target_m: Vector3 | None = Field(None, description="point that the camera looks at")
+    up: Vector3 = Field((0.0, 0.0, 1.0), description="direction that is up in the image")
 
 
 class Rig(Section):
     """Two cameras that look at the robot and do not move."""
 
-    image_size_px: tuple[Whole, Whole]
-    left: Camera
-    right: Camera
+    image_size_px: tuple[Whole, Whole] = Field(description="width and height")
+    left: Camera = Field(description="the left camera")
+    right: Camera = Field(description="the right camera")
 
 
 class Markers(Section):
     """Points fixed to the tool; the face is the part of them that must stay visible."""
 
-    positions_m: tuple[Vector3, ...] | None = Field(None, min_length=1, max_length=10_000)
-    numbers: tuple[Whole, ...] | None = Field(None, min_length=1)
-    face: tuple[Whole, ...] | None = Field(None, min_length=3)
-    center: Literal["midpoint"] | Whole = "midpoint"
+    positions_m: tuple[Vector3, ...] | None = Field(
+        None, min_length=1, max_length=10_000, description="in the frame of the tool"
+    )
+    numbers: tuple[Whole, ...] | None = Field(
+        None, min_length=1, description="number of each marker; null for 0, 1, 2 ..."
+    )
+    face: tuple[Whole, ...] | None = Field(
+        None, min_length=3, description="numbers of those in a plane that must stay visible"
+    )
+    center: Literal["midpoint"] | Whole = Field("midpoint", description="of the face: midpoint, or a number")
 
     @property
     def known(self) -> tuple[int, ...] | None:

@@ -83,6 +83,32 @@ def test_the_starter_speaks_of_every_key():
     assert not missing, f"say in {STARTER.name} what they mean"
 
 
+def unexplained(model):
+    """Keys without a description, by model; a key that holds a section has that of the section."""
+    for name, field in model.model_fields.items():
+        inner = inner_models(field.annotation)
+        if not field.description and not any(part.__doc__ for part in inner):
+            yield f"{model.__name__}.{name}"
+        for part in inner:
+            yield from unexplained(part)
+
+
+def test_every_key_says_what_it_means():
+    assert not set(unexplained(Config)), "describe them: Field(default, description=...)"
+
+
+def test_editors_are_told_what_a_key_means():
+    schema = json_schema()
+    objects = {"Config": schema, **schema["$defs"]}
+    silent = [
+        f"{name}.{key}"
+        for name, value in objects.items()
+        for key, inner in value.get("properties", {}).items()
+        if "description" not in inner and "$ref" not in str(inner)
+    ]
+    assert silent == ["Config.law"]  # the short form of control.laws
+
+
 def test_the_starter_loads_and_what_it_calls_defaults_are_defaults():
     text = STARTER.read_text(encoding="utf-8")
     spelled = re.sub(r"^( *)# (\w+: .*)$", lambda m: m[1] + m[2], text, flags=re.MULTILINE)
