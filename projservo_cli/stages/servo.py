@@ -1,5 +1,6 @@
 """Stage servo: one control law in closed loop with the simulated robot, to its verdict."""
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,7 +51,9 @@ DEPENDS_ON = (
 
 def gains_of(config: "Config") -> Gains:
     """Gains and limits of the laws."""
-    c = config.control
+    c, joints = config.control, joints_of(config)
+    endless = np.full(len(joints.types), math.inf)
+    stop = config.plant.joint_limits == "stop"
     return Gains(
         c.gain_t,
         c.gain_r,
@@ -60,22 +63,26 @@ def gains_of(config: "Config") -> Gains:
         c.gain,
         c.period_s,
         config.trajectory.delta,
-        joints_of(config).speed,
+        joints.speed,
         c.substeps == "auto",
+        joints.lower if stop else -endless,
+        joints.upper if stop else endless,
     )
 
 
 def limits_of(config: "Config") -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
+    noise_px = config.stop.noise_factor * config.noise.servo_px
     return Limits(
         joints_of(config).speed,
-        config.stop.image_px + config.stop.noise_factor * config.noise.servo_px,
+        config.stop.image_px + noise_px,
         config.stop.diverged_factor,
         config.stop.plateau_steps,
         config.stop.max_steps,
         config.plant.joint_limits == "stop",
         config.plant.image_border == "stop",
         config.stop.lost_steps,
+        noise_px,
     )
 
 
