@@ -14,10 +14,11 @@ from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.stages import driven
+from projservo_cli.stages.disturbed import disturbance_of, lose_markers
 from projservo_cli.stages.laws import law_for
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.reach import reach_for
-from projservo_cli.stages.sight import Sight, sight_of
+from projservo_cli.stages.sight import Sight, known_pins, sight_of
 from projservo_cli.stages.traces import Outcome, known, record_of, unknown
 from projservo_cli.stages.truth import (
     PIN_NOISE,
@@ -45,6 +46,7 @@ DEPENDS_ON = (
     "trajectory.delta",
     "control",
     "plant",
+    "disturbance",
     "stop",
 )
 
@@ -107,8 +109,11 @@ def run(
     truth = truth_of(config)
     reach = reach_of(config, truth)
     plant = plant_of(config, truth, reach.q_start)
+    plant = plant._replace(disturbance=disturbance_of(config, len(reach.q_start)))
     sight = sight_of(config, calibration, truth, reach) if law in BODY_LAWS else None
     noise = servo_noise(config, len(truth.face), 0 if sight is None else len(sight.pins))
+    pins = [] if sight is None else known_pins(calibration, truth)
+    lose_markers(config, noise, [truth.number[i] for i in (*truth.face, *pins)])
     if law not in CODES or config.plant.speed_scale < 1.0:
         controller = law_for(config, calibration, plan, law, reach, gains, sight)
         seen = plant if sight is None else plant._replace(pins=sight.pins)
