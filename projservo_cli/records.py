@@ -174,6 +174,12 @@ class CrossValidation:
     )
 
 
+def signed(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:
+    """Joint motions (2, n) of both rotations in the sense of their angles."""
+    signs = np.where(np.array([theta_r, theta_p]) >= 0.0, 1.0, -1.0)
+    return np.asarray(signs[:, None] * q_hat)
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """A reaching task as a translation and two rotations, and the motion planned for it.
@@ -241,8 +247,7 @@ class Plan:
 
     def rotation_sense(self) -> FloatArray:
         """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
-        signs = np.where(np.array([self.theta_r, self.theta_p]) >= 0.0, 1.0, -1.0)
-        return np.asarray(signs[:, None] * self.q_hat[1:3])
+        return signed(self.theta_r, self.theta_p, self.q_hat[1:3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,12 +262,6 @@ class Trace:
     observation: str = scalar(about="how the face is measured: points or body")
     position_error_mm: float | None = scalar(units="mm", about="true centre to true goal at the end")
     rotation_error_deg: float | None = scalar(units="deg", about="true rotation to the goal at the end")
-    translation_left: float | None = scalar(
-        about="share of the translation left at the end, as the law measures it"
-    )
-    rotation_left_deg: float | None = scalar(
-        units="deg", about="rotation left at the end, as the law measures it"
-    )
     self_occluded_steps_left: int = scalar(about="instants at which the left camera is behind the face")
     self_occluded_steps_right: int = scalar(about="instants at which the right camera is behind the face")
     center_deviation_mm: float | None = scalar(
@@ -271,23 +270,20 @@ class Trace:
     center_deviation_at_samples_mm: float | None = scalar(
         units="mm", about="largest distance of the centre from the line at the sampling instants"
     )
+    path_length_mm: float | None = scalar(
+        units="mm", about="length of the path of the centre, from sample to sample"
+    )
+    effort: float = scalar(units="rad²/s or m²/s", about="integral of the squared joint velocities")
     plateau_steps: int = scalar(about="longest stretch in which the image error falls < 1 % in 20 steps")
     speed_limited_steps: int = scalar(about="commands scaled to the joint-speed limit")
     visibility_limited_steps: int = scalar(about="commands whose translation was kept within delta·tau_0")
     first_outside_image: int = scalar(about="first instant with a marker outside an image, -1 for never")
     first_beyond_limit: int = scalar(about="first instant beyond a joint limit, -1 for never")
-    limit_joint: int = scalar(
-        about="the joint, from 0, that passed its limit first or stopped the run at it, -1 for none"
-    )
+    limit_joint: int = scalar(about="the joint that passed its limit first, -1 for none")
     q: FloatArray = array("instant", "joint", units="rad or m", about="joints")
     s: FloatArray = array("instant", "view", "marker", "xy", units="px", about="measured images of the face")
     s_star: FloatArray = array("view", "marker", "xy", units="px", about="target images")
     image_error: FloatArray = array("instant", units="px", about="rms over markers and views")
-    stop_error: FloatArray = array(
-        "instant",
-        units="px",
-        about="the same by which runs end: with the body, of the face where the body was measured to be",
-    )
     tau: FloatArray = array("instant", about="translation error, unit-norm kernel of (8)")
     tau_affine: FloatArray = array("instant", about="translation error, scale fixed through a_inf")
     theta_r: FloatArray = array("instant", units="rad", about="rotation error onto the plane")
@@ -308,13 +304,6 @@ class Trace:
     pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
     goal_pose: FloatArray = array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
     center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
-    q_read: FloatArray | None = array(
-        "instant",
-        "joint",
-        units="rad or m",
-        about="joint readings, where they are not the joints",
-        default=None,
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict, StringConstraints, model_validator
 
 from projservo_cli.config.checks import problems
-from projservo_cli.config.disturbance import Disturbance
 from projservo_cli.config.fields import (
     Count,
     JointVector,
@@ -53,6 +52,7 @@ class CalibrationSettings(Section):
     init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
         None, description="JSON file of a robot and rig known beforehand, tried first as a start"
     )
+    seed: Whole | None = Field(None, description="seed of the noise of the trials; null for that of the run")
     lens: Annotated[bool, Strict()] = Field(
         False, description="whether to estimate two coefficients of radial distortion a camera"
     )
@@ -104,9 +104,15 @@ class Goal(Section):
 
 
 class Task(Section):
-    """A reaching task from ``start`` to ``goal``."""
+    """A reaching task from ``start`` to ``goal``.
+
+    ``start_offset`` moves the start alone: a goal that is a turn stays that of the start without it.
+    """
 
     start: JointVector = Field(description="joint readings at the start")
+    start_offset: JointVector | None = Field(
+        None, description="added to the start alone; the goal stays what it is without"
+    )
     goal: Goal
 
 
@@ -238,7 +244,6 @@ class Config(Section):
     trajectory: Trajectory = Trajectory()
     control: Control = Control()
     plant: PlantSettings = PlantSettings()
-    disturbance: Disturbance = Disturbance()
     stop: Stop = Stop()
     report: ReportSettings = ReportSettings()
 

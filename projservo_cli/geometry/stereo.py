@@ -8,6 +8,10 @@ from projservo_cli.geometry.algebra import Vec4, dot, meet, scale, vec
 from projservo_cli.geometry.jit import njit
 from projservo_cli.records import FloatArray, WorkFailed
 
+# Rows of a camera that are left without the first, second or third, and signs of the minors.
+_OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
+_SIGNS = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
+
 
 @njit
 def plane_of(P: FloatArray, l0: float, l1: float, l2: float) -> Vec4:
@@ -97,11 +101,10 @@ def fundamental_matrix(P: FloatArray) -> FloatArray:
     WorkFailed
         If both cameras share one centre.
     """
-    F = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            rows = np.vstack([np.delete(P[0], j, axis=0), np.delete(P[1], i, axis=0)])
-            F[i, j] = (-1.0) ** (i + j) * np.linalg.det(rows)
+    rows = np.empty((3, 3, 4, 4))
+    rows[:, :, :2] = P[0][_OTHERS]
+    rows[:, :, 2:] = P[1][_OTHERS][:, None]
+    F: FloatArray = _SIGNS * np.linalg.det(rows)
     norm = float(np.linalg.norm(F))
     if not norm > 0.0:
         raise WorkFailed("both cameras have the same centre: a stereo rig needs a baseline")

@@ -16,7 +16,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.motion import joints_of, reference_of
-from projservo_cli.stages.truth import CALIBRATION_NOISE, Truth, generator, truth_of
+from projservo_cli.stages.truth import Truth, calibration_generator, calibration_seed, truth_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -57,7 +57,7 @@ def trial_motions(config: "Config") -> FloatArray:
 def simulate(config: "Config", truth: Truth) -> Observation:
     """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
     q = trial_motions(config)
-    rng = generator(config, CALIBRATION_NOISE)
+    rng = calibration_generator(config)
     noise = config.noise.calibration_px * rng.standard_normal((len(q), 2, len(truth.number), 2))
     images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)
@@ -106,7 +106,7 @@ def run(
         folds = settings.cross_validate
         assert folds is not None
         tell = partial(progress, "cross-validation")
-        held_out.append(cross_validate(solution, noise_px, folds, config.seed, tell))
+        held_out.append(cross_validate(solution, noise_px, folds, calibration_seed(config), tell))
 
     calibration = calibrate(
         observation,
@@ -115,7 +115,7 @@ def run(
         sigma_px=sigma_px,
         source="recorded" if config.recorded else "simulated",
         image_size=image_size_of(config),
-        seed=config.seed,
+        seed=calibration_seed(config),
         lens=settings.lens,
         init=init,
         fitted=hold_out if settings.cross_validate is not None else None,

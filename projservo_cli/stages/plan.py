@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.control.law import measure, new_state
 from projservo_cli.geometry.algebra import vec
 from projservo_cli.geometry.composition import composed_angle
 from projservo_cli.geometry.displacement import as_array, as_mat
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.geometry.lens import straight_views
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed
+from projservo_cli.stages.beginning import partitioned_at_start
 from projservo_cli.stages.constrained import (
     CONSTRAINED,
     VIEWS,
@@ -19,14 +18,12 @@ from projservo_cli.stages.constrained import (
     demands_of,
     motion_of,
 )
-from projservo_cli.stages.half_turn import half_turn_sense
 from projservo_cli.stages.reach import reach_for, sight_for
 from projservo_cli.stages.sight import Sight
 from projservo_cli.stages.truth import center_index, face_numbers
-from projservo_cli.task.face import Task, center_of, face_plane, task_from_images
+from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.margins import CONSTRAINTS, Demands, Reaching
-from projservo_cli.task.partition import Parts, partition
-from projservo_cli.task.target import task_from_body
+from projservo_cli.task.partition import Parts
 from projservo_cli.task.trajectory import trajectory_displacement
 from projservo_cli.task.visibility import (
     arc_minimum,
@@ -52,9 +49,6 @@ DEPENDS_ON = (
     "control.joint_speed_limit_deg_s",
     "control.prismatic_speed_limit_m_s",
 )
-TASK_DIMENSION = 6
-# Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
-HALF_TURN_BAND = math.radians(2.0)
 
 
 def run(config: "Config", calibration: Calibration) -> Plan:
@@ -118,34 +112,9 @@ def plan_task(
     WorkFailed
         If a marker cannot be triangulated or a motion is not unique.
     """
-    if len(q_start) != TASK_DIMENSION:
-        raise WorkFailed(
-            f"the partition of a task needs a robot of six joints, this one has {len(q_start)}: "
-            "its motions are then no unique kernels"
-        )
-    m = s_start.shape[1]
-    state = new_state(len(q_start), m)
-    if sight is None:
-        task, seen = task_from_images(model, s_start, s_star, center), s_start
-    else:
-        task = task_from_body(model, sight.body, q_start, sight.s_start, sight.s_star, center, m)
-        seen = sight.s_start
-    if not measure(model, task, straight_views(model.lens, seen), q_start, state):
-        raise WorkFailed(
-            "the face cannot be triangulated at the start: both cameras must see all its markers"
-        )
-    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
-    if not parts.found:
-        raise WorkFailed(
-            "the joint motion of the task is not unique at the start: the robot is near a singularity "
-            "or moves the face in fewer than six ways"
-        )
-    note = ""
-    if profile != CONSTRAINED and math.pi - abs(parts.theta_p) < HALF_TURN_BAND:
-        forward_sense = state.q_hat[2].copy()
-        bounds = (demands.lower, demands.upper)
-        state.memory.rotation[1], note = half_turn_sense(model, task, state.A, q_start, forward_sense, bounds)
-        parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    state, task, parts, note = partitioned_at_start(
+        model, q_start, s_start, s_star, center, profile, (demands.lower, demands.upper), sight
+    )
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     sigma = np.linspace(0.0, 1.0, samples)
     tau_0, theta_0 = _changes(np.array(parts.a), H_hat, task)

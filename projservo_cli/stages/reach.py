@@ -82,7 +82,10 @@ def _predicted(config: "Config", calibration: Calibration) -> Reach:
     for vector, key in ((start, "task.start"), (goal.joints, "task.goal.joints")):
         if vector is not None and len(vector.joints) != len(joints.types):
             raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")
-    q_start = np.array(start.values(joints.types))
+    q_from = np.array(start.values(joints.types))
+    q_start = q_from
+    if config.task.start_offset is not None:
+        q_start = q_from + np.array(config.task.start_offset.values(joints.types))
     joints.require_inside(q_start, "task.start")
     s_start, pins_start = _images(config, calibration, q_start, "task.start")
     if goal.images is not None:
@@ -93,7 +96,7 @@ def _predicted(config: "Config", calibration: Calibration) -> Reach:
     elif config.robot is None:
         raise InputError("task.goal.turn_deg needs the model of the robot: give joints or images instead")
     else:
-        q_goal = goal_joints(config, truth_of(config), q_start)
+        q_goal = goal_joints(config.task, joints.types, truth_of(config), q_from)
     joints.require_inside(q_goal, "task.goal")
     s_star, pins_star = _images(config, calibration, q_goal, "task.goal")
     return Reach(q_start, None, s_start, s_star, pins_start, pins_star)

@@ -13,7 +13,7 @@ from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.calibrate import images_at, trial_motions
 from projservo_cli.stages.motion import drive, foreign_robot, joints_of, near
-from projservo_cli.stages.truth import CALIBRATION_NOISE, Truth, generator, truth_of
+from projservo_cli.stages.truth import Truth, calibration_generator, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def record(
 def simulated(config: "Config", recording: Recording) -> SimulatedRobot:
     """The robot of a configuration at its reference, with the noise that ``calibrate`` would add."""
     truth = truth_of(config)
-    rng = generator(config, CALIBRATION_NOISE)
+    rng = calibration_generator(config)
     noise = rng.standard_normal((len(recording.targets), 2, len(truth.number), 2))
     return SimulatedRobot(truth, recording.targets[0], config.noise.calibration_px * noise[recording.pending])
 

@@ -62,7 +62,7 @@ def _region(config: "Config", q: FloatArray, share: float, image: FloatArray) ->
     span = np.ptp(q, axis=0)
     low, high = q.min(axis=0) - share * span, q.max(axis=0) + share * span
     if config.robot is not None:
-        robot = robot_of(config)
+        robot = robot_of(config.robot)
         # A recorded robot may have been where its configured limits do not reach.
         low = np.maximum(low, np.minimum(robot.lower, q.min(axis=0)))
         high = np.minimum(high, np.maximum(robot.upper, q.max(axis=0)))

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.control.law import TAU_AFFINE, THETA_S, Gains
+from projservo_cli.control.law import Gains
 from projservo_cli.geometry.normal import COORDINATES
-from projservo_cli.loop.compiled import Log, path_deviation
-from projservo_cli.loop.step import Limits, tolerance
+from projservo_cli.loop.compiled import Log, path_along, path_deviation
+from projservo_cli.loop.step import Limits
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.stages.truth import Reach, Truth
@@ -44,6 +44,7 @@ class Known(NamedTuple):
     center : (k, 3) true centre of the face, m.
     position_mm, rotation_deg : errors at the end.
     between_mm, at_samples_mm : largest distance of the centre from its line.
+    path_mm : length of the centre's path, from sample to sample.
     """
 
     pose: FloatArray
@@ -53,6 +54,7 @@ class Known(NamedTuple):
     rotation_deg: float | None = None
     between_mm: float | None = None
     at_samples_mm: float | None = None
+    path_mm: float | None = None
 
 
 def unknown(instants: int) -> Known:
@@ -70,15 +72,17 @@ def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gai
         return Known(pose, np.full((4, 4), np.nan), center)
     goal = reach.goal_pose @ np.linalg.solve(truth.robot.base_tool, middle)
     start = np.append(center[0], 1.0)
-    deviations = path_deviation(plant, outcome.log, outcome.steps, gains.period, start, goal, SUBSAMPLES)
+    length, at_samples = path_along(plant, outcome.log, outcome.steps, start, goal)
+    between = path_deviation(plant, outcome.log, outcome.steps, gains.period, start, goal, SUBSAMPLES)
     return Known(
         pose,
         reach.goal_pose,
         center,
         1e3 * float(np.linalg.norm(center[-1] - goal[:3])),
         rotation_between(pose[-1], reach.goal_pose),
-        1e3 * deviations[0],
-        1e3 * deviations[1],
+        1e3 * max(between, at_samples),
+        1e3 * at_samples,
+        1e3 * length,
     )
 
 
@@ -90,7 +94,6 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
     errors = log.errors[:rows]
     hidden = log.hidden[:rows] > 0.5
     outside, beyond, joint = (int(x) for x in log.events[:3])
-    translation_left, rotation_left = left(log, steps)
     return Trace(
         law=law,
         verdict=verdict,
@@ -100,12 +103,12 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
         observation="points" if np.isnan(views).all() else "body",
         position_error_mm=truth.position_mm,
         rotation_error_deg=truth.rotation_deg,
-        translation_left=translation_left,
-        rotation_left_deg=rotation_left,
         self_occluded_steps_left=int(hidden[:, 0].sum()),
         self_occluded_steps_right=int(hidden[:, 1].sum()),
         center_deviation_mm=truth.between_mm,
         center_deviation_at_samples_mm=truth.at_samples_mm,
+        path_length_mm=truth.path_mm,
+        effort=effort_of(log, steps, gains.period),
         plateau_steps=longest_plateau(log.error[:rows], limits.plateau_steps),
         speed_limited_steps=int((log.factor[:steps] < 1.0).sum()),
         visibility_limited_steps=int(outcome.limited),
@@ -113,11 +116,9 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
         first_beyond_limit=beyond,
         limit_joint=joint,
         q=log.q[:rows],
-        q_read=None if np.array_equal(log.read[:rows], log.q[:rows]) else log.read[:rows],
         s=np.ascontiguousarray(log.s[:rows, :, : reach.s_star.shape[1]]),
         s_star=reach.s_star,
         image_error=log.error[:rows],
-        stop_error=log.judged[:rows],
         tau=errors[:, 0],
         tau_affine=errors[:, 1],
         theta_r=errors[:, 2],
@@ -135,20 +136,10 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
     )
 
 
-def left(log: Log, steps: int) -> tuple[float | None, float | None]:
-    """Share of the translation and rotation, deg, that were left; None where the law measures neither."""
-    first, last = (float(log.errors[k, TAU_AFFINE]) for k in (0, steps))
-    turn = float(log.errors[steps, THETA_S])
-    share = last / first if first > 0.0 and math.isfinite(last) else None
-    return share, math.degrees(turn) if math.isfinite(turn) else None
-
-
-def words_left(log: Log, steps: int) -> str:
-    """What was left, in words."""
-    share, turn = left(log, steps)
-    parts = [] if share is None else [f"{share:.1%} of the translation"]
-    parts += [] if turn is None else [f"{turn:.3g} deg of rotation"]
-    return f"{' and '.join([*parts, f'an image error of {float(log.judged[steps]):.3g} px'])} are left"
+def effort_of(log: Log, steps: int, period: float) -> float:
+    """Integral of the squared joint velocities, rad²/s and m²/s added."""
+    q_dot = log.q_dot[:steps].ravel()
+    return float(q_dot @ q_dot) * period
 
 
 def rms(squares: FloatArray, count: FloatArray) -> FloatArray:
@@ -177,10 +168,9 @@ def longest_plateau(image_error: FloatArray, window: int) -> int:
 
 def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int) -> str:
     """Why a run ended, in a sentence."""
-    error, first = float(log.judged[steps]), float(log.judged[0])
-    within = tolerance(limits, float(log.fit[steps, 2]))
+    error, first = float(log.error[steps]), float(log.error[0])
     return {
-        "converged": f"image error {error:.3g} px is within {within:.3g} px",
+        "converged": f"image error {error:.3g} px is within {limits.image_px:.3g} px",
         "plateau": f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
         f"{limits.plateau_steps} steps: a local minimum",
         "max steps": f"no step left; image error {error:.3g} px was still changing",
@@ -190,7 +180,6 @@ def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int) ->
         "behind camera": f"a face marker passed behind a camera at step {steps}",
         "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
         + (f", {limits.lost_steps} periods after the last that was" if limits.lost_steps else ""),
-        "joint limit": f"joint {joint + 1} stands at its limit, {float(log.read[steps, joint]):.6g} (rad or "
-        f"m), and the task would take it beyond; {words_left(log, steps)}",
+        "joint limit": f"the command of step {steps} would take joint {joint + 1} beyond its limit",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
     }[verdict]

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,9 @@ from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plan
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
-    from projservo_cli.config.models import Perturbation
-    from projservo_cli.config.robot import Camera
+    from projservo_cli.config.models import Perturbation, Task
+    from projservo_cli.config.robot import Camera, Markers, Rig
+    from projservo_cli.config.robot import Robot as DescribedRobot
 
 # Independent streams of random numbers, each a child of the configuration's seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
@@ -81,6 +82,17 @@ def generator(config: "Config", *stream: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=stream))
 
 
+def calibration_seed(config: "Config") -> int:
+    """Seed of the trial motions and of all that is random in their evaluation."""
+    return config.seed if config.calibration.seed is None else config.calibration.seed
+
+
+def calibration_generator(config: "Config") -> np.random.Generator:
+    """Random numbers of the noise of the trial motions."""
+    seed = calibration_seed(config)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(CALIBRATION_NOISE,)))
+
+
 def face_numbers(config: "Config") -> tuple[int, ...]:
     """Numbers of the face markers."""
     if config.markers is None or config.markers.face is None:
@@ -97,9 +109,8 @@ def center_index(config: "Config") -> int:
     return MIDPOINT if center == "midpoint" else face_numbers(config).index(center)
 
 
-@lru_cache(maxsize=4)
 def truth_of(config: "Config") -> Truth:
-    """Build the truth.
+    """Build the truth, or find it again where it was built for another seed or task.
 
     Raises
     ------
@@ -112,35 +123,40 @@ def truth_of(config: "Config") -> Truth:
         raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
     if config.markers is None or config.markers.positions_m is None:
         raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
-    robot = robot_of(config)
-    numbers = config.markers.known
+    return _built(config.robot, config.rig, config.markers)
+
+
+@lru_cache(maxsize=16)
+def _built(described: "DescribedRobot", rig: "Rig", markers: "Markers") -> Truth:
+    robot = robot_of(described)
+    numbers = markers.known
     assert numbers is not None
-    points = np.c_[np.array(config.markers.positions_m), np.ones(len(numbers))]
+    points = np.c_[np.array(markers.positions_m), np.ones(len(numbers))]
+    face = markers.face or ()
     return Truth(
         robot,
-        np.array([camera_of(config.rig.left), camera_of(config.rig.right)]),
+        np.array([camera_of(rig.left), camera_of(rig.right)]),
         points @ robot.base_tool.T,
         numbers,
-        tuple(numbers.index(number) for number in config.markers.face or ()),
-        center_index(config) if config.markers.face else MIDPOINT,
-        np.array(config.rig.image_size_px, dtype=np.float64),
+        tuple(numbers.index(number) for number in face),
+        face.index(markers.center) if face and markers.center != "midpoint" else MIDPOINT,
+        np.array(rig.image_size_px, dtype=np.float64),
     )
 
 
-def robot_of(config: "Config") -> Robot:
-    """Robot of the DH table or the screws of a configuration."""
-    assert config.robot is not None
-    limits = config.robot.limits
-    if config.robot.dh is not None:
-        table = config.robot.dh
+def robot_of(described: "DescribedRobot") -> Robot:
+    """Robot of a DH table or of screws."""
+    limits = described.limits
+    if described.dh is not None:
+        table = described.dh
         rows = [
             (j.type == "P", math.radians(j.theta_deg), j.d_m, j.a_m, math.radians(j.alpha_deg))
             for j in table.joints
         ]
         return dh_robot(rows, table.convention == "modified", np.array(table.tool), limits)
-    screws = config.robot.screws
+    screws = described.screws
     assert screws is not None
-    types = config.robot.joint_types
+    types = described.joint_types
     bounds = np.array(limits)
     return Robot(
         np.array([twist(j.w, j.v) for j in screws.joints]),
@@ -176,11 +192,22 @@ class Reach:
 
     Attributes
     ----------
-    q_start : (n,) rad or m.
+    q_start : (n,) rad or m, with the offset of the start if there is one.
     goal_pose : (4, 4) true pose of the tool at the goal, m; None where only images are known.
     s_start, s_star : (2, m, 2) measured pixels of the face, px.
     pins_start, pins_star : (2, p, 2) measured pixels of the other markers, px, NaN where unknown.
     """
+
+    q_start: FloatArray
+    goal_pose: FloatArray | None
+    s_start: FloatArray
+    s_star: FloatArray
+    pins_start: FloatArray
+    pins_star: FloatArray
+
+
+class _Ends(NamedTuple):
+    """Start and goal without noise: joints (n,), pose (4, 4) and pixels (2, m, 2) of face and pins."""
 
     q_start: FloatArray
     goal_pose: FloatArray | None
@@ -204,38 +231,51 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
     face_numbers(config)
-    types = config.robot.joint_types if config.robot is not None else ""
-    q_start = np.array(config.task.start.values(types))
-    _require_limits(truth.robot, q_start, "task.start")
-    rng = generator(config, TARGET_NOISE)
-    clean = truth.images(q_start, truth.M_face)
+    ends = _ends(config.task, config.robot.joint_types if config.robot is not None else "", truth)
     sigma = config.noise.servo_px
-    s_start = clean + sigma * rng.standard_normal(clean.shape)
+    rng = generator(config, TARGET_NOISE)
+    s_start = ends.s_start + sigma * rng.standard_normal(ends.s_start.shape)
+    pins_noise = generator(config, PIN_TARGET_NOISE).standard_normal((2, *ends.pins_start.shape))
+    pins_start = ends.pins_start + sigma * pins_noise[0]
+    if ends.goal_pose is None:
+        return Reach(ends.q_start, None, s_start, ends.s_star, pins_start, ends.pins_star)
+    s_star = ends.s_star + sigma * rng.standard_normal(ends.s_star.shape)
+    pins_star = ends.pins_star + sigma * pins_noise[1]
+    return Reach(ends.q_start, ends.goal_pose, s_start, s_star, pins_start, pins_star)
+
+
+@lru_cache(maxsize=64)
+def _ends(task: "Task", types: str, truth: Truth) -> _Ends:
+    """What the ends of a task look like, for any seed and noise."""
+    q_from = np.array(task.start.values(types))
+    _require_limits(truth.robot, q_from, "task.start")
+    q_start = q_from
+    if task.start_offset is not None:
+        q_start = q_from + np.array(task.start_offset.values(types))
+        _require_limits(truth.robot, q_start, "task.start_offset")
     M_pins = truth.M[list(truth.pins)]
-    pins_start = truth.images(q_start, M_pins)
-    pins_noise = generator(config, PIN_TARGET_NOISE).standard_normal((2, *pins_start.shape))
-    pins_start = pins_start + sigma * pins_noise[0]
-    goal = config.task.goal
-    if goal.images is not None:
-        s_star = np.array([goal.images.left, goal.images.right])
-        return Reach(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
-    q_goal = goal_joints(config, truth, q_start)
+    s_start, pins_start = truth.images(q_start, truth.M_face), truth.images(q_start, M_pins)
+    if task.goal.images is not None:
+        s_star = np.array([task.goal.images.left, task.goal.images.right])
+        return _Ends(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
+    q_goal = goal_joints(task, types, truth, q_from)
     _require_limits(truth.robot, q_goal, "task.goal")
-    s_star = truth.images(q_goal, truth.M_face)
-    s_star = s_star + sigma * rng.standard_normal(s_star.shape)
-    pins_star = truth.images(q_goal, M_pins) + sigma * pins_noise[1]
-    return Reach(q_start, truth.robot.pose(q_goal), s_start, s_star, pins_start, pins_star)
+    return _Ends(
+        q_start,
+        truth.robot.pose(q_goal),
+        s_start,
+        truth.images(q_goal, truth.M_face),
+        pins_start,
+        truth.images(q_goal, M_pins),
+    )
 
 
-def goal_joints(config: "Config", truth: Truth, q_start: FloatArray) -> FloatArray:
+def goal_joints(task: "Task", types: str, truth: Truth, q_start: FloatArray) -> FloatArray:
     """Joints (n,) of a goal that is given by them or by a turn of the true robot, rad or m."""
-    assert config.task is not None
-    assert config.robot is not None
-    goal = config.task.goal
-    if goal.joints is not None:
-        return np.array(goal.joints.values(config.robot.joint_types))
-    assert goal.turn_deg is not None
-    return _turned(truth, q_start, goal.turn_deg, goal.perturbation)
+    if task.goal.joints is not None:
+        return np.array(task.goal.joints.values(types))
+    assert task.goal.turn_deg is not None
+    return _turned(truth, q_start, task.goal.turn_deg, task.goal.perturbation)
 
 
 def _turned(

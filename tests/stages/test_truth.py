@@ -8,7 +8,14 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.truth import camera_of, generator, plant_of, reach_of, truth_of
+from projservo_cli.stages.truth import (
+    calibration_generator,
+    camera_of,
+    generator,
+    plant_of,
+    reach_of,
+    truth_of,
+)
 from tests.conftest import ROOT
 from tests.stages.cases import case
 
@@ -160,3 +167,23 @@ def test_missing_parts_are_named(section, message):
     bare = case("ur5").config.model_copy(update={section: None})
     with pytest.raises(InputError, match=message):
         reach_of(bare, truth_of(bare))
+
+
+def test_an_offset_moves_the_start_and_leaves_the_goal():
+    plain = loaded("paper")
+    moved = loaded("paper", "task.start_offset={joints: [1, -2, 3, 0, 0, 0], unit: deg}")
+    truth = truth_of(plain)
+    start, goal = reach_of(plain, truth), reach_of(moved, truth_of(moved))
+    assert np.allclose(np.degrees(goal.q_start - start.q_start), [1, -2, 3, 0, 0, 0], atol=1e-12)
+    assert np.array_equal(start.goal_pose, goal.goal_pose)
+    beyond = loaded("paper", "task.start_offset={joints: [300, 0, 0, 0, 0, 0], unit: deg}")
+    with pytest.raises(WorkFailed, match=r"task\.start_offset: joint 1"):
+        reach_of(beyond, truth)
+
+
+def test_the_seed_of_the_calibration_is_its_own():
+    """The noise of the trials follows calibration.seed, that of the loop follows seed."""
+    own, other, both = (loaded("ur5", *sets) for sets in ((), ("calibration.seed=7",), ("seed=7",)))
+    same = [calibration_generator(config).standard_normal() for config in (own, other, both)]
+    assert same[1] == same[2] != same[0]
+    assert generator(other, 2).standard_normal() == generator(own, 2).standard_normal()

@@ -1,0 +1,71 @@
+"""The task at its start: measured and split into a translation and two rotations."""
+
+import math
+
+from projservo_cli.control.law import State, measure, new_state
+from projservo_cli.geometry.lens import straight_views
+from projservo_cli.records import FloatArray, Model, WorkFailed
+from projservo_cli.stages.constrained import CONSTRAINED
+from projservo_cli.stages.half_turn import half_turn_sense
+from projservo_cli.stages.sight import Sight
+from projservo_cli.task.face import Task, task_from_images
+from projservo_cli.task.partition import Parts, partition
+from projservo_cli.task.target import task_from_body
+
+TASK_DIMENSION = 6
+# Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
+HALF_TURN_BAND = math.radians(2.0)
+
+
+def partitioned_at_start(
+    model: Model,
+    q_start: FloatArray,
+    s_start: FloatArray,
+    s_star: FloatArray,
+    center: int,
+    profile: str,
+    bounds: tuple[FloatArray, FloatArray],
+    sight: Sight | None,
+) -> tuple[State, Task, Parts, str]:
+    """Measure and partition the task at its start; the arguments are those of ``plan_task``.
+
+    Returns
+    -------
+    state : with the face and the joint motions.
+    task : in the frame of the model.
+    parts : translation and rotations, a half turn in the sense that was rehearsed.
+    note : what to say of the rehearsal.
+
+    Raises
+    ------
+    WorkFailed
+        If a marker cannot be triangulated or a motion is not unique.
+    """
+    if len(q_start) != TASK_DIMENSION:
+        raise WorkFailed(
+            f"the partition of a task needs a robot of six joints, this one has {len(q_start)}: "
+            "its motions are then no unique kernels"
+        )
+    m = s_start.shape[1]
+    state = new_state(len(q_start), m)
+    if sight is None:
+        task, seen = task_from_images(model, s_start, s_star, center), s_start
+    else:
+        task = task_from_body(model, sight.body, q_start, sight.s_start, sight.s_star, center, m)
+        seen = sight.s_start
+    if not measure(model, task, straight_views(model.lens, seen), q_start, state):
+        raise WorkFailed(
+            "the face cannot be triangulated at the start: both cameras must see all its markers"
+        )
+    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    if not parts.found:
+        raise WorkFailed(
+            "the joint motion of the task is not unique at the start: the robot is near a singularity "
+            "or moves the face in fewer than six ways"
+        )
+    note = ""
+    if profile != CONSTRAINED and math.pi - abs(parts.theta_p) < HALF_TURN_BAND:
+        forward_sense = state.q_hat[2].copy()
+        state.memory.rotation[1], note = half_turn_sense(model, task, state.A, q_start, forward_sense, bounds)
+        parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    return state, task, parts, note
