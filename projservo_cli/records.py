@@ -262,6 +262,12 @@ class Trace:
     observation: str = scalar(about="how the face is measured: points or body")
     position_error_mm: float | None = scalar(units="mm", about="true centre to true goal at the end")
     rotation_error_deg: float | None = scalar(units="deg", about="true rotation to the goal at the end")
+    translation_left: float | None = scalar(
+        about="share of the translation left at the end, as the law measures it"
+    )
+    rotation_left_deg: float | None = scalar(
+        units="deg", about="rotation left at the end, as the law measures it"
+    )
     self_occluded_steps_left: int = scalar(about="instants at which the left camera is behind the face")
     self_occluded_steps_right: int = scalar(about="instants at which the right camera is behind the face")
     center_deviation_mm: float | None = scalar(
@@ -279,11 +285,18 @@ class Trace:
     visibility_limited_steps: int = scalar(about="commands whose translation was kept within delta·tau_0")
     first_outside_image: int = scalar(about="first instant with a marker outside an image, -1 for never")
     first_beyond_limit: int = scalar(about="first instant beyond a joint limit, -1 for never")
-    limit_joint: int = scalar(about="the joint that passed its limit first, -1 for none")
+    limit_joint: int = scalar(
+        about="the joint, from 0, that passed its limit first or stopped the run at it, -1 for none"
+    )
     q: FloatArray = array("instant", "joint", units="rad or m", about="joints")
     s: FloatArray = array("instant", "view", "marker", "xy", units="px", about="measured images of the face")
     s_star: FloatArray = array("view", "marker", "xy", units="px", about="target images")
     image_error: FloatArray = array("instant", units="px", about="rms over markers and views")
+    stop_error: FloatArray = array(
+        "instant",
+        units="px",
+        about="the same by which runs end: with the body, of the face where the body was measured to be",
+    )
     tau: FloatArray = array("instant", about="translation error, unit-norm kernel of (8)")
     tau_affine: FloatArray = array("instant", about="translation error, scale fixed through a_inf")
     theta_r: FloatArray = array("instant", units="rad", about="rotation error onto the plane")
@@ -304,6 +317,13 @@ class Trace:
     pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
     goal_pose: FloatArray = array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
     center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
+    q_read: FloatArray | None = array(
+        "instant",
+        "joint",
+        units="rad or m",
+        about="joint readings, where they are not the joints",
+        default=None,
+    )
 
 
 @dataclass(frozen=True, eq=False)

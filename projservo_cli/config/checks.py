@@ -250,6 +250,40 @@ def _goal_images(config: Any) -> Iterator[Finding]:
             )
 
 
+@_needs("disturbance", "plant", "robot", "markers")
+def _disturbance(config: Any) -> Iterator[Finding]:
+    given = config.disturbance
+    wanted = [name for name in ("lost_markers", "bump", "frozen_joint") if getattr(given, name) is not None]
+    if config.plant.use is not None and (wanted or given.delay_periods):
+        yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
+    types = config.robot.joint_types if config.robot is not None else None
+    for name in ("bump", "frozen_joint"):
+        if name in wanted and types and getattr(given, name).joint > len(types):
+            yield ("disturbance", name, "joint"), f"the robot has {len(types)} joints, counted from 1"
+    if given.bump is not None:
+        yield from _bump(given.bump, types)
+    known = config.markers.known if config.markers is not None else None
+    lost = given.lost_markers.markers if given.lost_markers is not None else None
+    for i, number in enumerate(lost or ()):
+        if known is not None and number not in known:
+            yield (
+                ("disturbance", "lost_markers", "markers", i),
+                f"there is no marker {number}; markers: {_listed(known)}",
+            )
+
+
+def _bump(bump: Any, types: str | None) -> Iterator[Finding]:
+    if (bump.by_deg is None) == (bump.by_m is None):
+        yield ("disturbance", "bump"), "give exactly one of by_deg and by_m"
+    elif types and bump.joint <= len(types):
+        fitting = "by_deg" if types[bump.joint - 1] == "R" else "by_m"
+        if getattr(bump, fitting) is None:
+            yield (
+                ("disturbance", "bump"),
+                f"joint {bump.joint} is of type {types[bump.joint - 1]}: give {fitting}",
+            )
+
+
 @_needs("control")
 def _gains(config: Any) -> Iterator[Finding]:
     control = config.control

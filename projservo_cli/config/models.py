@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, Strict, StringConstraints, model_validator
 
 from projservo_cli.config.checks import problems
+from projservo_cli.config.disturbance import Disturbance
 from projservo_cli.config.fields import (
     Count,
     JointVector,
@@ -244,6 +245,7 @@ class Config(Section):
     trajectory: Trajectory = Trajectory()
     control: Control = Control()
     plant: PlantSettings = PlantSettings()
+    disturbance: Disturbance = Disturbance()
     stop: Stop = Stop()
     report: ReportSettings = ReportSettings()
 

@@ -13,7 +13,7 @@ from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
 from projservo_cli.geometry.inverse import SETTLED, reach
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kinematics import backward
+from projservo_cli.geometry.kinematics import backward, blocked_joint
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts, clear
@@ -22,6 +22,8 @@ from projservo_cli.task.partition import Parts, clear
 # by about 0.1 mm from the path of a robot of a metre's size.
 PART_STEP = math.radians(2.5)
 ROUND_OFF = 1e-13
+# Halvings of a step until its end is at a limit: below round-off of a joint reading.
+HALVINGS = 48
 BRANCH_FACTOR = 2.0
 
 
@@ -88,12 +90,50 @@ def continued(
 
 
 @njit
+def up_to_limit(
+    model: Model,
+    q: FloatArray,
+    parts: Parts,
+    H_s: Mat4,
+    tau: float,
+    theta: float,
+    sense: float,
+    count: int,
+    gains: Gains,
+    state: State,
+) -> float:
+    """Largest share of a step, to round-off, at which no joint passes its limit; its parts in ``state.path``.
+
+    The displacement is shortened along the path by bisection, each time solved for the joints.
+    """
+    share = 0.0
+    width = 0.5
+    for _ in range(HALVINGS):
+        trial = share + width
+        first_order(parts, trial * tau, trial * theta, sense, state)
+        if continued(model, q, parts, H_s, trial * tau, trial * theta, count, state):
+            joint = blocked_joint(q, state.path[count], gains.lower, gains.upper)
+            if joint < 0:
+                share = trial
+            else:
+                state.blocked[0] = joint
+        width *= 0.5
+    first_order(parts, share * tau, share * theta, sense, state)
+    if share == 0.0 or not continued(model, q, parts, H_s, share * tau, share * theta, count, state):
+        for j in range(count + 1):
+            for i in range(q.shape[0]):
+                state.path[j, i] = q[i]
+        share = 0.0
+    return share
+
+
+@njit
 def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 
     The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before
-    any Newton step: the path itself never changes. Long steps are continued in parts of about 2.5°;
-    where a part fails there are more of them, up to 128.
+    any Newton step, and a position limit ends the step on it: the path itself never changes. Long steps
+    are continued in parts of about 2.5°; where a part fails there are more of them, up to 128.
 
     Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
     """
@@ -116,6 +156,9 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
             clear(state.q_dot)
             return SINGULAR
         count = min(MOST_PARTS, 2 * count)
+    state.blocked[0] = blocked_joint(q, state.path[count], gains.lower, gains.upper)
+    if state.blocked[0] >= 0:
+        share *= up_to_limit(model, q, parts, H_s, tau, theta, sense, count, gains, state)
     for i in range(q.shape[0]):
         state.q_dot[i] = (state.path[count, i] - q[i]) / gains.period
     state.share[0] = share

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub
+from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
 from projservo_cli.geometry.composition import composed_angle
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kinematics import operators_at
+from projservo_cli.geometry.kinematics import operators_at, row
 from projservo_cli.geometry.mechanisms import Work, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
@@ -30,7 +30,7 @@ ATTEMPTS = ((True, MOST_STEPS), (False, MOST_STEPS))
 # Parts a law may split one step into.
 MOST_PARTS = 128
 
-# No joint-speed limit, for any number of joints a configuration may have.
+# No limit, for any number of joints a configuration may have.
 UNLIMITED = np.full(64, np.inf)
 
 OK = 0
@@ -54,6 +54,7 @@ class Gains(NamedTuple):
     delta : share of τ_0 that one pure translation may use.
     speed : (n,) most joint motion per second, rad/s or m/s; infinite for none.
     substeps : whether a step is sent in the parts it was solved in.
+    lower, upper : (n,) joint limits, rad or m, at which a path ends; infinite for none.
     """
 
     gain_t: float
@@ -66,6 +67,8 @@ class Gains(NamedTuple):
     delta: float
     speed: FloatArray = UNLIMITED
     substeps: bool = False
+    lower: FloatArray = -UNLIMITED
+    upper: FloatArray = UNLIMITED
 
 
 class State(NamedTuple):
@@ -82,12 +85,15 @@ class State(NamedTuple):
     limited : (1,) how often visibility limited the translation.
     fit : (3,) sums of squared residuals of the predicted and of the fitted body, px², and the markers
         used, counted once a view; NaN where the face is measured point by point.
+    face_px : (1,) image error of the face where the body was measured to be, px rms per marker and view,
+        whether the face was seen or not; NaN where it is measured point by point.
     normal : (6, 7) workspace of the fit of the body.
     newton : (n,) one Newton step.
     path : (129, n) joints at the ends of the parts of a step, the current ones first.
     share : (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the
         limit to the loop.
     parts : (1,) parts of the step in ``path``; 0 where the joints go straight to the end.
+    blocked : (1,) joint at whose limit the step was made to end, −1 for none.
     straight : (2, b, 2) pixels as projective cameras would see them, where a lens bends them.
     """
 
@@ -101,11 +107,13 @@ class State(NamedTuple):
     memory: Memory
     limited: FloatArray
     fit: FloatArray
+    face_px: FloatArray
     normal: FloatArray
     newton: FloatArray
     path: FloatArray
     share: FloatArray
     parts: IntArray
+    blocked: IntArray
     straight: FloatArray
 
 
@@ -122,11 +130,13 @@ def new_state(n: int, m: int, observed: int = 0) -> State:
         Memory(np.zeros((2, n))),
         np.zeros(1),
         np.full(3, np.nan),
+        np.full(1, np.nan),
         new_normal(),
         np.zeros(n),
         np.zeros((MOST_PARTS + 1, n)),
         np.full(1, -1.0),
         np.zeros(1, dtype=np.int64),
+        np.full(1, -1, dtype=np.int64),
         np.zeros((2, max(m, observed), 2)),
     )
 
@@ -166,6 +176,7 @@ def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State)
     are fitted to the same views; others serve only where these do not determine the body.
     """
     fit = Fit(False, H, 0.0, 0.0, 0)
+    state.face_px[0] = math.nan
     for shown_only, most_steps in ATTEMPTS:
         fit = fit_body(model.P, task.body, s, H, shown_only, SETTLED_PX, most_steps, state.normal)
         if fit.found:
@@ -176,7 +187,24 @@ def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State)
     if not fit.found:
         return False
     carry(task.body, fit.H, state.A)
+    state.face_px[0] = predicted_error(model.P, state.A, task.A_star)
     return True
+
+
+@njit
+def predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
+    """Image error between points A and A_star (m, 4), px rms per point and view, [RH00] eq. (1)."""
+    total = 0.0
+    for view in range(2):
+        for k in range(A.shape[0]):
+            M, M_star = vec(A[k]), vec(A_star[k])
+            depth, depth_star = row(P[view], 2, M), row(P[view], 2, M_star)
+            if depth == 0.0 or depth_star == 0.0:
+                return math.nan
+            for i in range(2):
+                d = row(P[view], i, M) / depth - row(P[view], i, M_star) / depth_star
+                total += d * d
+    return math.sqrt(total / (2 * A.shape[0]))
 
 
 @njit

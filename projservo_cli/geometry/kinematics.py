@@ -82,6 +82,24 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
 
 
 @njit
+def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
+    """First joint outside its limits, or −1."""
+    for i in range(q.shape[0]):
+        if not lower[i] <= q[i] <= upper[i]:
+            return i
+    return -1
+
+
+@njit
+def blocked_joint(q: FloatArray, q_next: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
+    """First joint that a motion from q to q_next takes beyond a limit, or farther beyond it; else −1."""
+    for i in range(q.shape[0]):
+        if q_next[i] > max(q[i], upper[i]) or q_next[i] < min(q[i], lower[i]):
+            return i
+    return -1
+
+
+@njit
 def image_velocity(P: FloatArray, M: FloatArray, M_dot: FloatArray) -> tuple[float, float, float, float]:
     """Pixel of a point and its velocity for one camera, [RH00] eq. (7), second row corrected.
 

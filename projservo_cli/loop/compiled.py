@@ -9,7 +9,7 @@ from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
 from projservo_cli.geometry.algebra import apply, dot, mat, put_mat, put_vec, sub, vec
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kinematics import start_pose
+from projservo_cli.geometry.kinematics import beyond_limits, start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
     MARKERS_LOST,
@@ -18,20 +18,24 @@ from projservo_cli.loop.step import (
     RUNNING,
     Instant,
     Limits,
-    beyond_limits,
     finite,
     image_error,
     limit_speed,
     on_plateau,
     outside,
+    shorten,
+    stands_still,
+    tolerance,
     verdict_at,
 )
 from projservo_cli.plants.plant import (
     Plant,
     center_deviation,
+    knock,
     line_distance,
     observe,
     pose_after,
+    read_joints,
     rig_distance,
 )
 from projservo_cli.records import FloatArray, IntArray, Model
@@ -43,27 +47,31 @@ class Log(NamedTuple):
 
     Attributes
     ----------
-    q : (k, n) joints, rad or m.
+    q : (k, n) true joints, rad or m.
+    read : (k, n) joint readings, which is what the law is given.
     H : (k, 4, 4) true displacement of the face from the reference.
     s : (k, 2, m, 2) measured pixels of the face and, after them, of the pins.
     hidden : (k, 2) 1 where a view is self-occluded.
-    error : (k,) image error, px rms per marker and view.
+    error : (k,) image error of the face as it is seen, px rms per marker and view.
+    judged : (k,) image error by which the run ends: of the body where it is measured, else as seen.
     errors : (k, 5) control errors of the law.
     q_dot : (k, n) commanded joint velocities after the limit; zero where none was sent.
     factor : (k,) factor of the joint-speed limit.
     path : (k, parts + 1, n) joints at the ends of the parts of each step.
     parts : (k,) parts each step was sent in; 0 where the joints went straight to the end.
     fit : (k, 3) what measuring with the body left, as in the state of the law.
-    events : (4,) first instant outside an image, first beyond a joint limit, that joint, and how
-        often visibility limited the translation; −1 for never.
-    M, scratch : (m, 4) and (4, n) workspaces of the simulated robot.
+    events : (4,) first instant outside an image, first beyond a joint limit, the joint that passed one
+        or stopped the run at its own, and how often visibility limited the translation; −1 for never.
+    M, scratch : (m, 4) and (4, n), at least (4, 2), workspaces of the simulated robot.
     """
 
     q: FloatArray
+    read: FloatArray
     H: FloatArray
     s: FloatArray
     hidden: FloatArray
     error: FloatArray
+    judged: FloatArray
     errors: FloatArray
     q_dot: FloatArray
     factor: FloatArray
@@ -80,9 +88,11 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
     rows = max_steps + 1
     return Log(
         np.zeros((rows, n)),
+        np.zeros((rows, n)),
         np.zeros((rows, 4, 4)),
         np.zeros((rows, 2, m, 2)),
         np.zeros((rows, 2)),
+        np.zeros(rows),
         np.zeros(rows),
         np.full((rows, errors), np.nan),
         np.zeros((rows, n)),
@@ -92,7 +102,7 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
         np.full((rows, 3), np.nan),
         np.full(4, -1.0),
         np.zeros((m, 4)),
-        np.zeros((4, n)),
+        np.zeros((4, max(n, 2))),
     )
 
 
@@ -126,9 +136,10 @@ def run(
     """
     n = q_start.shape[0]
     M = log.M[: plant.M.shape[0]]
-    dq = log.scratch[0]
+    dq = log.scratch[0, :n]
     for i in range(n):
         log.q[0, i] = q_start[i]
+        log.read[0, i] = q_start[i]
     put_mat(log.H[0], start_pose(plant.model, q_start))
     first_distance = 0.0
     first_error = math.nan
@@ -136,22 +147,29 @@ def run(
     for k in range(limits.max_steps + 1):
         s = log.s[k]
         in_front = observe(plant, mat(log.H[k]), M, s, log.hidden[k])
+        distance = rig_distance(plant, M)
+        if plant.disturbance.delay > 0:
+            observe(plant, mat(log.H[max(0, k - plant.disturbance.delay)]), M, s, log.scratch[1])
         for view in range(2):
             for j in range(s.shape[1]):
                 s[view, j, 0] += noise[k, view, j, 0]
                 s[view, j, 1] += noise[k, view, j, 1]
-        distance = rig_distance(plant, M)
         if k == 0:
             first_distance = distance
         left = outside(s, task.s_star.shape[1], plant.image_size)
         if left and log.events[0] < 0.0:
             log.events[0] = k
+        joint = beyond_limits(log.read[k], plant.lower, plant.upper)
+        if joint >= 0 and log.events[1] < 0.0 and not limits.stop_at_joint_limit:
+            log.events[1] = k
+            log.events[2] = joint
         log.error[k] = image_error(s, task.s_star)
+        log.judged[k] = log.error[k]
         seen = True
         singular = False
         sound = True
         if in_front:
-            status = command(code, model, task, gains, s, log.q[k], state)
+            status = command(code, model, task, gains, s, log.read[k], state)
             seen = status != LOST
             singular = status == SINGULAR
             sound = finite(state.q_dot)
@@ -159,16 +177,21 @@ def run(
                 log.errors[k, i] = state.errors[i]
             for i in range(3):
                 log.fit[k, i] = state.fit[i]
-        error = log.error[k]
+            if math.isfinite(state.face_px[0]):
+                log.judged[k] = state.face_px[0]
+        error = log.judged[k]
         if math.isnan(first_error):
             first_error = error
-        now = Instant(in_front, seen, left, error, first_error, distance, first_distance, sound, singular)
+        within = tolerance(limits, log.fit[k, 2])
+        now = Instant(
+            in_front, seen, left, error, first_error, within, distance, first_distance, sound, singular
+        )
         verdict = verdict_at(now, limits)
         if verdict == MARKERS_LOST and waited < limits.lost_steps and k < limits.max_steps:
             waited += 1
             for i in range(n):
-                log.q[k + 1, i] = log.q[k, i]
-            put_mat(log.H[k + 1], mat(log.H[k]))
+                dq[i] = 0.0
+            advance(plant, log, k, dq)
             continue
         if verdict != RUNNING:
             return verdict, k
@@ -181,23 +204,33 @@ def run(
             log.factor[k] = limit_speed(state.q_dot, limits.speed)
         for i in range(n):
             dq[i] = state.q_dot[i] * gains.period
-        H = pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1])
+        if limits.stop_at_joint_limit:
+            joint = shorten(log.read[k], dq, plant.lower, plant.upper)
+            if joint >= 0:
+                for i in range(n):
+                    state.q_dot[i] = dq[i] / gains.period
+            joint = max(joint, state.blocked[0])
+            if joint >= 0 and stands_still(dq):
+                log.events[2] = joint
+                return JOINT_LIMIT, k
         if gains.substeps and 0 < state.parts[0] < log.path.shape[1]:
             log.parts[k] = state.parts[0]
             for j in range(state.parts[0] + 1):
                 for i in range(n):
                     log.path[k, j, i] = state.path[j, i]
-        joint = beyond_limits(log.q[k + 1], plant.lower, plant.upper)
-        if joint >= 0 and log.events[1] < 0.0:
-            log.events[1] = k + 1
-            log.events[2] = joint
-        if joint >= 0 and limits.stop_at_joint_limit:
-            return JOINT_LIMIT, k
         for i in range(n):
             log.q_dot[k, i] = state.q_dot[i]
-        put_mat(log.H[k + 1], H)
+        advance(plant, log, k, dq)
     last = limits.max_steps
-    return PLATEAU if on_plateau(log.error, last, limits.plateau_steps) else MAX_STEPS, last
+    return PLATEAU if on_plateau(log.judged, last, limits.plateau_steps) else MAX_STEPS, last
+
+
+@njit
+def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
+    """Move the robot by a joint step, rad or m, overwritten, and whatever befalls it; read its joints."""
+    knock(plant.disturbance, k + 1, dq)
+    put_mat(log.H[k + 1], pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1]))
+    read_joints(plant.disturbance, k + 1, log.q[k + 1], log.read[k], log.read[k + 1])
 
 
 @njit
@@ -231,8 +264,8 @@ def path_deviation(
     Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
     """
     M = log.M[: plant.M.shape[0]]
-    dq = log.scratch[2]
-    part = log.scratch[3]
+    dq = log.scratch[2, : log.q.shape[1]]
+    part = log.scratch[3, : log.q.shape[1]]
     most = 0.0
     for k in range(steps):
         for i in range(dq.shape[0]):

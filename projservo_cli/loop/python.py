@@ -7,6 +7,7 @@ import numpy as np
 
 from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, new_state
+from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.step import (
     DISTURBED,
@@ -17,12 +18,14 @@ from projservo_cli.loop.step import (
     RUNNING,
     Instant,
     Limits,
-    beyond_limits,
     finite,
     image_error,
     limit_speed,
     on_plateau,
     outside,
+    shorten,
+    stands_still,
+    tolerance,
     verdict_at,
 )
 from projservo_cli.plants.plant import Plant
@@ -31,6 +34,8 @@ from projservo_cli.task.face import Task
 
 LEFT_TO_THE_LOOP = (-1.0,)
 NOT_FITTED = (np.nan, np.nan, np.nan)
+UNKNOWN = (np.nan,)
+FREE = (-1,)
 
 
 class LoopLaw(Protocol):
@@ -38,7 +43,9 @@ class LoopLaw(Protocol):
 
     A law that keeps the joint-speed limit itself has an attribute ``share`` (1,), the share of the
     amplitude its limit left; the limit is else up to the loop. One that fits a body has an attribute
-    ``fit`` (3,), which the log keeps. One that wants its step sent in parts has an attribute ``path``
+    ``fit`` (3,), which the log keeps, and ``face_px`` (1,), the image error of the face by which the run
+    is judged. One that ends a step at the limit of a joint has an attribute ``blocked`` (1,), that joint
+    or −1. One that wants its step sent in parts has an attribute ``path``
     (parts + 1, n), the joints between them.
     """
 
@@ -57,6 +64,7 @@ class LoopPlant(Protocol):
     Attributes
     ----------
     plant : the truth, or what the calibration takes for it: image size, joint limits.
+    q : (n,) joints as they are, or as they were read.
     H : (4, 4) displacement of the face from the reference.
     hidden, in_front : as of ``plants.plant.observe``, when last observed.
     markers : how many are observed, those of the face first.
@@ -65,6 +73,7 @@ class LoopPlant(Protocol):
     """
 
     plant: Plant
+    q: FloatArray
     H: FloatArray
     hidden: FloatArray
     in_front: bool
@@ -105,6 +114,8 @@ class BuiltInLaw:
         self.errors = self.state.errors
         self.share = self.state.share
         self.fit = self.state.fit
+        self.face_px = self.state.face_px
+        self.blocked = self.state.blocked
 
     @property
     def path(self) -> FloatArray:
@@ -155,7 +166,8 @@ def _run(
     """Fill the log and return verdict and steps."""
     first_distance, first_error, waited = 0.0, math.nan, 0
     for k in range(limits.max_steps + 1):
-        log.q[k], log.H[k] = plant.joints(), plant.H
+        log.read[k] = plant.joints()
+        log.q[k], log.H[k] = plant.q, plant.H
         log.s[k] = plant.observe()
         log.hidden[k] = plant.hidden
         distance = plant.distance()
@@ -163,17 +175,24 @@ def _run(
         left = outside(log.s[k], s_star.shape[1], plant.plant.image_size)
         if left and log.events[0] < 0.0:
             log.events[0] = k
-        error = log.error[k] = image_error(log.s[k], s_star)
-        first_error = error if math.isnan(first_error) else first_error
+        joint = beyond_limits(log.read[k], plant.plant.lower, plant.plant.upper)
+        if joint >= 0 and log.events[1] < 0.0 and not limits.stop_at_joint_limit:
+            log.events[1], log.events[2] = k, joint
+        log.error[k] = log.judged[k] = image_error(log.s[k], s_star)
         if plant.disturbance:
             return DISTURBED, k
-        seen, singular, sound, q_dot = True, False, True, np.zeros_like(log.q[k])
+        seen, singular, sound, q_dot = True, False, True, np.zeros_like(log.read[k])
         if plant.in_front:
-            status, q_dot = law(log.s[k], log.q[k])
+            status, q_dot = law(log.s[k], log.read[k])
             seen, singular, sound = status != LOST, status == SINGULAR, finite(q_dot)
             log.errors[k], log.fit[k] = law.errors, getattr(law, "fit", NOT_FITTED)
+            face_px = float(getattr(law, "face_px", UNKNOWN)[0])
+            log.judged[k] = face_px if math.isfinite(face_px) else log.judged[k]
+        error = float(log.judged[k])
+        first_error = error if math.isnan(first_error) else first_error
+        within = tolerance(limits, float(log.fit[k, 2]))
         now = Instant(
-            plant.in_front, seen, left, error, first_error, distance, first_distance, sound, singular
+            plant.in_front, seen, left, error, first_error, within, distance, first_distance, sound, singular
         )
         verdict = verdict_at(now, limits)
         if verdict == MARKERS_LOST and waited < limits.lost_steps and k < limits.max_steps:
@@ -188,24 +207,28 @@ def _run(
         share = float(getattr(law, "share", LEFT_TO_THE_LOOP)[0])
         log.factor[k] = share if share >= 0.0 else limit_speed(q_dot, limits.speed)
         q_dot = q_dot * scale
-        joint = beyond_limits(log.q[k] + q_dot * period, plant.plant.lower, plant.plant.upper)
-        if joint >= 0 and log.events[1] < 0.0:
-            log.events[1], log.events[2] = k + 1, joint
-        if joint >= 0 and limits.stop_at_joint_limit:
-            return JOINT_LIMIT, k
-        steps = _steps(plant, law, q_dot, period, scale)
+        dq = q_dot * period
+        if limits.stop_at_joint_limit:
+            joint = shorten(log.read[k], dq, plant.plant.lower, plant.plant.upper)
+            if joint >= 0:
+                q_dot = dq / period
+            joint = max(joint, int(getattr(law, "blocked", FREE)[0]))
+            if joint >= 0 and stands_still(dq):
+                log.events[2] = joint
+                return JOINT_LIMIT, k
+        steps = _steps(plant, law, dq, scale)
         for step in steps:
             plant.command(step, time_for(step, period / len(steps), limits.speed * scale))
         log.q_dot[k] = q_dot
     last = limits.max_steps
-    return (PLATEAU if on_plateau(log.error, last, limits.plateau_steps) else MAX_STEPS), last
+    return (PLATEAU if on_plateau(log.judged, last, limits.plateau_steps) else MAX_STEPS), last
 
 
-def _steps(plant: LoopPlant, law: LoopLaw, q_dot: FloatArray, period: float, scale: float) -> FloatArray:
+def _steps(plant: LoopPlant, law: LoopLaw, dq: FloatArray, scale: float) -> FloatArray:
     """The joint steps (parts, n) to send: one, or the parts of a long one that is not scaled down."""
     path = getattr(law, "path", None)
     if path is None or len(path) < 3 or scale < 1.0 or not plant.takes_parts:
-        return (q_dot * period)[None]
+        return dq[None]
     return np.asarray(np.diff(path, axis=0))
 
 

@@ -11,7 +11,8 @@ Precedence of the verdicts at one instant, first match wins:
 6. ``singular``: the joint motion of the law is not unique.
 7. ``plateau``, ``max steps``: no step is left; plateau where the error fell by less than 1 % in
    the last window.
-8. ``joint limit``: the command would pass a joint limit and ``joint_limits`` is stop.
+8. ``joint limit``: a joint stands at its limit, the command would take it beyond, and ``joint_limits``
+   is stop. A command that would pass a limit is shortened to end there.
 
 While markers are lost the robot is held where it is for up to ``lost_steps`` periods in a row; the run
 goes on when they are seen again. ``disturbed`` is what the loop of a robot that is not simulated ends
@@ -51,6 +52,10 @@ VERDICTS = (
     "disturbed",
 )
 PLATEAU_FALL = 0.01
+# Joint steps below this, rad or m, are none.
+NO_MOTION = 1e-6
+# A step ends this share of it before a limit, lest rounding take it beyond.
+ROUND_OFF = 1e-12
 
 
 class Limits(NamedTuple):
@@ -65,6 +70,7 @@ class Limits(NamedTuple):
     max_steps : most commands.
     stop_at_joint_limit, stop_at_border : end the run, or only record.
     lost_steps : periods in a row that lost markers are waited for.
+    noise_px : how much of ``image_px`` allows for noise.
     """
 
     speed: FloatArray
@@ -75,6 +81,7 @@ class Limits(NamedTuple):
     stop_at_joint_limit: bool
     stop_at_border: bool
     lost_steps: int = 0
+    noise_px: float = 0.0
 
 
 class Instant(NamedTuple):
@@ -85,7 +92,9 @@ class Instant(NamedTuple):
     in_front : whether every face marker is in front of both cameras.
     seen : whether the law could measure with the markers that were seen.
     left : whether a face marker lies outside an image.
-    error, first_error : image error now and at the start, px rms per marker and view.
+    error, first_error : image error now and at the start, px rms per marker and view: of the face as
+        it is seen, or as the body that was measured has it.
+    tolerance : image error that counts as converged.
     distance, first_distance : of the face from the rig now and at the start, m.
     finite_command : whether every joint velocity is a finite number.
     singular : whether the joint motion of the law is not unique.
@@ -96,6 +105,7 @@ class Instant(NamedTuple):
     left: bool
     error: float
     first_error: float
+    tolerance: float
     distance: float
     first_distance: float
     finite_command: bool
@@ -146,12 +156,43 @@ def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
 
 
 @njit
-def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
-    """First joint outside its limits, or −1."""
+def tolerance(limits: Limits, views: float) -> float:
+    """Image error that counts as converged, px rms per marker and view.
+
+    A body fitted by six coordinates to so many markers, counted once a view, keeps √(6 / (2 views)) of
+    the noise of their pixels; NaN where the face is measured point by point.
+    """
+    if not views > 0.0:
+        return limits.image_px
+    return limits.image_px - limits.noise_px * max(0.0, 1.0 - math.sqrt(3.0 / views))
+
+
+@njit
+def shorten(q: FloatArray, dq: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
+    """Scale a joint step so that it ends where the first joint meets its limit; that joint, or −1.
+
+    A joint already beyond its limit may return, but go no farther.
+    """
+    share = 1.0
+    joint = -1
     for i in range(q.shape[0]):
-        if not lower[i] <= q[i] <= upper[i]:
-            return i
-    return -1
+        room = max(0.0, (upper[i] if dq[i] > 0.0 else -lower[i]) - (q[i] if dq[i] > 0.0 else -q[i]))
+        if abs(dq[i]) * share > room:
+            share = room / abs(dq[i]) * (1.0 - ROUND_OFF)
+            joint = i
+    if joint >= 0:
+        for i in range(q.shape[0]):
+            dq[i] *= share
+    return joint
+
+
+@njit
+def stands_still(dq: FloatArray) -> bool:
+    """Whether a joint step is too short to count as motion."""
+    for i in range(dq.shape[0]):
+        if abs(dq[i]) > NO_MOTION:
+            return False
+    return True
 
 
 @njit
@@ -180,7 +221,7 @@ def verdict_at(now: Instant, limits: Limits) -> int:
         return LEFT_IMAGE
     if not now.seen:
         return MARKERS_LOST
-    if now.error <= limits.image_px:
+    if now.error <= now.tolerance:
         return CONVERGED
     grown = now.error > limits.diverged_factor * now.first_error
     receded = now.distance > limits.diverged_factor * now.first_distance

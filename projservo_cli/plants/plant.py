@@ -25,6 +25,33 @@ from projservo_cli.records import FREE, FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
 
 NO_PINS = np.zeros((0, 4))
+NEVER = 2**62
+
+
+class Disturbance(NamedTuple):
+    """What befalls a simulated robot beside noise; instants count from 0, the start.
+
+    Attributes
+    ----------
+    delay : periods by which images are late; the first ones show the start.
+    bump_at : instant by which the joints have been knocked; −1 for never.
+    bump : (n,) by how much, rad or m.
+    bump_read : whether the readings follow the bump, or a joint slipped on its encoder.
+    frozen : joint whose reading stands still, −1 for none.
+    frozen_at, frozen_until : instant of the reading that stays, and the first that is true again.
+    """
+
+    delay: int
+    bump_at: int
+    bump: FloatArray
+    bump_read: bool
+    frozen: int
+    frozen_at: int
+    frozen_until: int
+
+
+# For any number of joints a configuration may have.
+UNDISTURBED = Disturbance(0, -1, np.zeros(64), True, -1, 0, NEVER)
 
 
 class Plant(NamedTuple):
@@ -42,6 +69,7 @@ class Plant(NamedTuple):
     lower, upper : (n,) joint limits, rad or m.
     opaque : whether the face hides its markers from a camera behind it.
     pins : (p, 4) further markers of the body at the reference, m; a camera sees those within its image.
+    disturbance : what befalls the robot.
     """
 
     model: Model
@@ -55,6 +83,7 @@ class Plant(NamedTuple):
     upper: FloatArray
     opaque: bool
     pins: FloatArray = NO_PINS
+    disturbance: Disturbance = UNDISTURBED
 
 
 @njit
@@ -72,6 +101,28 @@ def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: Flo
     for i in range(1, n):
         X = combine(1.0, X, float(dq[i]), mat(plant.model.H_hat_0[i]))
     return mul(twist_exponential(X), H)
+
+
+@njit
+def knock(disturbance: Disturbance, instant: int, dq: FloatArray) -> None:
+    """Add to a joint step, rad or m, what knocks the joints until the instant it ends at."""
+    if instant == disturbance.bump_at:
+        for i in range(dq.shape[0]):
+            dq[i] += disturbance.bump[i]
+
+
+@njit
+def read_joints(
+    disturbance: Disturbance, instant: int, q: FloatArray, before: FloatArray, reading: FloatArray
+) -> None:
+    """Readings (n,) of the joints q (n,), rad or m; ``before`` are those of the instant before."""
+    for i in range(q.shape[0]):
+        reading[i] = q[i]
+    if not disturbance.bump_read and 0 <= disturbance.bump_at <= instant:
+        for i in range(q.shape[0]):
+            reading[i] -= disturbance.bump[i]
+    if disturbance.frozen >= 0 and disturbance.frozen_at < instant < disturbance.frozen_until:
+        reading[disturbance.frozen] = before[disturbance.frozen]
 
 
 @njit

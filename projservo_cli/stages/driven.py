@@ -83,10 +83,13 @@ def run(
 
 def adapted(config: "Config", calibration: Calibration, gains: Gains, limits: Limits) -> tuple[Gains, Limits]:
     """Gains and limits for a robot that is not simulated: its joints, its noise, never beyond its limits."""
-    speed = joints_of(config, calibration.joint_types).speed
-    image_px = config.stop.image_px + config.stop.noise_factor * noise_px(config, calibration)
-    return gains._replace(speed=speed), limits._replace(
-        speed=speed, image_px=image_px, stop_at_joint_limit=True
+    joints = joints_of(config, calibration.joint_types)
+    noise = config.stop.noise_factor * noise_px(config, calibration)
+    return gains._replace(speed=joints.speed, lower=joints.lower, upper=joints.upper), limits._replace(
+        speed=joints.speed,
+        image_px=config.stop.image_px + noise,
+        noise_px=noise,
+        stop_at_joint_limit=True,
     )
 
 

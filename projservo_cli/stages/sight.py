@@ -40,6 +40,12 @@ def by_points(config: "Config", calibration: Calibration) -> bool:
     return config.control.observation == "points"
 
 
+def known_pins(calibration: Calibration, truth: Truth) -> list[int]:
+    """Indices of the markers beside the face that the calibration knows."""
+    known = calibration.marker.tolist()
+    return [i for i in truth.pins if truth.number[i] in known]
+
+
 def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Reach) -> Sight | None:
     """The body of the markers that the calibration knows; None where the face is measured point by point.
 
@@ -51,8 +57,8 @@ def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Re
     if by_points(config, calibration):
         return None
     known = calibration.marker.tolist()
-    pins = [i for i, index in enumerate(truth.pins) if truth.number[index] in known]
-    indices = [*truth.face, *(truth.pins[i] for i in pins)]
+    indices = [*truth.face, *known_pins(calibration, truth)]
+    pins = [truth.pins.index(i) for i in indices[len(truth.face) :]]
     M = calibration.M[[known.index(truth.number[index]) for index in indices]]
     return Sight(
         body_of(calibration.model(), M),

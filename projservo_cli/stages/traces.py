@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.control.law import Gains
+from projservo_cli.control.law import TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.normal import COORDINATES
 from projservo_cli.loop.compiled import Log, path_along, path_deviation
-from projservo_cli.loop.step import Limits
+from projservo_cli.loop.step import Limits, tolerance
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.stages.truth import Reach, Truth
@@ -94,6 +94,7 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
     errors = log.errors[:rows]
     hidden = log.hidden[:rows] > 0.5
     outside, beyond, joint = (int(x) for x in log.events[:3])
+    translation_left, rotation_left = left(log, steps)
     return Trace(
         law=law,
         verdict=verdict,
@@ -103,6 +104,8 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
         observation="points" if np.isnan(views).all() else "body",
         position_error_mm=truth.position_mm,
         rotation_error_deg=truth.rotation_deg,
+        translation_left=translation_left,
+        rotation_left_deg=rotation_left,
         self_occluded_steps_left=int(hidden[:, 0].sum()),
         self_occluded_steps_right=int(hidden[:, 1].sum()),
         center_deviation_mm=truth.between_mm,
@@ -116,9 +119,11 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
         first_beyond_limit=beyond,
         limit_joint=joint,
         q=log.q[:rows],
+        q_read=None if np.array_equal(log.read[:rows], log.q[:rows]) else log.read[:rows],
         s=np.ascontiguousarray(log.s[:rows, :, : reach.s_star.shape[1]]),
         s_star=reach.s_star,
         image_error=log.error[:rows],
+        stop_error=log.judged[:rows],
         tau=errors[:, 0],
         tau_affine=errors[:, 1],
         theta_r=errors[:, 2],
@@ -134,6 +139,22 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
         goal_pose=truth.goal_pose,
         center=truth.center,
     )
+
+
+def left(log: Log, steps: int) -> tuple[float | None, float | None]:
+    """Share of the translation and rotation, deg, that were left; None where the law measures neither."""
+    first, last = (float(log.errors[k, TAU_AFFINE]) for k in (0, steps))
+    turn = float(log.errors[steps, THETA_S])
+    share = last / first if first > 0.0 and math.isfinite(last) else None
+    return share, math.degrees(turn) if math.isfinite(turn) else None
+
+
+def words_left(log: Log, steps: int) -> str:
+    """What was left, in words."""
+    share, turn = left(log, steps)
+    parts = [] if share is None else [f"{share:.1%} of the translation"]
+    parts += [] if turn is None else [f"{turn:.3g} deg of rotation"]
+    return f"{' and '.join([*parts, f'an image error of {float(log.judged[steps]):.3g} px'])} are left"
 
 
 def effort_of(log: Log, steps: int, period: float) -> float:
@@ -168,9 +189,10 @@ def longest_plateau(image_error: FloatArray, window: int) -> int:
 
 def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int) -> str:
     """Why a run ended, in a sentence."""
-    error, first = float(log.error[steps]), float(log.error[0])
+    error, first = float(log.judged[steps]), float(log.judged[0])
+    within = tolerance(limits, float(log.fit[steps, 2]))
     return {
-        "converged": f"image error {error:.3g} px is within {limits.image_px:.3g} px",
+        "converged": f"image error {error:.3g} px is within {within:.3g} px",
         "plateau": f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
         f"{limits.plateau_steps} steps: a local minimum",
         "max steps": f"no step left; image error {error:.3g} px was still changing",
@@ -180,6 +202,7 @@ def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int) ->
         "behind camera": f"a face marker passed behind a camera at step {steps}",
         "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
         + (f", {limits.lost_steps} periods after the last that was" if limits.lost_steps else ""),
-        "joint limit": f"the command of step {steps} would take joint {joint + 1} beyond its limit",
+        "joint limit": f"joint {joint + 1} stands at its limit, {float(log.read[steps, joint]):.6g} (rad or "
+        f"m), and the task would take it beyond; {words_left(log, steps)}",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
     }[verdict]

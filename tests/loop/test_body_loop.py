@@ -49,9 +49,12 @@ def test_an_opaque_face_is_measured_by_the_pins(shown):
     run = Run(hidden, "exact", task=task, bounds=limits(max_steps=150))
     assert np.isnan(run.log.s[:, :, :4]).all()
     assert (run.log.fit[:, 2] == 10).all()
-    # No marker of the face was seen, hence no image error; the body arrives all the same.
+    # No marker of the face was seen, hence no image error; the body arrives and the run ends by it.
     assert np.isnan(run.log.error).all()
-    assert run.verdict == "max steps"
+    assert run.verdict == "converged"
+    assert run.log.judged[-1] <= 1e-3 < run.log.judged[-2]
+    true = sc.images(run.log.q[-1]) - sc.s_star
+    assert run.log.judged[-1] == pytest.approx(np.sqrt((true**2).sum() / 8), rel=1e-3)
     assert run.log.q[-1] == pytest.approx(sc.q_goal, abs=1e-5)
 
 

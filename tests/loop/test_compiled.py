@@ -123,7 +123,7 @@ def test_left_image():
 
 
 def test_joint_limit():
-    """Stopped before the command that would pass it, or only recorded with the joint that did."""
+    """Stopped at it, the last step shortened, or only recorded with the joint that passed."""
     sc = scene()
     upper = sc.plant.upper.copy()
     upper[2] = sc.q_start[2] + 0.5 * STEP[2]
@@ -133,8 +133,13 @@ def test_joint_limit():
     first = int(np.argmax(told.log.q[:, 2] > upper[2]))
     assert told.log.events[1:3].tolist() == [first, 2]
     stopped = Run(sc, "direct_three", bounds=limits(stop_at_joint_limit=True))
-    assert (stopped.verdict, stopped.steps) == ("joint limit", first - 1)
+    assert (stopped.verdict, stopped.steps) == ("joint limit", first)
+    assert stopped.log.events[1:3].tolist() == [-1, 2]
     assert (stopped.log.q[:, 2] <= upper[2]).all()
+    assert stopped.log.q[-1, 2] == pytest.approx(upper[2], abs=1e-11)
+    # The last step keeps its direction.
+    last, whole = np.diff(stopped.log.q, axis=0)[-1], np.diff(told.log.q, axis=0)[first - 1]
+    assert last / last[2] == pytest.approx(whole / whole[2], rel=1e-9)
 
 
 def test_behind_camera():

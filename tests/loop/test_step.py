@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.loop.step import (
     BEHIND_CAMERA,
     CONVERGED,
@@ -16,7 +17,6 @@ from projservo_cli.loop.step import (
     SINGULAR_VERDICT,
     VERDICTS,
     Instant,
-    beyond_limits,
     finite,
     image_error,
     limit_speed,
@@ -41,6 +41,7 @@ CALM = {
     "left": False,
     "error": 50.0,
     "first_error": 40.0,
+    "tolerance": 0.01,
     "distance": 1.5,
     "first_distance": 2.0,
     "finite_command": True,
@@ -50,7 +51,7 @@ CALM = {
 
 def verdict(border_stops=True, **given):
     state = {**CALM, **given}
-    return verdict_at(Instant(**state), limits(image_px=0.01, stop_at_border=border_stops))
+    return verdict_at(Instant(**state), limits(stop_at_border=border_stops))
 
 
 def test_a_calm_instant_goes_on():

@@ -12,8 +12,8 @@ from tests.conftest import ROOT
 CASES = [
     ("paper", ("noise.servo_px=0.5",)),  # half a turn, either sense of which is rehearsed
     ("ur5", ("noise.servo_px=1", "control.observation=points")),
-    ("paper", ("task.goal.turn_deg=60", "trajectory.profile=exponential")),
-    ("paper", ("task.goal.turn_deg=45", "trajectory.profile=constrained", "trajectory.samples=5")),
+    ("coupled", ("trajectory.profile=exponential",)),
+    ("coupled", ("trajectory.profile=constrained", "trajectory.samples=5")),
 ]
 
 

@@ -59,15 +59,18 @@ def test_opaque_face_loses_its_markers():
 
 
 def test_joint_limit_stops_where_it_is_told_to():
-    """The stacked law passes a joint limit on this task; told to stop it ends the step before."""
+    """The stacked law passes a joint limit on this task; told to stop it ends there."""
     passed = case("paper").trace("stacked")
     assert passed.first_beyond_limit > 0
     example = Case("paper", ["plant.joint_limits=stop"])
     trace = example.trace("stacked")
     assert trace.verdict == "joint limit"
-    assert trace.steps == passed.first_beyond_limit - 1
+    assert trace.steps == passed.first_beyond_limit
     assert trace.limit_joint == passed.limit_joint
     assert f"joint {trace.limit_joint + 1}" in trace.reason
+    bounds = example.plant.lower, example.plant.upper
+    assert np.abs(np.subtract(bounds, trace.q[-1]))[:, trace.limit_joint].min() < 1e-10
+    assert (trace.translation_left, trace.rotation_left_deg) == (None, None)  # it measures neither
 
 
 def test_noise_widens_the_tolerance_and_is_the_same_for_every_law():

@@ -1,0 +1,105 @@
+"""A position limit in the way: steps end at it, along the path, and the run says so."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.control import CODES
+from projservo_cli.geometry.kinematics import blocked_joint
+from projservo_cli.loop.python import BuiltInLaw, run
+from projservo_cli.loop.step import VERDICTS, shorten, stands_still
+from projservo_cli.plants.analytic import AnalyticPlant
+from tests.loop.test_python_loop import same_logs
+from tests.scene import GAINS, STEP, Run, limits, scene
+
+STOP = {"stop_at_joint_limit": True}
+
+
+def narrowed(share=0.5, joint=2):
+    """Scene with a joint limited at a share of its way, and gains that know the limits."""
+    sc = scene()
+    upper = sc.plant.upper.copy()
+    upper[joint] = sc.q_start[joint] + share * STEP[joint]
+    sc = sc._replace(plant=sc.plant._replace(upper=upper))
+    return sc, GAINS._replace(lower=sc.plant.lower, upper=upper)
+
+
+def off_line(center):
+    """Distances of centres (k, 3) from the line of a free run of the law."""
+    free = Run(scene(), "exact").center
+    way = (free[-1] - free[0]) / np.linalg.norm(free[-1] - free[0])
+    off = center - free[0]
+    return np.linalg.norm(off - np.outer(off @ way, way), axis=1)
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.97])
+def test_exact_goes_along_its_path_to_the_limit(share):
+    sc, gains = narrowed(share)
+    stopped = Run(sc, "exact", gains, limits(**STOP))
+    assert stopped.verdict == "joint limit"
+    assert stopped.log.events[1:3].tolist() == [-1, 2]
+    assert 0 <= sc.plant.upper[2] - stopped.log.q[-1, 2] < 1e-9
+    assert off_line(stopped.center).max() < 1e-10
+    # What is left is what the law measures there: the task was not finished, the face moved on the way.
+    first, last = stopped.log.errors[0], stopped.log.errors[-1]
+    assert 0 < last[1] < first[1]
+    assert 0 < last[4] < first[4]
+    # A law that leaves the limit to the loop bends off the line instead.
+    bent = Run(sc, "direct_two", gains, limits(**STOP))
+    assert bent.verdict == "joint limit"
+    assert share < 0.1 or off_line(bent.center).max() > 1e-6
+
+
+@pytest.mark.parametrize("law", ["exact", "direct_two", "stacked"])
+@pytest.mark.parametrize("sigma", [0.0, 0.3])
+def test_both_loops_end_at_the_limit_alike(law, sigma, rng):
+    sc, gains = narrowed()
+    bounds = limits(max_steps=200, **STOP)
+    noise = sigma * rng.normal(size=(201, 2, 4, 2))
+    compiled = Run(sc, law, gains, bounds, noise)
+    built_in = BuiltInLaw(CODES[law], sc.model, sc.task(), gains._replace(speed=bounds.speed))
+    plant = AnalyticPlant(sc.plant, sc.q_start, noise)
+    code, steps, log = run(built_in, plant, sc.s_star, GAINS.period, bounds)
+    assert (VERDICTS[code], steps) == (compiled.verdict, compiled.steps)
+    assert compiled.verdict == "joint limit"
+    assert (log.q[: steps + 1] <= sc.plant.upper).all()
+    same_logs(log, compiled.full, steps)
+
+
+def test_a_scaled_run_stops_at_the_limit_too():
+    sc, gains = narrowed()
+    built_in = BuiltInLaw(CODES["exact"], sc.model, sc.task(), gains)
+    plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((401, 2, 4, 2)))
+    code, _, _ = run(built_in, plant, sc.s_star, GAINS.period, limits(**STOP), 0.25)
+    assert VERDICTS[code] == "joint limit"
+    assert 0 <= sc.plant.upper[2] - plant.q[2] < 1e-5
+
+
+def test_limits_beside_the_path_change_nothing():
+    free = Run(scene(), "exact")
+    sc, gains = narrowed(1.5)
+    beside = Run(sc, "exact", gains, limits(**STOP))
+    assert (beside.verdict, beside.steps) == ("converged", free.steps)
+    np.testing.assert_array_equal(beside.log.q, free.log.q)
+
+
+def test_a_step_is_shortened_to_the_first_limit():
+    lower, upper = np.array([-1.0, -2.0, -np.inf]), np.array([1.0, 2.0, np.inf])
+    dq = np.array([0.5, -1.0, 40.0])
+    assert shorten(np.array([0.8, 0.0, 0.0]), dq, lower, upper) == 0
+    np.testing.assert_allclose(dq, [0.2, -0.4, 16.0], rtol=1e-11)
+    assert shorten(np.zeros(3), dq, lower, upper) == -1
+    beyond = np.array([1.1, 0.0, 0.0])
+    back, out = np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.1, 0.0])
+    assert shorten(beyond, back, lower, upper) == -1
+    assert back[0] == -0.3  # it may return
+    assert shorten(beyond, out, lower, upper) == 0
+    assert stands_still(out)
+    assert not stands_still(back)
+
+
+def test_which_joint_is_in_the_way():
+    lower, upper = np.full(2, -1.0), np.full(2, 1.0)
+    assert blocked_joint(np.zeros(2), np.array([1.0, -1.0]), lower, upper) == -1
+    assert blocked_joint(np.zeros(2), np.array([1.0, -1.1]), lower, upper) == 1
+    assert blocked_joint(np.array([1.2, 0.0]), np.array([1.1, 0.0]), lower, upper) == -1  # on its way back
+    assert blocked_joint(np.array([1.2, 0.0]), np.array([1.3, 0.0]), lower, upper) == 0
