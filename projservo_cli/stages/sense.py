@@ -1,6 +1,6 @@
 """The sense in which the rotations of a task are planned, without the rest of the plan."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from projservo_cli.records import Calibration, FloatArray, signed
 from projservo_cli.stages import plan
@@ -12,6 +12,16 @@ from projservo_cli.stages.truth import Reach, center_index
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
+
+
+class Sense(NamedTuple):
+    """All of a plan that a law needs that plans anew in each step: which way to turn."""
+
+    motions: FloatArray
+
+    def rotation_sense(self) -> FloatArray:
+        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
+        return self.motions
 
 
 def rotation_sense(

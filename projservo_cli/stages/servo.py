@@ -1,7 +1,7 @@
 """Stage servo: one control law in closed loop with the simulated robot, to its verdict."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from projservo_cli.stages.disturbed import disturbance_of, lose_markers
 from projservo_cli.stages.laws import law_for
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.reach import reach_for
+from projservo_cli.stages.sense import Sense
 from projservo_cli.stages.sight import Sight, known_pins, sight_of
 from projservo_cli.stages.traces import Outcome, known, record_of, unknown
 from projservo_cli.stages.truth import (
@@ -106,6 +107,35 @@ def run(
         gains, limits = driven.adapted(config, calibration, gains, limits)
         outcome = driven.run(config, calibration, plan, law, reach, gains, limits)
         return record_of(law, outcome, reach, gains, limits, unknown(outcome.steps + 1))
+    made = simulate(config, calibration, plan, law)
+    found = known(made.outcome, made.plant, made.truth, made.reach, gains)
+    return record_of(law, made.outcome, made.reach, gains, limits, found)
+
+
+class Simulated(NamedTuple):
+    """A run of the simulated robot: how it ended, and what it was made with."""
+
+    outcome: Outcome
+    plant: Plant
+    truth: Truth
+    reach: Reach
+
+
+def simulate(config: "Config", calibration: Calibration, plan: Plan | Sense, law: str) -> Simulated:
+    """Drive the simulated robot under one law from the start of the task to its verdict.
+
+    Parameters
+    ----------
+    plan : of the task; the sense of its rotations is enough for a built-in law.
+
+    Raises
+    ------
+    InputError
+        If the configuration lacks a part of the simulation.
+    WorkFailed
+        If the goal cannot be reached.
+    """
+    gains, limits = gains_of(config), limits_of(config)
     truth = truth_of(config)
     reach = reach_of(config, truth)
     plant = plant_of(config, truth, reach.q_start)
@@ -114,14 +144,21 @@ def run(
     noise = servo_noise(config, len(truth.face), 0 if sight is None else len(sight.pins))
     pins = [] if sight is None else known_pins(calibration, truth)
     lose_markers(config, noise, [truth.number[i] for i in (*truth.face, *pins)])
-    if law not in CODES or config.plant.speed_scale < 1.0:
+    if isinstance(plan, Plan) and not in_compiled_loop(config, law):
         controller = law_for(config, calibration, plan, law, reach, gains, sight)
         seen = plant if sight is None else plant._replace(pins=sight.pins)
         simulated = AnalyticPlant(seen, reach.q_start, noise)
         outcome = driven.run_law(controller, simulated, reach, gains, limits, config.plant.speed_scale)
-        return record_of(law, outcome, reach, gains, limits, known(outcome, plant, truth, reach, gains))
-    model = truth.model if law in METRIC_LAWS else calibration.model()
-    return drive(law, model, plant, truth, reach, gains, limits, noise, plan.rotation_sense(), sight)
+    else:
+        model = truth.model if law in METRIC_LAWS else calibration.model()
+        sense = plan.rotation_sense()
+        outcome = outcome_of(law, model, plant, truth, reach, gains, limits, noise, sense, sight)
+    return Simulated(outcome, plant, truth, reach)
+
+
+def in_compiled_loop(config: "Config", law: str) -> bool:
+    """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
+    return law in CODES and config.plant.speed_scale == 1.0
 
 
 def servo_noise(config: "Config", m: int, pins: int = 0) -> FloatArray:
@@ -146,6 +183,23 @@ def drive(
     sense: FloatArray | None = None,
     sight: Sight | None = None,
 ) -> Trace:
+    """Trace of one law with one model on the simulated robot; the arguments are those of ``outcome_of``."""
+    outcome = outcome_of(law, model, plant, truth, reach, gains, limits, noise, sense, sight)
+    return record_of(law, outcome, reach, gains, limits, known(outcome, plant, truth, reach, gains))
+
+
+def outcome_of(
+    law: str,
+    model: Model,
+    plant: Plant,
+    truth: Truth,
+    reach: Reach,
+    gains: Gains,
+    limits: Limits,
+    noise: FloatArray,
+    sense: FloatArray | None = None,
+    sight: Sight | None = None,
+) -> Outcome:
     """Run one law with one model on the simulated robot.
 
     Parameters
@@ -170,5 +224,4 @@ def drive(
     code, steps = run_loop(
         CODES[law], model, task, gains, limits, plant, noise, reach.q_start.copy(), state, log
     )
-    outcome = Outcome(VERDICTS[code], "", steps, log, float(state.limited[0]))
-    return record_of(law, outcome, reach, gains, limits, known(outcome, plant, truth, reach, gains))
+    return Outcome(VERDICTS[code], "", steps, log, float(state.limited[0]))

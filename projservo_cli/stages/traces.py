@@ -62,27 +62,69 @@ def unknown(instants: int) -> Known:
     return Known(np.full((instants, 4, 4), np.nan), np.full((4, 4), np.nan), np.full((instants, 3), np.nan))
 
 
+class Motion(NamedTuple):
+    """How the true face went from start to goal.
+
+    Attributes
+    ----------
+    position_mm, rotation_deg : errors at the end.
+    at_samples_mm : largest distance of the centre from its line, at the samples.
+    path_mm : length of the centre's path, from sample to sample.
+    start, goal : (4,) centre at both, m.
+    """
+
+    position_mm: float
+    rotation_deg: float
+    at_samples_mm: float
+    path_mm: float
+    start: FloatArray
+    goal: FloatArray
+
+
+def motion_of(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach) -> Motion | None:
+    """How the simulated face moved; None where the true goal is not known."""
+    if reach.goal_pose is None:
+        return None
+    log, steps = outcome.log, outcome.steps
+    middle = middle_of(plant)
+    start, end = log.H[0] @ middle, log.H[steps] @ middle
+    goal = reach.goal_pose @ np.linalg.solve(truth.robot.base_tool, middle)
+    length, at_samples = path_along(plant, log, steps, start, goal)
+    return Motion(
+        1e3 * float(np.linalg.norm(end[:3] - goal[:3])),
+        rotation_between(log.H[steps] @ truth.robot.base_tool, reach.goal_pose),
+        1e3 * at_samples,
+        1e3 * length,
+        start,
+        goal,
+    )
+
+
+def middle_of(plant: Plant) -> FloatArray:
+    """Centre (4,) of the face at the reference, m."""
+    return np.asarray(plant.M.mean(axis=0) if plant.center < 0 else plant.M[plant.center])
+
+
 def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gains) -> Known:
     """What is known of the simulated robot."""
     H = outcome.log.H[: outcome.steps + 1]
-    middle = plant.M.mean(axis=0) if plant.center < 0 else plant.M[plant.center]
-    center = (H @ middle)[:, :3]
+    center = (H @ middle_of(plant))[:, :3]
     pose = H @ truth.robot.base_tool
-    if reach.goal_pose is None:
+    motion = motion_of(outcome, plant, truth, reach)
+    if motion is None or reach.goal_pose is None:
         return Known(pose, np.full((4, 4), np.nan), center)
-    goal = reach.goal_pose @ np.linalg.solve(truth.robot.base_tool, middle)
-    start = np.append(center[0], 1.0)
-    length, at_samples = path_along(plant, outcome.log, outcome.steps, start, goal)
-    between = path_deviation(plant, outcome.log, outcome.steps, gains.period, start, goal, SUBSAMPLES)
+    between = path_deviation(
+        plant, outcome.log, outcome.steps, gains.period, motion.start, motion.goal, SUBSAMPLES
+    )
     return Known(
         pose,
         reach.goal_pose,
         center,
-        1e3 * float(np.linalg.norm(center[-1] - goal[:3])),
-        rotation_between(pose[-1], reach.goal_pose),
-        1e3 * max(between, at_samples),
-        1e3 * at_samples,
-        1e3 * length,
+        motion.position_mm,
+        motion.rotation_deg,
+        max(1e3 * between, motion.at_samples_mm),
+        motion.at_samples_mm,
+        motion.path_mm,
     )
 
 
