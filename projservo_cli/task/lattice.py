@@ -7,11 +7,9 @@ a path takes one share or several of them to the next of ``NODES`` equal values.
 
 import math
 
-import numpy as np
-
 from projservo_cli.geometry.algebra import apply, mat, vec
 from projservo_cli.geometry.inverse import reach
-from projservo_cli.geometry.jit import allocating, njit
+from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import backward, row
 from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray, IntArray
@@ -41,29 +39,30 @@ ROUGH = 1e-3
 STRAIGHTER = 1e-4
 
 
-@allocating
-def view_shares(reaching: Reaching, shares: FloatArray) -> None:
+@njit
+def view_shares(reaching: Reaching, shares: FloatArray, lines: FloatArray) -> None:
     """Smallest share of visibility and image over both cameras at all nodes (k, k, k) of t, r, p.
 
     A translation moves homogeneous pixels along a line, so two pixels a marker serve all of μ_t.
+
+    Parameters
+    ----------
+    lines : (2m, 7) workspace.
     """
     nodes = shares.shape[0]
     m = reaching.A.shape[0]
     tau = float(reaching.amplitudes[0])
     shift = mat(reaching.H_hat[0])
-    seen = np.empty(nodes)
-    depth = np.empty(2 * m)
-    lines = np.empty((2 * m, 6))
     for view in range(2):
         for marker in range(m):
-            depth[view * m + marker] = row(reaching.model.P[view], 2, vec(reaching.A[marker]))
+            lines[view * m + marker, 6] = row(reaching.model.P[view], 2, vec(reaching.A[marker]))
     for j in range(nodes):
         mu_r = j / (nodes - 1)
         for i in range(nodes):
             mu_t = i / (nodes - 1)
             left = visibility_margin(reaching, 0, mu_t, mu_r)
             right = visibility_margin(reaching, 1, mu_t, mu_r)
-            seen[i] = min(left, right) / reaching.scale[VISIBILITY]
+            shares[i, j, :] = min(left, right) / reaching.scale[VISIBILITY]
         for k in range(nodes):
             H = rotated(reaching.H_hat, reaching.amplitudes, mu_r, k / (nodes - 1))
             for marker in range(m):
@@ -80,11 +79,11 @@ def view_shares(reaching: Reaching, shares: FloatArray) -> None:
                     x = lines[line]
                     pixel = (x[0] + mu_t * x[3], x[1] + mu_t * x[4], x[2] + mu_t * x[5])
                     distance = border_distance(
-                        pixel, depth[line], reaching.demands.image_size, reaching.model.lens[line // m]
+                        pixel, x[6], reaching.demands.image_size, reaching.model.lens[line // m]
                     )
                     least = min(least, distance)
                 inside = image_margin(least, reaching.demands) / reaching.scale[IMAGE]
-                shares[i, j, k] = min(seen[i], inside)
+                shares[i, j, k] = min(shares[i, j, k], inside)
 
 
 @njit
@@ -119,35 +118,37 @@ def widest(shares: FloatArray, value: FloatArray) -> float:
     return float(value[-1, -1, -1])
 
 
-@allocating
-def solve_joints(reaching: Reaching, work: Work, newton: FloatArray, field: FloatArray) -> None:
+@njit
+def solve_joints(
+    reaching: Reaching, work: Work, newton: FloatArray, M: FloatArray, value: FloatArray, field: FloatArray
+) -> None:
     """Joints and their conditioning at coarse nodes, each continued from the best node before it.
 
     Parameters
     ----------
+    work, newton, M, value : workspaces, the last two (2, 4) and (a, b, c).
     field : (a, b, c, n + 1) on return the joints, rad or m, and the margin of conditioning; where they
         cannot be reached that margin is ``WORST`` and the joints are those before.
     """
     n = reaching.q_start.shape[0]
     a, b, c = field.shape[0] - 1, field.shape[1] - 1, field.shape[2] - 1
     H_back = backward(reaching.model, reaching.q_start)
-    value = np.empty(field.shape[:3])
-    M = np.empty((2, 4))
     for i in range(a + 1):
         for j in range(b + 1):
             for k in range(c + 1):
                 q = field[i, j, k, :n]
-                if i + j + k == 0:
-                    q[:] = reaching.q_start
-                    best = math.inf
-                    before = reaching.q_start
-                else:
+                before = reaching.q_start
+                earlier = before
+                best = math.inf
+                if i + j + k > 0:
                     best, code = best_before(value, i, j, k)
                     di, dj, dk = code >> 2, (code >> 1) & 1, code & 1
                     before = field[i - di, j - dj, k - dk, :n]
-                    q[:] = before
+                    earlier = before
                     if i >= 2 * di and j >= 2 * dj and k >= 2 * dk:
-                        q += before - field[i - 2 * di, j - 2 * dj, k - 2 * dk, :n]
+                        earlier = field[i - 2 * di, j - 2 * dj, k - 2 * dk, :n]
+                for l in range(n):
+                    q[l] = 2.0 * before[l] - earlier[l]
                 H = displaced(reaching.H_hat, reaching.amplitudes, i / a, j / b, k / c)
                 reached = best > WORST and reach(
                     reaching.model, H_back, H, reaching.A, q, work, newton, ROUGH
@@ -155,7 +156,8 @@ def solve_joints(reaching: Reaching, work: Work, newton: FloatArray, field: Floa
                 for l in range(n):
                     reached = reached and abs(q[l] - before[l]) <= MOST_STRIDE
                 if not reached:
-                    q[:] = before
+                    for l in range(n):
+                        q[l] = before[l]
                     field[i, j, k, n] = WORST
                     value[i, j, k] = WORST
                     continue
@@ -165,20 +167,24 @@ def solve_joints(reaching: Reaching, work: Work, newton: FloatArray, field: Floa
                 value[i, j, k] = max(min(best, min(within, field[i, j, k, n])), WORST + 1.0)
 
 
-@allocating
-def with_joints(reaching: Reaching, field: FloatArray, shares: FloatArray, joints: FloatArray) -> None:
+@njit
+def with_joints(
+    reaching: Reaching, field: FloatArray, line: FloatArray, shares: FloatArray, joints: FloatArray
+) -> None:
     """Lower the shares of the views to those of the joints, interpolated linearly between coarse nodes.
+
+    Nodes out of view stay as they are: no path worth its joints passes them.
 
     Parameters
     ----------
     field : (a, a, a, n + 1) joints and margin of conditioning of the coarse nodes.
+    line : (a, n + 1) workspace.
     shares : (k, k, k) of the nodes, k − 1 a multiple of a − 1.
-    joints : (k, k, k, n) on return the joints at the nodes, rad or m.
+    joints : (k, k, k, n) on return the joints at the nodes in view, rad or m.
     """
     n = joints.shape[3]
     nodes = shares.shape[0]
     ratio = (nodes - 1) // (field.shape[0] - 1)
-    line = np.empty((field.shape[0], n + 1))
     for i in range(nodes):
         i0 = min(i // ratio, field.shape[0] - 2)
         x = i / ratio - i0
@@ -191,6 +197,8 @@ def with_joints(reaching: Reaching, field: FloatArray, shares: FloatArray, joint
                     far = (1.0 - y) * field[i0 + 1, j0, k, l] + y * field[i0 + 1, j0 + 1, k, l]
                     line[k, l] = (1.0 - x) * near + x * far
             for k in range(nodes):
+                if shares[i, j, k] <= 0.0:
+                    continue
                 k0 = min(k // ratio, field.shape[2] - 2)
                 z = k / ratio - k0
                 for l in range(n):
@@ -221,8 +229,16 @@ def stride(q: FloatArray, other: FloatArray, weight: FloatArray) -> float:
     return longest
 
 
-@allocating
-def shortest(value: FloatArray, least: float, joints: FloatArray, weight: FloatArray, path: IntArray) -> int:
+@njit
+def shortest(
+    value: FloatArray,
+    least: float,
+    joints: FloatArray,
+    weight: FloatArray,
+    cost: FloatArray,
+    came: IntArray,
+    path: IntArray,
+) -> int:
     """Shortest in time of the monotone paths through nodes whose shares are ``least`` or more.
 
     Parameters
@@ -230,6 +246,7 @@ def shortest(value: FloatArray, least: float, joints: FloatArray, weight: FloatA
     value : (a, b, c) best smallest share of the paths up to each node; of the last, ``least`` or more.
     joints : (a, b, c, n) at the nodes, rad or m.
     weight : (n,) seconds a rad or m of each joint takes.
+    cost, came : (a, b, c) workspaces.
     path : (≥ a + b + c, 3) on return the nodes, first to last.
 
     Returns
@@ -237,12 +254,10 @@ def shortest(value: FloatArray, least: float, joints: FloatArray, weight: FloatA
     How many nodes the path has.
     """
     a, b, c = value.shape
-    cost = np.full((a, b, c), math.inf)
-    came = np.zeros((a, b, c), dtype=np.int8)
-    cost[0, 0, 0] = 0.0
     for i in range(a):
         for j in range(b):
             for k in range(c):
+                cost[i, j, k] = 0.0 if i + j + k == 0 else math.inf
                 if value[i, j, k] < least:
                     continue
                 for code in range(1, 8):
@@ -257,17 +272,19 @@ def shortest(value: FloatArray, least: float, joints: FloatArray, weight: FloatA
                     if total < cost[i, j, k]:
                         cost[i, j, k] = total
                         came[i, j, k] = code
-    count = 1
+    last = a + b + c - 3
     i, j, k = a - 1, b - 1, c - 1
-    node = i + j + k
-    path[node] = (i, j, k)
+    node = last
+    path[node, 0], path[node, 1], path[node, 2] = i, j, k
     while i + j + k > 0:
         code = came[i, j, k]
         i -= code >> 2
         j -= (code >> 1) & 1
         k -= code & 1
         node -= 1
-        count += 1
-        path[node] = (i, j, k)
-    path[:count] = path[node : node + count].copy()
-    return count
+        path[node, 0], path[node, 1], path[node, 2] = i, j, k
+    count = last + 1 - node
+    for step in range(count):
+        for axis in range(3):
+            path[step, axis] = path[node + step, axis]
+    return int(count)

@@ -30,27 +30,30 @@ DETOUR = 1.01
 ROUND_OFF = 1e-9
 
 
-@allocating
+@njit
 def continued(
     reaching: Reaching,
     near: FloatArray,
     far: FloatArray,
     parts: int,
     q: FloatArray,
+    before: FloatArray,
     work: Work,
     newton: FloatArray,
 ) -> bool:
     """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
+
+    ``before``, ``work`` and ``newton`` are workspaces.
 
     Returns
     -------
     False where a part does not settle or moves a joint by more than ``MOST_PART``.
     """
     H_back = backward(reaching.model, reaching.q_start)
-    before = np.empty_like(q)
     for part in range(1, parts + 1):
         x = part / parts
-        before[:] = q
+        for i in range(q.shape[0]):
+            before[i] = q[i]
         mu_t = (1.0 - x) * near[0] + x * far[0]
         mu_r = (1.0 - x) * near[1] + x * far[1]
         mu_p = (1.0 - x) * near[2] + x * far[2]
@@ -63,9 +66,9 @@ def continued(
     return True
 
 
-@allocating
+@njit
 def follow(
-    reaching: Reaching, mu: FloatArray, q: FloatArray, condition: FloatArray, work: Work, newton: FloatArray
+    reaching: Reaching, mu: FloatArray, q: FloatArray, condition: FloatArray, work: Work, scratch: FloatArray
 ) -> int:
     """Joints along a path and the reciprocal condition there, continued from the start.
 
@@ -74,29 +77,31 @@ def follow(
     mu : (s, 3) shares, the first row zero.
     q, condition : (s, n) and (s,) on return rad or m, and reciprocal conditions; NaN where the joints
         cannot follow.
+    work, scratch : workspaces, the latter (≥ 4, ≥ max(n, 4)).
 
     Returns
     -------
     How many rows they can follow.
     """
     rows = len(mu)
-    M = np.empty((2, 4))
+    n = reaching.q_start.shape[0]
+    newton, before, M = scratch[0, :n], scratch[1, :n], scratch[2:4, :4]
     q[:] = math.nan
     condition[:] = math.nan
-    current = reaching.q_start.copy()
-    operators_at(reaching.model, current, work.H_hat)
+    operators_at(reaching.model, reaching.q_start, work.H_hat)
     for row in range(rows):
-        if row > 0:
-            parts = 1
-            settled = False
-            while not settled:
-                settled = continued(reaching, mu[row - 1], mu[row], parts, current, work, newton)
-                if not settled:
-                    parts *= 2
-                    current[:] = q[row - 1]
-                    if parts > MOST_PARTS:
-                        return row
-        q[row] = current
+        settled = row == 0
+        parts = 1
+        for i in range(n):
+            q[row, i] = reaching.q_start[i] if row == 0 else q[row - 1, i]
+        while not settled:
+            settled = continued(reaching, mu[row - 1], mu[row], parts, q[row], before, work, newton)
+            if not settled:
+                parts *= 2
+                for i in range(n):
+                    q[row, i] = q[row - 1, i] if parts <= MOST_PARTS else math.nan
+                if parts > MOST_PARTS:
+                    return row
         H = displaced(reaching.H_hat, reaching.amplitudes, mu[row, 0], mu[row, 1], mu[row, 2])
         condition[row] = reciprocal_condition(reaching, H, work, M, newton)
     return rows
@@ -129,7 +134,7 @@ def interpolate(field: FloatArray, mu: FloatArray, x: FloatArray) -> None:
         x[l] = (1.0 - w) * low + w * ((1.0 - u) * near + u * far)
 
 
-@allocating
+@njit
 def piece(
     reaching: Reaching,
     field: FloatArray,
@@ -146,17 +151,17 @@ def piece(
     field : (a, a, a, n + 1) joints and margin of conditioning at coarse nodes.
     weight : (n,) seconds a rad or m of each joint takes.
     near, far : (3,) its ends.
-    work : (3, n + 1) workspace.
+    work : (3, ≥ max(n + 1, 3)) workspace.
     """
     n = weight.shape[0]
     least = math.inf
     time = 0.0
-    mu = np.empty(3)
+    mu = work[2]
     for part in range(parts + 1):
         x = part / parts
         for axis in range(3):
             mu[axis] = (1.0 - x) * near[axis] + x * far[axis]
-        here = work[part % 2]
+        here = work[part % 2, : n + 1]
         interpolate(field, mu, here)
         least = min(least, view_share(reaching, mu[0], mu[1], mu[2]))
         least = min(least, here[n] / reaching.scale[CONDITIONING])
@@ -192,7 +197,7 @@ def straightened(
     How many corners there are.
     """
     nodes = path / last
-    work = np.empty((3, field.shape[3]))
+    work = np.empty((3, max(field.shape[3], 3)))
     kept[0] = 0
     corners = 1
     time = 0.0

@@ -44,6 +44,8 @@ CHECKS = 151
 ENDLESS = 1e9
 # Shares of this part of the best one are as good, joints being interpolated; the quicker path is better.
 EQUALLY = 0.95
+# The lattices of joints that were not looked at.
+NOTHING = np.empty(0)
 
 
 class Along(NamedTuple):
@@ -111,12 +113,22 @@ class Path(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """Lattices of one choice of senses, and what their best path is worth."""
+    """Lattices of one choice of senses, and what their best path is worth.
+
+    Attributes
+    ----------
+    reaching : the task in these senses.
+    views : (k, k, k) best smallest share in view of the paths up to each node.
+    in_view : of those to the last node.
+    field, joints, value : joints at coarse nodes, at all nodes, and best smallest share of the paths up
+        to each node; without meaning where ``least`` is −∞.
+    least : largest smallest share; −∞ where the views alone keep it from being good enough.
+    """
 
     reaching: Reaching
     views: FloatArray
+    in_view: float
     field: FloatArray
-    both: FloatArray
     joints: FloatArray
     value: FloatArray
     least: float
@@ -127,7 +139,7 @@ def along(reaching: Reaching, mu: FloatArray) -> Along:
     n = len(reaching.q_start)
     work = workspace(n, 4 * len(reaching.A))
     q, condition = np.empty((len(mu), n)), np.empty(len(mu))
-    rows = follow(reaching, mu, q, condition, work, np.empty(n))
+    rows = follow(reaching, mu, q, condition, work, np.empty((4, max(n, 4))))
     visibility, distance = np.empty((len(mu), 2)), np.empty((len(mu), 2))
     view_path(reaching, mu, visibility, distance)
     limit = np.full(len(mu), math.nan)
@@ -178,10 +190,11 @@ def plan_path(reaching: Reaching) -> Path:
     n = len(reaching.q_start)
     work, newton = workspace(n, 4 * len(reaching.A)), np.empty(n)
     reaching = _turned(reaching, turning_sense(reaching), theta_p)
-    candidates = [_candidate(reaching, work, newton)]
-    if theta_p != 0.0 and (abs(theta_p) > 0.5 * math.pi or candidates[0].least <= 0.0):
-        other = theta_p - math.copysign(2.0 * math.pi, theta_p)
-        candidates.append(_candidate(_turned(reaching, reaching.amplitudes[1], other), work, newton))
+    candidates = [_candidate(reaching, 0.0, work, newton)]
+    least = candidates[0].least
+    if theta_p != 0.0 and (abs(theta_p) > 0.5 * math.pi or least <= 0.0):
+        other = _turned(reaching, reaching.amplitudes[1], theta_p - math.copysign(2.0 * math.pi, theta_p))
+        candidates.append(_candidate(other, max(EQUALLY * least, 0.0), work, newton))
     good = max(EQUALLY * max(candidate.least for candidate in candidates), 0.0)
     paths = [_quickest(candidate) for candidate in candidates if candidate.least > good]
     best = _best(paths)
@@ -207,19 +220,22 @@ def _positive(margin: float) -> float:
     return margin if margin > 0.0 else 1.0
 
 
-def _candidate(reaching: Reaching, work: Work, newton: FloatArray) -> Candidate:
-    """Fill the lattices of one choice of senses."""
+def _candidate(reaching: Reaching, good: float, work: Work, newton: FloatArray) -> Candidate:
+    """Fill the lattices of one choice of senses; those of the joints only where the views let it be good."""
     n = len(reaching.q_start)
-    views = np.empty((NODES, NODES, NODES))
-    view_shares(reaching, views)
+    shares, views = np.empty((NODES, NODES, NODES)), np.empty((NODES, NODES, NODES))
+    view_shares(reaching, shares, np.empty((2 * len(reaching.A), 7)))
+    in_view = widest(shares, views)
+    if not in_view > good:
+        return Candidate(reaching, views, in_view, NOTHING, NOTHING, NOTHING, -math.inf)
     field = np.empty((COARSE, COARSE, COARSE, n + 1))
-    solve_joints(reaching, work, newton, field)
+    solve_joints(reaching, work, newton, np.empty((2, 4)), np.empty(field.shape[:3]), field)
     ends = field[0, 0, 0], field[-1, -1, -1]
     reaching.scale[JOINTS] = _positive(min(limit_margin(end[:n], reaching.demands) for end in ends))
     reaching.scale[CONDITIONING] = _positive(min(float(end[n]) for end in ends))
-    joints, both, value = np.empty((*views.shape, n)), views.copy(), np.empty_like(views)
-    with_joints(reaching, field, both, joints)
-    return Candidate(reaching, views, field, both, joints, value, widest(both, value))
+    joints, value = np.empty((*shares.shape, n)), np.empty_like(shares)
+    with_joints(reaching, field, np.empty((COARSE, n + 1)), shares, joints)
+    return Candidate(reaching, views, in_view, field, joints, value, widest(shares, value))
 
 
 def _quickest(candidate: Candidate) -> Path:
@@ -231,16 +247,13 @@ def _quickest(candidate: Candidate) -> Path:
 
 def _in_view(candidates: list[Candidate]) -> Path:
     """Shortest path in shares of the candidate that keeps its distance best, joints left aside."""
-    values = [np.empty_like(candidate.views) for candidate in candidates]
-    found = [widest(candidate.views, value) for candidate, value in zip(candidates, values, strict=True)]
-    least = max(found)
-    candidate, value = candidates[found.index(least)], values[found.index(least)]
+    candidate = max(candidates, key=lambda candidate: candidate.in_view)
     demands = candidate.reaching.demands
     endless = np.full(3, math.inf)
     free = candidate.reaching._replace(demands=demands._replace(lower=-endless, upper=endless, speed=endless))
     shares = _grid(NODES)
     field = np.concatenate([_grid(COARSE), np.full((COARSE,) * 3 + (1,), ENDLESS)], axis=3)
-    return _timed(candidate.reaching, _corners(free, field, value, least, shares))
+    return _timed(candidate.reaching, _corners(free, field, candidate.views, candidate.in_view, shares))
 
 
 @lru_cache(maxsize=2)
@@ -257,7 +270,8 @@ def _corners(
     weight = np.empty(joints.shape[3])
     slowness(reaching.demands.speed, weight)
     path = np.empty((3 * NODES, 3), dtype=np.int64)
-    path = path[: shortest(value, least, joints, weight, path)]
+    cost, came = np.empty_like(value), np.empty(value.shape, dtype=np.int64)
+    path = path[: shortest(value, least, joints, weight, cost, came, path)]
     kept = np.empty(len(path) + 1, dtype=np.int64)
     count = straightened(reaching, field, weight, path, NODES - 1, least, kept)
     return np.asarray(path[kept[:count]] / (NODES - 1))

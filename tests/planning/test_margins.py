@@ -84,7 +84,7 @@ def test_joints_follow_the_planned_displacement(name):
 def test_lattice_of_the_views_holds_their_shares(name):
     reaching = reaching_of(name)
     shares = np.empty((6, 6, 6))
-    view_shares(reaching, shares)
+    view_shares(reaching, shares, np.empty((8, 7)))
     for i, j, k in itertools.product(range(6), repeat=3):
         assert shares[i, j, k] == pytest.approx(view_share(reaching, i / 5, j / 5, k / 5), abs=1e-10)
 
@@ -117,7 +117,8 @@ def test_widest_and_shortest_path_among_all(seed):
     value = np.empty(shape)
     assert widest(margins, value) == best
     found = np.empty((8, 3), dtype=np.int64)
-    count = shortest(value, best, joints, weight, found)
+    cost, came = np.empty(shape), np.empty(shape, dtype=np.int64)
+    count = shortest(value, best, joints, weight, cost, came, found)
     taken = [tuple(int(x) for x in node) for node in found[:count]]
     assert taken in paths
     assert min(margins[node] for node in taken) == best
