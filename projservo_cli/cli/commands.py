@@ -181,6 +181,22 @@ COMMANDS = {
         variants=_variants(config="Configuration (YAML) with a simulated task. Default: paper.yaml."),
         example="projservo bench --json",
     ),
+    "cases": Command(
+        "Run degenerate and adverse tasks and print what becomes of them.",
+        "Calibrates the paper's arm once and runs exact, direct_two and direct_three on turns from 0 to 180 "
+        "degrees about the roll axis and tilted ones, parallel, coplanar and opposite faces, tasks without "
+        "translation or rotation, across a singularity and into a joint limit, and on the 180 degree turn "
+        "with noise, lost markers, a bump, a slip, a frozen reading and late images. Prints a row a case: "
+        "verdict, steps, final errors and self-occluded steps of each law; --json also says what each case "
+        "sets in the configuration. A law that ends badly is a result, not a failure of the call.",
+        ("sets", "output", "force"),
+        variants=_variants(
+            "TABLE",
+            output="Table to write as well (CSV).",
+            force="Replace the table if there is one.",
+        ),
+        example="projservo cases --set noise.servo_px=0.5 -o cases.csv",
+    ),
     "equations": Command(
         "List the equations of the paper and the code of each.",
         "Prints number, title, function, test and erratum of every equation.",

@@ -16,7 +16,7 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import backward, blocked_joint
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
-from projservo_cli.task.partition import Parts, clear
+from projservo_cli.task.partition import Parts
 
 # A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
 # by about 0.1 mm from the path of a robot of a metre's size.
@@ -128,12 +128,27 @@ def up_to_limit(
 
 
 @njit
+def first_order_only(
+    parts: Parts, tau: float, theta: float, sense: float, share: float, gains: Gains, state: State
+) -> int:
+    """First-order joint step of a displacement that is already within the joint-speed limit."""
+    first_order(parts, tau, theta, sense, state)
+    for i in range(state.q_dot.shape[0]):
+        state.q_dot[i] /= gains.period
+    state.share[0] = share
+    state.parts[0] = 0
+    state.blocked[0] = -1
+    return OK
+
+
+@njit
 def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 
     The joint-speed limit shortens the amplitude along the path, by the first-order joint step, before
     any Newton step, and a position limit ends the step on it: the path itself never changes. Long steps
-    are continued in parts of about 2.5°; where a part fails there are more of them, up to 128.
+    are continued in parts of about 2.5°; where a part fails there are more of them, up to 128. Across a
+    singularity, where none of them can be solved, the first-order step is taken.
 
     Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
     """
@@ -153,8 +168,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     count = min(MOST_PARTS, max(1, math.ceil(most / PART_STEP)))
     while not continued(model, q, parts, H_s, tau, theta, count, state):
         if count == MOST_PARTS:
-            clear(state.q_dot)
-            return SINGULAR
+            return first_order_only(parts, tau, theta, sense, share, gains, state)
         count = min(MOST_PARTS, 2 * count)
     state.blocked[0] = blocked_joint(q, state.path[count], gains.lower, gains.upper)
     if state.blocked[0] >= 0:
