@@ -18,6 +18,22 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
     "format": ([BIN / "ruff", "format", "--check", "."], {}),
     "types": ([BIN / "mypy"], {}),
     "imports": ([BIN / "lint-imports"], {}),
+    "documentation": (
+        [
+            PYTHON,
+            "-m",
+            "sphinx",
+            "-q",
+            "-W",
+            "-n",
+            "--keep-going",
+            "-d",
+            "build/doctrees",
+            "docs",
+            "build/docs",
+        ],
+        {"NUMBA_DISABLE_JIT": "1"},
+    ),
     "interpreted tests and coverage": ([*PYTEST, *INTERPRETED], {"NUMBA_DISABLE_JIT": "1"}),
     "compiled tests": ([*PYTEST], {}),
 }

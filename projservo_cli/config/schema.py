@@ -16,8 +16,14 @@ def json_schema() -> dict[str, Any]:
     schema: dict[str, Any] = _plain(Config.model_json_schema())
     schema["required"].remove("name")  # by default that of the file
     keys = schema["properties"]
-    keys["plant"] = {"anyOf": [keys["plant"], {"type": "string"}]}  # the short forms of plant.use
-    keys["law"] = schema["$defs"]["Control"]["properties"]["laws"]["items"]  # and of control.laws
+    keys["plant"] = {  # the short forms of plant.use
+        "anyOf": [keys["plant"], {"type": "string"}],
+        "description": "What is driven; module:Class is short for plant.use.",
+    }
+    keys["law"] = {  # and of control.laws
+        **schema["$defs"]["Control"]["properties"]["laws"]["items"],
+        "description": "Short for control.laws with this law alone.",
+    }
     return {"$schema": DRAFT, **schema, "title": "Configuration of projservo"}
 
 

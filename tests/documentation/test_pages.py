@@ -1,0 +1,138 @@
+"""Every command of the documentation is run, in a folder of its own for each page."""
+
+import json
+import sys
+
+import h5py
+import numpy as np
+import pytest
+
+import projservo_cli
+from projservo_cli.config import load_config
+from projservo_cli.stages.truth import truth_of
+from tests.detection.rendering import render, square
+from tests.documentation.blocks import DOCS, ROOT, blocks_of, run_page
+
+PAGES = sorted(DOCS.glob("*.md"))
+# Those that run laws or plan: only with the compiler.
+DRIVING = {"api", "commands", "law", "run-file", "tutorial"}
+LANGUAGES = {"sh", "python", "text", "yaml"}
+# What cannot be run by a test, and how often it stands there.
+NOT_RUN = {"installation": 1}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with the shipped configurations and what a reader is said to have."""
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    return tmp_path
+
+
+def put_tags(folder):
+    """Two pairs of images with a tag, and their joint readings."""
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'projservo[detect]'")
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    for side in ("left", "right"):
+        (folder / "images" / side).mkdir(parents=True)
+        for k in range(2):
+            image = render(cv2, tags, (160, 120), [(k, square((80 + 5 * k, 60), 50, 0.2 * k))])
+            (folder / "images" / side / f"{k}.png").write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    (folder / "readings.csv").write_text("q1,q2\n0.1,0.2\n0.1,0.3\n")
+
+
+def put_sheet(folder):
+    """The simulated robot of a configuration as a data sheet."""
+    truth = truth_of(load_config(folder / "configs" / "stanford.yaml"))
+    twists = truth.robot.H_hat_0
+    sheet = {
+        "screws": [{"w": [T[2, 1], T[0, 2], T[1, 0]], "v": T[:3, 3].tolist()} for T in twists],
+        "q_reference": truth.robot.q_reference.tolist(),
+        "camera_left": truth.P[0].tolist(),
+        "camera_right": truth.P[1].tolist(),
+        "markers_tool": truth.M[:, :3].tolist(),
+        "marker_numbers": list(truth.number),
+        "T_base_tool_at_reference": np.eye(4).tolist(),
+    }
+    (folder / "sheet.json").write_text(json.dumps(sheet))
+
+
+def check_installation(folder, names):
+    assert load_config(folder / "mine.yaml").name == "mine"
+    assert json.loads((folder / "projservo.schema.json").read_text())["title"]
+
+
+def check_tutorial(folder, names):
+    run = projservo_cli.load("results/task")
+    assert {name: trace.verdict for name, trace in run.traces.items() if name in {"direct_two", "exact"}} == {
+        "direct_two": "converged",
+        "exact": "converged",
+    }
+    assert run.calibration.source == "recorded"
+    drift = {name: run.traces[name].center_deviation_mm for name in ("exact", "direct_two")}
+    assert drift["exact"] < drift["direct_two"]
+
+
+def check_diagnostics(folder, names):
+    calibration = projservo_cli.load("results/spoiled").calibration
+    np.testing.assert_array_equal(calibration.weak, [False] * 4 + [True, False])
+    assert len(calibration.outlier) == 8
+
+
+def check_law(folder, names):
+    assert projservo_cli.load("results/law").traces["my_laws:Damped"].verdict == "converged"
+
+
+def check_api(folder, names):
+    assert names["rates"].shape == (2, 10, 2, 6)
+    np.testing.assert_allclose(names["same"], names["pixels"], atol=1e-9)  # px, of a thousand
+
+
+def check_run_file(folder, names):
+    """What the page says of groups is what is there, and in which."""
+    reference = pytest.importorskip("tests.documentation.extensions").reference
+    with h5py.File("results/paper/run.h5") as file:
+        found = {}
+        file.visititems(lambda name, item: found.update({name: item.attrs.get("record")}))
+    held = {name: record for name, record in found.items() if record is not None}
+    said = {name.replace("<law>", "direct_two"): record.__name__ for name, record in reference.GROUPS.items()}
+    assert held == {name: said[name] for name in held}
+    assert {"calibrate/observation", "calibrate/calibration", "plan", "servo/direct_two"} <= set(held)
+
+
+HAS = {"tables": (put_tags, put_sheet)}
+CHECK = {
+    "installation": check_installation,
+    "tutorial": check_tutorial,
+    "diagnostics": check_diagnostics,
+    "law": check_law,
+    "api": check_api,
+    "run-file": check_run_file,
+}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=[pytest.mark.volume] if page.stem in DRIVING else [])
+        for page in PAGES
+    ],
+)
+def test_page(folder, page, capsys):
+    if page.stem == "run-file":
+        pytest.importorskip("xarray")
+        pytest.importorskip("h5netcdf")
+    for put in HAS.get(page.stem, ()):
+        put(folder)
+    names = run_page(page, lambda: capsys.readouterr().out)
+    CHECK.get(page.stem, lambda *_: None)(folder, names)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_block_is_run_or_excused(page):
+    blocks = [block for block in blocks_of(page) if not block.language.startswith("{")]
+    assert {block.language for block in blocks} <= LANGUAGES
+    assert sum(1 for block in blocks if block.excuse) == NOT_RUN.get(page.stem, 0)
+    assert all(block.excuse or block.file for block in blocks if block.language == "yaml")

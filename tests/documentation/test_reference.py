@@ -1,0 +1,99 @@
+"""What the documentation says by itself: all of it, as it is, and nothing that is not there."""
+
+import dataclasses
+import re
+
+import pytest
+
+from projservo_cli import records
+from projservo_cli.cli.commands import COMMANDS
+from projservo_cli.config.schema import json_schema
+from projservo_cli.equations import REGISTER
+from tests.documentation.blocks import DOCS, ROOT
+
+extensions = pytest.importorskip("tests.documentation.extensions", exc_type=pytest.skip.Exception)
+reference, docstrings = extensions.reference, extensions.docstrings
+
+# Sites that pages may link to; no test has a network.
+SITES = {"keepachangelog.com"}
+
+
+def cells(lines):
+    """Rows of all tables in Markdown, each a list of cells."""
+    rows = [line for line in lines if line.startswith("| ")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]] for row in rows]
+
+
+def test_every_key_has_a_row():
+    schema = json_schema()
+    sections = [schema, *(part for part in schema["$defs"].values() if "properties" in part)]
+    wanted = [f"`{key}`" for section in sections for key in section["properties"]]
+    rows = [row for row in cells(reference.configuration()) if row[0].startswith("`")]
+    assert sorted(row[0] for row in rows) == sorted(wanted)
+    assert all(len(row) == 5 and row[4] for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "default", "unit"),
+    [
+        ("`period_s`", "number, > 0", "`0.04`", "s"),
+        ("`joint_speed_limit_deg_s`", "number, > 0 or null", "`125.0`", "°/s"),
+        ("`gain_t`", "number, > 0", "`2.5`", "1/s"),
+        ("`self_occlusion`", "`transparent`, `opaque`", "`transparent`", ""),
+        ("`image_size_px`", "list of 2 × (whole number, ≥ 0)", "required", "px"),
+        ("`table`", "text", "required", ""),
+        ("`lens`", "true or false", "`false`", ""),
+    ],
+)
+def test_a_key_is_told_as_it_is(key, value, default, unit):
+    rows = [row[1:4] for row in cells(reference.configuration()) if row[0] == key]
+    assert [value, default, unit] in rows
+
+
+def test_every_field_of_every_record_has_a_row():
+    lines = list(reference.run_file())
+    rows = [row for row in cells(lines) if row[0].startswith("`")]
+    kinds = [kind for kind in vars(records).values() if dataclasses.is_dataclass(kind)]
+    assert set(reference.GROUPS.values()) == set(kinds)
+    wanted = sum(len(dataclasses.fields(kind)) for kind in reference.GROUPS.values())
+    assert len(rows) == wanted
+    assert all(len(row) == 4 and row[1] and row[3] for row in rows)
+
+
+def test_every_command_and_equation_is_there():
+    commands = "\n".join(reference.commands())
+    assert re.findall(r"^## projservo ([\w-]+)$", commands, flags=re.MULTILINE) == list(COMMANDS)
+    assert len(cells(reference.equations())) == 2 + len(REGISTER)
+
+
+def test_words_of_the_code_are_shown_as_they_are():
+    assert reference.text("t_* with |p_0| `x`") == r"t\_\* with \|p\_0\| \`x\`"
+
+
+def test_sections_of_docstrings_become_lists():
+    text = [
+        "Summary.",
+        "",
+        "Parameters",
+        "----------",
+        "q, q_dot : (n,) readings,",
+        "    rad or m.",
+        "",
+        "Raises",
+        "------",
+        "InputError",
+        "    If not.",
+    ]
+    assert docstrings.rewritten(text) == [
+        *("Summary.", "", "", "**Parameters**", "", "", "``q``, ``q_dot``", "    (n,) readings,"),
+        *("    rad or m.", "", "", "**Raises**", "", "", "``InputError``", "    If not."),
+    ]
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", text):
+        site = re.fullmatch(r"https://([\w.]+)(/\S*)?", target)
+        assert site[1] in SITES if site else (page.parent / target).is_file(), target
+    assert not re.search(r"http://", text)
