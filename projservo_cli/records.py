@@ -202,10 +202,13 @@ class Plan:
         about="what the motion comes nearest to failing, as a share of its ends' margins"
     )
     duration: float | None = scalar(
-        units="s", about="time at the joint-speed limit; none without a limit or where joints cannot follow"
+        units="s",
+        about="time it takes, as asked for or at the joint-speed limit; none without a limit or where "
+        "joints cannot follow",
     )
     tau_limit: float = scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
     sigma: FloatArray = array("sample", about="path parameter from 0 to 1")
+    time: FloatArray = array("sample", units="s", about="when that is reached; NaN where there is no time")
     mu: FloatArray = array("sample", "part", about="shares of t, r, p that are done")
     H_d: FloatArray = array("sample", "row", "coordinate", about="planned displacement of the face")
     s: FloatArray = array("sample", "view", "marker", "xy", units="px", about="predicted images of the face")
@@ -255,6 +258,8 @@ class Trace:
     """One closed-loop run of one law, from the first instant to its verdict."""
 
     law: str = scalar(about="name of the control law")
+    mode: str = scalar(about="replan: each step plans anew; track, image_track: the plan is followed")
+    planned_s: float | None = scalar(units="s", about="when the followed plan arrives; none for replan")
     verdict: str = scalar(about="how the run ended")
     reason: str = scalar(about="why, in a sentence")
     steps: int = scalar(about="commands sent")

@@ -8,6 +8,7 @@ import click
 
 from projservo_cli import plugins
 from projservo_cli.cli.output import Console
+from projservo_cli.modes import law_and_mode
 from projservo_cli.records import LAWS, InputError
 
 
@@ -35,7 +36,8 @@ def require_asked(options: dict[str, Any], config: Any, steps: Sequence[Any]) ->
     from projservo_cli.plants.foreign import METHODS
 
     servo = [step for step in steps if step.stage == "servo" and step.why]
-    wanted = {("law", step.law): f"--law {step.law}" for step in servo if step.law not in CODES}
+    laws = [law_and_mode(step.law)[0] for step in servo]
+    wanted = {("law", law): f"--law {law}" for law in laws if law not in CODES}
     if servo and config.plant.use is not None:
         wanted["plant", config.plant.use] = f"--set plant={config.plant.use}"
     named = None if options["config"] else _given(options)

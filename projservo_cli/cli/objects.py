@@ -8,6 +8,7 @@ from typing import Any
 from projservo_cli.cli.options import wrapped
 from projservo_cli.cli.suggested import suggested_words
 from projservo_cli.config import Config
+from projservo_cli.modes import name_of
 from projservo_cli.records import Calibration
 from projservo_cli.store import Run
 
@@ -161,18 +162,18 @@ def _plan_words(value: dict[str, Any]) -> list[str]:
         "  rotation {theta_s_deg:.2f} deg = {theta_r_deg:.2f} deg onto the plane, "
         "{theta_p_deg:.2f} deg within it".format_map(value),
         "  least: " + ", ".join(f"{name} {_number(value['margins'][name]['least'])}" for name in NEAREST),
-        *([f"  duration {value['duration']:.3g} s at the joint-speed limit"] if value["duration"] else []),
+        *([f"  duration {value['duration']:.3g} s"] if value["duration"] else []),
     ]
 
 
 def _servo_words(value: dict[str, Any]) -> list[str]:
-    head = f"  {'law':<17}{'verdict':<13}{'steps':>6}{'mm':>10}{'deg':>10}{'occluded':>11}{'drift mm':>11}"
+    head = f"  {'law':<20}{'verdict':<13}{'steps':>6}{'mm':>9}{'deg':>9}{'occluded':>11}{'drift mm':>10}"
     rows = [
-        f"  {trace['law']:<17}{trace['verdict']:<13}{trace['steps']:>6}"
-        f"{_number(trace['position_error_mm']):>10}"
-        f"{_number(trace['rotation_error_deg']):>10}"
+        f"  {name_of(trace['law'], trace['mode']):<20}{trace['verdict']:<13}{trace['steps']:>6}"
+        f"{_number(trace['position_error_mm']):>9}"
+        f"{_number(trace['rotation_error_deg']):>9}"
         f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}"
-        f"{_number(trace['center_deviation_mm']):>11}"
+        f"{_number(trace['center_deviation_mm']):>10}"
         for trace in value["laws"]
     ]
     return ["servo: true errors at the end, self-occluded steps left/right", head, *rows]

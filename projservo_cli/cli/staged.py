@@ -10,6 +10,7 @@ import click
 
 from projservo_cli.cli.foreign import confirm, law_names, require_asked, require_named, require_terminal
 from projservo_cli.cli.output import Console, print_json
+from projservo_cli.modes import name_of
 from projservo_cli.records import WorkFailed
 
 
@@ -43,10 +44,10 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
     config, stored = resolve(options)
-    laws = given or tuple(dict.fromkeys(config.control.laws))
     if options["suggest"] is not None:
         require_covariance(config)
-    steps = steps_for(config, stored, names, laws=laws, force=options["force"])
+    steps = steps_for(config, stored, names, laws=given, force=options["force"])
+    laws = tuple(step.law for step in steps if step.law)
     call = _Call(names, laws, config, stored, steps, console)
     if options["dry_run"]:
         return _dry(call, as_json=options["json"])
@@ -181,7 +182,10 @@ def _verdict(call: _Call) -> int:
     for trace in missed:
         reason = f": {trace.reason}" if trace.reason else ""
         must_converge = " must converge, but" if trace.law in must else ""
-        click.echo(f"projservo: {trace.law}{must_converge} ended in {trace.verdict}{reason}", err=True)
+        click.echo(
+            f"projservo: {name_of(trace.law, trace.mode)}{must_converge} ended in {trace.verdict}{reason}",
+            err=True,
+        )
     infeasible = _infeasible(call)
     return 1 if missed or missed_calibration or infeasible else 0
 

@@ -8,6 +8,8 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from projservo_cli.modes import REPLAN
+
 Path = tuple[str | int, ...]
 Finding = tuple[Path, str]
 Check = Callable[[Any], Iterator[Finding]]
@@ -282,6 +284,18 @@ def _bump(bump: Any, types: str | None) -> Iterator[Finding]:
                 ("disturbance", "bump"),
                 f"joint {bump.joint} is of type {types[bump.joint - 1]}: give {fitting}",
             )
+
+
+@_needs("control", "trajectory")
+def _plan_to_follow(config: Any) -> Iterator[Finding]:
+    control = config.control
+    limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
+    if any(mode != REPLAN for mode in control.mode) and {*limits, config.trajectory.duration_s} == {None}:
+        yield (
+            ("control", "mode"),
+            "follows the plan in time, and nothing gives it one: set trajectory.duration_s, or a limit with "
+            "control.joint_speed_limit_deg_s",
+        )
 
 
 @_needs("control")

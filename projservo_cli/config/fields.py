@@ -1,9 +1,11 @@
 """Building blocks of the configuration: strict finite numbers, vectors, joint vectors."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, WithJsonSchema
+
+from projservo_cli.modes import MODES
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
@@ -16,6 +18,21 @@ Vector4 = tuple[Number, Number, Number, Number]
 Matrix34 = tuple[Vector4, Vector4, Vector4]
 Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
 JointType = Literal["R", "P"]
+
+
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+Mode = Literal["replan", "track", "image_track"]
+_MODE = {"enum": list(MODES)}
+# One mode may stand for a list of it.
+Modes = Annotated[
+    tuple[Mode, ...],
+    BeforeValidator(_listed),
+    Field(min_length=1),
+    WithJsonSchema({"anyOf": [_MODE, {"type": "array", "items": _MODE, "minItems": 1}]}),
+]
 
 IDENTITY: Matrix44 = (
     (1.0, 0.0, 0.0, 0.0),

@@ -9,6 +9,7 @@ from projservo_cli.config.disturbance import Disturbance
 from projservo_cli.config.fields import (
     Count,
     JointVector,
+    Modes,
     NotNegative,
     Positive,
     Section,
@@ -127,6 +128,9 @@ class Trajectory(Section):
     samples: Annotated[int, Strict(), Field(ge=2, le=100_001)] = Field(
         101, description="points of the path that are stored"
     )
+    duration_s: Positive | None = Field(
+        None, description="time the motion is given; null for as little as the joint-speed limit lets it take"
+    )
     border_px: NotNegative = Field(
         5.0, description="in the profile constrained: least distance of a marker from the border of an image"
     )
@@ -137,12 +141,17 @@ class Trajectory(Section):
 
 
 class Control(Section):
-    """The laws to run, their gains in 1/s, and how fast the joints may move."""
+    """The laws to run, in which modes, their gains in 1/s, and how fast the joints may move."""
 
     laws: tuple[Law, ...] = Field(
         ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"),
         min_length=1,
         description="laws to run, each from the start; module:Class for a law of yours",
+    )
+    mode: Modes = Field(
+        ("replan",),
+        description="whether each step plans anew or the plan is followed; with a list, each law in those "
+        "of the modes that it has",
     )
     must_converge: tuple[Law, ...] = Field(
         ("direct_three", "direct_two"), description="laws whose failure is that of the call, exit code 1"

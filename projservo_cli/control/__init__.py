@@ -5,12 +5,14 @@ from projservo_cli.control.direct_three import direct_three
 from projservo_cli.control.direct_two import direct_two
 from projservo_cli.control.euclidean_points import euclidean_points
 from projservo_cli.control.exact import exact
+from projservo_cli.control.following import aim, go_on
 from projservo_cli.control.law import LOST, Gains, State
 from projservo_cli.control.stacked import stacked
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.task.face import Task
+from projservo_cli.task.reference import following
 
 CODES = {law: code for code, law in enumerate(LAWS)}
 
@@ -37,14 +39,20 @@ def command(
             return LOST
         straight(model.lens, s, state.straight)
         seen = state.straight
+    if following(task.reference):
+        aim(task.reference, gains, state)
     if code == 0:
-        return direct_three(model, task, gains, seen, q, state)
-    if code == 1:
-        return direct_two(model, task, gains, seen, q, state)
-    if code == 2:
-        return stacked(model, task, gains, seen, q, state)
-    if code == 3:
-        return blockwise(model, task, gains, seen, q, state)
-    if code == 4:
-        return euclidean_points(model, task, gains, seen, q, state)
-    return exact(model, task, gains, seen, q, state)
+        status = direct_three(model, task, gains, seen, q, state)
+    elif code == 1:
+        status = direct_two(model, task, gains, seen, q, state)
+    elif code == 2:
+        status = stacked(model, task, gains, seen, q, state)
+    elif code == 3:
+        status = blockwise(model, task, gains, seen, q, state)
+    elif code == 4:
+        status = euclidean_points(model, task, gains, seen, q, state)
+    else:
+        status = exact(model, task, gains, seen, q, state)
+    if following(task.reference):
+        go_on(task.reference, gains, status, code == 5, state)
+    return status

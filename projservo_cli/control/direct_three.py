@@ -17,4 +17,5 @@ def direct_three(model: Model, task: Task, gains: Gains, s: FloatArray, q: Float
     p = gains.gain_p * parts.theta_p
     for i in range(q.shape[0]):
         state.q_dot[i] = t * state.q_hat[0, i] + r * state.q_hat[1, i] + p * state.q_hat[2, i]
+        state.q_dot[i] += state.q_ahead[i] / gains.period
     return OK

@@ -89,4 +89,5 @@ def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatAr
     t = translation_rate(task, gains, parts, state)
     for i in range(q.shape[0]):
         state.q_dot[i] = t * state.q_hat[0, i] + rate * state.q_hat[3, i]
+        state.q_dot[i] += state.q_ahead[i] / gains.period
     return OK

@@ -8,6 +8,7 @@ forward kinematics alone, [RH00] eqs. (6), (19); no metric quantity enters.
 import math
 
 from projservo_cli.control.direct_two import single_rotation
+from projservo_cli.control.following import speed_share
 from projservo_cli.control.law import MOST_PARTS, OK, SINGULAR, Gains, State, partitioned, translation_rate
 from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
@@ -17,6 +18,7 @@ from projservo_cli.geometry.kinematics import backward, blocked_joint
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
+from projservo_cli.task.reference import following, planned_step
 
 # A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
 # by about 0.1 mm from the path of a robot of a metre's size.
@@ -34,29 +36,31 @@ def desired(parts: Parts, H_s: Mat4, tau: float, theta: float, share: float) -> 
 
 
 @njit
-def first_order(parts: Parts, tau: float, theta: float, sense: float, state: State) -> float:
-    """First-order joint step τ q̂_t + θ q̂_s of one period into ``state.q_dot``; its largest entry."""
+def first_order(parts: Parts, tau: float, theta: float, sense: float, ahead: float, state: State) -> float:
+    """First-order joint step τ q̂_t + θ q̂_s of one period into ``state.q_dot``; its largest entry.
+
+    Where a plan is followed, the joint motion of its next period is added in the share ``ahead``.
+    """
     most = 0.0
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] = tau * state.q_hat[0, i] + theta * sense * state.q_hat[3, i]
+        state.q_dot[i] += ahead * state.q_ahead[i]
         most = max(most, abs(state.q_dot[i]))
     return most
 
 
 @njit
-def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
-    """Share of the amplitude at which the first-order joint step keeps the joint-speed limit."""
-    share = 1.0
-    for i in range(q_step.shape[0]):
-        size = abs(q_step[i])
-        if size * share > speed[i] * period:
-            share = speed[i] * period / size
-    return share
-
-
-@njit
 def continued(
-    model: Model, q: FloatArray, parts: Parts, H_s: Mat4, tau: float, theta: float, count: int, state: State
+    model: Model,
+    task: Task,
+    q: FloatArray,
+    parts: Parts,
+    H_s: Mat4,
+    tau: float,
+    theta: float,
+    ahead: float,
+    count: int,
+    state: State,
 ) -> bool:
     """Solve the displacement in ``count`` equal parts, each from the one before, into ``state.path``.
 
@@ -78,6 +82,8 @@ def continued(
             state.path[j, i] = state.path[j - 1, i] + step
             predicted += step * step
         goal = desired(parts, H_s, tau, theta, j / count)
+        if following(task.reference):
+            goal = mul(planned_step(task.reference, float(state.clock[0]), ahead * j / count), goal)
         if not reach(model, H_back, goal, state.A, state.path[j], state.work, state.newton, SETTLED):
             return False
         taken = 0.0
@@ -92,12 +98,14 @@ def continued(
 @njit
 def up_to_limit(
     model: Model,
+    task: Task,
     q: FloatArray,
     parts: Parts,
     H_s: Mat4,
     tau: float,
     theta: float,
     sense: float,
+    ahead: float,
     count: int,
     gains: Gains,
     state: State,
@@ -110,16 +118,18 @@ def up_to_limit(
     width = 0.5
     for _ in range(HALVINGS):
         trial = share + width
-        first_order(parts, trial * tau, trial * theta, sense, state)
-        if continued(model, q, parts, H_s, trial * tau, trial * theta, count, state):
+        first_order(parts, trial * tau, trial * theta, sense, trial * ahead, state)
+        if continued(model, task, q, parts, H_s, trial * tau, trial * theta, trial * ahead, count, state):
             joint = blocked_joint(q, state.path[count], gains.lower, gains.upper)
             if joint < 0:
                 share = trial
             else:
                 state.blocked[0] = joint
         width *= 0.5
-    first_order(parts, share * tau, share * theta, sense, state)
-    if share == 0.0 or not continued(model, q, parts, H_s, share * tau, share * theta, count, state):
+    first_order(parts, share * tau, share * theta, sense, share * ahead, state)
+    if share == 0.0 or not continued(
+        model, task, q, parts, H_s, share * tau, share * theta, share * ahead, count, state
+    ):
         for j in range(count + 1):
             for i in range(q.shape[0]):
                 state.path[j, i] = q[i]
@@ -132,7 +142,7 @@ def first_order_only(
     parts: Parts, tau: float, theta: float, sense: float, share: float, gains: Gains, state: State
 ) -> int:
     """First-order joint step of a displacement that is already within the joint-speed limit."""
-    first_order(parts, tau, theta, sense, state)
+    first_order(parts, tau, theta, sense, share, state)
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] /= gains.period
     state.share[0] = share
@@ -150,6 +160,9 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     are continued in parts of about 2.5°; where a part fails there are more of them, up to 128. Across a
     singularity, where none of them can be solved, the first-order step is taken.
 
+    While a plan is followed, the displacement is that of the plan in the next period after the one that
+    takes back what the face is off.
+
     Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
     """
     status, parts = partitioned(model, task, s, q, state)
@@ -160,19 +173,19 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         return SINGULAR
     tau = translation_rate(task, gains, parts, state) * gains.period
     theta = gains.gain_s * theta_s * gains.period
-    first_order(parts, tau, theta, sense, state)
+    first_order(parts, tau, theta, sense, 1.0, state)
     share = speed_share(state.q_dot, gains.speed, gains.period)
     tau *= share
     theta *= share
-    most = first_order(parts, tau, theta, sense, state)
+    most = first_order(parts, tau, theta, sense, share, state)
     count = min(MOST_PARTS, max(1, math.ceil(most / PART_STEP)))
-    while not continued(model, q, parts, H_s, tau, theta, count, state):
+    while not continued(model, task, q, parts, H_s, tau, theta, share, count, state):
         if count == MOST_PARTS:
             return first_order_only(parts, tau, theta, sense, share, gains, state)
         count = min(MOST_PARTS, 2 * count)
     state.blocked[0] = blocked_joint(q, state.path[count], gains.lower, gains.upper)
     if state.blocked[0] >= 0:
-        share *= up_to_limit(model, q, parts, H_s, tau, theta, sense, count, gains, state)
+        share *= up_to_limit(model, task, q, parts, H_s, tau, theta, sense, share, count, gains, state)
     for i in range(q.shape[0]):
         state.q_dot[i] = (state.path[count, i] - q[i]) / gains.period
     state.share[0] = share

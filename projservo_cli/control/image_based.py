@@ -7,6 +7,7 @@ from projservo_cli.geometry.kinematics import image_velocity
 from projservo_cli.geometry.lens import straighten
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
+from projservo_cli.task.reference import following
 
 
 @njit
@@ -21,7 +22,10 @@ def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, f
             work.B[i, first + 2 * k] = u_dot
             work.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):
-        target = task.s_star[view, k]
-        u, v = straighten(model.lens[view], float(target[0]), float(target[1]))
+        if following(task.reference):
+            u, v = float(state.s_aim[view, k, 0]), float(state.s_aim[view, k, 1])
+        else:
+            target = task.s_star[view, k]
+            u, v = straighten(model.lens[view], float(target[0]), float(target[1]))
         work.rhs[first + 2 * k] = s[view, k, 0] - u
         work.rhs[first + 2 * k + 1] = s[view, k, 1] - v

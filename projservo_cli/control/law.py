@@ -21,6 +21,7 @@ from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, carry, fit_body, new_normal
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
+from projservo_cli.task.reference import following
 from projservo_cli.task.visibility import limited_translation
 
 # Whether to fit only the views that the goal showed, and in how many steps; written as values of a loop,
@@ -95,6 +96,10 @@ class State(NamedTuple):
     parts : (1,) parts of the step in ``path``; 0 where the joints go straight to the end.
     blocked : (1,) joint at whose limit the step was made to end, −1 for none.
     straight : (2, b, 2) pixels as projective cameras would see them, where a lens bends them.
+    clock : (1,) periods of the plan that are done, where one is followed.
+    A_aim : (m, 4) the face where the plan is now.
+    s_aim : (2, m, 2) pixels the image-based law aims at while it follows a plan.
+    q_ahead : (n,) joint motion of the plan in the next period; zero where none is followed.
     """
 
     work: Work
@@ -115,6 +120,10 @@ class State(NamedTuple):
     parts: IntArray
     blocked: IntArray
     straight: FloatArray
+    clock: FloatArray
+    A_aim: FloatArray
+    s_aim: FloatArray
+    q_ahead: FloatArray
 
 
 def new_state(n: int, m: int, observed: int = 0) -> State:
@@ -138,6 +147,10 @@ def new_state(n: int, m: int, observed: int = 0) -> State:
         np.zeros(1, dtype=np.int64),
         np.full(1, -1, dtype=np.int64),
         np.zeros((2, max(m, observed), 2)),
+        np.zeros(1),
+        np.zeros((m, 4)),
+        np.zeros((2, m, 2)),
+        np.zeros(n),
     )
 
 
@@ -208,18 +221,40 @@ def predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
 
 
 @njit
+def aimed(task: Task, state: State) -> Task:
+    """The task whose target is where the plan is now; the task itself where none is followed."""
+    if not following(task.reference):
+        return task
+    return Task(
+        task.s_star,
+        state.A_aim,
+        task.order,
+        task.center,
+        task.F,
+        task.O,
+        task.visible,
+        task.body,
+        task.reference,
+    )
+
+
+@njit
 def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> tuple[int, Parts]:
-    """Measure and partition the remaining task; the errors are written to the state."""
+    """Measure and partition the remaining task, or what is left to the place the plan has now.
+
+    The errors are written to the state.
+    """
     for i in range(state.q_dot.shape[0]):
         state.q_dot[i] = 0.0
     for i in range(state.errors.shape[0]):
         state.errors[i] = math.nan
     if not measure(model, task, s, q, state):
         return LOST, no_parts()
-    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    aim = aimed(task, state)
+    parts = partition(state.work, aim, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
     if not parts.found:
         return SINGULAR, parts
-    way = sub(center_of(task.A_star, task.center), parts.A_c)
+    way = sub(center_of(aim.A_star, task.center), parts.A_c)
     theta_s, _, _, _ = composed_angle(parts.theta_r, parts.theta_p)
     state.errors[TAU] = parts.tau
     state.errors[TAU_AFFINE] = math.sqrt(dot(way, way))

@@ -14,17 +14,18 @@ from typing import Any
 
 from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
+from projservo_cli.modes import names_of
 from projservo_cli.records import InputError
 from projservo_cli.stages import Progress
 from projservo_cli.store import SERVO, Result, Run, save
 
 STAGES = ("calibrate", "plan", "servo", "report")
-# Where a file lies does not matter, only what it says. Which laws are run, and which of them must
-# converge, changes the run of none of them.
+# Where a file lies does not matter, only what it says. Which laws are run, in which modes, and which of
+# them must converge, changes the run of none of them.
 NOT_HASHED: dict[str, tuple[str, ...]] = {
     "calibrate": ("data.table", "calibration.init"),
     "plan": ("data.table",),
-    "servo": ("data.table", "control.laws", "control.must_converge"),
+    "servo": ("data.table", "control.laws", "control.mode", "control.must_converge"),
     "report": ("data.table",),
 }
 
@@ -38,7 +39,7 @@ class Step:
     Attributes
     ----------
     stage : name of the stage.
-    law : name of the law for ``servo``, else empty.
+    law : name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty.
     key : what the key of the result will be.
     why : why it has to be made; empty where the stored one is up to date.
     inputs : files read and their hashes.
@@ -81,8 +82,8 @@ def steps_for(
     Raises
     ------
     InputError
-        When a file cannot be read, or a recorded calibration would be replaced by a simulated
-        one without ``force``.
+        When a file cannot be read, a law has none of the modes of ``control.mode``, or a recorded
+        calibration would be replaced by a simulated one without ``force``.
     """
     last = max(named, key=STAGES.index)
     stages = STAGES[: STAGES.index(last) + 1]
@@ -106,12 +107,12 @@ def has_task(config: Config) -> bool:
 def _keys(
     config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
 ) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, law, key and input hashes of every result of the stages, each key made from those before."""
+    """Stage, run, key and input hashes of every result of the stages, each key made from those before."""
     inputs = _file_hashes(config, run)
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     for stage in stages:
         keys = []
-        for law in dict.fromkeys(laws) if stage == "servo" else [""]:
+        for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
             extra = {"before": before, "law": law}
             keys.append(digest(config, _depends_on(stage), without=NOT_HASHED[stage], extra=extra))
             yield stage, law, keys[-1], inputs if stage == "calibrate" else {}
@@ -174,7 +175,7 @@ def make(
     Parameters
     ----------
     step, config, run : what to make, from what.
-    laws : laws whose traces a report is about; others may be stored, of other settings perhaps.
+    laws : names of the runs a report is about; others may be stored, of other settings perhaps.
     progress : told how far the stage is.
 
     Returns

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.records import FloatArray
+from projservo_cli.records import FloatArray, WorkFailed
 from projservo_cli.stages.calibrate import image_size_of
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.task.margins import (
@@ -38,7 +38,7 @@ class Motion:
     mu : (s, 3) shares.
     along : margins at the shares.
     checked, checked_mu : margins and shares (k, 3) by which the motion is judged.
-    duration : at the joint-speed limit, s; None without a limit or where the joints cannot follow.
+    time : (s,) when each is reached, s; NaN without a limit or where the joints cannot follow.
     """
 
     reaching: Reaching
@@ -46,7 +46,12 @@ class Motion:
     along: Along
     checked: Along
     checked_mu: FloatArray
-    duration: float | None
+    time: FloatArray
+
+    @property
+    def duration(self) -> float | None:
+        """When it arrives, s; None where there is no time."""
+        return float(self.time[-1]) if math.isfinite(self.time[-1]) else None
 
     def least(self) -> tuple[FloatArray, FloatArray]:
         """Smallest value (4,) of each constraint in its own unit, and the shares (4, 3) where it is."""
@@ -142,27 +147,67 @@ def demands_of(config: "Config", joint_types: str = "") -> Demands:
     )
 
 
-def motion_of(profile: str, reaching: Reaching, sigma: FloatArray, pure_translation: float) -> Motion:
+def motion_of(
+    profile: str,
+    reaching: Reaching,
+    sigma: FloatArray,
+    pure_translation: float,
+    duration: float | None = None,
+) -> Motion:
     """Motion of a profile: one of the paper's, or planned under constraints.
 
     Parameters
     ----------
     sigma : (s,) path parameter in [0, 1]; of a planned motion the part of its duration.
     pure_translation : most share of the translation before any rotation, δ τ_0 / τ.
+    duration : time it is given, s; None for as little as the joint-speed limit lets it take.
+
+    Raises
+    ------
+    WorkFailed
+        If the joints would be too fast.
     """
     if profile == CONSTRAINED:
         path = plan_path(reaching)
         mu = path.at(sigma)
-        return Motion(
-            path.reaching, mu, along(path.reaching, mu), path.along, path.mu, _finite(path.duration)
-        )
+        time = timed(sigma * path.duration, sigma, duration)
+        return Motion(path.reaching, mu, along(path.reaching, mu), path.along, path.mu, time)
     mu = profile_shares(profile, sigma, pure_translation)
     found = along(reaching, mu)
-    return Motion(reaching, mu, found, found, mu, None)
+    shortest = least_time(found.q, reaching.demands.speed)
+    return Motion(reaching, mu, found, found, mu, timed(shortest, sigma, duration))
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+def least_time(q: FloatArray, speed: FloatArray) -> FloatArray:
+    """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s.
+
+    NaN throughout where no joint has a limit.
+    """
+    if not np.isfinite(speed).any():
+        return np.full(len(q), math.nan)
+    steps = (np.abs(np.diff(q, axis=0)) / speed).max(axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def timed(shortest: FloatArray, sigma: FloatArray, duration: float | None) -> FloatArray:
+    """Time (s,) of a motion that is given a duration, s: its shortest time stretched to that.
+
+    Where nothing limits the speed, the path parameter sigma (s,) passes evenly.
+
+    Raises
+    ------
+    WorkFailed
+        If the joints would be too fast.
+    """
+    least = float(shortest[-1])
+    if duration is None:
+        return shortest
+    if least > duration:
+        raise WorkFailed(
+            f"trajectory.duration_s {duration:g}: the joint-speed limit lets the motion take {least:.4g} s "
+            "or more: give it longer, or null for as short as that"
+        )
+    return shortest * (duration / least) if least > 0.0 else sigma * duration
 
 
 def constrained_verdict(motion: Motion) -> tuple[bool, str]:

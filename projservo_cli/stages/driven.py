@@ -10,6 +10,7 @@ from projservo_cli.control.law import Gains
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw
 from projservo_cli.loop.python import run as run_loop
 from projservo_cli.loop.step import VERDICTS, Limits
+from projservo_cli.modes import law_and_mode
 from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.plants.driven import DrivenRobot
 from projservo_cli.plants.foreign import at_rest_after
@@ -39,12 +40,12 @@ def run(
     config: "Config",
     calibration: Calibration,
     plan: Plan,
-    law: str,
+    name: str,
     reach: Reach,
     gains: Gains,
     limits: Limits,
 ) -> Outcome:
-    """Drive the robot of ``plant.use`` to the start of the task and from there under a law.
+    """Drive the robot of ``plant.use`` to the start of the task and from there under the law of a run.
 
     Before the first motion, what the robot sees must agree with the calibration where it stands. The
     robot is stopped on every way out.
@@ -60,8 +61,8 @@ def run(
         raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
     joints = joints_of(config, calibration.joint_types)
     numbers = observed(config, calibration)
-    sight = sight_for(config, calibration, reach) if law in BODY_LAWS else None
-    controller = law_for(config, calibration, plan, law, reach, gains, sight)
+    sight = sight_for(config, calibration, reach) if law_and_mode(name)[0] in BODY_LAWS else None
+    controller = law_for(config, calibration, plan, name, reach, gains, sight)
     believed = believed_plant(config, calibration, reach, joints)
     shown = face_numbers(config) if sight is None else watched(config, calibration)
     robot = foreign_robot(config, joints, len(numbers))

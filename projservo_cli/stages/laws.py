@@ -10,9 +10,11 @@ from projservo_cli import plugins
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, OK, Gains
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw
+from projservo_cli.modes import REPLAN, law_and_mode
 from projservo_cli.plugins import what_failed
 from projservo_cli.records import METRIC_LAWS, Calibration, FloatArray, InputError, IntArray, Plan, WorkFailed
 from projservo_cli.results import ImageModel, image_model
+from projservo_cli.stages.following import followed
 from projservo_cli.stages.reach import face_of
 from projservo_cli.stages.sight import Sight
 from projservo_cli.stages.truth import Reach, center_index, truth_of
@@ -81,20 +83,22 @@ def law_for(
     config: "Config",
     calibration: Calibration,
     plan: Plan,
-    law: str,
+    name: str,
     reach: Reach,
     gains: Gains,
     sight: Sight | None = None,
 ) -> LoopLaw:
-    """The law of a name, ready for the Python loop; with a sight it measures with the body.
+    """The law of the run of a name, ready for the Python loop; with a sight it measures with the body.
 
     Raises
     ------
     InputError
-        If there is no such law, or it needs a model of the robot that the configuration lacks.
+        If there is no such law, it needs a model of the robot that the configuration lacks, or the plan to
+        follow has no time.
     WorkFailed
-        If it cannot be made.
+        If it cannot be made, or the joints cannot follow the plan.
     """
+    law, mode = law_and_mode(name)
     if law not in CODES:
         face = face_of(config, calibration)
         model = image_model(calibration)
@@ -111,6 +115,8 @@ def law_for(
         task = task_from_images(believed, reach.s_start, reach.s_star, center)
     else:
         task = task_from_body(believed, sight.body, reach.q_start, sight.s_start, sight.s_star, center, m)
+    if mode != REPLAN:
+        task = followed(believed, task, plan, gains.period, config.plant.speed_scale)
     built_in = BuiltInLaw(CODES[law], believed, task, gains)
     built_in.state.memory.rotation[:] = plan.rotation_sense()
     return built_in

@@ -80,6 +80,7 @@ def run(config: "Config", calibration: Calibration) -> Plan:
         config.trajectory.samples,
         demands_of(config, calibration.joint_types),
         sight_for(config, calibration, reach),
+        config.trajectory.duration_s,
     )
 
 
@@ -94,6 +95,7 @@ def plan_task(
     samples: int,
     demands: Demands,
     sight: Sight | None = None,
+    duration: float | None = None,
 ) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
@@ -106,11 +108,12 @@ def plan_task(
     profile, delta, samples : which part is driven when, share of τ_0, points of the path.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
     sight : the body to measure with; without it the face is measured point by point.
+    duration : time the motion is given, s; None for as little as the joint-speed limit lets it take.
 
     Raises
     ------
     WorkFailed
-        If a marker cannot be triangulated or a motion is not unique.
+        If a marker cannot be triangulated, a motion is not unique or the joints would be too fast.
     """
     state, task, parts, note = partitioned_at_start(
         model, q_start, s_start, s_star, center, profile, (demands.lower, demands.upper), sight
@@ -130,7 +133,8 @@ def plan_task(
         q_start,
         np.ones(4),
     )
-    motion = motion_of(profile, reaching, sigma, tau_limit / parts.tau if parts.tau > 0.0 else 1.0)
+    pure_translation = tau_limit / parts.tau if parts.tau > 0.0 else 1.0
+    motion = motion_of(profile, reaching, sigma, pure_translation, duration)
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     H_d = np.array([trajectory_displacement(H_hat, (tau, theta_r, theta_p), row) for row in motion.mu])
     images = np.moveaxis(project(model.P, state.A @ np.swapaxes(H_d, 1, 2), model.lens), 0, 1)
@@ -156,6 +160,7 @@ def plan_task(
         duration=motion.duration,
         tau_limit=tau_limit,
         sigma=sigma,
+        time=motion.time,
         mu=motion.mu,
         H_d=H_d,
         s=images,

@@ -10,11 +10,13 @@ from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, new_state
 from projservo_cli.loop.compiled import new_log
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import VERDICTS, Limits
+from projservo_cli.modes import REPLAN, following_mode, law_and_mode
 from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.stages import driven
 from projservo_cli.stages.disturbed import disturbance_of, lose_markers
+from projservo_cli.stages.following import followed
 from projservo_cli.stages.laws import law_for
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.reach import reach_for
@@ -90,26 +92,33 @@ def limits_of(config: "Config") -> Limits:
 
 
 def run(
-    config: "Config", calibration: Calibration, plan: Plan, law: str, *, progress: object = None
+    config: "Config", calibration: Calibration, plan: Plan, name: str, *, progress: object = None
 ) -> Trace:
-    """Drive one law from the start of the task to its verdict.
+    """Drive one law in one mode from the start of the task to its verdict.
+
+    Parameters
+    ----------
+    name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
 
     Raises
     ------
     InputError
-        If the configuration lacks a part of the simulation.
+        If the configuration lacks a part of the simulation, or the plan to follow has no time.
     WorkFailed
-        If the goal cannot be reached.
+        If the goal cannot be reached, or the joints cannot follow the plan.
     """
+    law, mode = law_and_mode(name)
+    planned_s = None if mode == REPLAN or plan.duration is None else plan.duration / config.plant.speed_scale
     gains, limits = gains_of(config), limits_of(config)
     if config.plant.use is not None:
         reach = reach_for(config, calibration)
         gains, limits = driven.adapted(config, calibration, gains, limits)
-        outcome = driven.run(config, calibration, plan, law, reach, gains, limits)
-        return record_of(law, outcome, reach, gains, limits, unknown(outcome.steps + 1))
-    made = simulate(config, calibration, plan, law)
-    found = known(made.outcome, made.plant, made.truth, made.reach, gains)
-    return record_of(law, made.outcome, made.reach, gains, limits, found)
+        outcome = driven.run(config, calibration, plan, name, reach, gains, limits)
+        found = unknown(outcome.steps + 1)
+    else:
+        outcome, plant, truth, reach = simulate(config, calibration, plan, name)
+        found = known(outcome, plant, truth, reach, gains)
+    return record_of(law, outcome, reach, gains, limits, found, mode, planned_s)
 
 
 class Simulated(NamedTuple):
@@ -121,20 +130,22 @@ class Simulated(NamedTuple):
     reach: Reach
 
 
-def simulate(config: "Config", calibration: Calibration, plan: Plan | Sense, law: str) -> Simulated:
-    """Drive the simulated robot under one law from the start of the task to its verdict.
+def simulate(config: "Config", calibration: Calibration, plan: Plan | Sense, name: str) -> Simulated:
+    """Drive the simulated robot from the start of the task to the verdict of one run.
 
     Parameters
     ----------
-    plan : of the task; the sense of its rotations is enough for a built-in law.
+    plan : of the task; the sense of its rotations is enough for a built-in law that does not follow it.
+    name : as of ``run``.
 
     Raises
     ------
     InputError
-        If the configuration lacks a part of the simulation.
+        If the configuration lacks a part of the simulation, or the plan to follow has no time.
     WorkFailed
-        If the goal cannot be reached.
+        If the goal cannot be reached, or the joints cannot follow the plan.
     """
+    law, mode = law_and_mode(name)
     gains, limits = gains_of(config), limits_of(config)
     truth = truth_of(config)
     reach = reach_of(config, truth)
@@ -145,20 +156,27 @@ def simulate(config: "Config", calibration: Calibration, plan: Plan | Sense, law
     pins = [] if sight is None else known_pins(calibration, truth)
     lose_markers(config, noise, [truth.number[i] for i in (*truth.face, *pins)])
     if isinstance(plan, Plan) and not in_compiled_loop(config, law):
-        controller = law_for(config, calibration, plan, law, reach, gains, sight)
+        controller = law_for(config, calibration, plan, name, reach, gains, sight)
         seen = plant if sight is None else plant._replace(pins=sight.pins)
         simulated = AnalyticPlant(seen, reach.q_start, noise)
         outcome = driven.run_law(controller, simulated, reach, gains, limits, config.plant.speed_scale)
     else:
         model = truth.model if law in METRIC_LAWS else calibration.model()
         sense = plan.rotation_sense()
-        outcome = outcome_of(law, model, plant, truth, reach, gains, limits, noise, sense, sight)
+        reference = plan if isinstance(plan, Plan) and mode != REPLAN else None
+        outcome = outcome_of(law, model, plant, truth, reach, gains, limits, noise, sense, sight, reference)
     return Simulated(outcome, plant, truth, reach)
 
 
 def in_compiled_loop(config: "Config", law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
     return law in CODES and config.plant.speed_scale == 1.0
+
+
+def sense_is_enough(config: "Config", name: str) -> bool:
+    """Whether a run needs no more of the plan than the sense of its rotations."""
+    law, mode = law_and_mode(name)
+    return mode == REPLAN and in_compiled_loop(config, law)
 
 
 def servo_noise(config: "Config", m: int, pins: int = 0) -> FloatArray:
@@ -182,10 +200,13 @@ def drive(
     noise: FloatArray,
     sense: FloatArray | None = None,
     sight: Sight | None = None,
+    plan: Plan | None = None,
 ) -> Trace:
     """Trace of one law with one model on the simulated robot; the arguments are those of ``outcome_of``."""
-    outcome = outcome_of(law, model, plant, truth, reach, gains, limits, noise, sense, sight)
-    return record_of(law, outcome, reach, gains, limits, known(outcome, plant, truth, reach, gains))
+    outcome = outcome_of(law, model, plant, truth, reach, gains, limits, noise, sense, sight, plan)
+    found = known(outcome, plant, truth, reach, gains)
+    mode, planned_s = (REPLAN, None) if plan is None else (following_mode(law), plan.duration)
+    return record_of(law, outcome, reach, gains, limits, found, mode, planned_s)
 
 
 def outcome_of(
@@ -199,6 +220,7 @@ def outcome_of(
     noise: FloatArray,
     sense: FloatArray | None = None,
     sight: Sight | None = None,
+    plan: Plan | None = None,
 ) -> Outcome:
     """Run one law with one model on the simulated robot.
 
@@ -209,6 +231,7 @@ def outcome_of(
     noise : (≥ max_steps + 1, 2, m, 2) px, with a sight m + p markers.
     sense : (2, n) joint motions of the planned rotations r and p, which decide the sense of a half turn.
     sight : the body to measure with; without it the face is measured point by point.
+    plan : what to follow, in the frame of the model; without it every step plans anew.
     """
     n, m, observed = len(reach.q_start), len(truth.face), len(truth.face)
     if sight is None:
@@ -217,6 +240,8 @@ def outcome_of(
         task = task_from_body(model, sight.body, reach.q_start, sight.s_start, sight.s_star, truth.center, m)
         plant = plant._replace(pins=sight.pins)
         observed += len(sight.pins)
+    if plan is not None:
+        task = followed(model, task, plan, gains.period, 1.0)
     state = new_state(n, m, observed)
     if sense is not None:
         state.memory.rotation[:] = sense

@@ -9,12 +9,16 @@ from projservo_cli.control.law import TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.normal import COORDINATES
 from projservo_cli.loop.compiled import Log, path_along, path_deviation
 from projservo_cli.loop.step import Limits, tolerance
+from projservo_cli.modes import REPLAN
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.stages.truth import Reach, Truth
 
 # Points of a joint step at which the deviation between samples is measured.
 SUBSAMPLES = 50
+
+# Share of the translation and rotation, deg, that are left; None where they are not measured.
+Remaining = tuple[float | None, float | None]
 
 
 class Outcome(NamedTuple):
@@ -128,7 +132,16 @@ def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gai
     )
 
 
-def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Limits, truth: Known) -> Trace:
+def record_of(
+    law: str,
+    outcome: Outcome,
+    reach: Reach,
+    gains: Gains,
+    limits: Limits,
+    truth: Known,
+    mode: str = REPLAN,
+    planned_s: float | None = None,
+) -> Trace:
     """Record of a finished run."""
     verdict, steps, log = outcome.verdict, outcome.steps, outcome.log
     rows = steps + 1
@@ -136,18 +149,21 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
     errors = log.errors[:rows]
     hidden = log.hidden[:rows] > 0.5
     outside, beyond, joint = (int(x) for x in log.events[:3])
-    translation_left, rotation_left = left(log, steps)
+    # A law that follows a plan measures what is left to where the plan is, not to the goal.
+    remaining = left(log, steps) if mode == REPLAN else (None, None)
     return Trace(
         law=law,
+        mode=mode,
+        planned_s=planned_s,
         verdict=verdict,
-        reason=outcome.disturbance or reason_of(verdict, log, steps, limits, joint),
+        reason=outcome.disturbance or reason_of(verdict, log, steps, limits, joint, remaining),
         steps=steps,
         period=gains.period,
         observation="points" if np.isnan(views).all() else "body",
         position_error_mm=truth.position_mm,
         rotation_error_deg=truth.rotation_deg,
-        translation_left=translation_left,
-        rotation_left_deg=rotation_left,
+        translation_left=remaining[0],
+        rotation_left_deg=remaining[1],
         self_occluded_steps_left=int(hidden[:, 0].sum()),
         self_occluded_steps_right=int(hidden[:, 1].sum()),
         center_deviation_mm=truth.between_mm,
@@ -183,7 +199,7 @@ def record_of(law: str, outcome: Outcome, reach: Reach, gains: Gains, limits: Li
     )
 
 
-def left(log: Log, steps: int) -> tuple[float | None, float | None]:
+def left(log: Log, steps: int) -> Remaining:
     """Share of the translation and rotation, deg, that were left; None where the law measures neither."""
     first, last = (float(log.errors[k, TAU_AFFINE]) for k in (0, steps))
     turn = float(log.errors[steps, THETA_S])
@@ -191,9 +207,9 @@ def left(log: Log, steps: int) -> tuple[float | None, float | None]:
     return share, math.degrees(turn) if math.isfinite(turn) else None
 
 
-def words_left(log: Log, steps: int) -> str:
+def words_left(log: Log, steps: int, remaining: Remaining) -> str:
     """What was left, in words."""
-    share, turn = left(log, steps)
+    share, turn = remaining
     parts = [] if share is None else [f"{share:.1%} of the translation"]
     parts += [] if turn is None else [f"{turn:.3g} deg of rotation"]
     return f"{' and '.join([*parts, f'an image error of {float(log.judged[steps]):.3g} px'])} are left"
@@ -229,7 +245,7 @@ def longest_plateau(image_error: FloatArray, window: int) -> int:
     return longest + window - 1 if longest else 0
 
 
-def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int) -> str:
+def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int, remaining: Remaining) -> str:
     """Why a run ended, in a sentence."""
     error, first = float(log.judged[steps]), float(log.judged[0])
     within = tolerance(limits, float(log.fit[steps, 2]))
@@ -245,6 +261,6 @@ def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int) ->
         "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
         + (f", {limits.lost_steps} periods after the last that was" if limits.lost_steps else ""),
         "joint limit": f"joint {joint + 1} stands at its limit, {float(log.read[steps, joint]):.6g} (rad or "
-        f"m), and the task would take it beyond; {words_left(log, steps)}",
+        f"m), and the task would take it beyond; {words_left(log, steps, remaining)}",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
     }[verdict]

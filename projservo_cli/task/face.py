@@ -10,6 +10,7 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, triangulate_points
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
+from projservo_cli.task.reference import NO_REFERENCE, Reference
 
 MIDPOINT = -1
 
@@ -27,6 +28,7 @@ class Task(NamedTuple):
     O : (2, 4) optical centres, a_inf·O = 1.
     visible : (2,) sign of a·O on the visible side of the face, one a camera.
     body : all markers of the body, by which the face is measured; none for point by point.
+    reference : the plan that is followed; none where every step plans anew.
     """
 
     s_star: FloatArray
@@ -37,6 +39,7 @@ class Task(NamedTuple):
     O: FloatArray
     visible: FloatArray
     body: Body = NO_BODY
+    reference: Reference = NO_REFERENCE
 
 
 @njit

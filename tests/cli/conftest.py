@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from projservo_cli import cli, files
+from projservo_cli.modes import law_and_mode
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import chain
 from projservo_cli.tables import read_table
@@ -85,7 +86,8 @@ class Stages:
 
     def servo(self, config: Any, calibration: Any, plan: Any, law: str, *, progress: Any) -> Any:
         self._make(law)
-        return fake(Trace, config.seed, law=law, verdict=self.verdicts.get(law, "converged"))
+        name, mode = law_and_mode(law)
+        return fake(Trace, config.seed, law=name, mode=mode, verdict=self.verdicts.get(law, "converged"))
 
     def report(self, run: Any, directory: Any, *, progress: Any) -> Any:
         self._make("report")

@@ -32,6 +32,41 @@ def test_up_to_date_is_skipped_and_prints_the_same(projservo, stages):
     assert load("out").path.read_bytes() == stored
 
 
+def test_each_law_runs_in_those_of_the_modes_that_it_has(projservo, stages):
+    modes = "control.mode=[replan, track, image_track]"
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--set", modes, "--json")
+    assert answer.code == 0
+    assert stages.made == ["calibrate", "plan", *(names := ["direct_three", "direct_three_track"]),
+                           *(others := ["stacked", "stacked_image_track"])]  # fmt: skip
+    assert list(load("out").traces) == names + others
+    told = [f"{row['law']} {row['mode']}" for row in answer.json["laws"]]
+    assert told == ["direct_three replan", "direct_three track", "stacked replan", "stacked image_track"]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (
+            ["--law", "stacked"],
+            "control.mode track: stacked has no such mode, only replan and image_track; laws",
+        ),
+        (
+            ["--set", "control.joint_speed_limit_deg_s=null"],
+            "nothing gives it one: set trajectory.duration_s",
+        ),
+        (["--set", "control.mode=trak"], "control.mode: 'trak' is not one of them; did you mean track?"),
+    ],
+)
+def test_a_mode_that_cannot_be_is_refused_before_anything_is_made(projservo, stages, given, words):
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--set", "control.mode=track", *given)
+    assert answer.code == 2
+    assert words in answer.err
+    assert len(answer.err.splitlines()) == 1
+    assert stages.made == []
+    # A calibration does not care.
+    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "--set", "control.mode=track").code == 0
+
+
 @pytest.mark.parametrize(
     ("change", "remade"),
     [
@@ -42,6 +77,7 @@ def test_up_to_date_is_skipped_and_prints_the_same(projservo, stages):
         ("control.gain_t=1", ALL[2:]),
         ("control.laws=[stacked]", ["report"]),
         ("control.must_converge=[]", []),
+        ("control.mode=[replan, image_track]", ["stacked_image_track", "report"]),
         ("report.formats=[svg]", ["report"]),
         ("noise.servo_px=0.1", []),
         ("name=other", []),

@@ -8,10 +8,14 @@ import json
 
 import numpy as np
 
+from projservo_cli.modes import MODES_OF
 from projservo_cli.records import LAWS
+from tests.control.following import Followed
 from tests.samples import frame
 from tests.scene import GAINS, Run, limits, scene, with_pins
 
+# Laws that can follow a plan.
+FOLLOWING = tuple(MODES_OF)
 # Pixel noise of four markers on the face and five pins.
 WHOLE_NOISE = 0.5 * np.random.default_rng(8).standard_normal((16, 2, 9, 2))
 
@@ -39,6 +43,11 @@ def hashes():
             sc, "exact", GAINS, limits(max_steps=15), WHOLE_NOISE, frame(1), task=sc.body_task(frame(1))
         )
         found[f"exact, body, {types}"] = hash_of(run)
+    # Without JIT planning takes minutes; a plan that is followed is compared on one arm alone.
+    sc = scene()
+    for law in FOLLOWING:
+        bounds = limits(speed=np.full(6, 0.8), max_steps=15)
+        found[f"{law}, following"] = hash_of(Followed(sc, law, frame(1), bounds=bounds, noise=noise))
     return found
 
 

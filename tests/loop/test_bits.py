@@ -7,7 +7,7 @@ import sys
 
 from projservo_cli.records import LAWS
 from tests.conftest import INTERPRETED, ROOT
-from tests.loop.bits import hashes
+from tests.loop.bits import FOLLOWING, hashes
 
 
 def test_both_modes_are_equal_to_the_bit():
@@ -22,5 +22,5 @@ def test_both_modes_are_equal_to_the_bit():
     )
     assert there.returncode == 0, there.stderr
     found = json.loads(there.stdout)
-    assert len(found) == 2 * (len(LAWS) + 1)
+    assert len(found) == 2 * (len(LAWS) + 1) + len(FOLLOWING)
     assert found == hashes()

@@ -9,6 +9,8 @@ from projservo_cli.loop.python import BuiltInLaw, run
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.records import LAWS
+from tests.control.following import Followed, tracked
+from tests.loop.bits import FOLLOWING
 from tests.samples import frame
 from tests.scene import GAINS, STEP, Run, limits, scene, with_pins
 
@@ -39,6 +41,21 @@ def test_both_loops_are_equal_to_the_bit(law, types, rng):
     verdict, steps, log = in_python(sc, law, bounds, noise, G)
     assert (VERDICTS[verdict], steps) == (compiled.verdict, compiled.steps)
     assert (compiled.full.factor < 1).any()
+    same_logs(log, compiled.full, steps)
+
+
+@pytest.mark.parametrize("law", FOLLOWING)
+def test_both_loops_follow_a_plan_alike(law, rng):
+    """With noise, a joint-speed limit that is active, and periods in which the face is lost."""
+    sc, G = scene(), frame(2)
+    bounds = limits(speed=np.full(6, 0.4), max_steps=60, lost_steps=5)
+    noise = 0.3 * rng.normal(size=(61, 2, 4, 2))
+    noise[7:10, 0, 1] = np.nan
+    compiled = Followed(sc, law, G, bounds=bounds, noise=noise)
+    verdict, steps, log = in_python(sc, law, bounds, noise, G, tracked(sc, G, compiled.plan))
+    assert (VERDICTS[verdict], steps) == (compiled.verdict, compiled.steps)
+    assert (compiled.full.factor < 1).any()
+    assert (compiled.full.q[7:10] == compiled.full.q[7]).all()
     same_logs(log, compiled.full, steps)
 
 

@@ -1,0 +1,41 @@
+"""Plans of the scene in miniature, and runs that follow them."""
+
+import math
+
+import numpy as np
+
+from projservo_cli.records import NO_LENS
+from projservo_cli.stages.following import followed
+from projservo_cli.stages.plan import plan_task
+from projservo_cli.task.margins import within
+from tests.scene import GAINS, Run, limits
+
+SPEED = math.radians(30.0)
+
+
+def planned(sc, G=None, profile="linear", duration=None, speed=SPEED):
+    """Plan of a scene in the frame of its model, at a joint-speed limit."""
+    model = sc.seen(G)
+    n = len(sc.q_start)
+    demands = within(np.full(n, -9.0), np.full(n, 9.0))._replace(speed=np.full(n, speed))
+    return plan_task(
+        model._replace(lens=NO_LENS), sc.q_start, sc.s_start, sc.s_star, sc.plant.center, profile, 0.9, 101,
+        demands, None, duration,
+    )  # fmt: skip
+
+
+def tracked(sc, G=None, plan=None, rate=1.0, task=None):
+    """Task of a scene with the plan to follow."""
+    task = sc.task(G) if task is None else task
+    return followed(sc.seen(G), task, planned(sc, G) if plan is None else plan, GAINS.period, rate)
+
+
+class Followed(Run):
+    """One compiled closed loop that follows its plan."""
+
+    def __init__(self, sc, law, G=None, plan=None, bounds=None, task=None, **given):
+        self.plan = planned(sc, G) if plan is None else plan
+        task = tracked(sc, G, self.plan, task=task)
+        self.periods = self.plan.duration / GAINS.period
+        bounds = limits(speed=np.full(len(sc.q_start), SPEED)) if bounds is None else bounds
+        super().__init__(sc, law, G=G, task=task, bounds=bounds, **given)

@@ -1,0 +1,110 @@
+"""Following a plan with a calibrated, noisy robot: how near the line, and when it arrives.
+
+Run as ``python -m tests.control.tracking [SEEDS] [NAME …]`` for the whole study: one row a seed.
+"""
+
+import sys
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.config import load_config
+from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.traces import rotation_between
+from projservo_cli.stages.truth import truth_of
+from tests.conftest import ROOT
+
+NOISE = ["noise.calibration_px=0.5", "noise.servo_px=0.5"]
+# Within this of the goal, mm and deg, a run has arrived; it has until one period after the planned time.
+ARRIVED_MM, ARRIVED_DEG = 1.0, 0.5
+
+
+class Kept(NamedTuple):
+    """How a run kept to the plan.
+
+    Attributes
+    ----------
+    most_mm, rms_mm : distance of the true centre from its line, between the samples and at them.
+    planned : time of arrival that was planned, in periods.
+    arrived : first instant at the goal; infinite for never.
+    position_mm, rotation_deg : errors one period after the planned time, or where the run ended before.
+    occluded : instants at which a camera did not see the face.
+    """
+
+    verdict: str
+    steps: int
+    most_mm: float
+    rms_mm: float
+    planned: float
+    arrived: float
+    position_mm: float
+    rotation_deg: float
+    occluded: int
+
+    @property
+    def on_the_line(self) -> bool:
+        return self.most_mm <= 3.0 and self.rms_mm <= 1.5
+
+    @property
+    def in_time(self) -> bool:
+        at_goal = self.position_mm <= ARRIVED_MM and self.rotation_deg <= ARRIVED_DEG
+        return at_goal and abs(self.arrived - self.planned) <= 1.0
+
+
+def off_the_line(trace, goal):
+    """Distance (k,) of the true centre from its line at every instant, mm."""
+    way = (goal - trace.center[0]) / np.linalg.norm(goal - trace.center[0])
+    off = trace.center - trace.center[0]
+    return 1e3 * np.linalg.norm(off - np.outer(off @ way, way), axis=1)
+
+
+def kept(trace, truth):
+    """What a trace says of its plan."""
+    body = np.linalg.solve(truth.robot.base_tool, truth.M_face.mean(axis=0))
+    goal = (trace.goal_pose @ body)[:3]
+    position = 1e3 * np.linalg.norm(trace.center - goal, axis=1)
+    rotation = np.array([rotation_between(pose, trace.goal_pose) for pose in trace.pose])
+    there = np.flatnonzero((position <= ARRIVED_MM) & (rotation <= ARRIVED_DEG))
+    planned = trace.planned_s / trace.period if trace.planned_s is not None else np.nan
+    last = trace.steps if np.isnan(planned) else min(trace.steps, int(planned) + 1)
+    return Kept(
+        trace.verdict,
+        trace.steps,
+        trace.center_deviation_mm,
+        float(np.sqrt(np.mean(off_the_line(trace, goal) ** 2))),
+        planned,
+        float(there[0]) if len(there) else np.inf,
+        float(position[last]),
+        float(rotation[last]),
+        int(trace.self_occluded.sum()),
+    )
+
+
+def runs(seed, names, overrides=(), arm="paper"):
+    """Runs by name, calibrated and observed with noise of one seed, gain 0.1 a step."""
+    config = load_config(ROOT / "configs" / f"{arm}.yaml", [*NOISE, f"seed={seed}", *overrides])
+    _, calibration, _ = calibrate.run(config)
+    planned = plan.run(config, calibration)
+    truth = truth_of(config)
+    return {name: kept(servo.run(config, calibration, planned, name), truth) for name in names}
+
+
+def study(seeds=100, names=("exact_track",)):
+    """Print every run, then how many kept to the line and to the time."""
+    found = {name: [] for name in names}
+    for seed in range(1, seeds + 1):
+        for name, run in runs(seed, names).items():
+            found[name].append(run)
+            print(name, seed, *(f"{value:.4g}" if isinstance(value, float) else value for value in run))
+    for name, rows in found.items():
+        print(
+            f"{name}: on the line {sum(row.on_the_line for row in rows)}, in time "
+            f"{sum(row.in_time for row in rows)}, converged "
+            f"{sum(row.verdict == 'converged' for row in rows)}, without occlusion "
+            f"{sum(row.occluded == 0 for row in rows)} of {len(rows)}; most "
+            f"{max(row.most_mm for row in rows):.3g} mm, rms {max(row.rms_mm for row in rows):.3g} mm"
+        )
+
+
+if __name__ == "__main__":
+    study(*(int(value) for value in sys.argv[1:2]), *([tuple(sys.argv[2:])] if sys.argv[2:] else []))
