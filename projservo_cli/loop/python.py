@@ -5,7 +5,7 @@ from typing import Protocol
 
 import numpy as np
 
-from projservo_cli.control import command
+from projservo_cli.control.bound import bind, bound_command
 from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, new_state
 from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.loop.compiled import Log, new_log
@@ -109,8 +109,9 @@ class BuiltInLaw:
     """
 
     def __init__(self, code: int, model: Model, task: Task, gains: Gains) -> None:
-        self.code, self.model, self.task, self.gains = code, model, task, gains
+        self.gains = gains
         self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M))
+        self.bound = bind(code, model, task, gains, self.state)
         self.errors = self.state.errors
         self.share = self.state.share
         self.fit = self.state.fit
@@ -124,7 +125,7 @@ class BuiltInLaw:
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
-        status = command(self.code, self.model, self.task, self.gains, s, q, self.state)
+        status = bound_command(self.bound, s, q)
         return status, self.state.q_dot.copy()
 
 

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control import CODES, command
+from projservo_cli.control import CODES
+from projservo_cli.control.bound import bind, bound_command
 from projservo_cli.control.law import ERRORS, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
@@ -87,6 +88,7 @@ class Case:
         self.points = self.drive(self.task, self.plant)
         self.whole = self.drive(self.body_task, self.body_plant)
         self.state = new_state(len(self.q_start), len(truth.face))
+        self.bound = bind(CODES["direct_three"], self.model, self.task, self.gains, self.state)
 
     def job(self, law: str, task: Task, plant: Plant, bounds: Limits) -> Job:
         """One run with a state and a log of its own."""
@@ -113,7 +115,7 @@ class Case:
     def one_step(self) -> int:
         """One step of direct_three, called from Python."""
         S, Q = self.points
-        return command(CODES["direct_three"], self.model, self.task, self.gains, S[0], Q[0], self.state)
+        return bound_command(self.bound, S[0], Q[0])
 
     def whole_run(self) -> Job:
         """A run of 150 steps, traced."""
