@@ -12,7 +12,7 @@ from projservo_cli.version import __version__  # noqa: E402
 
 project = "projservo"
 release = version = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "docstrings", "mathml", "reference"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "docstrings", "links", "mathml", "reference"]
 exclude_patterns = ["extensions"]
 nitpicky = True
 

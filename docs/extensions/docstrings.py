@@ -60,9 +60,9 @@ def _docstring(app: Sphinx, what: str, name: str, found: Any, options: Any, line
 def _signature(
     app: Sphinx, what: str, name: str, found: Any, options: Any, signature: str | None, returns: str | None
 ) -> tuple[str | None, str | None] | None:
-    """No signature for records: it repeats their fields."""
-    record = dataclasses.is_dataclass(found) or hasattr(found, "_fields")
-    return ("", None) if what == "class" and record else None
+    """No signature for records, which repeats their fields, and for protocols, which are never made."""
+    plain = dataclasses.is_dataclass(found) or hasattr(found, "_fields") or hasattr(found, "_is_protocol")
+    return ("", None) if what == "class" and plain else None
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

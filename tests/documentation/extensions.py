@@ -10,8 +10,9 @@ pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'proj
 sys.path.insert(0, str(DOCS / "extensions"))
 try:
     import docstrings
+    import links
     import reference
 finally:
     sys.path.remove(str(DOCS / "extensions"))
 
-__all__ = ["docstrings", "reference"]
+__all__ = ["docstrings", "links", "reference"]
