@@ -20,6 +20,7 @@ from projservo_cli.calibration import (
 )
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.assembly import assemble, with_lost_markers
+from projservo_cli.calibration.diagnosis import blamed_joint
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
 from projservo_cli.calibration.frame import (
@@ -32,15 +33,18 @@ from projservo_cli.calibration.frame import (
 )
 from projservo_cli.calibration.nominal import Nominal, solve_from
 from projservo_cli.calibration.optimization import Problem, prepare
-from projservo_cli.calibration.quality import Agreement, Expected
+from projservo_cli.calibration.quality import REFUSE_RATIO, Agreement, Expected, Misfit
 from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
 from projservo_cli.calibration.reconstruction import Frame, image_frame
 from projservo_cli.calibration.refined import Solution, determined, solve
 from projservo_cli.calibration.shown import require_images
 from projservo_cli.calibration.weakest import worst_determined
-from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, Observation
 
 METHODS = ("refined", "linear", "closed_form")
+# Fitted noise over the expected one from which on, though the fit passes, one joint may be to blame: it is
+# where its change leaves no more than this share.
+DOUBTFUL_RATIO, DOUBTFUL_SHARE = 2.0, 0.5
 A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 Fitted = Callable[[Solution, float], None]
 
@@ -110,19 +114,9 @@ def calibrate(
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "refined":
             frame = image_frame(readings, image_size)
-            q_reference = reference_joints(readings.q)
-            search = partial(solve, readings, q_reference, epipolar, frame, rng, expected)
-            solution, note = (
-                (search(), "")
-                if init is None
-                else solve_from(init, readings, q_reference, epipolar, expected, search)
+            solution, expected, result = _most_likely(
+                readings, epipolar, frame, expect, rng, lens=lens, init=init
             )
-            if lens:
-                solution = distortion.with_lens(solution, frame, epipolar)
-                epipolar = distortion.straight_epipolar(solution, rng)
-                expected = expect(epipolar.sigma_px)
-            result = _refined(solution, epipolar, expected, frame)
-            result = dataclasses.replace(result, advice=(*result.advice, *([note] if note else [])))
         elif method == "linear":
             result = _linear(readings, epipolar, expected)
         else:
@@ -133,13 +127,56 @@ def calibrate(
     return dataclasses.replace(result, source=source, seconds=seconds)
 
 
+def _most_likely(
+    readings: Readings,
+    epipolar: Epipolar,
+    frame: Frame,
+    expect: Callable[[float], Expected],
+    rng: np.random.Generator,
+    *,
+    lens: bool,
+    init: Nominal | None,
+) -> tuple[Solution, Expected, Calibration]:
+    """Maximum likelihood, the noise it is measured by, and its record; a misfit names the joint if it can."""
+    q_reference = reference_joints(readings.q)
+    expected = expect(epipolar.sigma_px)
+    search = partial(solve, readings, q_reference, epipolar, frame, rng, expected)
+
+    def blame(most_px: float) -> str:
+        return blamed_joint(readings, q_reference, epipolar, frame, most_px, rng)
+
+    try:
+        solution, note = (
+            (search(), "")
+            if init is None
+            else solve_from(init, readings, q_reference, epipolar, expected, search)
+        )
+        straight = epipolar
+        if lens:
+            solution = distortion.with_lens(solution, frame, epipolar)
+            straight = distortion.straight_epipolar(solution, rng)
+            expected = expect(straight.sigma_px)
+        result = _refined(solution, straight, expected, frame)
+    except Misfit as refused:
+        # The joints of a simulation are as configured: their types and readings are not to blame.
+        cause = "" if expected.known else blame(REFUSE_RATIO * expected.sigma_px)
+        if not cause:
+            raise
+        raise Misfit(f"{cause}; as given, {refused}") from None
+    cause = ""
+    if not expected.known and expected.ratio(solution.agreement) > DOUBTFUL_RATIO:
+        cause = blame(DOUBTFUL_SHARE * solution.agreement.sigma_px)
+    advice = (*filter(None, (cause,)), *result.advice, *filter(None, (note,)))
+    return solution, expected, dataclasses.replace(result, advice=advice)
+
+
 def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Frame) -> Calibration:
     """Record of the maximum likelihood in its projective frame, with its covariance."""
     share = distortion.share_explained(whole, frame) if whole.scene.lens is None else 0.0
     solution, kept = determined(whole)
     refusal = expected.refusal(solution.agreement)
     if refusal is not None:
-        raise WorkFailed(refusal + distortion.hint(share))
+        raise Misfit(refusal + distortion.hint(share))
     problem, scene, agreement = solution.problem, solution.scene, solution.agreement
     readings = problem.readings
     found = culprits.find(problem, scene, agreement.used, agreement.sigma_px)
@@ -150,8 +187,8 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Fra
             len(np.unique(found.suspect[:, 0])),
             len(readings.q),
         )
-    except WorkFailed as refused:
-        raise WorkFailed(f"{refused}{distortion.hint(share)}") from None
+    except Misfit as refused:
+        raise Misfit(f"{refused}{distortion.hint(share)}") from None
     result = _projective(problem, scene)
     _, J = adjustment.derivative(scene, readings, problem.q)
     used = agreement.used.astype(np.float64)

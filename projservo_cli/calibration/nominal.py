@@ -14,6 +14,7 @@ from projservo_cli.calibration.refined import (
     RAYLEIGH,
     SAME_LEVEL,
     Solution,
+    far_px,
     hopeless_px,
     least_squares,
     robust_search,
@@ -139,6 +140,6 @@ def _from(scene: Scene, readings: Readings, q_reference: FloatArray, epipolar: E
     pixels, depth = predict_pixels(scene, readings, problem.q)
     if not np.isfinite(pixels).all() or not (depth[readings.seen] > 0.0).all():
         return None
-    found = robust_search(problem, scene, np.ones(len(readings.q), dtype=np.bool_))
+    found = robust_search(problem, scene, np.ones(len(readings.q), dtype=np.bool_), far_px(epipolar))
     level = float(np.median(np.linalg.norm(found.residual[readings.seen], axis=1)))
     return least_squares(problem, found.scene, level / RAYLEIGH, hopeless_px(epipolar))

@@ -22,6 +22,7 @@ SETTLED = 1e-7
 LEAST_RESIDUAL = 1e-5
 
 Weighting = Callable[[FloatArray], FloatArray]
+Stalled = Callable[[FloatArray], bool]
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,14 @@ def fixed(weight: FloatArray) -> Weighting:
 
 
 def minimize(
-    problem: Problem, scene: Scene, weighting: Weighting, *, cameras: bool = True, most: int = 200
+    problem: Problem,
+    scene: Scene,
+    weighting: Weighting,
+    *,
+    cameras: bool = True,
+    most: int = 200,
+    settled_at: float = SETTLED,
+    stalled: Stalled = lambda residual: False,
 ) -> Fit:
     """Weighted least squares over all parameters, or with the cameras held.
 
@@ -121,6 +129,8 @@ def minimize(
     weighting : weights (2, N) from residuals (2, N, 2), recomputed after each accepted step.
     cameras : whether the cameras are free.
     most : steps after which to give up.
+    settled_at : a step that moves the images by less than this fraction of the residual is the last.
+    stalled : told the residuals (2, N, 2) after each accepted step; true ends the search.
     """
     place, readings = problem.place, problem.readings
     free = np.arange(place.size) >= (0 if cameras else 2 * CAMERA)
@@ -143,10 +153,12 @@ def minimize(
         fresh = x is not None and np.isfinite(new_cost) and new_cost <= cost
         if x is not None:
             moved = float((weight[..., None] * problem.change(J, x) ** 2).sum())
-            settled = moved <= SETTLED**2 * max(cost, LEAST_RESIDUAL**2 * float(weight.sum()))
+            settled = moved <= settled_at**2 * max(cost, LEAST_RESIDUAL**2 * float(weight.sum()))
         if fresh:
             scene, residual, weight = candidate, new_residual, weighting(new_residual)
             damping = max(0.1 * damping, LEAST_DAMPING)
+            if stalled(residual):
+                break
         else:
             damping *= 10.0
     cost = float((weight[..., None] * residual**2).sum())

@@ -22,6 +22,10 @@ OFF_LINE = 5.0
 ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
 
 
+class Misfit(WorkFailed):
+    """No model of the robot describes what was seen."""
+
+
 @dataclass(frozen=True, eq=False)
 class Agreement:
     """What a fit leaves of the images.
@@ -153,16 +157,16 @@ def require_explained(unexplained: int, sightings: int, suspect_poses: int, pose
 
     Raises
     ------
-    WorkFailed
+    Misfit
         If the model of the robot, not single errors, is at odds with the data.
     """
     if unexplained > max(3.0, MOST_UNEXPLAINED * sightings):
-        raise WorkFailed(
+        raise Misfit(
             f"the fit does not describe the data: in {unexplained} of {sightings} sightings both cameras "
             "agree with each other but not with the robot; check the joint readings and types (R or P)"
         )
     if suspect_poses > MOST_SUSPECT * poses:
-        raise WorkFailed(
+        raise Misfit(
             f"the fit does not describe the data: {suspect_poses} of {poses} poses contradict their joint "
             "readings; check the joint readings, their units and types (R or P)"
         )

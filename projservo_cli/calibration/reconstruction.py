@@ -4,6 +4,7 @@ Everything guessed here (focal length, principal point, square pixels) is free i
 whose result is projective.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -152,9 +153,21 @@ def distance_spread(points: FloatArray, pairs: tuple[IntArray, IntArray, IntArra
     return float(np.median(np.concatenate(deviations))) if deviations else np.inf
 
 
-def metric_guesses(
-    F: FloatArray, readings: Readings, frame: Frame, keep: int, factor: float = 1.0
-) -> list[Guess]:
+def guess_at(F: FloatArray, readings: Readings, frame: Frame, focal: float) -> Guess:
+    """Reconstruction of the pairs seen by both cameras from a focal length in units of the image size.
+
+    Parameters
+    ----------
+    F : (3, 3) fundamental matrix.
+    readings : what was seen.
+    frame : guessed principal points and sizes.
+    focal : guessed.
+    """
+    left, right = (readings.pixels[v][readings.both] for v in (0, 1))
+    return dataclasses.replace(relative_pose(F, intrinsics(frame, focal), left, right), focal=focal)
+
+
+def metric_guesses(F: FloatArray, readings: Readings, frame: Frame, keep: int) -> list[Guess]:
     """Guessed reconstructions of the pairs seen by both cameras, best first.
 
     The focal length is the one that keeps the distances between markers most constant over the
@@ -166,7 +179,6 @@ def metric_guesses(
     readings : what was seen.
     frame : guessed principal points and sizes.
     keep : most guesses to return.
-    factor : multiplies the focal lengths found.
 
     Raises
     ------
@@ -174,13 +186,11 @@ def metric_guesses(
         If no two markers were seen together at two poses.
     """
     both = readings.both
-    left, right = readings.pixels[0][both], readings.pixels[1][both]
     pairs = marker_pairs(readings.pose_of[both], readings.marker_of[both])
 
     def guess(log_focal: float) -> Guess:
-        focal = float(np.exp(log_focal))
-        found = relative_pose(F, intrinsics(frame, focal), left, right)
-        return Guess(found.P, found.points, distance_spread(found.points, pairs), focal)
+        found = guess_at(F, readings, frame, float(np.exp(log_focal)))
+        return dataclasses.replace(found, spread=distance_spread(found.points, pairs))
 
     grid = np.linspace(np.log(SHORTEST), np.log(LONGEST), TRIALS)
     scan = [guess(x) for x in grid]
@@ -193,8 +203,7 @@ def metric_guesses(
     # A minimum at which the body changes its shape a lot more than at the best is none to start from.
     minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
-    best = [_golden(guess, grid[i] - step, grid[i] + step, scan[i]) for i in minima]
-    return best if factor == 1.0 else [guess(np.log(factor * b.focal)) for b in best]
+    return [_golden(guess, grid[i] - step, grid[i] + step, scan[i]) for i in minima]
 
 
 def _golden(guess: Callable[[float], Guess], low: float, high: float, best: Guess) -> Guess:

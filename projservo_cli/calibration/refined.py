@@ -10,10 +10,18 @@ from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.body import LEAST, Alignment, merge
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
-from projservo_cli.calibration.optimization import Fit, Problem, Weighting, fixed, minimize, prepare
-from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected
+from projservo_cli.calibration.optimization import (
+    Fit,
+    Problem,
+    Stalled,
+    Weighting,
+    fixed,
+    minimize,
+    prepare,
+)
+from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected, Misfit
 from projservo_cli.calibration.readings import Readings, of_poses, restrict
-from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
+from projservo_cli.calibration.reconstruction import Frame, Guess, guess_at, metric_guesses
 from projservo_cli.calibration.start import place, rotation_axes
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
@@ -26,6 +34,11 @@ MASK_ROUNDS = 4
 LEAST_SHARE = 0.25
 # A start that leaves this many times the epipolar noise after the robust search is a wrong one.
 HOPELESS = 10.0
+# A robust search that would still be refused and has come nearer by less than this share over so many
+# steps is not continued.
+CRAWL, PATIENCE = 0.01, 10
+# A step of the screws alone that moves the images by less than this fraction of the residual is the last.
+ROUGHLY = 1e-2
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a
 # wrong one often leads where the best does not. After a pass, poses whose residual is so many times
 # the median are left out of the next.
@@ -68,8 +81,10 @@ def solve(
 
     Raises
     ------
-    WorkFailed
+    Misfit
         If no start leads anywhere.
+    WorkFailed
+        If too little was seen to start from.
     """
     problem = prepare(readings, q_reference)
     hopeless = hopeless_px(epipolar)
@@ -79,7 +94,7 @@ def solve(
     for factors in FOCAL_FACTORS:
         usable = of_poses(readings, trusted)
         for scene in islice(starts(problem, usable, epipolar, frame, rng, factors), SEARCHES):
-            searched = robust_search(problem, scene, trusted)
+            searched = robust_search(problem, scene, trusted, far_px(epipolar))
             level = float(np.median(distances(searched.residual, usable_rows(problem, trusted))))
             # Different starts that end at one place need not be followed to the end twice.
             if any(abs(level - other) < SAME_LEVEL * other for other in levels):
@@ -105,7 +120,7 @@ def solve(
             if not np.array_equal(before, trusted):
                 levels = []
     if best is None:
-        raise WorkFailed(
+        raise Misfit(
             "the data contradict the joint readings from the start: check that they belong to their poses, "
             "their units (rad, m) and types (R or P), and that rows of one pose belong together"
         )
@@ -115,6 +130,11 @@ def solve(
 def hopeless_px(epipolar: Epipolar) -> float:
     """Noise beyond which least squares is not worth its time, px."""
     return HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA)
+
+
+def far_px(epipolar: Epipolar) -> float:
+    """Noise with which a fit would be refused, px."""
+    return REFUSE_RATIO * max(epipolar.sigma_px, LEAST_SIGMA)
 
 
 def usable_rows(problem: Problem, trusted: BoolArray) -> BoolArray:
@@ -159,9 +179,11 @@ def starts(
     Parameters are those of ``solve``; ``readings`` may be those of the problem at some of its poses,
     and ``factors`` multiply the focal lengths that fit best.
     """
+    guesses = metric_guesses(epipolar.F, readings, frame, FOCAL_MINIMA)
     for factor in factors:
-        for guess in metric_guesses(epipolar.F, readings, frame, FOCAL_MINIMA, factor):
-            alignment = _merged(guess, readings)
+        for best in guesses:
+            guess = best if factor == 1.0 else guess_at(epipolar.F, readings, frame, factor * best.focal)
+            alignment = merged(guess, readings)
             if int(np.isfinite(alignment.body[:, 0]).sum()) < LEAST:
                 raise WorkFailed(
                     "no three markers are seen together by both cameras: more must be seen at once"
@@ -173,7 +195,7 @@ def starts(
                     yield Scene(guess.P, screws.H_hat, M)
 
 
-def _merged(guess: Guess, readings: Readings) -> Alignment:
+def merged(guess: Guess, readings: Readings) -> Alignment:
     """Body and poses from the points of a guessed reconstruction."""
     both = readings.both
     shape = (len(readings.q), readings.marker.size)
@@ -194,7 +216,26 @@ def cauchy(seen: BoolArray) -> Weighting:
     return weighting
 
 
-def robust_search(problem: Problem, scene: Scene, trusted: BoolArray) -> Fit:
+def crawling(seen: BoolArray, far: float) -> Stalled:
+    """Whether a search is far from the noise and hardly comes nearer, asked after each of its steps.
+
+    Parameters
+    ----------
+    seen : (2, N) readings that count.
+    far : noise from which on a search counts as far, px.
+    """
+    levels: list[float] = []
+
+    def stalled(residual: FloatArray) -> bool:
+        levels.append(float(np.median(distances(residual, seen))))
+        if len(levels) <= PATIENCE or levels[-1] <= RAYLEIGH * far:
+            return False
+        return levels[-1] > (1.0 - CRAWL) * levels[-1 - PATIENCE]
+
+    return stalled
+
+
+def robust_search(problem: Problem, scene: Scene, trusted: BoolArray, far: float) -> Fit:
     """Screws alone, then everything, under a Cauchy loss over the trusted poses (K,).
 
     Parameters
@@ -202,10 +243,12 @@ def robust_search(problem: Problem, scene: Scene, trusted: BoolArray) -> Fit:
     problem : what to explain.
     scene : start.
     trusted : (K,) poses that count.
+    far : noise beyond which a search that hardly proceeds is given up, px.
     """
-    weighting = cauchy(usable_rows(problem, trusted))
-    scene = minimize(problem, scene, weighting, cameras=False, most=20).scene
-    return minimize(problem, scene, weighting, most=100)
+    rows = usable_rows(problem, trusted)
+    weighting = cauchy(rows)
+    scene = minimize(problem, scene, weighting, cameras=False, most=20, settled_at=ROUGHLY).scene
+    return minimize(problem, scene, weighting, most=100, stalled=crawling(rows, far))
 
 
 def least_squares(problem: Problem, scene: Scene, sigma: float, hopeless: float) -> Solution | None:

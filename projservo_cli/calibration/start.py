@@ -94,7 +94,12 @@ def isolated_axes(R: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatAr
 
 
 def rotation_axes(
-    alignment: Alignment, q: FloatArray, prismatic: BoolArray, rng: np.random.Generator, keep: int
+    alignment: Alignment,
+    q: FloatArray,
+    prismatic: BoolArray,
+    rng: np.random.Generator,
+    keep: int,
+    steps: int = ROTATION_STEPS,
 ) -> list[FloatArray]:
     """Axis directions that explain the rotations of the poses, the distinct minima, best first.
 
@@ -108,6 +113,7 @@ def rotation_axes(
     prismatic : (n,) joints that do not turn.
     rng : draws the axes.
     keep : most sets to return.
+    steps : of the search.
 
     Returns
     -------
@@ -120,7 +126,7 @@ def rotation_axes(
     direct = isolated_axes(R, q, prismatic)
     if direct is not None:
         w[0] = direct
-    w, loss = _fit_axes(w, R, q, prismatic)
+    w, loss = _fit_axes(w, R, q, prismatic, steps)
     order = np.argsort(loss)
     kept: list[FloatArray] = []
     enough = min(UNLIKELY * loss[order[0]] + 1e-9, CONTRADICTION * len(R))
@@ -134,7 +140,7 @@ def rotation_axes(
 
 
 def _fit_axes(
-    w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray
+    w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:
     """Levenberg–Marquardt for all starts at once: axes (S, n, 3) and losses (S,)."""
     S, n = w.shape[:2]
@@ -143,13 +149,15 @@ def _fit_axes(
     damping = np.full(S, 1e-2)
     residual, J = _axis_residuals(w, base, R, q, prismatic)
     loss, weight = _cauchy(residual)
-    for _ in range(ROTATION_STEPS):
-        A = np.einsum("skia,sk,skib->sab", J, weight, J)
-        g = np.einsum("skia,sk,ski->sa", J, weight, residual)
-        size = A.shape[1]
+    for _ in range(steps):
+        size = J.shape[-1]
+        rows = J.reshape(S, -1, size)
+        weighted = np.swapaxes(rows * np.repeat(weight, 3, axis=1)[..., None], 1, 2)
+        A = weighted @ rows
+        g = (weighted @ residual.reshape(S, -1, 1))[..., 0]
         A += (damping * np.trace(A, axis1=1, axis2=2) / size + 1e-12)[:, None, None] * np.eye(size)
-        step = -np.linalg.solve(A, g[..., None])[..., 0]
-        turn = rotation_exponential(step.reshape(S, n + 1, 3))
+        step = -np.linalg.solve(A, g[..., None]).reshape(S, n + 1, 3)
+        turn = rotation_exponential(np.asarray(step, dtype=np.float64))
         w_new = np.einsum("snij,snj->sni", turn[:, :n], w)
         base_new = turn[:, n] @ base
         residual_new, J_new = _axis_residuals(w_new, base_new, R, q, prismatic)
