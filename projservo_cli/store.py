@@ -120,7 +120,7 @@ def save(run: Run) -> None:
             group.attrs["inputs"] = json.dumps(result.inputs, sort_keys=True)
             group.attrs["records"] = json.dumps(list(result.records))
             for label, record in result.records.items():
-                _save_record(group.create_group(label) if label else group, record)
+                save_record(group.create_group(label) if label else group, record)
 
 
 def load(target: Path | str) -> Run:
@@ -166,7 +166,7 @@ def _load_result(path: Path, group: h5py.Group) -> Result:
         _text(group, "configuration"),
         json.loads(_text(group, "provenance")),
         json.loads(_text(group, "inputs")),
-        {label: _load_record(path, group[label] if label else group) for label in labels},
+        {label: load_record(path, group[label] if label else group) for label in labels},
     )
 
 
@@ -177,7 +177,7 @@ def _text(group: h5py.Group, name: str, default: str | None = None) -> str:
     return value
 
 
-def _save_record(group: h5py.Group, record: Any) -> None:
+def save_record(group: h5py.Group, record: Any) -> None:
     """Store each field of a record by its metadata; None is stored as nothing."""
     group.attrs["record"] = type(record).__name__
     arrays = {}
@@ -236,7 +236,8 @@ def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> No
                 group[name].dims[axis].attach_scale(group[dim])
 
 
-def _load_record(path: Path, group: h5py.Group) -> Any:
+def load_record(path: Path, group: h5py.Group) -> Any:
+    """Read a record that ``save_record`` stored; an InputError where it is of another version."""
     kind = getattr(record_types, _text(group, "record"), None)
     if not dataclasses.is_dataclass(kind):
         raise InputError(f"{path}: {group.name} holds a record this version does not know; use another run")

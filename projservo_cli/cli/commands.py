@@ -74,7 +74,7 @@ COMMANDS = {
         "With --set plant=module:Class (or plant in the configuration) a robot of yours takes the place of "
         "the simulated one. It is driven to the start of the task and from there by each law, and stopped on "
         "every way out.",
-        (*_OF_STAGES, "laws", "speed_scale", "confirm"),
+        (*_OF_STAGES, "laws", "speed_scale", "confirm", "origin"),
         stage=True,
         example="projservo servo -o results/ur5 --law direct_two --law stacked",
     ),
@@ -130,6 +130,25 @@ COMMANDS = {
             force="Replace the table if there is one.",
         ),
         example="projservo detect images/left images/right --joints-csv q.csv --output tags.csv",
+    ),
+    "sweep": Command(
+        "Make many runs over a grid of values and random draws.",
+        "Makes the runs of a sweep (configs/sweep_noise.yaml shows one) in parts that are stored as they are "
+        "done, and assembles them to one table, sweep.h5, which xarray.open_dataset reads. Interrupted or "
+        "killed, the same command goes on where it was. What a run does depends on its number alone: "
+        "projservo servo --from SWEEP:INDEX makes any of them anew.\n\n"
+        "projservo report SWEEP writes statistics and figures. With --scheduler the workers of a Dask "
+        "cluster do the work; it needs pip install 'projservo[cluster]' here and there.",
+        ("config", "sets", "output", "force", "dry_run", "threads", "scheduler"),
+        variants=_variants(
+            "DIR",
+            config="Configuration of the sweep (YAML).",
+            sets="Override a value of the sweep, such as runs=10.",
+            output="Folder of the sweep. Default: results/<name of the sweep>.",
+            force="Begin anew, whatever is in the folder.",
+            threads="Processes. Default: all processors.",
+        ),
+        example="projservo sweep -c configs/sweep_noise.yaml -j 2",
     ),
     "validate": Command(
         "Predict held-out images with a calibration.",

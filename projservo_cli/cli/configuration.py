@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from projservo_cli.config import Config, Override, load_config
+from projservo_cli.config import Config, Override, load_config, to_yaml
 from projservo_cli.records import InputError
 from projservo_cli.store import Run, load, run_path
 
@@ -20,6 +20,8 @@ def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
         When either cannot be read or makes no sense.
     """
     overrides = given_overrides(options)
+    if options["origin"] is not None:
+        return _from_sweep(options["origin"], options, overrides)
     stored = stored_run(options["output"]) if options["output"] else None
     if options["config"]:
         config = load_config(options["config"], overrides)
@@ -31,6 +33,23 @@ def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
         config = load_config(shipped(SHIPPED), overrides)
     target = run_path(options["output"] or Path("results") / config.name)
     return config, stored or stored_run(target) or Run(target)
+
+
+def _from_sweep(origin: str, options: dict[str, Any], overrides: list[Override]) -> tuple[Config, Run]:
+    """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
+    if options["config"]:
+        raise InputError("-c and --from: the configuration is that of the sweep; leave -c out")
+    from projservo_cli.sweep.again import run_of
+
+    config, calibration = run_of(origin)
+    if overrides:
+        config = load_config(config.name, overrides, text=to_yaml(config))
+    target = run_path(options["output"] or Path("results") / config.name)
+    run = stored_run(target) or Run(target)
+    stored = run.results.get("calibrate")
+    if calibration is not None and (stored is None or stored.key != calibration.key):
+        run = Run(target, run.configuration, {"calibrate": calibration})
+    return config, run
 
 
 def stored_run(target: str | Path) -> Run | None:

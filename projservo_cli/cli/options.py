@@ -126,6 +126,16 @@ OPTIONS: dict[str, click.Option] = {
             help="On servo and record: ask on the terminal before the first motion.",
         ),
         click.Option(
+            ["origin", "--from"],
+            metavar="SWEEP:INDEX",
+            help="On servo: the run of that number of a sweep, made anew as a run of its own.",
+        ),
+        click.Option(
+            ["--scheduler"],
+            metavar="ADDRESS",
+            help="On sweep: the Dask scheduler whose workers do the work, such as tcp://host:8786.",
+        ),
+        click.Option(
             ["--to"],
             type=click.Choice(["csv", "mat", "npz"]),
             help="On export: the kind of file.",

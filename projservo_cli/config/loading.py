@@ -79,7 +79,7 @@ def load_config(
         All that is wrong, one line ``file:line:column: path: what`` each.
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
-    document = Document("" if path is None else _read(path) if text is None else text, str(path or ""))
+    document = Document("" if path is None else read_text(path) if text is None else text, str(path or ""))
     found = list(document.problems)
     values = document.values
     if values is None:
@@ -90,23 +90,29 @@ def load_config(
         found.append(Problem((), "the configuration is empty; start from one of the shipped ones"))
     for change in changes:
         written_out(values)
-        problem = _apply(values, change, document)
-        found += [problem] if problem else []
+        found += apply_overrides(values, [change], document)
     written_out(values)
     if not any(problem.path == () for problem in found):
         found += _defects(_defaults(values, path))
     if found:
-        raise InputError("\n".join(_lines(document, found)))
+        raise InputError("\n".join(problem_lines(document, found)))
     return Config.model_validate(values)
 
 
-def _read(path: pathlib.Path | str) -> str:
+def read_text(path: pathlib.Path | str) -> str:
+    """Text of a configuration; an InputError where there is none."""
     try:
         return pathlib.Path(path).read_text(encoding="utf-8-sig")
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text; expected a YAML configuration") from error
+
+
+def apply_overrides(values: dict[str, Any], changes: Sequence[Override], document: Document) -> list[Problem]:
+    """Set values in place, in order; what could not be set."""
+    problems = [_apply(values, change, document) for change in changes]
+    return [problem for problem in problems if problem]
 
 
 def _apply(values: dict[str, Any], change: Override, document: Document) -> Problem | None:
@@ -182,7 +188,7 @@ def _alone(name: str) -> type[Section]:
     return model
 
 
-def _lines(document: Document, found: Sequence[Problem]) -> list[str]:
+def problem_lines(document: Document, found: Sequence[Problem]) -> list[str]:
     """One line a problem, flags last, otherwise in the order of the file."""
     placed = [(problem.source or document.place(problem.path), problem) for problem in found]
     placed.sort(key=lambda item: _position(item[0]))

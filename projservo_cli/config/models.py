@@ -227,7 +227,8 @@ class ReportSettings(Section):
     )
 
 
-def _folder_name(name: str) -> str:
+def folder_name(name: str) -> str:
+    """A name that can be that of a folder; else ValueError."""
     if name != name.strip() or name in {"", ".", ".."} or any(c in '/\\:*?"<>|' or c < " " for c in name):
         raise ValueError("must be usable as the name of a folder: no path separators, no surrounding spaces")
     return name
@@ -240,7 +241,7 @@ class Config(Section):
     far as the stages asked for do without them.
     """
 
-    name: Annotated[str, StringConstraints(max_length=100), AfterValidator(_folder_name)] = Field(
+    name: Annotated[str, StringConstraints(max_length=100), AfterValidator(folder_name)] = Field(
         description="of the run and its folder; by default that of the file"
     )
     seed: Whole = Field(0, description="of all random numbers; the same seed gives the same run")

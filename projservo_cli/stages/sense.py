@@ -9,27 +9,31 @@ from projservo_cli.stages.constrained import CONSTRAINED
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.sight import Sight
 from projservo_cli.stages.truth import Reach, center_index
+from projservo_cli.task.face import Task
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
 
 
 class Sense(NamedTuple):
-    """All of a plan that a law needs that plans anew in each step: which way to turn."""
+    """All of a plan that a law needs that plans anew in each step: which way to turn.
+
+    Attributes
+    ----------
+    motions : (2, n) joint motions of the rotations r and p in the sense they are planned.
+    task : measured as the plan is; None where the whole plan was made.
+    """
 
     motions: FloatArray
+    task: Task | None
 
     def rotation_sense(self) -> FloatArray:
         """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
         return self.motions
 
 
-def rotation_sense(
-    config: "Config", calibration: Calibration, reach: Reach, sight: Sight | None
-) -> FloatArray:
-    """Joint motions (2, n) of the rotations r and p in the sense that the plan takes them.
-
-    The same as that of the whole plan, which only the profile constrained needs for it.
+def rotation_sense(config: "Config", calibration: Calibration, reach: Reach, sight: Sight | None) -> Sense:
+    """The sense that the plan of a task takes; only the profile constrained needs the whole plan for it.
 
     Raises
     ------
@@ -38,9 +42,9 @@ def rotation_sense(
     """
     profile = config.trajectory.profile
     if profile == CONSTRAINED:
-        return plan.run(config, calibration).rotation_sense()
+        return Sense(plan.run(config, calibration).rotation_sense(), None)
     joints = joints_of(config, calibration.joint_types)
-    state, _, parts, _ = partitioned_at_start(
+    state, task, parts, _ = partitioned_at_start(
         calibration.model(),
         reach.q_start,
         reach.s_start,
@@ -50,4 +54,4 @@ def rotation_sense(
         (joints.lower, joints.upper),
         sight,
     )
-    return signed(parts.theta_r, parts.theta_p, state.q_hat[1:3])
+    return Sense(signed(parts.theta_r, parts.theta_p, state.q_hat[1:3]), task)

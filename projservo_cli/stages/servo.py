@@ -33,7 +33,7 @@ from projservo_cli.stages.truth import (
     reach_of,
     truth_of,
 )
-from projservo_cli.task.face import task_from_images
+from projservo_cli.task.face import Task, task_from_images
 from projservo_cli.task.target import task_from_body
 
 if TYPE_CHECKING:
@@ -107,18 +107,22 @@ def run(
     WorkFailed
         If the goal cannot be reached, or the joints cannot follow the plan.
     """
+    if config.plant.use is None:
+        return record(config, name, plan, simulate(config, calibration, plan, name))
     law, mode = law_and_mode(name)
-    planned_s = None if mode == REPLAN or plan.duration is None else plan.duration / config.plant.speed_scale
     gains, limits = gains_of(config), limits_of(config)
-    if config.plant.use is not None:
-        reach = reach_for(config, calibration)
-        gains, limits = driven.adapted(config, calibration, gains, limits)
-        outcome = driven.run(config, calibration, plan, name, reach, gains, limits)
-        found = unknown(outcome.steps + 1)
-    else:
-        outcome, plant, truth, reach = simulate(config, calibration, plan, name)
-        found = known(outcome, plant, truth, reach, gains)
-    return record_of(law, outcome, reach, gains, limits, found, mode, planned_s)
+    reach = reach_for(config, calibration)
+    gains, limits = driven.adapted(config, calibration, gains, limits)
+    outcome = driven.run(config, calibration, plan, name, reach, gains, limits)
+    found = unknown(outcome.steps + 1)
+    return record_of(law, outcome, reach, gains, limits, found, mode, planned_time(config, mode, plan))
+
+
+def planned_time(config: "Config", mode: str, plan: Plan | Sense) -> float | None:
+    """When a run that follows a plan arrives by it, s; None where it follows none or that has no time."""
+    if mode == REPLAN or not isinstance(plan, Plan) or plan.duration is None:
+        return None
+    return plan.duration / config.plant.speed_scale
 
 
 class Simulated(NamedTuple):
@@ -164,8 +168,21 @@ def simulate(config: "Config", calibration: Calibration, plan: Plan | Sense, nam
         model = truth.model if law in METRIC_LAWS else calibration.model()
         sense = plan.rotation_sense()
         reference = plan if isinstance(plan, Plan) and mode != REPLAN else None
-        outcome = outcome_of(law, model, plant, truth, reach, gains, limits, noise, sense, sight, reference)
+        # Of the same model and images, the task of the plan is that of a law that measures as the plan does.
+        task = plan.task if isinstance(plan, Sense) and law in BODY_LAWS else None
+        outcome = outcome_of(
+            law, model, plant, truth, reach, gains, limits, noise, sense, sight, reference, task
+        )
     return Simulated(outcome, plant, truth, reach)
+
+
+def record(config: "Config", name: str, plan: Plan | Sense, made: Simulated) -> Trace:
+    """Trace of a run of the simulated robot."""
+    law, mode = law_and_mode(name)
+    gains, limits = gains_of(config), limits_of(config)
+    found = known(made.outcome, made.plant, made.truth, made.reach, gains)
+    planned_s = planned_time(config, mode, plan)
+    return record_of(law, made.outcome, made.reach, gains, limits, found, mode, planned_s)
 
 
 def in_compiled_loop(config: "Config", law: str) -> bool:
@@ -209,6 +226,14 @@ def drive(
     return record_of(law, outcome, reach, gains, limits, found, mode, planned_s)
 
 
+def measured_task(model: Model, reach: Reach, center: int, sight: Sight | None) -> Task:
+    """The task as the images at start and goal show it, by the body or point by point."""
+    if sight is None:
+        return task_from_images(model, reach.s_start, reach.s_star, center)
+    m = reach.s_star.shape[1]
+    return task_from_body(model, sight.body, reach.q_start, sight.s_start, sight.s_star, center, m)
+
+
 def outcome_of(
     law: str,
     model: Model,
@@ -221,6 +246,7 @@ def outcome_of(
     sense: FloatArray | None = None,
     sight: Sight | None = None,
     plan: Plan | None = None,
+    task: Task | None = None,
 ) -> Outcome:
     """Run one law with one model on the simulated robot.
 
@@ -232,12 +258,12 @@ def outcome_of(
     sense : (2, n) joint motions of the planned rotations r and p, which decide the sense of a half turn.
     sight : the body to measure with; without it the face is measured point by point.
     plan : what to follow, in the frame of the model; without it every step plans anew.
+    task : where it was measured already.
     """
     n, m, observed = len(reach.q_start), len(truth.face), len(truth.face)
-    if sight is None:
-        task = task_from_images(model, reach.s_start, reach.s_star, truth.center)
-    else:
-        task = task_from_body(model, sight.body, reach.q_start, sight.s_start, sight.s_star, truth.center, m)
+    if task is None:
+        task = measured_task(model, reach, truth.center, sight)
+    if sight is not None:
         plant = plant._replace(pins=sight.pins)
         observed += len(sight.pins)
     if plan is not None:

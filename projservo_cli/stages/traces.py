@@ -104,6 +104,13 @@ def motion_of(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach) -> Mot
     )
 
 
+def path_between_mm(outcome: Outcome, plant: Plant, motion: Motion, period: float) -> float:
+    """Largest distance of the centre from its line, between the samples too, mm."""
+    log, steps = outcome.log, outcome.steps
+    between = path_deviation(plant, log, steps, period, motion.start, motion.goal, SUBSAMPLES)
+    return max(1e3 * between, motion.at_samples_mm)
+
+
 def middle_of(plant: Plant) -> FloatArray:
     """Centre (4,) of the face at the reference, m."""
     return np.asarray(plant.M.mean(axis=0) if plant.center < 0 else plant.M[plant.center])
@@ -117,16 +124,13 @@ def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gai
     motion = motion_of(outcome, plant, truth, reach)
     if motion is None or reach.goal_pose is None:
         return Known(pose, np.full((4, 4), np.nan), center)
-    between = path_deviation(
-        plant, outcome.log, outcome.steps, gains.period, motion.start, motion.goal, SUBSAMPLES
-    )
     return Known(
         pose,
         reach.goal_pose,
         center,
         motion.position_mm,
         motion.rotation_deg,
-        max(1e3 * between, motion.at_samples_mm),
+        path_between_mm(outcome, plant, motion, gains.period),
         motion.at_samples_mm,
         motion.path_mm,
     )

@@ -311,6 +311,12 @@ def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
     WorkFailed
         If a camera sees the face edge-on at the start.
     """
+    return _plant(truth, q_start.tobytes(), config.plant.self_occlusion == "opaque")
+
+
+@lru_cache(maxsize=64)
+def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
+    q_start = np.frombuffer(start_bytes)
     M = truth.M_face
     start = M @ (truth.robot.pose(q_start) @ np.linalg.inv(truth.robot.base_tool)).T
     order = cyclic_order(start)
@@ -331,5 +337,5 @@ def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
         truth.image_size,
         truth.robot.lower,
         truth.robot.upper,
-        config.plant.self_occlusion == "opaque",
+        opaque,
     )

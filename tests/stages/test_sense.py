@@ -23,4 +23,4 @@ def test_the_sense_is_that_of_the_whole_plan(name, overrides):
     _, calibration, _ = calibrate.run(config)
     reach = reach_for(config, calibration)
     found = rotation_sense(config, calibration, reach, sight_for(config, calibration, reach))
-    assert np.array_equal(found, plan.run(config, calibration).rotation_sense())
+    assert np.array_equal(found.rotation_sense(), plan.run(config, calibration).rotation_sense())

@@ -1,0 +1,150 @@
+"""The configuration of a sweep: what is run how often, over which values."""
+
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+
+from projservo_cli.config.fields import Count, Number, Positive, Section, Whole
+from projservo_cli.config.loading import Override, apply_overrides, problem_lines, read_text
+from projservo_cli.config.messages import translated
+from projservo_cli.config.models import folder_name
+from projservo_cli.config.yaml_source import Document, Problem
+from projservo_cli.records import InputError
+
+BASE, LAW = "base", "law"  # names of axes with a meaning of their own
+
+
+def _one_or_more(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
+
+
+def _plain(value: Any) -> Any:
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError("takes text, finite numbers, true, false, null, lists and mappings") from error
+    return value
+
+
+Plain = Annotated[Any, AfterValidator(_plain)]
+
+
+class Linked(Section):
+    """Several keys that take the same values together."""
+
+    keys: tuple[str, ...] = Field(
+        min_length=1, description="keys of the configuration, such as noise.servo_px"
+    )
+    values: tuple[Plain, ...] = Field(min_length=1, description="values that all of them take in turn")
+
+
+def _axis(value: Any) -> Any:
+    """A list of values stands for one key that bears the name of the axis."""
+    return {"keys": [""], "values": value} if isinstance(value, list) else value
+
+
+Axis = Annotated[Linked, BeforeValidator(_axis)]
+
+
+class Distribution(Section):
+    """What a value is drawn from: exactly one of the four."""
+
+    uniform: tuple[Number, Number] | None = Field(None, description="least and largest value")
+    log_uniform: tuple[Positive, Positive] | None = Field(
+        None, description="least and largest value, of which the logarithm is uniform"
+    )
+    normal: tuple[Number, Positive] | None = Field(None, description="mean and standard deviation")
+    choice: tuple[Plain, ...] | None = Field(None, min_length=1, description="values of equal chances")
+
+    @model_validator(mode="after")
+    def _one(self) -> "Distribution":
+        given = [(name, value) for name, value in self if value is not None]
+        if len(given) != 1:
+            raise ValueError("give exactly one of uniform, log_uniform, normal and choice")
+        name, value = given[0]
+        if name in ("uniform", "log_uniform") and not value[0] < value[1]:
+            raise ValueError(f"{name} needs a least value below the largest")
+        return self
+
+
+class Tasks(Section):
+    """Reaching tasks instead of that of the base."""
+
+    random: Count = Field(description="number of random tasks, which the runs of a cell take in turn")
+
+
+class SweepConfig(Section):
+    """Closed-loop runs over a grid of values, each drawn by its number alone.
+
+    A cell is one combination of the values of the grid. Run r of a cell has the same task, noise and
+    drawn values as run r of every other cell, so that laws are compared on equal terms.
+    """
+
+    name: Annotated[str, AfterValidator(folder_name)]
+    seed: Whole = Field(0, description="of all that is drawn: tasks, noise, calibrations and random values")
+    base: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
+        min_length=1, description="configurations (YAML) beside this file; several are an axis of the grid"
+    )
+    set: dict[str, Plain] = Field({}, description="values that every run takes instead of those of the base")
+    runs: Annotated[int, Field(ge=1, le=100_000_000, strict=True)] = Field(
+        100, description="runs of each cell"
+    )
+    grid: dict[str, Axis] = Field({}, description="values of each key; law is short for control.laws")
+    random: dict[str, Distribution] = Field(
+        {}, description="what the value of a key is drawn from, for each run; for each calibration where "
+        "that depends on the key"
+    )  # fmt: skip
+    tasks: Tasks | None = Field(None, description="null for the task of the base")
+    calibrations: Count = Field(1, description="calibrations of a cell; run r is made with number r mod this")
+    traces: tuple[Whole, ...] = Field((), description="numbers of the runs whose whole traces are kept")
+    between_samples: Annotated[bool, Field(strict=True)] = Field(
+        False, description="whether the deviation of the path is measured between samples too, which is slow"
+    )
+    chunk: Count | None = Field(None, description="runs made and stored at a time; null for about a second's")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "SweepConfig":
+        if len(set_of := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
+            raise ValueError(f"base: two files of one name, {', '.join(sorted(set_of))}: rename one")
+        for name, axis in self.grid.items():
+            if name == BASE:
+                raise ValueError("grid.base: several configurations are listed under base")
+            if axis.keys == ("",) and name in self.random:
+                raise ValueError(f"random.{name}: stands in the grid as well; keep one")
+            if len({json.dumps(value) for value in axis.values}) < len(axis.values):
+                raise ValueError(f"grid.{name}: a value stands there twice")
+        return self
+
+    def keys_of(self, name: str) -> tuple[str, ...]:
+        """Keys of the configuration that an axis of the grid sets."""
+        keys = self.grid[name].keys
+        return (name,) if keys == ("",) else keys
+
+
+def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
+    """Read and check the configuration of a sweep; ``base`` becomes absolute paths.
+
+    Raises
+    ------
+    InputError
+        All that is wrong, one line ``file:line:column: path: what`` each.
+    """
+    document = Document(read_text(path), str(path))
+    if not isinstance(document.values, dict):
+        problems = document.problems or [Problem((), "expected keys and values such as base: paper.yaml")]
+        raise InputError("\n".join(problem_lines(document, problems)))
+    values = document.values
+    problems = list(document.problems)
+    problems += apply_overrides(values, [Override.parse(text) for text in overrides], document)
+    values.setdefault("name", pathlib.Path(path).stem)
+    try:
+        sweep = SweepConfig.model_validate(values)
+    except ValidationError as error:
+        problems += translated(SweepConfig, error.errors(include_url=False), values)
+    if problems:
+        raise InputError("\n".join(problem_lines(document, problems)))
+    folder = pathlib.Path(path).parent
+    return sweep.model_copy(update={"base": tuple(str((folder / base).resolve()) for base in sweep.base)})

@@ -1,0 +1,352 @@
+"""What run number i of a sweep is: an ordinary configuration."""
+
+import hashlib
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.config import Config, Override, digest, load_config, to_yaml
+from projservo_cli.config.fields import JointVector
+from projservo_cli.config.models import Goal, Task
+from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
+from projservo_cli.modes import law_and_mode, names_of
+from projservo_cli.records import FloatArray, InputError
+from projservo_cli.stages.calibrate import DEPENDS_ON as CALIBRATION_DEPENDS_ON
+from projservo_cli.stages.chain import NOT_HASHED
+
+# Streams of the sweep's seed.
+RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES = range(5)
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One dimension of the grid: its name, the keys it sets, its values."""
+
+    name: str
+    keys: tuple[str, ...]
+    values: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class TaskSet:
+    """Random tasks of a base: joints (k, n) at start and goal, rad or m."""
+
+    q_start: FloatArray
+    q_goal: FloatArray
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Where run number ``run`` stands: its cell, its number in the cell, and those of what it shares."""
+
+    run: int
+    cell: int
+    draw: int
+    calibration: int
+    task: int
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A sweep with its bases at hand, so that it needs no file.
+
+    Attributes
+    ----------
+    sweep : its configuration.
+    bases : name and resolved YAML of each base.
+    """
+
+    sweep: SweepConfig
+    bases: tuple[tuple[str, str], ...]
+
+    @cached_property
+    def axes(self) -> tuple[Axis, ...]:
+        """Dimensions of the grid, the last one running fastest; there is always one of laws."""
+        found = [Axis(BASE, (), tuple(name for name, _ in self.bases))] if len(self.bases) > 1 else []
+        for name in self.sweep.grid:
+            found.append(Axis(name, self.sweep.keys_of(name), self.sweep.grid[name].values))
+        if all(LAW not in axis.keys for axis in found):
+            control = load_config("base", text=self.bases[0][1]).control
+            found.append(Axis(LAW, (LAW,), names_of(control.laws, control.mode)))
+        return tuple(found)
+
+    @cached_property
+    def cells(self) -> int:
+        """Number of cells."""
+        return math.prod(len(axis.values) for axis in self.axes)
+
+    @property
+    def total(self) -> int:
+        """Number of runs."""
+        return self.cells * self.sweep.runs
+
+    @cached_property
+    def recipe(self) -> dict[str, Any]:
+        """All there is, as JSON values; ``from_recipe`` makes the design of it."""
+        return {"sweep": self.sweep.model_dump(mode="json"), "bases": [list(base) for base in self.bases]}
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of all the results depend on; where files lie and how runs are grouped is not in it."""
+        left_out = {"name", "base", "chunk"}
+        values = {name: value for name, value in self.recipe["sweep"].items() if name not in left_out}
+        text = json.dumps([values, self.recipe["bases"]], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def numbers(self, run: int) -> Numbers:
+        """Where a run stands.
+
+        Raises
+        ------
+        InputError
+            If there is no such run.
+        """
+        if not 0 <= run < self.total:
+            raise InputError(f"run {run}: the sweep {self.sweep.name} has runs 0 to {self.total - 1}")
+        cell, draw = divmod(run, self.sweep.runs)
+        tasks = self.sweep.tasks
+        return Numbers(run, cell, draw, draw % self.sweep.calibrations, draw % tasks.random if tasks else -1)
+
+    def values(self, cell: int) -> dict[str, Any]:
+        """Value of each axis in a cell."""
+        places = np.unravel_index(cell, [len(axis.values) for axis in self.axes])
+        return {axis.name: axis.values[int(i)] for axis, i in zip(self.axes, places, strict=True)}
+
+    def base_of(self, cell: int) -> int:
+        """Which base a cell is made from."""
+        return cell // (self.cells // len(self.bases))
+
+    def cell(self, cell: int) -> Config:
+        """Configuration of a cell before anything is drawn.
+
+        Raises
+        ------
+        InputError
+            If a value of the grid is not one that its key takes, or a simulated task is missing.
+        """
+        return _cell(self, cell)
+
+    def calibrated(self, cell: int, calibration: int) -> Config:
+        """Configuration of a cell with the seed of a calibration and what is drawn for it."""
+        return _calibrated(self, cell, calibration)
+
+    def calibration_key(self, cell: int, calibration: int) -> str:
+        """Hash of all a calibration depends on; cells that share it share the calibration."""
+        return _calibration_key(self, cell, calibration)
+
+    def config(self, run: int, tasks: Mapping[int, TaskSet]) -> Config:
+        """Configuration of a run.
+
+        Parameters
+        ----------
+        run : its number.
+        tasks : random tasks of each base, by number, where the sweep has any.
+
+        Raises
+        ------
+        InputError
+            If a drawn value is not one that its key takes.
+        """
+        at = self.numbers(run)
+        config = self.calibrated(at.cell, at.calibration)
+        drawn = self._drawn(VALUES, at.draw, per_calibration=False)
+        if drawn:
+            config = changed(config, drawn, f"run {run}")
+        update: dict[str, Any] = {"seed": seed_of(self.sweep.seed, RUNS, at.draw)}
+        if at.task >= 0:
+            update["task"] = _task(config, tasks[self.base_of(at.cell)], at.task)
+        return config.model_copy(update=update)
+
+    def drawn(self, run: int) -> dict[str, Any]:
+        """Values drawn for a run and for its calibration, in the order of ``random``."""
+        at = self.numbers(run)
+        found = self._drawn(VALUES, at.draw, per_calibration=False)
+        found |= self._drawn(CALIBRATION_VALUES, at.calibration, per_calibration=True)
+        return {key: found[key] for key in self.sweep.random}
+
+    def calibrations(self) -> Iterator[tuple[int, int]]:
+        """Cell and number of each calibration that is needed, each once."""
+        seen = set()
+        for cell, number in product(range(self.cells), range(min(self.sweep.calibrations, self.sweep.runs))):
+            key = self.calibration_key(cell, number)
+            if key not in seen:
+                seen.add(key)
+                yield cell, number
+
+    def _drawn(self, stream: int, number: int, *, per_calibration: bool) -> dict[str, Any]:
+        keys = [key for key in self.sweep.random if for_calibration(key) is per_calibration]
+        if not keys:
+            return {}
+        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number)))
+        return {key: sample(self.sweep.random[key], rng) for key in keys}
+
+
+def read_design(sweep: SweepConfig) -> Design:
+    """Read the bases of a sweep and check every cell.
+
+    Raises
+    ------
+    InputError
+        If a base cannot be read, or a cell is no configuration of a simulated task.
+    """
+    changes = [_override("set", key, value) for key, value in sweep.set.items()]
+    bases = tuple((Path(base).stem, to_yaml(load_config(base, changes))) for base in sweep.base)
+    design = Design(sweep, bases)
+    for run in (number for number in sweep.traces if number >= design.total):
+        raise InputError(f"traces: there is no run {run}; the sweep has runs 0 to {design.total - 1}")
+    for cell in range(design.cells):
+        design.cell(cell)
+    for draw in range(min(3, sweep.runs) if sweep.random else 0):
+        changed(design.cell(0), design.drawn(draw), f"run {draw}")
+    return design
+
+
+def from_recipe(recipe: Mapping[str, Any]) -> Design:
+    """The design that a recipe is of."""
+    bases = tuple((str(name), str(text)) for name, text in recipe["bases"])
+    return Design(SweepConfig.model_validate(recipe["sweep"]), bases)
+
+
+def for_calibration(key: str) -> bool:
+    """Whether the calibration depends on a key of the configuration."""
+    return any(f"{key}.".startswith(f"{part}.") for part in CALIBRATION_DEPENDS_ON)
+
+
+def seed_of(seed: int, stream: int, number: int) -> int:
+    """Seed of one of many draws."""
+    return int(np.random.SeedSequence(seed, spawn_key=(stream, number)).generate_state(1, np.uint64)[0] >> 1)
+
+
+def sample(distribution: Distribution, rng: np.random.Generator) -> Any:
+    """One value; always as many random numbers, whatever the distribution."""
+    uniform, normal = rng.random(), rng.standard_normal()
+    if distribution.uniform is not None:
+        least, most = distribution.uniform
+        return least + (most - least) * uniform
+    if distribution.log_uniform is not None:
+        least, most = distribution.log_uniform
+        return math.exp(math.log(least) + (math.log(most) - math.log(least)) * uniform)
+    if distribution.normal is not None:
+        mean, deviation = distribution.normal
+        return mean + deviation * normal
+    assert distribution.choice is not None
+    return distribution.choice[int(uniform * len(distribution.choice))]
+
+
+def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
+    """A configuration with other values.
+
+    Raises
+    ------
+    InputError
+        If a value is not one that its key takes.
+    """
+    resolved = config.model_dump(mode="json")
+    try:
+        for key, value in values.items():
+            _put(resolved, key.split("."), value)
+        return Config.model_validate(resolved)
+    except (ValueError, KeyError, IndexError, TypeError):
+        overrides = [_override(what, key, value) for key, value in values.items()]
+        load_config(config.name, overrides, text=to_yaml(config))  # says what is wrong in the user's words
+        raise
+
+
+def _put(values: Any, path: Sequence[str], value: Any) -> None:
+    for step in path[:-1]:
+        values = values[int(step)] if isinstance(values, list) else values[step]
+    if isinstance(values, list):
+        values[int(path[-1])] = value
+    else:
+        values[path[-1]] = value
+
+
+def _override(what: str, key: str, value: Any) -> Override:
+    path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(key.split(".")))
+    return Override(f"{what}: {key}={json.dumps(value)}", path, value)
+
+
+def _overrides(what: str, key: str, value: Any) -> list[Override]:
+    """A value as overrides; that of a law sets its mode too where its name tells one."""
+    if key != LAW:
+        return [_override(what, key, value)]
+    flag = f"{what}: {key}={json.dumps(value)}"
+    law, mode = law_and_mode(value)
+    found = [Override(flag, ("control", "laws"), [law])]
+    return found if law == value else [*found, Override(flag, ("control", "mode"), [mode])]
+
+
+def name_of_run(config: Config) -> str:
+    """Name of the only run of a configuration: its law, with the mode where it follows the plan.
+
+    Raises
+    ------
+    InputError
+        If it has several, or none.
+    """
+    names = names_of(config.control.laws, config.control.mode)
+    if len(names) != 1:
+        raise InputError(
+            f"a cell runs one law in one mode, not {', '.join(names)}: list them under grid.law, such as "
+            "law: [exact, exact_track]"
+        )
+    return names[0]
+
+
+@lru_cache(maxsize=1024)
+def _cell(design: Design, cell: int) -> Config:
+    base = design.bases[design.base_of(cell)]
+    values = design.values(cell)
+    changes = [
+        change
+        for axis in design.axes
+        for key in axis.keys
+        for change in _overrides(f"grid.{axis.name}", key, values[axis.name])
+    ]
+    config = load_config(base[0], changes, text=base[1])
+    if config.recorded or None in (config.robot, config.rig, config.markers, config.task):
+        raise InputError(f"base {base[0]}: a sweep needs a simulated robot with a task, and no data")
+    if config.plant.use is not None:
+        raise InputError(f"base {base[0]}: a sweep drives the simulated robot; leave plant.use out")
+    name_of_run(config)
+    assert config.task is not None
+    control = config.control.model_copy(update={"must_converge": ()})
+    reference = config.calibration.reference or config.task.start
+    calibration = config.calibration.model_copy(update={"reference": reference})
+    return config.model_copy(
+        update={"name": design.sweep.name, "control": control, "calibration": calibration}
+    )
+
+
+@lru_cache(maxsize=4096)
+def _calibrated(design: Design, cell: int, number: int) -> Config:
+    config = design.cell(cell)
+    drawn = design._drawn(CALIBRATION_VALUES, number, per_calibration=True)
+    if drawn:
+        config = changed(config, drawn, f"calibration {number}")
+    seed = seed_of(design.sweep.seed, CALIBRATIONS, number)
+    calibration = config.calibration.model_copy(update={"seed": seed})
+    return config.model_copy(update={"calibration": calibration})
+
+
+@lru_cache(maxsize=4096)
+def _calibration_key(design: Design, cell: int, number: int) -> str:
+    config = design.calibrated(cell, number).model_copy(update={"seed": 0})
+    return digest(config, CALIBRATION_DEPENDS_ON, without=NOT_HASHED["calibrate"])
+
+
+def _task(config: Config, tasks: TaskSet, number: int) -> Task:
+    """Random task of a number; an offset of the start stays."""
+    assert config.task is not None
+    start, goal = (
+        JointVector(joints=tuple(float(x) for x in q[number]), unit="rad")
+        for q in (tasks.q_start, tasks.q_goal)
+    )
+    return Task(start=start, start_offset=config.task.start_offset, goal=Goal(joints=goal))

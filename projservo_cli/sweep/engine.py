@@ -1,0 +1,162 @@
+"""Where the parts of a sweep are made: here, in processes of this machine, or on a cluster."""
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from concurrent.futures.process import ProcessPoolExecutor
+from itertools import islice
+from typing import Any, Protocol, TypeVar
+
+from projservo_cli.records import InputError, WorkFailed
+
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
+MOST_LOSSES = 5  # of workers in a row, without a job done in between
+
+
+class Engine(Protocol):
+    """What makes jobs, ``workers`` at a time; ``losses`` are raised by futures whose worker was lost."""
+
+    workers: int
+    losses: tuple[type[Exception], ...]
+
+    def open(self) -> Executor:
+        """A pool to submit jobs to, made anew after workers were lost."""
+
+    def check(self) -> None:
+        """Raise WorkFailed where nothing can come back any more."""
+
+    def close(self) -> None:
+        """Give back what was taken; jobs that run are dropped."""
+
+
+class Here(Executor):
+    """The pool of one: a job is made when it is submitted."""
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> "Future[Any]":
+        """A future that is done."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*arguments, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+class LocalEngine:
+    """Processes of this machine; a single one is this process.
+
+    Parameters
+    ----------
+    workers : how many.
+    """
+
+    losses: tuple[type[Exception], ...] = ()
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        self._pool: Executor | None = None
+
+    def open(self) -> Executor:
+        """Start the processes."""
+        self.close()
+        if self.workers == 1:
+            self._pool = Here()
+        else:
+            context = multiprocessing.get_context("spawn")
+            self._pool = ProcessPoolExecutor(self.workers, context, _leave_interrupts_to_the_parent)
+        return self._pool
+
+    def check(self) -> None:
+        """A pool tells by itself."""
+
+    def close(self) -> None:
+        """End the processes at once."""
+        if isinstance(self._pool, ProcessPoolExecutor):
+            processes = list((self._pool._processes or {}).values())
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for process in processes:
+                process.terminate()
+        self._pool = None
+
+
+def _leave_interrupts_to_the_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def completed(engine: Engine, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
+    """Results of jobs as they are done, in any order; what a lost worker had is made again.
+
+    No more jobs wait than keep all workers busy, and a result is let go when the next is asked for.
+
+    Raises
+    ------
+    WorkFailed
+        If workers are lost again and again, or the engine is.
+    InputError
+        What a job raises.
+    """
+    waiting = iter(jobs)
+    pool = engine.open()
+    futures: dict[Future[Result], Job] = {}
+    again: list[Job] = []
+    losses = 0
+    lost: tuple[type[BaseException], ...] = (BrokenExecutor, CancelledError, OSError, *engine.losses)
+    try:
+        while True:
+            room = max(0, 2 * engine.workers - len(futures) - len(again)) if engine.workers > 1 else 1
+            for job in [*again, *islice(waiting, room)]:
+                futures[pool.submit(function, job)] = job
+            again = []
+            if not futures:
+                return
+            done, _ = wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
+            if not done:
+                engine.check()
+            for future in done:
+                job = futures.pop(future)
+                try:
+                    result = future.result()
+                except lost as error:
+                    engine.check()
+                    again.append(job)
+                    reason = error
+                    continue
+                losses = 0
+                yield result
+                del result
+            if again:
+                losses += 1
+                if losses > MOST_LOSSES:
+                    raise WorkFailed(
+                        f"workers were lost {losses} times in a row ({' '.join(str(reason).split())}): see "
+                        "whether the machine has memory left; run the sweep again to continue"
+                    )
+                again += futures.values()
+                futures.clear()
+                pool = engine.open()
+    finally:
+        engine.close()
+
+
+def engine_for(workers: int, scheduler: str | None) -> Engine:
+    """The engine that the command line asks for.
+
+    Raises
+    ------
+    InputError
+        If the package of the cluster is not installed, or its versions differ.
+    WorkFailed
+        If the scheduler does not answer.
+    """
+    if scheduler is None:
+        return LocalEngine(workers)
+    try:
+        from projservo_cli.sweep.cluster import ClusterEngine
+    except ImportError as error:
+        raise InputError(
+            f"--scheduler {scheduler}: the package distributed is missing: pip install 'projservo[cluster]'"
+        ) from error
+    return ClusterEngine(scheduler)

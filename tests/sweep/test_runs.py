@@ -1,0 +1,105 @@
+"""Rows of a sweep against the ordinary stages: every run redone by itself is its row, to the bit."""
+
+import math
+
+import numpy as np
+import pytest
+
+from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.sweep.design import name_of_run
+from projservo_cli.sweep.preparation import Wanted, calibrate_one, drawn_tasks
+from projservo_cli.sweep.runs import Part, run_part
+from tests.sweep.cases import design
+
+# Of each case every run is redone.
+CASES = {
+    "laws": {
+        "grid": {"law": ["direct_three", "exact", "exact_track", "euclidean_points"]},
+        "runs": 1,
+    },
+    "points": {"set": {"control.observation": "points"}, "random": {"control.gain_s": {"uniform": [1, 3]}}},
+    "late images": {"set": {"disturbance.delay_periods": 2}, "runs": 2},
+    "constrained": {"set": {"trajectory.profile": "constrained"}, "runs": 1, "between_samples": True},
+    "python loop": {"set": {"plant.speed_scale": 0.5, "stop.max_steps": 10}, "runs": 1},
+    "half turn": {"base": "paper", "runs": 2, "set": {"noise.calibration_px": 0.5}},
+    "tasks": {"tasks": {"random": 4}, "grid": {"law": ["direct_two"]}, "runs": 4},
+}
+SAME = {
+    "position_error_mm": "position_error_mm",
+    "rotation_error_deg": "rotation_error_deg",
+    "self_occluded_steps_left": "self_occluded_steps_left",
+    "self_occluded_steps_right": "self_occluded_steps_right",
+    "first_outside_image": "first_outside_image",
+    "first_beyond_limit": "first_beyond_limit",
+    "speed_limited_steps": "speed_limited_steps",
+    "visibility_limited_steps": "visibility_limited_steps",
+    "path_length_mm": "path_length_mm",
+    "center_deviation_at_samples_mm": "center_deviation_at_samples_mm",
+    "center_deviation_mm": "center_deviation_mm",
+    "effort": "effort",
+    "steps": "steps",
+}
+
+
+def part_of(found, first=0, last=None):
+    """A part with all it needs."""
+    tasks = {} if found.sweep.tasks is None else {0: drawn_tasks(found, 0, found.sweep.tasks.random)}
+    made = [
+        calibrate_one(Wanted(found.calibration_key(*place), found.calibrated(*place)))
+        for place in found.calibrations()
+    ]
+    calibrations = {one.wanted.key: one.records and one.records[1] for one in made}
+    return Part(found, first, found.total if last is None else last, calibrations, tasks)
+
+
+@pytest.mark.volume
+@pytest.mark.parametrize("name", CASES)
+def test_every_run_redone_by_the_stages_is_its_row(name):
+    found = design(**CASES[name])
+    part = part_of(found)
+    made = run_part(part)
+    for i in range(found.total):
+        config = found.config(i, part.tasks)
+        _, calibration, _ = calibrate.run(config)
+        trace = servo.run(config, calibration, plan.run(config, calibration), name_of_run(config))
+        row = {column: values[i] for column, values in made.columns.items()}
+        assert row["verdict"].decode() == trace.verdict
+        assert row["seed"] == config.seed
+        assert row["image_error_px"] == trace.image_error[-1]
+        for column, field in SAME.items():
+            if column in row:
+                assert row[column] == getattr(trace, field), column
+        R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
+        angle = math.degrees(math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+        assert row["rotation_deg"] == pytest.approx(angle, abs=1e-4)
+        centre = trace.center[-1] - trace.center[0]
+        assert abs(np.linalg.norm(centre) * 1e3 - row["distance_mm"]) <= row["position_error_mm"] + 1e-6
+        assert row["path_length_mm"] >= np.linalg.norm(centre) * 1e3 - 1e-9
+
+
+@pytest.mark.volume
+def test_parts_do_not_depend_on_how_runs_are_divided():
+    found = design(runs=3, traces=[1, 4], random={"control.gain_t": {"normal": [2.5, 0.2]}})
+    part = part_of(found)
+    whole = run_part(part)
+    pieces = [
+        run_part(Part(found, first, first + 1, part.calibrations, part.tasks))
+        for first in reversed(range(found.total))
+    ][::-1]
+    for column, values in whole.columns.items():
+        assert np.concatenate([piece.columns[column] for piece in pieces]).tobytes() == values.tobytes()
+    assert sorted(whole.traces) == [1, 4]
+    assert np.array_equal(whole.traces[4].q, pieces[4].traces[4].q)
+    assert whole.traces[4].law == "stacked"
+
+
+def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
+    """Without trials there is no calibration; an offset beyond a joint limit is no start."""
+    made = run_part(part_of(design(runs=1, set={"calibration.frames_per_joint": 0})))
+    assert made.columns["verdict"].tolist() == [b"not calibrated"] * 2
+    assert made.columns["usable"].tolist() == [0, 0]
+    limits = {"task.start_offset": {"joints": [0, 0, 300, 0, 0, 0], "unit": "deg"}}
+    made = run_part(part_of(design(runs=1, set=limits)))
+    assert made.columns["verdict"].tolist() == [b"not started"] * 2
+    assert np.isnan(made.columns["position_error_mm"]).all()
+    assert made.columns["steps"].tolist() == [-1, -1]
