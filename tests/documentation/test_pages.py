@@ -1,6 +1,7 @@
 """Every command of the documentation is run, in a folder of its own for each page."""
 
 import json
+import re
 import sys
 
 import h5py
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 import projservo_cli
+from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.stages.truth import truth_of
 from tests.detection.rendering import render, square
@@ -59,12 +61,12 @@ def put_sheet(folder):
     (folder / "sheet.json").write_text(json.dumps(sheet))
 
 
-def check_installation(folder, names):
+def check_installation(folder, names, read):
     assert load_config(folder / "mine.yaml").name == "mine"
     assert json.loads((folder / "projservo.schema.json").read_text())["title"]
 
 
-def check_tutorial(folder, names):
+def check_tutorial(folder, names, read):
     run = projservo_cli.load("results/task")
     assert {name: trace.verdict for name, trace in run.traces.items() if name in {"direct_two", "exact"}} == {
         "direct_two": "converged",
@@ -75,22 +77,39 @@ def check_tutorial(folder, names):
     assert drift["exact"] < drift["direct_two"]
 
 
-def check_diagnostics(folder, names):
+def check_diagnostics(folder, names, read):
     calibration = projservo_cli.load("results/spoiled").calibration
     np.testing.assert_array_equal(calibration.weak, [False] * 4 + [True, False])
     assert len(calibration.outlier) == 8
 
 
-def check_law(folder, names):
+def check_commands(folder, names, read):
+    """The objects have the keys that the page tells."""
+    rows = [line.split("|")[1:3] for line in (DOCS / "commands.md").read_text().splitlines()]
+    told = {row[0].strip(" `"): set(re.findall(r"`(\w+)`", row[1])) for row in rows if len(row) == 2}
+    assert cli.run(["calibrate", "plan", "-o", "results/ur5", "--json"]) == 0
+    found = json.loads(read())
+    later = {"cross_validation", "suggestions"}  # only where they are asked for
+    assert told["calibrate"] - {"name", "type", "excitation", "weak"} - later <= set(found["calibrate"])
+    assert {"name", "type", "excitation", "weak"} == set(found["calibrate"]["joints"][0])
+    assert told["plan"] - {"least", "mu"} <= set(found["plan"])
+    assert {"least", "mu"} == set(found["plan"]["margins"]["joints"])
+    assert cli.run(["record", "-c", "configs/ur5.yaml", "--output", "trials.csv"]) == 0
+    read()
+    assert cli.run(["validate", "results/ur5", "--data", "trials.csv", "--json"]) == 0
+    assert told["validate"] | {"run"} == set(json.loads(read()))
+
+
+def check_law(folder, names, read):
     assert projservo_cli.load("results/law").traces["my_laws:Damped"].verdict == "converged"
 
 
-def check_api(folder, names):
+def check_api(folder, names, read):
     assert names["rates"].shape == (2, 10, 2, 6)
     np.testing.assert_allclose(names["same"], names["pixels"], atol=1e-9)  # px, of a thousand
 
 
-def check_run_file(folder, names):
+def check_run_file(folder, names, read):
     """What the page says of groups is what is there, and in which."""
     reference = pytest.importorskip("tests.documentation.extensions").reference
     with h5py.File("results/paper/run.h5") as file:
@@ -107,6 +126,7 @@ CHECK = {
     "installation": check_installation,
     "tutorial": check_tutorial,
     "diagnostics": check_diagnostics,
+    "commands": check_commands,
     "law": check_law,
     "api": check_api,
     "run-file": check_run_file,
@@ -126,8 +146,12 @@ def test_page(folder, page, capsys):
         pytest.importorskip("h5netcdf")
     for put in HAS.get(page.stem, ()):
         put(folder)
-    names = run_page(page, lambda: capsys.readouterr().out)
-    CHECK.get(page.stem, lambda *_: None)(folder, names)
+
+    def read():
+        return capsys.readouterr().out
+
+    names = run_page(page, read)
+    CHECK.get(page.stem, lambda *_: None)(folder, names, read)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
