@@ -5,18 +5,20 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE / "extensions"), str(HERE.parent)]
+sys.path[:0] = [str(HERE), str(HERE.parent)]
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # docstrings are read, nothing is computed
 
 from projservo_cli.version import __version__  # noqa: E402
 
 project = "projservo"
 release = version = __version__
-extensions = ["myst_parser", "sphinx.ext.autodoc", "docstrings", "links", "mathml", "reference"]
+OWN = ("docstrings", "links", "mathml", "reference")
+extensions = ["myst_parser", "sphinx.ext.autodoc", *(f"extensions.{name}" for name in OWN)]
 exclude_patterns = ["extensions"]
 nitpicky = True
 
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_enable_OWN = ("docstrings", "links", "mathml", "reference")
+extensions = ["myst_parser", "sphinx.ext.autodoc", *(f"extensions.{name}" for name in OWN)]
 myst_heading_anchors = 3
 myst_dmath_double_inline = True
 

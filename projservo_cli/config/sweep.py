@@ -83,7 +83,9 @@ class SweepConfig(Section):
     drawn values as run r of every other cell, so that laws are compared on equal terms.
     """
 
-    name: Annotated[str, AfterValidator(folder_name)]
+    name: Annotated[str, AfterValidator(folder_name)] = Field(
+        description="of the sweep and its folder; by default that of the file"
+    )
     seed: Whole = Field(0, description="of all that is drawn: tasks, noise, calibrations and random values")
     base: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
         min_length=1, description="configurations (YAML) beside this file; several are an axis of the grid"

@@ -9,6 +9,7 @@ import yaml
 from projservo_cli.config import Config, digest, load_config
 from projservo_cli.config.fields import Section
 from projservo_cli.config.schema import STARTER, json_schema, schema_text
+from projservo_cli.config.sweep import SweepConfig
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = sorted(path for path in (ROOT / "configs").glob("*.yaml") if not path.match("sweep_*"))
@@ -93,8 +94,9 @@ def unexplained(model):
             yield from unexplained(part)
 
 
-def test_every_key_says_what_it_means():
-    assert not set(unexplained(Config)), "describe them: Field(default, description=...)"
+@pytest.mark.parametrize("model", [Config, SweepConfig])
+def test_every_key_says_what_it_means(model):
+    assert not set(unexplained(model)), "describe them: Field(default, description=...)"
 
 
 def test_editors_are_told_what_a_key_means():

@@ -1,9 +1,12 @@
 """The fenced blocks of a page of Markdown, and running them as a reader would."""
 
+import importlib
 import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+
+import pytest
 
 from projservo_cli import cli
 
@@ -36,6 +39,13 @@ class Block:
     file: str
     excuse: str
     follows: bool
+
+
+def imported(*names):
+    """Extensions that the documentation is built with, as modules."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(DOCS))
+        return [importlib.import_module(f"extensions.{name}") for name in names]
 
 
 def blocks_of(page):

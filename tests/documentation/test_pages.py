@@ -13,7 +13,7 @@ from projservo_cli import cli
 from projservo_cli.config import load_config
 from projservo_cli.stages.truth import truth_of
 from tests.detection.rendering import render, square
-from tests.documentation.blocks import DOCS, ROOT, blocks_of, run_page
+from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, run_page
 
 PAGES = sorted(DOCS.glob("*.md"))
 # Those that run laws or plan: only with the compiler.
@@ -111,7 +111,8 @@ def check_api(folder, names, read):
 
 def check_run_file(folder, names, read):
     """What the page says of groups is what is there, and in which."""
-    reference = pytest.importorskip("tests.documentation.extensions").reference
+    pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
+    (reference,) = imported("reference")
     with h5py.File("results/paper/run.h5") as file:
         found = {}
         file.visititems(lambda name, item: found.update({name: item.attrs.get("record")}))

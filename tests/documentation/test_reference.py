@@ -8,11 +8,12 @@ import pytest
 from projservo_cli import records
 from projservo_cli.cli.commands import COMMANDS
 from projservo_cli.config.schema import json_schema
+from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.equations import REGISTER
-from tests.documentation.blocks import DOCS, ROOT
+from tests.documentation.blocks import DOCS, ROOT, imported
 
-extensions = pytest.importorskip("tests.documentation.extensions", exc_type=pytest.skip.Exception)
-reference, docstrings = extensions.reference, extensions.docstrings
+pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
+docstrings, keys, links, reference = imported("docstrings", "keys", "links", "reference")
 
 # Sites that pages may link to; none so far.
 SITES: frozenset[str] = frozenset()
@@ -24,11 +25,18 @@ def cells(lines):
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", row)[1:-1]] for row in rows]
 
 
-def test_every_key_has_a_row():
-    schema = json_schema()
+@pytest.mark.parametrize(
+    ("schema", "lines"),
+    [
+        (json_schema(), keys.configuration()),
+        (SweepConfig.model_json_schema(), keys.sweep()),
+    ],
+    ids=["configuration", "sweep"],
+)
+def test_every_key_has_a_row(schema, lines):
     sections = [schema, *(part for part in schema["$defs"].values() if "properties" in part)]
     wanted = [f"`{key}`" for section in sections for key in section["properties"]]
-    rows = [row for row in cells(reference.configuration()) if row[0].startswith("`")]
+    rows = [row for row in cells(lines) if row[0].startswith("`")]
     assert sorted(row[0] for row in rows) == sorted(wanted)
     assert all(len(row) == 5 and row[4] for row in rows)
 
@@ -46,7 +54,7 @@ def test_every_key_has_a_row():
     ],
 )
 def test_a_key_is_told_as_it_is(key, value, default, unit):
-    rows = [row[1:4] for row in cells(reference.configuration()) if row[0] == key]
+    rows = [row[1:4] for row in cells(keys.configuration()) if row[0] == key]
     assert [value, default, unit] in rows
 
 
@@ -67,7 +75,7 @@ def test_every_command_and_equation_is_there():
 
 
 def test_words_of_the_code_are_shown_as_they_are():
-    assert reference.text("t_* with |p_0| `x`") == r"t\_\* with \|p\_0\| \`x\`"
+    assert keys.text("t_* with |p_0| `x`") == r"t\_\* with \|p\_0\| \`x\`"
 
 
 def test_sections_of_docstrings_become_lists():
@@ -106,7 +114,7 @@ def test_broken_links_of_built_pages_are_found(tmp_path):
         '<script src="https://example.org/x.js"></script><link href="lost.css">'
     )
     (tmp_path / "b.html").write_text('<h1 id="there"></h1>')
-    assert sorted(extensions.links.broken(tmp_path)) == [
+    assert sorted(links.broken(tmp_path)) == [
         "a.html: links to b.html#nowhere, a place that is not on the page",
         "a.html: links to c.html, which is not there",
         "a.html: links to lost.css, which is not there",
