@@ -36,6 +36,7 @@ from projservo_cli.task.margins import (
     limit_margin,
 )
 from projservo_cli.task.path import follow, straightened, view_path
+from projservo_cli.task.search import searched
 from projservo_cli.task.visibility import margin_coefficients
 
 # Points of a path at which its joints and margins are looked at.
@@ -44,6 +45,9 @@ CHECKS = 151
 ENDLESS = 1e9
 # Shares of this part of the best one are as good, joints being interpolated; the quicker path is better.
 EQUALLY = 0.95
+# Nodes a search for a narrow way may solve for, and shares it tries to keep.
+SOUGHT = 1500
+NARROW = (0.0, 0.05, 0.2)
 # The lattices of joints that were not looked at.
 NOTHING = np.empty(0)
 
@@ -199,6 +203,8 @@ def plan_path(reaching: Reaching) -> Path:
     paths = [_quickest(candidate) for candidate in candidates if candidate.least > good]
     best = _best(paths)
     if best is None or best.shares().min() <= 0.0:
+        best = _best([*paths, *_narrow(candidates, work)])
+    if best is None or best.shares().min() <= 0.0:
         best = _best([*paths, _in_view(candidates)])
     assert best is not None
     return best
@@ -243,6 +249,25 @@ def _quickest(candidate: Candidate) -> Path:
     reaching, field = candidate.reaching, candidate.field
     mu = _corners(reaching, field, candidate.value, candidate.least, candidate.joints)
     return _timed(reaching, mu)
+
+
+def _narrow(candidates: list[Candidate], work: Work) -> list[Path]:
+    """Paths that ``searched`` finds; each time one is found it is asked for more distance."""
+    paths = []
+    for candidate in candidates:
+        n = len(candidate.reaching.q_start)
+        joints, came = np.empty((*candidate.views.shape, n)), np.empty(candidate.views.shape, dtype=np.int64)
+        stack, path = np.empty((7 * SOUGHT + 1, 5), dtype=np.int64), np.empty((3 * NODES, 3), dtype=np.int64)
+        scratch = np.empty((4, max(n, 4)))
+        for least in NARROW:
+            arguments = (candidate.reaching, candidate.views, least, SOUGHT, came, joints, stack, scratch)
+            if candidate.in_view <= least:
+                break
+            count = searched(*arguments, work, path)
+            if count == 0:
+                break
+            paths.append(_timed(candidate.reaching, path[:count] / (NODES - 1)))
+    return paths
 
 
 def _in_view(candidates: list[Candidate]) -> Path:
