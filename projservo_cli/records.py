@@ -124,6 +124,14 @@ class Calibration:
         "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
     )
     worst_determined: str | None = scalar(about="direction the data determine worst, in words", default=None)
+    predicted_rms_px: float | None = scalar(
+        units="px",
+        about="expected error of images at poses of all joints within their ranges, rms per marker and view",
+        default=None,
+    )
+    predicted_p99_px: float | None = scalar(
+        units="px", about="what that rms stays below in 99 of 100 draws of the noise", default=None
+    )
     lens: FloatArray | None = array(
         "view",
         "lens_term",

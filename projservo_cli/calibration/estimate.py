@@ -23,6 +23,7 @@ from projservo_cli.calibration.assembly import assemble, with_lost_markers
 from projservo_cli.calibration.diagnosis import blamed_joint
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
+from projservo_cli.calibration.expectation import predicted_error
 from projservo_cli.calibration.frame import (
     ProjectiveScene,
     isotropic,
@@ -204,8 +205,15 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Fra
     )
     advice = (*record.advice, *distortion.advice(record, share, frame.known))
     spread = reach.all_spreads(record.model(), result.M, factor, reach.surroundings(readings))
-    worst = worst_determined(problem, scene, adjusted, spread, expected.noise_px(agreement))
-    record = dataclasses.replace(record, advice=advice, worst_determined=worst)
+    sigma = expected.noise_px(agreement)
+    error, bound = predicted_error(record.model(), result.M, factor, reach.surroundings(readings), readings.q)
+    record = dataclasses.replace(
+        record,
+        advice=advice,
+        worst_determined=worst_determined(problem, scene, adjusted, spread, sigma),
+        predicted_rms_px=sigma * error,
+        predicted_p99_px=sigma * bound,
+    )
     return record if kept.all() else with_lost_markers(record, whole.problem.readings, kept)
 
 

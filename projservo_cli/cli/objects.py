@@ -128,10 +128,19 @@ def _calibrate_words(value: dict[str, Any]) -> list[str]:
         *(_lens_words(value["lens"]) if value["lens"] else []),
         wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
         *([wrapped(f"worst determined: {worst}", "  ")] if (worst := value["worst_determined"]) else []),
+        *_predicted_words(value["predicted_rms_px"], value["predicted_p99_px"]),
         *_held_out_words(value.get("cross_validation")),
         *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),
         *suggested_words(value),
     ]
+
+
+def _predicted_words(rms: float | None, bound: float | None) -> list[str]:
+    """Expected error of images, where the method has a covariance."""
+    if rms is None or bound is None:
+        return []
+    text = f"predicted error within the ranges of the joints: {_number(rms)} px rms, 99 % below"
+    return [wrapped(f"{text} {_number(bound)} px", "  ")]
 
 
 def _held_out_words(value: dict[str, Any] | None) -> list[str]:

@@ -60,6 +60,12 @@ def calibration_words(calibration: Calibration, *, estimated: bool) -> list[str]
     found.append(_worst_joint(calibration))
     if calibration.worst_determined:
         found.append(f"Worst determined of all is {calibration.worst_determined}.")
+    if calibration.predicted_rms_px is not None and calibration.predicted_p99_px is not None:
+        found.append(
+            f"Within the ranges of the joints images are expected to err by "
+            f"{short(calibration.predicted_rms_px)} px rms, and in 99 of 100 calibrations by less than "
+            f"{short(calibration.predicted_p99_px)} px."
+        )
     left_out = (
         (len(calibration.outlier), "reading", "left out as an outlier", "left out as outliers"),
         (len(calibration.suspect), "joint reading", "contradicts the images", "contradict the images"),

@@ -1,0 +1,57 @@
+"""The error of predicted images that a calibration states, against quantiles and errors that are known."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.calibration.expectation import quantile
+from tests.calibration.bound import Bound
+from tests.calibration.simulated_robot import random_robot, trials
+
+SIGMA = 0.5
+
+
+@pytest.mark.parametrize("count", [1, 4, 50])
+def test_equal_variances_have_the_quantile_of_chi2(count):
+    assert quantile(np.full(count, 0.3), 0.99) == pytest.approx(0.3 * chi2.ppf(0.99, count), rel=1e-12)
+    assert quantile(np.zeros(count), 0.99) == 0.0
+
+
+@pytest.mark.parametrize("decay", [0.5, 0.8, 0.95])
+def test_falling_variances_have_the_quantile_of_many_draws(decay):
+    variances = decay ** np.arange(60)
+    draws = np.random.default_rng(0).standard_normal((40000, 60)) ** 2 @ variances
+    # The sample quantile has a standard error below 1.5 %; three moments are right to 3 % here.
+    assert quantile(variances, 0.99) == pytest.approx(np.quantile(draws, 0.99), rel=0.05)
+
+
+@pytest.mark.parametrize("types", ["RRR", "RPRP"])
+def test_errors_over_draws_of_the_noise_are_as_stated(types):
+    rng = np.random.default_rng(5)
+    robot = random_robot(types, rng, markers=5)
+    q = trials(robot, frames=4)
+    held_out = rng.uniform(q.min(axis=0), q.max(axis=0), (200, len(types)))
+    bound = Bound(robot, q, held_out)
+    square, stated, limit = [], [], []
+    for seed in range(16):
+        observation = robot.observe(q, SIGMA, np.random.default_rng(seed))
+        found = calibrate(observation, types, sigma_px=SIGMA)
+        square.append(2.0 * np.mean((predict(found, held_out) - robot.images(held_out)) ** 2))
+        stated.append(found.predicted_rms_px)
+        limit.append(found.predicted_p99_px)
+    # The statement is about 60 poses of the same ranges, here are others, and all count: within a tenth.
+    expected = np.sqrt(2.0 * bound.mean_square()) * SIGMA
+    np.testing.assert_allclose(stated, expected, rtol=0.1)
+    spread = 4.0 * bound.relative_error(len(square))
+    assert np.mean(square) / np.mean(np.square(stated)) == pytest.approx(1.0, abs=spread + 0.2)
+    # Two beyond the bound have a chance of one in a hundred, by the binomial distribution.
+    assert int((np.sqrt(square) > limit).sum()) <= 1
+    assert (np.array(limit) > stated).all()
+
+
+def test_methods_without_covariance_state_none():
+    robot = random_robot("RRR", np.random.default_rng(5), markers=5)
+    found = calibrate(robot.observe(trials(robot), 0.1, np.random.default_rng(1)), "RRR", method="linear")
+    assert found.predicted_rms_px is None
+    assert found.predicted_p99_px is None
