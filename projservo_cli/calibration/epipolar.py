@@ -8,6 +8,7 @@ from projservo_cli.calibration.rotations import cross
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 SAMPLES = 500
+PARAMETERS = 7  # of a fundamental matrix
 # Median of |x| over the standard deviation of a normal variable.
 MAD = 0.6744897501960817
 # Correspondences farther than this many standard deviations do not count in the noise.
@@ -30,6 +31,11 @@ class Epipolar:
     F: FloatArray
     sigma_px: float
     inlier: BoolArray
+
+    @property
+    def relative_error(self) -> float:
+        """Standard error of the noise as a share of it, one residual a correspondence less those F takes."""
+        return float(1.0 / np.sqrt(2.0 * (np.count_nonzero(self.inlier) - PARAMETERS)))
 
 
 def homogeneous(pixels: FloatArray) -> FloatArray:
@@ -232,9 +238,9 @@ def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> E
     residual = sampson(in_pixels, homogeneous(left), homogeneous(right))
     scale = max(float(np.median(np.abs(residual))) / MAD, 1e-9)
     inlier = np.abs(residual) <= OUTLIER * scale
-    if inlier.sum() <= 7:
+    if inlier.sum() <= PARAMETERS:
         raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
-    sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - 7)))
+    sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - PARAMETERS)))
     parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
     if float(np.median(parallax)) < LEAST_PARALLAX * sigma:
         raise WorkFailed(

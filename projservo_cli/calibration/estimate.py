@@ -111,7 +111,7 @@ def calibrate(
         both = readings.both
         epipolar = epipolar_geometry(readings.pixels[0][both], readings.pixels[1][both], rng)
         expect = partial(quality.expected_noise, sigma_px=sigma_px, source=source)
-        expected = expect(epipolar.sigma_px)
+        expected = expect(epipolar)
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "refined":
             frame = image_frame(readings, image_size)
@@ -132,7 +132,7 @@ def _most_likely(
     readings: Readings,
     epipolar: Epipolar,
     frame: Frame,
-    expect: Callable[[float], Expected],
+    expect: Callable[[Epipolar], Expected],
     rng: np.random.Generator,
     *,
     lens: bool,
@@ -140,7 +140,7 @@ def _most_likely(
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum likelihood, the noise it is measured by, and its record; a misfit names the joint if it can."""
     q_reference = reference_joints(readings.q)
-    expected = expect(epipolar.sigma_px)
+    expected = expect(epipolar)
     search = partial(solve, readings, q_reference, epipolar, frame, rng, expected)
 
     def blame(most_px: float) -> str:
@@ -156,7 +156,7 @@ def _most_likely(
         if lens:
             solution = distortion.with_lens(solution, frame, epipolar)
             straight = distortion.straight_epipolar(solution, rng)
-            expected = expect(straight.sigma_px)
+            expected = expect(straight)
         result = _refined(solution, straight, expected, frame)
     except Misfit as refused:
         # The joints of a simulation are as configured: their types and readings are not to blame.

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
+from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.excitation import REACH_M, REACH_RAD, WEAK_NOISE, describe_joint
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
-# Fitted noise over the noise expected: above the first more than pixel noise is left, above the
-# second the model does not describe the data.
-WARN_RATIO, REFUSE_RATIO = 1.15, 3.0
+# Fitted noise over the noise expected: above the first, or so many standard errors above one where that
+# is less, more than pixel noise is left; above the last the model does not describe the data.
+WARN_RATIO, WARN_ERRORS, REFUSE_RATIO = 1.15, 4.0, 3.0
 # Shares of sightings both views agree on, and of poses, that may be left out of a fit.
 MOST_UNEXPLAINED, MOST_SUSPECT = 0.02, 0.4
 # Share of sightings beyond which outliers are what limits a fit.
@@ -66,11 +67,13 @@ class Expected:
     sigma_px : noise that was given, else that of the epipolar geometry.
     known : whether it is the true noise of a simulation, so that χ² decides.
     origin : where it comes from, in words.
+    error : its own standard error as a share of it, zero where it was given.
     """
 
     sigma_px: float
     known: bool
     origin: str
+    error: float
 
     def ratio(self, agreement: Agreement) -> float:
         """Fitted over expected noise."""
@@ -80,12 +83,17 @@ class Expected:
         """Noise a covariance is scaled by, px: the true one of a simulation, else never below the fitted."""
         return self.sigma_px if self.known else max(self.sigma_px, agreement.sigma_px)
 
+    def warn_ratio(self, agreement: Agreement) -> float:
+        """Ratio above which more than pixel noise is left: both noises come from finitely many residuals."""
+        error = float(np.hypot(self.error, 1.0 / np.sqrt(2.0 * max(agreement.dof, 1))))
+        return min(WARN_RATIO, 1.0 + WARN_ERRORS * error)
+
     def agrees(self, agreement: Agreement) -> bool:
         """Whether a fit leaves nothing but the expected noise, so that no other need be sought."""
         if self.known:
             low, high = chi2_band(agreement.dof)
             return low <= self.ratio(agreement) ** 2 <= high
-        return self.ratio(agreement) <= WARN_RATIO
+        return self.ratio(agreement) <= self.warn_ratio(agreement)
 
     def refusal(self, agreement: Agreement) -> str | None:
         """Why a fit must not pass, or None where it may."""
@@ -105,18 +113,19 @@ class Expected:
         return None
 
 
-def expected_noise(epipolar_px: float, sigma_px: float | None, source: str) -> Expected:
+def expected_noise(epipolar: Epipolar, sigma_px: float | None, source: str) -> Expected:
     """Noise to measure a fit by.
 
     Parameters
     ----------
-    epipolar_px : noise from the epipolar residuals, px.
+    epipolar : epipolar geometry of the rig, whose residuals show the noise.
     sigma_px : noise that was configured or given, px, or None.
     source : ``simulated`` or ``recorded``.
     """
     if sigma_px is None:
-        return Expected(max(epipolar_px, LEAST_SIGMA), False, "that the epipolar geometry shows")
-    return Expected(sigma_px, source == "simulated", "that were given")
+        noise = max(epipolar.sigma_px, LEAST_SIGMA)
+        return Expected(noise, False, "that the epipolar geometry shows", epipolar.relative_error)
+    return Expected(sigma_px, source == "simulated", "that were given", 0.0)
 
 
 def require_off_line(M: FloatArray, factor: FloatArray) -> None:
@@ -178,7 +187,7 @@ def shortfall(method: str, agreement: Agreement, expected: Expected) -> str | No
     The methods without refinement are kept for comparison: they return what they find, marked so.
     Theirs is no least-squares fit, so that residuals above the noise are their own doing.
     """
-    if method == "refined" or expected.ratio(agreement) <= WARN_RATIO:
+    if method == "refined" or expected.ratio(agreement) <= expected.warn_ratio(agreement):
         return None
     return (
         f"the {method} method explains the images only to {agreement.sigma_px:.3g} px a coordinate, "
@@ -223,7 +232,7 @@ def verdict(
         limit = suspicion
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
     reason = f"residuals of {sigma:.3g} px a coordinate agree with {wanted}"
-    if ratio > WARN_RATIO:
+    if ratio > expected.warn_ratio(agreement):
         limit = suspicion
         left = f"residuals of {sigma:.3g} px a coordinate are {ratio:.3g} times {wanted}"
         reason = f"more than pixel noise is left: {left}"

@@ -189,6 +189,19 @@ def test_ratios_at_which_a_recorded_run_is_warned_of_and_refused():
     assert "3.01 times" in refusal(observation, "RRR", sigma_px=fitted / 3.01)
 
 
+def test_much_data_warn_of_less():
+    """Four standard errors of the fitted noise, of which 3,000 degrees of freedom know one to 1.3 %."""
+    observation = seen(scene(types="RRR", markers=10), frames=25)
+    fitted = calibrate(observation, "RRR", sigma_px=SIGMA, source="recorded")
+    limit = 1.0 + 4.0 / np.sqrt(2.0 * fitted.dof)
+    assert 1.04 < limit < 1.06
+    for ratio, warned in ((0.999 * limit, False), (1.001 * limit, True)):
+        given = fitted.sigma_fitted_px / ratio
+        calibration = calibrate(observation, "RRR", sigma_px=given, source="recorded")
+        assert calibration.usable
+        assert ("more than pixel noise" in calibration.reason) == warned
+
+
 # A face of four, of three markers, and a plate of eight: the motion makes up for what the body lacks.
 FLAT = {
     "three": [[0.05, 0.0, 0.0], [-0.04, 0.06, 0.01], [-0.03, -0.05, 0.02]],
