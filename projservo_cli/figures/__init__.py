@@ -13,6 +13,7 @@ from projservo_cli.figures import (
     errors,
     images,
     joints,
+    modes,
     overview,
     partition,
     path,
@@ -39,6 +40,8 @@ class FigureSpec:
     data, draw : what makes it, from a ``Material``; from a ``Fit`` where it needs no task.
     laws : whose traces it shows: all of them, or any of them where ``any_law`` is set.
     studies : whether it shows the extra runs.
+    modes : whether it compares runs that follow the plan with others.
+    noisy : whether it shows runs with noise that has been drawn many times.
     goal : whether it needs a known goal pose.
     task : whether it needs a task; without, a calibration and what it was made from will do.
     alt : what can be seen, for those who do not see it; by default the title.
@@ -53,6 +56,8 @@ class FigureSpec:
     laws: tuple[str, ...] = ()
     any_law: bool = False
     studies: bool = False
+    modes: bool = False
+    noisy: bool = False
     goal: bool = False
     task: bool = True
     alt: str = ""
@@ -243,5 +248,43 @@ FIGURES = (
         6.0,
         path.data,
         path.draw,
+    ),
+    FigureSpec(
+        "fig15_modes_path",
+        "Path of the centre: planning anew in each step, and following the plan",
+        "beside the paper's, after section 4",
+        3.0,
+        modes.data_path,
+        modes.draw_path,
+        modes=True,
+        goal=True,
+        alt="Distance of the centre from its straight line over the way along it, one curve a law and mode.",
+    ),
+    FigureSpec(
+        "fig16_modes_images",
+        "Image error: planning anew in each step, and following the plan",
+        "beside the paper's, after section 4",
+        3.2,
+        modes.data_images,
+        modes.draw_images,
+        modes=True,
+        alt=(
+            "Image error over time on a linear and on a logarithmic scale, one curve a law and mode, with "
+            "the time at which the plan arrives."
+        ),
+    ),
+    FigureSpec(
+        "fig17_modes_noise",
+        "Noise in the loop: planning anew in each step, and following the plan",
+        "beside the paper's, after section 4",
+        3.2,
+        modes.data_noise,
+        modes.draw_noise,
+        modes=True,
+        noisy=True,
+        alt=(
+            "Standard deviation over the image noise of the centre and of the commands over time, one curve "
+            "a law and mode."
+        ),
     ),
 )

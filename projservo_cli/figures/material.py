@@ -1,6 +1,6 @@
 """What figures are made from: the records of a run, the truth behind it, and the extra runs."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.control.law import Gains
+from projservo_cli.modes import IMAGE_TRACK, REPLAN, TRACK, law_and_mode
 from projservo_cli.plants.plant import Plant
 from projservo_cli.plants.robot import Robot
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, Model, Observation, Plan, Trace
@@ -25,6 +26,13 @@ TITLES = {
     "euclidean_points": "Euclidean points",
 }
 VIEWS = ("left", "right")
+
+
+def title(name: str) -> str:
+    """Name of a run as the figures write it: that of its law, and whether it follows the plan."""
+    law, mode = law_and_mode(name)
+    follows = {TRACK: ", following the plan", IMAGE_TRACK: ", following planned images"}
+    return TITLES.get(law, law) + follows.get(mode, "")
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +90,8 @@ class Material(Fit):
     traces : runs of the laws by name.
     studies : extra runs; None where they could not be made.
     no_studies : why not.
+    noisy : runs with noise that has been drawn anew in each, of equal length, by name.
+    noise_px : standard deviation of that noise, per coordinate.
     """
 
     calibrated: Model
@@ -92,6 +102,14 @@ class Material(Fit):
     traces: Mapping[str, Trace] = field(default_factory=dict)
     studies: Studies | None = None
     no_studies: str = ""
+    noisy: Mapping[str, Sequence[Trace]] = field(default_factory=dict)
+    noise_px: float = 0.0
+
+    def compared(self) -> list[str]:
+        """Names of the runs of laws that follow the plan, each after that in which the law plans anew."""
+        modes = {name: law_and_mode(name) for name, trace in self.traces.items() if trace.steps > 0}
+        laws = [law for law, mode in modes.values() if mode != REPLAN]
+        return [name for name, (law, _) in modes.items() if law in laws]
 
     @property
     def middle(self) -> FloatArray:

@@ -10,9 +10,10 @@ import numpy as np
 
 from projservo_cli.config import Config, load_config
 from projservo_cli.figures.drift import drift_rows
-from projservo_cli.figures.material import VIEWS
+from projservo_cli.figures.material import VIEWS, title
+from projservo_cli.modes import name_of
 from projservo_cli.page.pictures import SECTIONS, Picture, pictures
-from projservo_cli.page.words import calibration_words, held_out_words, law_words, title
+from projservo_cli.page.words import calibration_words, held_out_words, law_words
 from projservo_cli.records import Calibration, Plan, Report, Trace
 from projservo_cli.store import Run
 
@@ -219,7 +220,7 @@ def _plan(plan: Plan) -> dict[str, Any]:
 
 def _law(trace: Trace, config: Config) -> dict[str, Any]:
     return {
-        "title": title(trace.law),
+        "title": title(name_of(trace.law, trace.mode)),
         "words": law_words(trace),
         "trace": trace,
         "converged": trace.verdict == "converged",

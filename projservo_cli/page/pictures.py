@@ -61,7 +61,7 @@ def _file(spec: FigureSpec, kind: str) -> str:
 def _section(spec: FigureSpec) -> str:
     if not spec.task:
         return "calibration"
-    return "control" if spec.laws or spec.studies else "plan"
+    return "control" if spec.laws or spec.studies or spec.modes else "plan"
 
 
 def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> Picture:

@@ -8,7 +8,8 @@ from markupsafe import Markup
 
 from projservo_cli.calibration.excitation import REACH_M, REACH_RAD, WEAK_NOISE
 from projservo_cli.calibration.quality import chi2_band
-from projservo_cli.figures.material import TITLES
+from projservo_cli.figures.material import title
+from projservo_cli.modes import name_of
 from projservo_cli.records import Calibration, CrossValidation, Trace
 
 MINUS = "\N{MINUS SIGN}"
@@ -105,7 +106,7 @@ def law_words(trace: Trace) -> str:
     """Verdict of a law, its reason, and where it ended, in one sentence."""
     seconds = short(trace.steps * trace.period)
     steps = f"{trace.steps} step{'s' * (trace.steps != 1)}"
-    text = f"{title(trace.law)}: {trace.verdict} after {steps} ({seconds} s)"
+    text = f"{title(name_of(trace.law, trace.mode))}: {trace.verdict} after {steps} ({seconds} s)"
     if trace.reason:
         text += (
             f", because the {trace.reason}" if trace.reason.startswith("image error") else f": {trace.reason}"
@@ -116,8 +117,3 @@ def law_words(trace: Trace) -> str:
             "from its goal"
         )
     return f"{text}."
-
-
-def title(law: str) -> str:
-    """Name of a law as the figures write it."""
-    return TITLES.get(law, law)

@@ -168,6 +168,10 @@ def lacking(spec: FigureSpec, material: Fit) -> str:
         return f"no run of {', '.join(missing)} with a step to show; make it: projservo servo report"
     if spec.studies and material.studies is None:
         return f"the extra runs could not be made: {material.no_studies}"
+    if spec.modes and not material.compared():
+        return "no run follows the plan: set control.mode, such as [replan, track], and run servo report"
+    if spec.noisy and not material.noisy:
+        return "the runs with noise could not be made"
     if spec.goal and not _goal_known(material):
         return "the pose of the goal is unknown, only its images are"
     return ""

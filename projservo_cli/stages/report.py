@@ -18,6 +18,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task
 from projservo_cli.stages.claims import claims_of
 from projservo_cli.stages.drawing import draw_all, drawing_beside
+from projservo_cli.stages.noisy import DRAWS, NOISE_PX, noisy_runs
 from projservo_cli.stages.studies import (
     LAMBDAS,
     STEP_LIMIT_DEG,
@@ -92,7 +93,7 @@ def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progre
         left_out.append({"what": "studies", "reason": reason})
     numbers = tuple(truth.number[i] for i in truth.face)
     calibrated = bench.models["calibrated"]
-    return Material(
+    material = Material(
         run.calibration,
         run.observation,
         calibrated,
@@ -105,6 +106,26 @@ def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progre
         reason,
         held_out=run.cross_validation,
     )
+    if material.compared():
+        material = _with_noise(material, run, bench, left_out)
+    return material
+
+
+def _with_noise(material: Material, run: "Run", bench: Bench, left_out: list[dict[str, str]]) -> Material:
+    """The material with the noisy runs that compare the modes; named in ``left_out`` where they fail."""
+    config = load_config(run.path, text=run.configuration)
+    sigma = config.noise.servo_px or NOISE_PX
+    try:
+        noisy = noisy_runs(bench, config, run.calibration, run.plan, material.compared(), sigma)
+    except WorkFailed as error:
+        left_out.append({"what": "runs with noise", "reason": " ".join(str(error).split())})
+        return material
+    for name, runs in noisy.items():
+        if len(runs) < DRAWS:
+            reason = f"{DRAWS - len(runs)} of {DRAWS} with {sigma:g} px of noise ended early"
+            left_out.append({"what": f"runs with noise of {name}", "reason": reason})
+    noisy = {name: runs for name, runs in noisy.items() if len(runs) > 1}
+    return replace(material, noisy=noisy, noise_px=sigma)
 
 
 def _composition(

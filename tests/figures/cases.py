@@ -1,5 +1,6 @@
 """Runs for the tests of figures and report: the shipped tasks, calibrated by a known projective frame."""
 
+import dataclasses
 from functools import lru_cache
 
 import numpy as np
@@ -7,8 +8,10 @@ import numpy as np
 from projservo_cli.calibration.prediction import prediction_derivative
 from projservo_cli.config import load_config
 from projservo_cli.figures.material import Material
+from projservo_cli.modes import following_mode, name_of
 from projservo_cli.records import LAWS, METRIC_LAWS, Calibration
 from projservo_cli.stages import calibrate, plan, servo, studies, truth
+from projservo_cli.stages.noisy import noisy_runs
 from projservo_cli.task.margins import within
 from tests.conftest import ROOT
 from tests.fake_records import fake
@@ -16,6 +19,9 @@ from tests.fake_records import fake
 SHORT = 4
 GAINS = (0.5, 0.1)
 PERIODS_S = (0.08, 0.04)
+DRAWS = 4
+# Laws whose runs that follow the plan are shown beside those that plan anew.
+FOLLOWING = ("exact", "stacked")
 
 
 def config_of(name, *overrides):
@@ -44,6 +50,7 @@ def case(name="paper", steps=SHORT, whole=False):
         config.trajectory.delta,
         21,
         within(true.robot.lower, true.robot.upper),
+        duration=2.0,
     )
     bench = studies.bench_of(config, model, planned)
     noise = servo.servo_noise(config, len(true.face))
@@ -61,6 +68,11 @@ def case(name="paper", steps=SHORT, whole=False):
         )
         for law in LAWS
     }
+    limits = servo.limits_of(config)
+    for law in FOLLOWING:
+        traces[name_of(law, following_mode(law))] = servo.drive(
+            law, model, bench.plant, true, reach, bench.gains, limits, noise, bench.sense, None, planned
+        )
     extra = studies.run_studies(bench) if whole else studies.run_studies(bench, GAINS, PERIODS_S)
     numbers = tuple(true.number[i] for i in true.face)
     observation = calibrate.simulate(config, true)
@@ -68,6 +80,8 @@ def case(name="paper", steps=SHORT, whole=False):
     material = Material(
         calibration, observation, model, true.robot, bench.plant, planned, numbers, traces, extra
     )
+    noisy = noisy_runs(bench, config, calibration, planned, material.compared(), 0.5, DRAWS)
+    material = dataclasses.replace(material, noisy=noisy, noise_px=0.5)
     return config, bench, material
 
 

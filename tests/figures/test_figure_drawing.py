@@ -121,9 +121,8 @@ def test_same_input_gives_the_same_bytes(tmp_path, kind):
 
 
 def test_names_follow_the_numbers_of_the_paper():
-    assert [int(name[3:5]) for name in NAMES] == list(
-        range(15)
-    )  # 0 the overview, 13 the calibration, 14 the path
+    # 0 the overview, 13 the calibration, 14 the path, 15 to 17 the modes
+    assert [int(name[3:5]) for name in NAMES] == list(range(18))
 
 
 def test_curves_differ_without_their_colour():

@@ -29,7 +29,9 @@ def short(trace, steps):
     """A trace cut after some steps."""
     fields = {field.name: field.metadata.get("dims", ()) for field in dataclasses.fields(trace)}
     cut = {
-        name: getattr(trace, name)[: steps + 1] for name, dims in fields.items() if dims[:1] == ("instant",)
+        name: getattr(trace, name)[: steps + 1]
+        for name, dims in fields.items()
+        if dims[:1] == ("instant",) and getattr(trace, name) is not None
     }
     cut |= {name: getattr(trace, name)[:steps] for name, dims in fields.items() if dims[:1] == ("step",)}
     return dataclasses.replace(trace, steps=steps, verdict="diverged", **cut)
