@@ -1,9 +1,8 @@
 """Classical stereo law: the sum of two monocular laws."""
 
-from projservo_cli.control.image_based import put_view
+from projservo_cli.control.image_based import pseudo_inverse, put_view
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
@@ -17,14 +16,13 @@ def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArr
     if not measure(model, task, s, q, state):
         return LOST
     n = q.shape[0]
-    work = state.work
     for i in range(n):
         state.q_dot[i] = 0.0
     for view in range(2):
         put_view(model, task, s, state, view, 0)
         rows = 2 * state.A.shape[0]
-        if not least_squares(work.B, rows, n, state.q_hat[0], work.pivot, work.z, work.rhs):
+        if not pseudo_inverse(state, rows, state.newton):
             return SINGULAR
         for i in range(n):
-            state.q_dot[i] -= gains.gain * state.q_hat[0, i]
+            state.q_dot[i] -= gains.gain * state.newton[i]
     return OK

@@ -1,6 +1,6 @@
 """Direct control of translation and two rotations: the paper's directTHREE."""
 
-from projservo_cli.control.law import OK, Gains, State, partitioned, translation_rate
+from projservo_cli.control.law import OK, SINGULAR, Gains, State, follow, partitioned, translation_rate
 from projservo_cli.geometry.jit import njit
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
@@ -15,7 +15,10 @@ def direct_three(model: Model, task: Task, gains: Gains, s: FloatArray, q: Float
     t = translation_rate(task, gains, parts, state)
     r = gains.gain_r * parts.theta_r
     p = gains.gain_p * parts.theta_p
+    for i in range(state.xi_dot.shape[0]):
+        state.xi_dot[i] = t * state.q_hat[0, i] + r * state.q_hat[1, i] + p * state.q_hat[2, i]
+    if not follow(state):
+        return SINGULAR
     for i in range(q.shape[0]):
-        state.q_dot[i] = t * state.q_hat[0, i] + r * state.q_hat[1, i] + p * state.q_hat[2, i]
         state.q_dot[i] += state.q_ahead[i] / gains.period
     return OK

@@ -1,6 +1,6 @@
 """Direct control of translation and one rotation: the paper's directTWO."""
 
-from projservo_cli.control.law import OK, SINGULAR, Gains, State, partitioned, translation_rate
+from projservo_cli.control.law import OK, SINGULAR, Gains, State, follow, partitioned, translation_rate
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, inner, mul, unit, vec
 from projservo_cli.geometry.composition import composed_angle, composed_operator
 from projservo_cli.geometry.jit import njit
@@ -87,7 +87,10 @@ def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatAr
         return SINGULAR
     rate = gains.gain_s * theta_s * sense
     t = translation_rate(task, gains, parts, state)
+    for i in range(state.xi_dot.shape[0]):
+        state.xi_dot[i] = t * state.q_hat[0, i] + rate * state.q_hat[3, i]
+    if not follow(state):
+        return SINGULAR
     for i in range(q.shape[0]):
-        state.q_dot[i] = t * state.q_hat[0, i] + rate * state.q_hat[3, i]
         state.q_dot[i] += state.q_ahead[i] / gains.period
     return OK

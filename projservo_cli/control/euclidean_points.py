@@ -1,9 +1,9 @@
 """Classical stereo law: triangulated Euclidean points, with a metric model."""
 
+from projservo_cli.control.image_based import pseudo_inverse
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
 from projservo_cli.geometry.algebra import apply, mat, vec
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
@@ -21,8 +21,9 @@ def euclidean_points(
     n = q.shape[0]
     m = state.A.shape[0]
     work = state.work
-    for i in range(n):
-        operator = mat(work.H_hat[i])
+    operators = work.columns
+    for i in range(operators.shape[0]):
+        operator = mat(operators[i])
         for k in range(m):
             velocity = apply(operator, vec(state.A[k]))
             work.B[i, 3 * k] = velocity[0]
@@ -31,7 +32,7 @@ def euclidean_points(
     for k in range(m):
         for j in range(3):
             work.rhs[3 * k + j] = state.A[k, j] - task.A_star[k, j]
-    if not least_squares(work.B, 3 * m, n, state.q_dot, work.pivot, work.z, work.rhs):
+    if not pseudo_inverse(state, 3 * m, state.q_dot):
         return SINGULAR
     for i in range(n):
         state.q_dot[i] *= -gains.gain

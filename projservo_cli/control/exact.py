@@ -9,7 +9,16 @@ import math
 
 from projservo_cli.control.direct_two import single_rotation
 from projservo_cli.control.following import speed_share
-from projservo_cli.control.law import MOST_PARTS, OK, SINGULAR, Gains, State, partitioned, translation_rate
+from projservo_cli.control.law import (
+    MOST_PARTS,
+    OK,
+    SINGULAR,
+    Gains,
+    State,
+    follow,
+    partitioned,
+    translation_rate,
+)
 from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
 from projservo_cli.geometry.inverse import SETTLED, reach
@@ -39,11 +48,15 @@ def desired(parts: Parts, H_s: Mat4, tau: float, theta: float, share: float) -> 
 def first_order(parts: Parts, tau: float, theta: float, sense: float, ahead: float, state: State) -> float:
     """First-order joint step τ q̂_t + θ q̂_s of one period into ``state.q_dot``; its largest entry.
 
-    Where a plan is followed, the joint motion of its next period is added in the share ``ahead``.
+    Where a plan is followed, the joint motion of its next period is added in the share ``ahead``. NaN
+    where the joints cannot make it.
     """
+    for i in range(state.xi_dot.shape[0]):
+        state.xi_dot[i] = tau * state.q_hat[0, i] + theta * sense * state.q_hat[3, i]
+    if not follow(state):
+        return math.nan
     most = 0.0
     for i in range(state.q_dot.shape[0]):
-        state.q_dot[i] = tau * state.q_hat[0, i] + theta * sense * state.q_hat[3, i]
         state.q_dot[i] += ahead * state.q_ahead[i]
         most = max(most, abs(state.q_dot[i]))
     return most
@@ -173,7 +186,8 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         return SINGULAR
     tau = translation_rate(task, gains, parts, state) * gains.period
     theta = gains.gain_s * theta_s * gains.period
-    first_order(parts, tau, theta, sense, 1.0, state)
+    if not math.isfinite(first_order(parts, tau, theta, sense, 1.0, state)):
+        return SINGULAR
     share = speed_share(state.q_dot, gains.speed, gains.period)
     tau *= share
     theta *= share

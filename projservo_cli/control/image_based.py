@@ -3,8 +3,10 @@
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import apply, mat, put_vec, vec
 from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.geometry.kinematics import image_velocity
 from projservo_cli.geometry.lens import straighten
+from projservo_cli.geometry.span import joint_motion
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.reference import following
@@ -14,8 +16,9 @@ from projservo_cli.task.reference import following
 def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
     """Interaction matrix and image error of one view, [RH00] eq. (7), into rows from ``first`` on."""
     work = state.work
-    for i in range(work.H_hat.shape[0]):
-        operator = mat(work.H_hat[i])
+    operators = work.columns
+    for i in range(operators.shape[0]):
+        operator = mat(operators[i])
         for k in range(state.A.shape[0]):
             put_vec(state.A_t[k], apply(operator, vec(state.A[k])))
             _, _, u_dot, v_dot = image_velocity(model.P[view], state.A[k], state.A_t[k])
@@ -29,3 +32,19 @@ def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, f
             u, v = straighten(model.lens[view], float(target[0]), float(target[1]))
         work.rhs[first + 2 * k] = s[view, k, 0] - u
         work.rhs[first + 2 * k + 1] = s[view, k, 1] - v
+
+
+@njit
+def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
+    """Joint motion q̂ (n,) of least squares, and of least norm, of the matrix in the workspace.
+
+    The matrix has a column for each of ``Work.columns``: a pseudo-inverse of the
+    product of an image Jacobian of full column rank and of coordinates of full row rank is the product of
+    both pseudo-inverses.
+    """
+    work = state.work
+    if work.columns.shape[0] == q_hat.shape[0]:
+        return least_squares(work.B, rows, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
+    if not least_squares(work.B, rows, work.xi.shape[0], work.xi, work.pivot, work.z, work.rhs):
+        return False
+    return joint_motion(work, work.xi, q_hat)

@@ -15,7 +15,8 @@ from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
 from projservo_cli.geometry.composition import composed_angle
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import operators_at, row
-from projservo_cli.geometry.mechanisms import Work, workspace
+from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work, workspace
+from projservo_cli.geometry.span import joint_motion
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, carry, fit_body, new_normal
@@ -79,8 +80,9 @@ class State(NamedTuple):
     ----------
     work : arrays of the kernels, the current operators among them.
     A, A_t, A_r : (m, 4) current points, target without translation, target without both.
-    q_hat : (4, n) joint motions t, r, p, s.
+    q_hat : (4, n) joint motions t, r, p, s; (4, 6) coordinates in the span of an arm of n ≠ 6.
     q_dot : (n,) joint velocity commanded, rad/s or m/s.
+    xi_dot : (6,) the same in the coordinates of ``q_hat``; ``q_dot`` itself for six joints.
     errors : (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad.
     memory : what is carried to the next step.
     limited : (1,) how often visibility limited the translation.
@@ -108,6 +110,7 @@ class State(NamedTuple):
     A_r: FloatArray
     q_hat: FloatArray
     q_dot: FloatArray
+    xi_dot: FloatArray
     errors: FloatArray
     memory: Memory
     limited: FloatArray
@@ -126,17 +129,24 @@ class State(NamedTuple):
     q_ahead: FloatArray
 
 
-def new_state(n: int, m: int, observed: int = 0) -> State:
-    """Fresh state for n joints, m face markers and so many observed, at least those of the face."""
+def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
+    """Fresh state for n joints, m face markers and so many observed, at least those of the face.
+
+    An arm of n ≠ 6 joints has a span.
+    """
+    q_dot = np.zeros(n)
+    own = len(span.H_hat) == 0
+    k = n if own else COORDINATES
     return State(
-        workspace(n, 4 * m),
+        workspace(n, 4 * m, span),
         np.zeros((m, 4)),
         np.zeros((m, 4)),
         np.zeros((m, 4)),
-        np.zeros((4, n)),
-        np.zeros(n),
+        np.zeros((4, k)),
+        q_dot,
+        q_dot if own else np.zeros(k),
         np.full(len(ERRORS), np.nan),
-        Memory(np.zeros((2, n))),
+        Memory(np.zeros((2, k))),
         np.zeros(1),
         np.full(3, np.nan),
         np.full(1, np.nan),
@@ -262,6 +272,14 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
     state.errors[THETA_P] = parts.theta_p
     state.errors[THETA_S] = theta_s
     return OK, parts
+
+
+@njit
+def follow(state: State) -> bool:
+    """Joint velocity ``q_dot`` of the velocity ``xi_dot``; False where the joints cannot make it."""
+    if state.work.span.H_hat.shape[0] == 0:
+        return True
+    return joint_motion(state.work, state.xi_dot, state.q_dot)
 
 
 @njit

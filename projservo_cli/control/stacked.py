@@ -1,9 +1,8 @@
 """Classical stereo law: pseudo-inverse of the stacked image Jacobians."""
 
-from projservo_cli.control.image_based import put_view
+from projservo_cli.control.image_based import pseudo_inverse, put_view
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
@@ -20,8 +19,7 @@ def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray
     rows = 2 * state.A.shape[0]
     for view in range(2):
         put_view(model, task, s, state, view, view * rows)
-    work = state.work
-    if not least_squares(work.B, 2 * rows, n, state.q_dot, work.pivot, work.z, work.rhs):
+    if not pseudo_inverse(state, 2 * rows, state.q_dot):
         return SINGULAR
     for i in range(n):
         state.q_dot[i] *= -gains.gain

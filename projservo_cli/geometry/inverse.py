@@ -9,6 +9,7 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import Work
+from projservo_cli.geometry.span import joint_motion
 from projservo_cli.records import FloatArray, Model
 
 MOST_NEWTON_STEPS = 6
@@ -29,6 +30,8 @@ def reach(
 ) -> bool:
     """Newton steps on the joints ``q``, in place, until they displace the face A by ``goal``.
 
+    Each is of least norm with more than six joints; with fewer the face comes as near as they bring it.
+
     Parameters
     ----------
     H_back : inverse forward kinematics at the joints where A was seen.
@@ -43,6 +46,8 @@ def reach(
     """
     n = q.shape[0]
     m = A.shape[0]
+    redundant = work.columns.shape[0] < n
+    x = work.xi if redundant else newton
     for _ in range(MOST_NEWTON_STEPS):
         H = mul(operators_at(model, q, work.H_hat), H_back)
         for k in range(m):
@@ -50,11 +55,14 @@ def reach(
             miss = sub(apply(goal, vec(A[k])), reached)
             for j in range(4):
                 work.rhs[4 * k + j] = miss[j]
-            for i in range(n):
-                velocity = apply(mat(work.H_hat[i]), reached)
+            columns = work.columns
+            for i in range(columns.shape[0]):
+                velocity = apply(mat(columns[i]), reached)
                 for j in range(4):
                     work.B[i, 4 * k + j] = velocity[j]
-        if not least_squares(work.B, 4 * m, n, newton, work.pivot, work.z, work.rhs):
+        if not least_squares(work.B, 4 * m, min(n, x.shape[0]), x, work.pivot, work.z, work.rhs):
+            return False
+        if redundant and not joint_motion(work, x, newton):
             return False
         most = 0.0
         for i in range(n):

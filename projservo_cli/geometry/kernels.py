@@ -96,6 +96,8 @@ def orthogonalize(
         if k == n - 1:
             last = norm
         if norm == 0.0:
+            for j in range(k, n):
+                B[j, j] = 0.0
             break
         if best != k:
             pivot[k], pivot[best] = pivot[best], pivot[k]

@@ -31,15 +31,40 @@ NULL_MOTION = 1e-9
 NO_OPERATOR: Mat4 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+COORDINATES = 6
+
+
+class Span(NamedTuple):
+    """Six operators that span all displacements; none where those of the joints do.
+
+    Attributes
+    ----------
+    H_hat : (6, 4, 4) the operators, or (0, 4, 4).
+    dual : (6, 16) by which an operator, read row by row, has its coordinates.
+    """
+
+    H_hat: FloatArray
+    dual: FloatArray
+
+
+# Six joints span the displacements by themselves.
+OWN = Span(np.zeros((0, 4, 4)), np.zeros((COORDINATES, 16)))
+
+
 class Work(NamedTuple):
     """Arrays the compiled functions write to, so that nothing is allocated in a loop.
 
     Attributes
     ----------
     H_hat : (n, 4, 4) operators at the current joints.
-    B : (n, rows) columns of the matrix being factorised.
+    B : (≥ n, rows) columns of the matrix being factorised.
     rhs : (rows,) right-hand side.
-    z, pivot : (n,) of the factorisation.
+    z, pivot : (≥ n,) of the factorisation.
+    span : of an arm of n ≠ 6.
+    basis : operators whose sums the mechanisms are: of the span, else ``H_hat`` itself.
+    columns : independent operators for least squares: of the span of n > 6 joints, else ``H_hat`` itself.
+    J : (6, n) coordinates of the operators in the span.
+    norms, xi : (6,) of a factorisation, and coordinates of a displacement.
     """
 
     H_hat: FloatArray
@@ -47,6 +72,12 @@ class Work(NamedTuple):
     rhs: FloatArray
     z: FloatArray
     pivot: IntArray
+    span: Span
+    basis: FloatArray
+    columns: FloatArray
+    J: FloatArray
+    norms: FloatArray
+    xi: FloatArray
 
 
 class Mechanism(NamedTuple):
@@ -62,15 +93,24 @@ class Mechanism(NamedTuple):
     H_hat: FloatArray
 
 
-def workspace(n: int, rows: int) -> Work:
-    """Arrays for n joints and matrices of at most ``rows`` rows."""
-    width = max(n, 8, (rows + 3) // 4 * 4)
+def workspace(n: int, rows: int, span: Span = OWN) -> Work:
+    """Arrays for n joints and matrices of at most ``rows`` rows, with the span of an arm of n ≠ 6."""
+    columns = max(n, COORDINATES)
+    width = max((n + 3) // 4 * 4, 8, (rows + 3) // 4 * 4)
+    H_hat = np.zeros((n, 4, 4))
+    own = len(span.H_hat) == 0
     return Work(
-        np.zeros((n, 4, 4)),
-        np.zeros((n, width)),
+        H_hat,
+        np.zeros((columns, width)),
         np.zeros(width),
-        np.zeros(n),
-        np.zeros(n, dtype=np.int64),
+        np.zeros(columns),
+        np.zeros(columns, dtype=np.int64),
+        span,
+        H_hat if own else span.H_hat,
+        H_hat if own or n < COORDINATES else span.H_hat,
+        np.zeros((COORDINATES, n)),
+        np.zeros(COORDINATES),
+        np.zeros(COORDINATES),
     )
 
 
@@ -92,9 +132,10 @@ def kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
 @njit
 def operator_of(work: Work, q_hat: FloatArray) -> Mat4:
     """Operator Σ q̂_i Ĥ_i of a joint motion."""
-    H = multiple(float(q_hat[0]), mat(work.H_hat[0]))
+    operators = work.basis
+    H = multiple(float(q_hat[0]), mat(operators[0]))
     for i in range(1, q_hat.shape[0]):
-        K = mat(work.H_hat[i])
+        K = mat(operators[i])
         k = float(q_hat[i])
         H = (
             H[0] + k * K[0], H[1] + k * K[1], H[2] + k * K[2], H[3] + k * K[3],
@@ -112,9 +153,10 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
     The joint motion of unit norm under which two planes through the line have no velocity.
     """
     a_1, a_2 = dual_pencil(A, D)
+    operators = work.basis
     n = q_hat.shape[0]
     for i in range(n):
-        operator = mat(work.H_hat[i])
+        operator = mat(operators[i])
         put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
         put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
     if not kernel_of_eight(work, q_hat):
@@ -125,9 +167,10 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
 @njit
 def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Revolution around the axis through two points, [RH00] eq. (9), scaled to radians."""
+    operators = work.basis
     n = q_hat.shape[0]
     for i in range(n):
-        operator = mat(work.H_hat[i])
+        operator = mat(operators[i])
         put_rows(work, i, 0, apply(operator, A_1))
         put_rows(work, i, 4, apply(operator, A_2))
     if not kernel_of_eight(work, q_hat):
@@ -138,9 +181,10 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
 @njit
 def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Revolution around a point within a plane, [RH00] eq. (10), scaled to radians."""
+    operators = work.basis
     n = q_hat.shape[0]
     for i in range(n):
-        operator = mat(work.H_hat[i])
+        operator = mat(operators[i])
         put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
         put_rows(work, i, 4, apply(operator, A))
     if not kernel_of_eight(work, q_hat):
@@ -156,9 +200,10 @@ def moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     not. Then Σ q̂_i Ĥ_i vanishes against its terms.
     """
     H = operator_of(work, q_hat)
+    operators = work.basis
     terms = 0.0
     for i in range(q_hat.shape[0]):
-        operator = mat(work.H_hat[i])
+        operator = mat(operators[i])
         terms += q_hat[i] * q_hat[i] * inner(operator, operator)
     if not inner(H, H) > NULL_MOTION * NULL_MOTION * terms:
         return False, NO_OPERATOR

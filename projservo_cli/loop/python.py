@@ -8,6 +8,7 @@ import numpy as np
 from projservo_cli.control.bound import bind, bound_command
 from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, new_state
 from projservo_cli.geometry.kinematics import beyond_limits
+from projservo_cli.geometry.span import span_of
 from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.step import (
     DISTURBED,
@@ -110,7 +111,8 @@ class BuiltInLaw:
 
     def __init__(self, code: int, model: Model, task: Task, gains: Gains) -> None:
         self.gains = gains
-        self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M))
+        span = span_of(model, task.A_star)
+        self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M), span)
         self.bound = bind(code, model, task, gains, self.state)
         self.errors = self.state.errors
         self.share = self.state.share

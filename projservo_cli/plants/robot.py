@@ -211,7 +211,11 @@ def _newton(robot: Robot, goal: FloatArray, q: FloatArray) -> FloatArray | None:
         H_hat = joint_operators(model, q)
         tip = H_hat @ pose[:, 3]
         J = np.stack([H_hat[:, 2, 1], H_hat[:, 0, 2], H_hat[:, 1, 0], *tip.T[:3]])
-        step = np.linalg.solve(J.T @ J + 1e-9 * float(error @ error) * np.eye(len(q)), J.T @ error)
+        damping = 1e-9 * float(error @ error)
+        if len(q) > len(error):  # of least norm
+            step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(len(error)), error)
+        else:
+            step = np.linalg.solve(J.T @ J + damping * np.eye(len(q)), J.T @ error)
         q = q + step / max(1.0, float(np.abs(step).max()) / 0.5)
     return q if np.abs(error).max() < 1e-10 else None
 

@@ -2,8 +2,11 @@
 
 import math
 
+import numpy as np
+
 from projservo_cli.control.law import State, measure, new_state
 from projservo_cli.geometry.lens import straight_views
+from projservo_cli.geometry.span import joint_motion, span_of
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.stages.constrained import CONSTRAINED
 from projservo_cli.stages.half_turn import half_turn_sense
@@ -12,7 +15,6 @@ from projservo_cli.task.face import Task, task_from_images
 from projservo_cli.task.partition import Parts, partition
 from projservo_cli.task.target import task_from_body
 
-TASK_DIMENSION = 6
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
 HALF_TURN_BAND = math.radians(2.0)
 
@@ -41,18 +43,13 @@ def partitioned_at_start(
     WorkFailed
         If a marker cannot be triangulated or a motion is not unique.
     """
-    if len(q_start) != TASK_DIMENSION:
-        raise WorkFailed(
-            f"the partition of a task needs a robot of six joints, this one has {len(q_start)}: "
-            "its motions are then no unique kernels"
-        )
     m = s_start.shape[1]
-    state = new_state(len(q_start), m)
     if sight is None:
         task, seen = task_from_images(model, s_start, s_star, center), s_start
     else:
         task = task_from_body(model, sight.body, q_start, sight.s_start, sight.s_star, center, m)
         seen = sight.s_start
+    state = new_state(len(q_start), m, span=span_of(model, task.A_star))
     if not measure(model, task, straight_views(model.lens, seen), q_start, state):
         raise WorkFailed(
             "the face cannot be triangulated at the start: both cameras must see all its markers"
@@ -69,3 +66,15 @@ def partitioned_at_start(
         state.memory.rotation[1], note = half_turn_sense(model, task, state.A, q_start, forward_sense, bounds)
         parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
     return state, task, parts, note
+
+
+def joint_motions(state: State) -> FloatArray:
+    """Joint motions t, r, p (3, n) of a partitioned task; zero for one that the joints cannot make."""
+    q_hat = np.zeros((3, len(state.q_dot)))
+    if len(state.work.span.H_hat) == 0:
+        q_hat[:] = state.q_hat[:3]
+        return q_hat
+    for row in range(3):
+        if not joint_motion(state.work, state.q_hat[row], q_hat[row]):
+            q_hat[row] = 0.0
+    return q_hat

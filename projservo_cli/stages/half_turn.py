@@ -7,6 +7,7 @@ import numpy as np
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, new_state
 from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.geometry.span import span_of
 from projservo_cli.loop.compiled import new_log
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import CONVERGED, Limits
@@ -28,7 +29,7 @@ def half_turn_sense(
     q_hat_p: FloatArray,
     bounds: tuple[FloatArray, FloatArray],
 ) -> tuple[FloatArray, str]:
-    """Sense of a half turn within the plane, as the joint motion ±q̂_p that begins it.
+    """Sense of a half turn within the plane, as the motion ±q̂_p that begins it, in the coordinates given.
 
     Either sense reaches the goal, but they take the joints elsewhere. Both are rehearsed on the
     calibrated model itself, at a tenth of the error and at most 5° a step; the sense that arrives
@@ -58,7 +59,8 @@ def half_turn_sense(
     noise = np.zeros((REHEARSAL_STEPS + 1, 2, len(A), 2))
     outcomes = []
     for sign in (1.0, -1.0):
-        state, log = new_state(n, len(A)), new_log(n, len(A), REHEARSAL_STEPS, len(ERRORS))
+        state = new_state(n, len(A), span=span_of(model, task.A_star))
+        log = new_log(n, len(A), REHEARSAL_STEPS, len(ERRORS))
         state.memory.rotation[1] = sign * q_hat_p
         verdict, steps = run_loop(
             CODES["direct_two"], model, task, REHEARSAL, limits, plant, noise, q_start.copy(), state, log

@@ -9,6 +9,7 @@ import numpy as np
 from projservo_cli import plugins
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, OK, Gains
+from projservo_cli.geometry.span import in_span
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw
 from projservo_cli.modes import REPLAN, law_and_mode
 from projservo_cli.plugins import what_failed
@@ -118,5 +119,6 @@ def law_for(
     if mode != REPLAN:
         task = followed(believed, task, plan, gains.period, config.plant.speed_scale)
     built_in = BuiltInLaw(CODES[law], believed, task, gains)
-    built_in.state.memory.rotation[:] = plan.rotation_sense()
+    span, sense = built_in.state.work.span, plan.rotation_sense()
+    built_in.state.memory.rotation[:] = in_span(span, believed, reach.q_start, sense)
     return built_in

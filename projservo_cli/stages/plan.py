@@ -9,8 +9,9 @@ from projservo_cli.geometry.algebra import vec
 from projservo_cli.geometry.composition import composed_angle
 from projservo_cli.geometry.displacement import as_array, as_mat
 from projservo_cli.geometry.kinematics import project
+from projservo_cli.geometry.mechanisms import COORDINATES
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed
-from projservo_cli.stages.beginning import partitioned_at_start
+from projservo_cli.stages.beginning import joint_motions, partitioned_at_start
 from projservo_cli.stages.constrained import (
     CONSTRAINED,
     VIEWS,
@@ -19,6 +20,7 @@ from projservo_cli.stages.constrained import (
     motion_of,
 )
 from projservo_cli.stages.reach import reach_for, sight_for
+from projservo_cli.stages.reachable import require_in_span
 from projservo_cli.stages.sight import Sight
 from projservo_cli.stages.truth import center_index, face_numbers
 from projservo_cli.task.face import Task, center_of, face_plane
@@ -119,6 +121,7 @@ def plan_task(
         model, q_start, s_start, s_star, center, profile, (demands.lower, demands.upper), sight
     )
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
+    q_hat = joint_motions(state)
     sigma = np.linspace(0.0, 1.0, samples)
     tau_0, theta_0 = _changes(np.array(parts.a), H_hat, task)
     tau_limit = min((delta * t for t in tau_0 if t > 0.0), default=math.inf)
@@ -138,6 +141,8 @@ def plan_task(
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     H_d = np.array([trajectory_displacement(H_hat, (tau, theta_r, theta_p), row) for row in motion.mu])
     images = np.moveaxis(project(model.P, state.A @ np.swapaxes(H_d, 1, 2), model.lens), 0, 1)
+    if len(q_start) < COORDINATES:
+        require_in_span(model, state.A, q_start, images)
     a = np.array(parts.a)
     carried = np.linalg.solve(np.swapaxes(H_d, 1, 2), a[:, None])[..., 0]
     margins = margin(carried, task.O, task.visible)
@@ -183,7 +188,7 @@ def plan_task(
         A_c=np.array(parts.A_c),
         A_c_star=np.array(center_of(task.A_star, center)),
         q_start=q_start,
-        q_hat=state.q_hat[:3],
+        q_hat=q_hat,
         H_hat=H_hat,
         optical_center=task.O,
         tau_0=tau_0,

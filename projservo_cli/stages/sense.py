@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from projservo_cli.records import Calibration, FloatArray, signed
 from projservo_cli.stages import plan
-from projservo_cli.stages.beginning import partitioned_at_start
+from projservo_cli.stages.beginning import joint_motions, partitioned_at_start
 from projservo_cli.stages.constrained import CONSTRAINED
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.sight import Sight
@@ -54,4 +54,4 @@ def rotation_sense(config: "Config", calibration: Calibration, reach: Reach, sig
         (joints.lower, joints.upper),
         sight,
     )
-    return Sense(signed(parts.theta_r, parts.theta_p, state.q_hat[1:3]), task)
+    return Sense(signed(parts.theta_r, parts.theta_p, joint_motions(state)[1:3]), task)

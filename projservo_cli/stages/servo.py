@@ -7,6 +7,7 @@ import numpy as np
 
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, new_state
+from projservo_cli.geometry.span import in_span, span_of
 from projservo_cli.loop.compiled import new_log
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import VERDICTS, Limits
@@ -268,9 +269,10 @@ def outcome_of(
         observed += len(sight.pins)
     if plan is not None:
         task = followed(model, task, plan, gains.period, 1.0)
-    state = new_state(n, m, observed)
+    span = span_of(model, task.A_star)
+    state = new_state(n, m, observed, span)
     if sense is not None:
-        state.memory.rotation[:] = sense
+        state.memory.rotation[:] = in_span(span, model, reach.q_start, sense)
     log = new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
     code, steps = run_loop(
         CODES[law], model, task, gains, limits, plant, noise, reach.q_start.copy(), state, log

@@ -26,7 +26,8 @@ from projservo_cli.geometry.algebra import (
 from projservo_cli.geometry.displacement import twist_exponential
 from projservo_cli.geometry.jit import inline, njit
 from projservo_cli.geometry.normal import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
-from projservo_cli.records import BoolArray, FloatArray, Model, WorkFailed
+from projservo_cli.geometry.span import invariant_rotations
+from projservo_cli.records import BoolArray, FloatArray, Model
 
 Vec3 = tuple[float, float, float]
 # A step that moves the images by less than this, px rms a coordinate, is the last: what it leaves is
@@ -95,7 +96,8 @@ def body_of(model: Model, M: FloatArray) -> Body:
     """Body of calibrated markers.
 
     The rotations are those of the joints: the three directions in which their actions on the plane at
-    infinity spread most, orthonormal in the invariant form −½ trace(L L'), hence per rad.
+    infinity spread most, orthonormal in the invariant form −½ trace(L L'), hence per rad. Where the joints
+    do not turn the body about three directions, they are those of a metric that the joints keep.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ def body_of(model: Model, M: FloatArray) -> Body:
     Raises
     ------
     WorkFailed
-        If the joints do not turn the body about three independent directions.
+        If the joints keep no metric of the calibrated frame.
     """
     M = M / (M @ model.a_inf)[:, None]
     D = np.linalg.svd(model.a_inf[None])[2][1:]
@@ -114,12 +116,10 @@ def body_of(model: Model, M: FloatArray) -> Body:
     _, sizes, rows = np.linalg.svd(np.concatenate([actions, brackets]).reshape(-1, 9))
     L = rows[:3].reshape(3, 3, 3)
     form = -0.5 * np.einsum("iab,jba->ij", L, L)
-    if not (sizes[2] > 1e-6 * sizes[0] and np.linalg.eigvalsh(form)[0] > 1e-6):
-        raise WorkFailed(
-            "the joints do not turn the body about three directions, so that its displacements are not "
-            "known: measure point by point with control.observation: points"
-        )
-    L = np.linalg.solve(np.linalg.cholesky(form), L.reshape(3, 9)).reshape(3, 3, 3)
+    if sizes[2] > 1e-6 * sizes[0] and np.linalg.eigvalsh(form)[0] > 1e-6:
+        L = np.linalg.solve(np.linalg.cholesky(form), L.reshape(3, 9)).reshape(3, 3, 3)
+    else:
+        L = invariant_rotations(actions)
     offset = M - M.mean(axis=0)
     carry = np.eye(4) - np.outer(M.mean(axis=0), model.a_inf)
     return Body(

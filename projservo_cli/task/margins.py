@@ -24,7 +24,7 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kernels import orthogonalize
 from projservo_cli.geometry.kinematics import image_velocity, row
 from projservo_cli.geometry.lens import bend
-from projservo_cli.geometry.mechanisms import Work
+from projservo_cli.geometry.mechanisms import COORDINATES, Work
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
@@ -196,4 +196,7 @@ def reciprocal_condition(
     first, _, last = orthogonalize(
         jacobian.B, 4 * m, n, norms, jacobian.z, jacobian.pivot, jacobian.rhs, False
     )
+    if n > COORDINATES:  # further joints add no motion of the face
+        sixth = jacobian.B[COORDINATES - 1, COORDINATES - 1]
+        last = 1.0 / sixth if sixth > 0.0 else 0.0
     return last / first if first > 0.0 else 0.0

@@ -14,6 +14,7 @@ import numpy as np
 from projservo_cli.geometry.algebra import apply, mat, sub, vec
 from projservo_cli.geometry.composition import wrap
 from projservo_cli.geometry.mechanisms import Work, workspace
+from projservo_cli.geometry.span import span_of
 from projservo_cli.records import FloatArray
 from projservo_cli.task.lattice import (
     COARSE,
@@ -141,7 +142,7 @@ class Candidate(NamedTuple):
 def along(reaching: Reaching, mu: FloatArray) -> Along:
     """Joints and margins at the shares mu (s, 3), whose first row is zero."""
     n = len(reaching.q_start)
-    work = workspace(n, 4 * len(reaching.A))
+    work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
     q, condition = np.empty((len(mu), n)), np.empty(len(mu))
     rows = follow(reaching, mu, q, condition, work, np.empty((4, max(n, 4))))
     visibility, distance = np.empty((len(mu), 2)), np.empty((len(mu), 2))
@@ -192,7 +193,7 @@ def plan_path(reaching: Reaching) -> Path:
     """
     theta_p = float(reaching.amplitudes[2])
     n = len(reaching.q_start)
-    work, newton = workspace(n, 4 * len(reaching.A)), np.empty(n)
+    work, newton = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A)), np.empty(n)
     reaching = _turned(reaching, turning_sense(reaching), theta_p)
     candidates = [_candidate(reaching, 0.0, work, newton)]
     least = candidates[0].least

@@ -6,6 +6,7 @@ from projservo_cli.geometry.displacement import as_array, as_mat
 from projservo_cli.geometry.kinematics import forward, operators_at
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import workspace
+from projservo_cli.geometry.span import span_of
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.task.body import Body, Fit, fit_body, new_normal
 from projservo_cli.task.face import Task, task_from_images
@@ -49,11 +50,11 @@ def task_from_body(
     images = (np.ascontiguousarray(s_start[:, :m]), np.ascontiguousarray(s_star[:, :m]))
     task = task_from_images(model, *images, center)
     H_start = settled(model, body, s_start, as_array(forward(model, q_start)), "start")
-    work = workspace(len(q_start), 4 * m)
+    work = workspace(len(q_start), 4 * m, span_of(model, task.A_star))
     operators_at(model, q_start, work.H_hat)
     A = np.ascontiguousarray(body.M[:m] @ H_start.T)
-    A_t, A_r, q_hat = np.zeros((m, 4)), np.zeros((m, 4)), np.zeros((4, len(q_start)))
-    parts = partition(work, task, A, A_t, A_r, q_hat, Memory(np.zeros((2, len(q_start)))))
+    A_t, A_r, q_hat = np.zeros((m, 4)), np.zeros((m, 4)), np.zeros((4, len(work.basis)))
+    parts = partition(work, task, A, A_t, A_r, q_hat, Memory(np.zeros((2, q_hat.shape[1]))))
     if not parts.found:
         raise WorkFailed(
             "the joint motion of the task is not unique at the start: the robot is near a singularity "

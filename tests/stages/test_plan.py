@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.records import WorkFailed
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.task.margins import within
 from projservo_cli.task.trajectory import PROFILES
-from tests.samples import arm, face, frame, in_frame, pixels
+from tests.samples import frame, in_frame, pixels
 from tests.stages.cases import case
 
 
@@ -92,25 +91,6 @@ def test_an_infeasible_profile_is_named():
             assert profile in plan.reason
             assert "trajectory.profile" in plan.reason
     assert verdicts["linear"].feasible
-
-
-def test_a_robot_of_five_or_seven_joints_is_refused():
-    for types in ("RRRRR", "RRRRRRR"):
-        model = arm(types)
-        s = pixels(model.P, face())
-        n = len(types)
-        with pytest.raises(WorkFailed, match="six joints"):
-            plan_task(
-                model,
-                model.q_reference,
-                s,
-                s,
-                -1,
-                "linear",
-                0.9,
-                3,
-                within(np.full(n, -9.0), np.full(n, 9.0)),
-            )
 
 
 def test_a_start_that_is_the_goal_is_a_plan_without_motion():
