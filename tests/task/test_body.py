@@ -69,10 +69,19 @@ def test_the_basis_is_one_of_rigid_displacements(seed):
     assert body.D @ model.a_inf == pytest.approx(np.zeros(3), abs=1e-12)
 
 
-def test_a_robot_that_turns_about_one_direction_has_no_known_body():
+def test_a_robot_that_turns_about_one_direction_has_a_body_all_the_same():
+    """What it cannot do may be counted in any metric; what it can is counted as it is."""
     parallel = np.array([revolute([0.1 * i, 0.2, 0.0], [0.0, 0.0, 1.0]) for i in range(6)])
-    with pytest.raises(WorkFailed, match=r"control\.observation: points"):
-        body_of(arm()._replace(H_hat_0=parallel), markers())
+    body = body_of(arm()._replace(H_hat_0=parallel), markers())
+    L = body.H_hat[:, :3, :3].reshape(3, 9)
+    wanted = parallel[0, :3, :3].ravel()
+    assert np.linalg.lstsq(L.T, wanted, rcond=None)[0] @ L == pytest.approx(wanted, abs=1e-12)
+    assert np.linalg.matrix_rank(np.r_[L, [wanted]]) == 3
+
+
+def test_joints_that_keep_no_metric_have_no_body(rng):
+    with pytest.raises(WorkFailed, match="keep no metric"):
+        body_of(arm()._replace(H_hat_0=rng.normal(size=(6, 4, 4))), markers())
 
 
 def test_two_directions_of_turning_imply_the_third():
