@@ -17,6 +17,7 @@ from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesse
 from projservo_cli.calibration.refined import (
     RAYLEIGH,
     ROUGHLY,
+    Tell,
     cauchy,
     distances,
     far_px,
@@ -90,6 +91,7 @@ def blamed_joint(
     frame: Frame,
     most_px: float,
     rng: np.random.Generator,
+    tell: Tell,
 ) -> str:
     """The one change of one joint with which the model does describe the data, in words; empty if none.
 
@@ -104,6 +106,7 @@ def blamed_joint(
     frame : guessed image centres and sizes.
     most_px : noise per coordinate that a change must not leave more than, px.
     rng : draws axes.
+    tell : told before each change how many were compared, of how many.
     """
     try:
         guess = metric_guesses(epipolar.F, readings, frame, keep=1)[0]
@@ -111,7 +114,9 @@ def blamed_joint(
         return ""
     alignment = merged(guess, readings)
     candidates = []
-    for hypothesis in hypotheses(readings, q_reference):
+    changes = list(hypotheses(readings, q_reference))
+    for done, hypothesis in enumerate(changes):
+        tell("calibration, joint at fault", done, len(changes))
         problem = prepare(hypothesis.readings, hypothesis.q_reference)
         for scene in _starts(problem, guess, alignment, rng):
             level = _level(problem, scene) + hypothesis.handicap

@@ -37,7 +37,7 @@ from projservo_cli.calibration.optimization import Problem, prepare
 from projservo_cli.calibration.quality import REFUSE_RATIO, Agreement, Expected, Misfit
 from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
 from projservo_cli.calibration.reconstruction import Frame, image_frame
-from projservo_cli.calibration.refined import Solution, determined, solve
+from projservo_cli.calibration.refined import Solution, Tell, determined, solve, tell_nobody
 from projservo_cli.calibration.shown import require_images
 from projservo_cli.calibration.weakest import worst_determined
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation
@@ -62,6 +62,7 @@ def calibrate(
     lens: bool = False,
     init: Nominal | None = None,
     fitted: Fitted | None = None,
+    tell: Tell = tell_nobody,
 ) -> Calibration:
     """Projective kinematics [RH00] section 2 from pixels and joint readings alone.
 
@@ -77,6 +78,7 @@ def calibrate(
     lens : whether to estimate two coefficients of radial distortion a camera, about the image centre.
     init : robot and rig to try first as a start of ``refined``; the search follows where that misses.
     fitted : told the solution of ``refined`` and its noise, px, for what needs more than the record.
+    tell : told how far ``refined`` is: what it does, how much of it is done, and of how much.
 
     Raises
     ------
@@ -116,7 +118,7 @@ def calibrate(
         if method == "refined":
             frame = image_frame(readings, image_size)
             solution, expected, result = _most_likely(
-                readings, epipolar, frame, expect, rng, lens=lens, init=init
+                readings, epipolar, frame, expect, rng, lens=lens, init=init, tell=tell
             )
         elif method == "linear":
             result = _linear(readings, epipolar, expected)
@@ -137,14 +139,15 @@ def _most_likely(
     *,
     lens: bool,
     init: Nominal | None,
+    tell: Tell,
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum likelihood, the noise it is measured by, and its record; a misfit names the joint if it can."""
     q_reference = reference_joints(readings.q)
     expected = expect(epipolar)
-    search = partial(solve, readings, q_reference, epipolar, frame, rng, expected)
+    search = partial(solve, readings, q_reference, epipolar, frame, rng, expected, tell)
 
     def blame(most_px: float) -> str:
-        return blamed_joint(readings, q_reference, epipolar, frame, most_px, rng)
+        return blamed_joint(readings, q_reference, epipolar, frame, most_px, rng, tell)
 
     try:
         solution, note = (
@@ -154,6 +157,7 @@ def _most_likely(
         )
         straight = epipolar
         if lens:
+            tell("calibration, lens", 0, 1)
             solution = distortion.with_lens(solution, frame, epipolar)
             straight = distortion.straight_epipolar(solution, rng)
             expected = expect(straight)

@@ -1,6 +1,6 @@
 """Maximum likelihood from pixels and joint readings alone: starts, robust search, choice of the best."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 
@@ -50,6 +50,12 @@ SEARCHES = 5
 SAME_LEVEL = 1e-3
 FOCAL_MINIMA, AXIS_MINIMA = 3, 3
 
+Tell = Callable[[str, int, int], None]
+
+
+def tell_nobody(what: str, done: int, total: int) -> None:
+    """Show nothing of how far a search is."""
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -67,6 +73,7 @@ def solve(
     frame: Frame,
     rng: np.random.Generator,
     expected: Expected,
+    tell: Tell = tell_nobody,
 ) -> Solution:
     """Best fit over the starts; the first that leaves nothing but the expected noise ends the search.
 
@@ -78,6 +85,7 @@ def solve(
     frame : guessed image centres and sizes.
     rng : draws starts.
     expected : noise to measure fits by.
+    tell : told before each start how many were tried, of at most how many.
 
     Raises
     ------
@@ -91,9 +99,11 @@ def solve(
     best: Solution | None = None
     trusted = np.ones(len(readings.q), dtype=bool)
     levels: list[float] = []
-    for factors in FOCAL_FACTORS:
+    for number, factors in enumerate(FOCAL_FACTORS):
         usable = of_poses(readings, trusted)
-        for scene in islice(starts(problem, usable, epipolar, frame, rng, factors), SEARCHES):
+        tried = islice(starts(problem, usable, epipolar, frame, rng, factors), SEARCHES)
+        for done, scene in enumerate(tried, number * SEARCHES):
+            tell("calibration, starts", done, len(FOCAL_FACTORS) * SEARCHES)
             searched = robust_search(problem, scene, trusted, far_px(epipolar))
             level = float(np.median(distances(searched.residual, usable_rows(problem, trusted))))
             # Different starts that end at one place need not be followed to the end twice.

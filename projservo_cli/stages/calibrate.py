@@ -119,6 +119,7 @@ def run(
         lens=settings.lens,
         init=init,
         fitted=hold_out if settings.cross_validate is not None else None,
+        tell=progress,
     )
     return observation, calibration, held_out[0] if held_out else None
 
