@@ -10,22 +10,21 @@ from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.body import Alignment
 from projservo_cli.calibration.culprits import unexplained
 from projservo_cli.calibration.epipolar import Epipolar
-from projservo_cli.calibration.optimization import Problem, minimize, prepare
-from projservo_cli.calibration.quality import require_explained
-from projservo_cli.calibration.readings import Readings
-from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
-from projservo_cli.calibration.refined import (
+from projservo_cli.calibration.fit import (
     RAYLEIGH,
     ROUGHLY,
-    Tell,
     cauchy,
     distances,
     far_px,
     hopeless_px,
     least_squares,
-    merged,
     robust_search,
 )
+from projservo_cli.calibration.optimization import Problem, minimize, prepare
+from projservo_cli.calibration.quality import require_explained
+from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.reconstruction import Frame, Guess, metric_guesses
+from projservo_cli.calibration.refined import Tell, merged
 from projservo_cli.calibration.start import place, rotation_axes
 from projservo_cli.records import FloatArray, WorkFailed
 

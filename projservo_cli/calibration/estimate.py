@@ -24,6 +24,7 @@ from projservo_cli.calibration.diagnosis import blamed_joint
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
 from projservo_cli.calibration.expectation import predicted_error
+from projservo_cli.calibration.fit import Solution, determined
 from projservo_cli.calibration.frame import (
     ProjectiveScene,
     isotropic,
@@ -37,7 +38,7 @@ from projservo_cli.calibration.optimization import Problem, prepare
 from projservo_cli.calibration.quality import REFUSE_RATIO, Agreement, Expected, Misfit
 from projservo_cli.calibration.readings import Readings, gather, reference_joints, restrict
 from projservo_cli.calibration.reconstruction import Frame, image_frame
-from projservo_cli.calibration.refined import Solution, Tell, determined, solve, tell_nobody
+from projservo_cli.calibration.refined import Tell, solve, tell_nobody
 from projservo_cli.calibration.shown import require_images
 from projservo_cli.calibration.weakest import worst_determined
 from projservo_cli.records import Calibration, FloatArray, InputError, Observation

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli.calibration import calibrate, cross_validate
-from projservo_cli.calibration.refined import Solution
+from projservo_cli.calibration.fit import Solution
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
