@@ -7,6 +7,7 @@ from projservo_cli.stages.truth import truth_of
 from tests.planning.arm import arm_of, feasible, flood, pivot_ratio, pose, solve
 from tests.planning.driven import configured, driven, feasible_tasks, true_task, words
 from tests.samples import poe
+from tests.stages.cases import case
 
 pytestmark = pytest.mark.volume
 
@@ -71,3 +72,14 @@ def test_flood_reaches_nothing_behind_a_wall(tasks):
     reached = flood(arm_of(truth, 1e-6), free, task.c, c, still, still, found.q_start[0])
     assert reached[:2].all()
     assert not reached[2:].any()
+
+
+def test_a_task_that_needs_coupled_parts_is_driven_in_sight():
+    """A turn first hides the face; the planned motion, with 0.5 px of noise throughout, never does."""
+    example = case("coupled")
+    assert not example.planned(example.truth.model, "rotation_first", 101).feasible
+    q_goal = np.array(example.config.task.goal.joints.values("RRRRRR"))
+    run = driven("coupled", 0, example.reach.q_start, q_goal)
+    assert run.planned
+    assert run.converged, run.reason
+    assert run.occluded == 0

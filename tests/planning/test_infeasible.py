@@ -1,0 +1,63 @@
+"""Tasks that no motion can do: the plan names the constraint, the camera and the place."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.config import load_config
+from projservo_cli.stages.constrained import demands_of
+from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.truth import truth_of
+from tests.conftest import ROOT
+
+pytestmark = pytest.mark.volume
+
+# A rig of wide angle that stands within the reach of the arm of ur5.yaml.
+NEAR = (
+    "rig={{image_size_px: [1280, 1024], "
+    "left: {{focal_px: [300, 300], principal_point_px: [639.5, 511.5], position_m: [0.85, {}, 0.45], "
+    "target_m: [0.3, 0.12, 0.45]}}, "
+    "right: {{focal_px: [300, 300], principal_point_px: [639.5, 511.5], position_m: [0.85, {}, 0.45], "
+    "target_m: [0.3, 0.12, 0.45]}}}}"
+)
+# Start and goal in degrees: one that passes a camera so closely that turning cannot keep up, and one that
+# begins 2.7 px from the border of an image, where 5 px are asked for.
+PASSING = (
+    [168.057, -266.215, -20.278, 41.361, -128.377, -93.061],
+    [276.133, 294.127, -50.457, 4.022, -83.974, -294.656],
+)
+BORDER = (
+    [0.977, -159.178, 190.12, -34.988, 18.725, -56.874],
+    [-12.633, -149.758, 180.678, -4.066, 48.153, 174.349],
+)
+CAMERAS = ("rig.left.position_m=[0.9, {}, 0.63]", "rig.right.position_m=[0.9, {}, 0.63]")
+
+
+def planned(name, task, overrides, **demands):
+    """Plan of a task of a shipped configuration with another rig, with the true operators."""
+    config = load_config(ROOT / "configs" / f"{name}.yaml", overrides)
+    truth = truth_of(config)
+    q_start, q_goal = np.radians(task)
+    s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
+    asked = demands_of(config)._replace(**demands)
+    return plan_task(truth.model, q_start, s_start, s_star, truth.center, "constrained", 0.9, 101, asked)
+
+
+@pytest.mark.parametrize(("camera", "y"), [("left", (0.06, 0.18)), ("right", (0.18, 0.06))])
+def test_a_camera_that_is_passed_too_closely(camera, y):
+    plan = planned("ur5", PASSING, [NEAR.format(*y)])
+    assert not plan.feasible
+    assert plan.constraint == "visibility"
+    assert f"visibility fails first: visibility from the {camera} camera" in plan.reason
+    assert "at mu_t 0." in plan.reason
+    assert plan.least[0] <= 0.0
+
+
+@pytest.mark.parametrize(("camera", "y"), [("left", (-0.9, 0.9)), ("right", (0.9, -0.9))])
+def test_an_end_too_near_to_the_border_of_an_image(camera, y):
+    overrides = [line.format(value) for line, value in zip(CAMERAS, y, strict=True)]
+    plan = planned("coupled", BORDER, overrides)
+    assert not plan.feasible
+    assert plan.constraint == "image"
+    assert f"px from the border of the {camera} image (5 px asked for)" in plan.reason
+    assert 0.0 < plan.least[1] < 5.0
+    assert "image fails first" not in planned("coupled", BORDER, overrides, border_px=0.0).reason
