@@ -17,7 +17,8 @@ ENTRY = re.compile(r"(?P<names>\w+(?:, \w+)*) : (?P<text>.*)")
 
 def _sections(lines: list[str]) -> Iterator[tuple[str, list[str]]]:
     """Title and lines of each section; the title of what comes before the first is empty."""
-    title, body = "", []
+    title = ""
+    body: list[str] = []
     for line, following in zip(lines, [*lines[1:], ""], strict=True):
         if RULE.fullmatch(line):
             continue
