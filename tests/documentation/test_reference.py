@@ -1,12 +1,14 @@
 """What the documentation says by itself: all of it, as it is, and nothing that is not there."""
 
 import dataclasses
+import importlib
 import re
 
 import pytest
 
 from projservo_cli import records
 from projservo_cli.cli.commands import COMMANDS
+from projservo_cli.config import Config
 from projservo_cli.config.schema import json_schema
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.equations import REGISTER
@@ -120,3 +122,30 @@ def test_broken_links_of_built_pages_are_found(tmp_path):
         "a.html: links to lost.css, which is not there",
         "a.html: loads https://example.org/x.js from the network",
     ]
+
+
+PACKAGES = "geometry|calibration|task|control|loop|plants"
+
+
+def resolved(name):
+    """What a dotted name below the package stands for: a module, or something in one."""
+    module, _, last = name.rpartition(".")
+    try:
+        return importlib.import_module(f"projservo_cli.{name}")
+    except ModuleNotFoundError:
+        return getattr(importlib.import_module(f"projservo_cli.{module}"), last)
+
+
+def test_the_mathematics_is_where_the_page_says():
+    text = (DOCS / "mathematics.md").read_text(encoding="utf-8")
+    names = set(re.findall(rf"`((?:{PACKAGES})(?:\.\w+)+)`", text)) - set(keys_of(Config))
+    assert len(names) > 20
+    for name in names:
+        assert resolved(name) is not None
+
+
+def keys_of(model):
+    """Dotted keys of a configuration, two levels deep, which look like names of modules."""
+    for name, field in model.model_fields.items():
+        for key in getattr(type(field.default), "model_fields", ()):
+            yield f"{name}.{key}"
