@@ -35,7 +35,8 @@ class ClusterEngine:
 
     def __init__(self, address: str) -> None:
         self.address = address
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is said in our words
+        for name in ("distributed", "tornado", "asyncio"):  # what matters is said in our words
+            logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             make: Any = distributed.Client
             self._client = make(address, timeout=PATIENCE_S, set_as_default=False)
@@ -47,13 +48,14 @@ class ClusterEngine:
                 "dask scheduler and dask worker, and see whether the address is right"
             ) from error
         self._check_versions()
+        self._pool: Executor = self._client.get_executor(retries=RETRIES, pure=False)
         self.workers = sum(self._client.nthreads().values())
 
-    def open(self) -> Executor:
-        """The scheduler as a pool."""
-        self.check()
-        pool: Executor = self._client.get_executor(retries=RETRIES, pure=False)
-        return pool
+    def pool(self, *, anew: bool = False) -> Executor:
+        """The scheduler as a pool, the same as long as there is the scheduler."""
+        if anew:
+            self.check()
+        return self._pool
 
     def check(self) -> None:
         """Raise WorkFailed where the scheduler is gone."""

@@ -175,9 +175,12 @@ def run(
     try:
         _make(design, folder, engine, status, progress, say)
     except KeyboardInterrupt:
+        engine.close()
         if folder.stored():
             assembled(design, folder)
         raise
+    finally:
+        engine.close()
     assembled(design, folder)
     shutil.rmtree(folder.parts)
     return Status(design.total, design.total, status.chunk)

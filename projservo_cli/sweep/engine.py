@@ -1,7 +1,9 @@
 """Where the parts of a sweep are made: here, in processes of this machine, or on a cluster."""
 
 import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from concurrent.futures.process import ProcessPoolExecutor
@@ -22,8 +24,8 @@ class Engine(Protocol):
     workers: int
     losses: tuple[type[Exception], ...]
 
-    def open(self) -> Executor:
-        """A pool to submit jobs to, made anew after workers were lost."""
+    def pool(self, *, anew: bool = False) -> Executor:
+        """The pool to submit jobs to; another one after workers of the first were lost."""
 
     def check(self) -> None:
         """Raise WorkFailed where nothing can come back any more."""
@@ -59,14 +61,15 @@ class LocalEngine:
         self.workers = workers
         self._pool: Executor | None = None
 
-    def open(self) -> Executor:
-        """Start the processes."""
-        self.close()
-        if self.workers == 1:
+    def pool(self, *, anew: bool = False) -> Executor:
+        """The processes, started when they are first asked for."""
+        if anew:
+            self.close()
+        if self._pool is None and self.workers == 1:
             self._pool = Here()
-        else:
+        elif self._pool is None:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.workers, context, _leave_interrupts_to_the_parent)
+            self._pool = ProcessPoolExecutor(self.workers, context, _follow_the_parent)
         return self._pool
 
     def check(self) -> None:
@@ -82,8 +85,16 @@ class LocalEngine:
         self._pool = None
 
 
-def _leave_interrupts_to_the_parent() -> None:
+def _follow_the_parent() -> None:
+    """Leave interrupts to the parent, and end when it is gone, however it ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
+
+
+def _end_with(process: Any) -> None:
+    if process is not None:
+        process.join()
+    os._exit(1)
 
 
 def completed(engine: Engine, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
@@ -99,7 +110,7 @@ def completed(engine: Engine, function: Callable[[Job], Result], jobs: Iterable[
         What a job raises.
     """
     waiting = iter(jobs)
-    pool = engine.open()
+    pool = engine.pool()
     futures: dict[Future[Result], Job] = {}
     again: list[Job] = []
     losses = 0
@@ -108,7 +119,7 @@ def completed(engine: Engine, function: Callable[[Job], Result], jobs: Iterable[
         while True:
             room = max(0, 2 * engine.workers - len(futures) - len(again)) if engine.workers > 1 else 1
             for job in [*again, *islice(waiting, room)]:
-                futures[pool.submit(function, job)] = job
+                futures[_submitted(pool, function, job)] = job
             again = []
             if not futures:
                 return
@@ -136,9 +147,20 @@ def completed(engine: Engine, function: Callable[[Job], Result], jobs: Iterable[
                     )
                 again += futures.values()
                 futures.clear()
-                pool = engine.open()
+                pool = engine.pool()
     finally:
-        engine.close()
+        for future in futures:
+            future.cancel()
+
+
+def _submitted(pool: Executor, function: Callable[[Job], Result], job: Job) -> "Future[Result]":
+    """The future of a job; where the pool is broken already, one that failed."""
+    try:
+        return pool.submit(function, job)
+    except (RuntimeError, OSError) as error:
+        failed: Future[Result] = Future()
+        failed.set_exception(error if isinstance(error, OSError) else BrokenExecutor(str(error)))
+        return failed
 
 
 def engine_for(workers: int, scheduler: str | None) -> Engine:

@@ -1,0 +1,173 @@
+"""A sweep ended in every way and gone on with is the sweep that was not; its table is what readers expect."""
+
+import json
+import signal
+
+import numpy as np
+import pytest
+
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.sweep import engine
+from projservo_cli.sweep.driver import Folder, read_manifest, status_of
+from projservo_cli.sweep.runs import columns_of
+from projservo_cli.sweepfile import SweepTable
+from tests.sweep.cases import columns, design, make
+from tests.sweep.processes import (
+    differences,
+    finish,
+    kill_group,
+    parts,
+    start,
+    wait_for_parts,
+    written,
+)
+
+pytestmark = pytest.mark.volume
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Configuration and folder of a sweep that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("whole")
+    config = written(folder)
+    code, _, err = finish(start(config, folder / "out"))
+    assert code == 0, err
+    return config, folder / "out"
+
+
+def test_killed_and_run_again_equals_the_uninterrupted_one(whole, tmp_path):
+    """Ten kills at random moments are made by ``python -m tests.sweep.processes 10``."""
+    config, reference = whole
+    for stored in (1, 4):
+        process = start(config, tmp_path)
+        wait_for_parts(process, tmp_path, stored)
+        kill_group(process)
+    left = {path.name: path.stat().st_mtime_ns for path in parts(tmp_path)}
+    assert left
+    assert not (tmp_path / "sweep.h5").exists()
+    code, _, err = finish(start(config, tmp_path, "-j", "2"))
+    assert code == 0
+    assert f"{2 * len(left)} of 20 runs are stored already" in err
+    assert not differences(tmp_path, reference)
+    assert not parts(tmp_path)
+
+
+def test_interrupted_it_leaves_a_table_of_what_was_done(whole, tmp_path):
+    config, reference = whole
+    process = start(config, tmp_path, "-j", "2")
+    wait_for_parts(process, tmp_path, 2)
+    process.send_signal(signal.SIGINT)
+    code, _, err = finish(process)
+    assert code == 130, err
+    assert "Traceback" not in err
+    table, full = SweepTable(tmp_path / "sweep.h5"), SweepTable(reference / "sweep.h5")
+    rows = table.column("run")
+    assert 4 <= len(rows) < 20
+    for name in table.names:
+        assert table.column(name).tobytes() == full.column(name)[rows].tobytes()
+    code, out, _ = finish(start(config, tmp_path, "--json"))
+    told = json.loads(out)
+    assert (code, told["complete"], told["runs"], told["done"], told["cells"]) == (0, True, 20, 20, 2)
+    assert not differences(tmp_path, reference)
+
+
+def test_the_table_opens_in_xarray_and_pandas(whole):
+    xarray = pytest.importorskip("xarray", reason="xarray is not installed")
+    pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
+    pytest.importorskip("pandas", reason="pandas is not installed")
+    _, folder = whole
+    ours = columns(folder)
+    with xarray.open_dataset(folder / "sweep.h5") as data:
+        assert dict(data.sizes) == {"run": 20}
+        frame = data.to_dataframe()
+        assert data["position_error_mm"].attrs["units"] == "mm"
+    assert frame.index.tolist() == list(range(20))
+    assert set(frame.columns) == set(ours) - {"run"}
+    for name, values in ours.items():
+        if name != "run":
+            assert frame[name].tolist() == pytest.approx(values.tolist(), nan_ok=True, abs=0)
+    assert frame.groupby("law")["steps"].count().to_dict() == {"direct_two": 10, "stacked": 10}
+    with xarray.open_dataset(folder / "sweep.h5", group="traces/10") as trace:
+        assert trace.sizes["instant"] == ours["steps"][10] + 1
+        assert trace.attrs["law"] == "stacked"
+
+
+def test_another_configuration_is_refused_unless_forced(tmp_path):
+    first, second = design(runs=1, chunk=1), design(runs=1, chunk=1, seed=2)
+    make(first, tmp_path)
+    before = columns(tmp_path)
+    assert make(first, tmp_path).complete
+    with pytest.raises(InputError, match=r"of another configuration.*--force"):
+        make(second, tmp_path)
+    assert all(np.array_equal(columns(tmp_path)[name], before[name]) for name in ("run", "seed"))
+    make(second, tmp_path, force=True)
+    assert columns(tmp_path)["seed"].tolist() != before["seed"].tolist()
+
+
+def test_other_versions_do_not_go_on_with_a_sweep(tmp_path):
+    found, folder = design(runs=1, chunk=1), Folder(tmp_path)
+    make(found, tmp_path)
+    manifest = read_manifest(folder)
+    manifest["provenance"]["numba"] = "0.1"
+    folder.manifest.write_text(json.dumps(manifest), encoding="utf-8")
+    with pytest.raises(InputError, match=r"made with numba 0\.1, now"):
+        status_of(found, folder, force=False)
+    folder.manifest.write_text("{", encoding="utf-8")
+    with pytest.raises(InputError, match="damaged"):
+        status_of(found, folder, force=False)
+
+
+def test_a_damaged_part_is_named(tmp_path):
+    found, folder = design(runs=1, chunk=1, traces=[0]), Folder(tmp_path)
+
+    def interrupt(what, done, total):
+        if what == "runs" and done == 1:
+            raise KeyboardInterrupt
+
+    from projservo_cli.sweep.driver import run
+
+    with pytest.raises(KeyboardInterrupt):
+        run(found, folder, engine.LocalEngine(1), interrupt, lambda _: None)
+    (part,) = folder.stored()
+    assert status_of(found, folder, force=False).done == 1
+    assert SweepTable(folder.table).rows == 1
+    assert len(columns(tmp_path)) == len(columns_of(found))
+    part.write_bytes(part.read_bytes()[:1000])
+    with pytest.raises(InputError, match=f"{part.name}.*damaged"):
+        make(found, tmp_path)
+
+
+def slow_or_dead(job):
+    """A job that ends its process the first time it is made."""
+    number, marker = job
+    if number == 3 and not marker.exists():
+        marker.touch()
+        import os
+
+        os._exit(9)
+    return number
+
+
+def test_jobs_of_a_lost_process_are_made_again(tmp_path):
+    found = engine.LocalEngine(2)
+    jobs = [(number, tmp_path / "died") for number in range(12)]
+    try:
+        assert sorted(engine.completed(found, slow_or_dead, jobs)) == list(range(12))
+    finally:
+        found.close()
+    assert (tmp_path / "died").exists()
+
+
+def always_dead(job):
+    """A job that no process survives."""
+    import os
+
+    os._exit(9)
+
+
+def test_processes_that_die_again_and_again_end_in_words(monkeypatch):
+    monkeypatch.setattr(engine, "MOST_LOSSES", 1)
+    found = engine.LocalEngine(2)
+    with pytest.raises(WorkFailed, match="lost 2 times in a row"):
+        list(engine.completed(found, always_dead, [1]))
+    found.close()
