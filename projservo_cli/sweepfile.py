@@ -151,7 +151,9 @@ def _copy_traces(file: h5py.File, parts: Sequence[Path]) -> None:
     for part in parts:
         with h5py.File(part, "r", locking=False) as source:
             for run in source.get(TRACES, ()):
-                source.copy(f"{TRACES}/{run}", file.require_group(TRACES))
+                # Not as they are: references to dimensions do not survive a copy to another file.
+                trace = load_record(part, source[f"{TRACES}/{run}"])
+                save_record(file.create_group(f"{TRACES}/{run}"), trace)
 
 
 class SweepTable:

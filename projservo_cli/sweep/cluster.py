@@ -35,8 +35,9 @@ class ClusterEngine:
 
     def __init__(self, address: str) -> None:
         self.address = address
-        for name in ("distributed", "tornado", "asyncio"):  # what matters is said in our words
-            logging.getLogger(name).setLevel(logging.CRITICAL)
+        for name in list(logging.root.manager.loggerDict):  # what matters is said in our words
+            if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
+                logging.getLogger(name).setLevel(logging.CRITICAL)
         try:
             make: Any = distributed.Client
             self._client = make(address, timeout=PATIENCE_S, set_as_default=False)

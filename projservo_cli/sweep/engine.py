@@ -147,7 +147,7 @@ def completed(engine: Engine, function: Callable[[Job], Result], jobs: Iterable[
                     )
                 again += futures.values()
                 futures.clear()
-                pool = engine.pool()
+                pool = engine.pool(anew=True)
     finally:
         for future in futures:
             future.cancel()

@@ -89,7 +89,7 @@ def test_a_killed_scheduler_is_told_and_what_was_stored_is_gone_on_with(cluster,
     code, _, err = finish(process)
     assert code == 1
     assert "the connection to the scheduler is lost; what was stored until then is kept" in err
-    assert "Traceback" not in err
+    assert "Traceback" not in err, err
     stored = {path.name: path.read_bytes() for path in parts(out)}
     assert 3 <= len(stored) < 10
     another = Cluster(cluster.folder)
