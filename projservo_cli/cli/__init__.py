@@ -112,7 +112,7 @@ def _dispatch(arguments: list[str]) -> int:
     unused = [OPTIONS[name].opts[-1] for name in OPTIONS if name in given - allowed(names)]
     if unused:
         raise click.UsageError(f"{', '.join(unused)}: not used by {' '.join(names)}")
-    module = "staged" if COMMANDS[names[0]].stage else names[0]
+    module = "swept" if names == ["report"] and rest else "staged" if COMMANDS[names[0]].stage else names[0]
     command = importlib.import_module(f"projservo_cli.cli.{module}")
     code: int = command.run(names, rest, context.params)
     return code
@@ -139,6 +139,8 @@ def _commands(words: Sequence[str]) -> tuple[list[str], list[str]]:
             )
         return [words[0]], list(words[1:])
     stages = [name for name, command in COMMANDS.items() if command.stage]
+    if words[0] == "report" and len(words) == 2 and words[1] not in COMMANDS:  # of a sweep, not of a run
+        return ["report"], [words[1]]
     for word in words:
         if word in COMMANDS and word not in stages:
             raise click.UsageError(f"{word} stands alone; it does not chain with {words[0]}")

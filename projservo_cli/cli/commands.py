@@ -82,7 +82,9 @@ COMMANDS = {
         "Draw the figures and check the paper's claims.",
         "Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; "
         "and report.html, one page that tells it all and needs no other file. Makes every stage before it "
-        "where needed.",
+        "where needed.\n\n"
+        "projservo report SWEEP, with the folder of a sweep, writes its statistics and figures instead: "
+        "success with intervals, final errors, laws compared on the same tasks.",
         _OF_STAGES,
         stage=True,
         example="projservo calibrate plan servo report -c configs/ur5.yaml -o results/ur5",

@@ -251,6 +251,7 @@ def assembled(design: Design, folder: Folder) -> int:
     attributes = {
         "name": design.sweep.name,
         "key": design.key,
+        "random": list(design.sweep.random),
         "axes": [[axis.name, list(axis.values)] for axis in design.axes],
         "columns": [column.name for column in columns],
         "provenance": manifest["provenance"],

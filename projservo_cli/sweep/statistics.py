@@ -1,0 +1,200 @@
+"""Statistics of a sweep: how often runs arrive, how they end, and laws compared on the same tasks."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.stats import binomtest
+
+from projservo_cli.config.sweep import LAW
+from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.sweepfile import SweepTable
+
+Z_95 = 1.959963984540054
+SUCCESS = "converged"
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+MEASURES = (
+    "steps",
+    "position_error_mm",
+    "rotation_error_deg",
+    "path_length_ratio",
+    "center_deviation_at_samples_mm",
+    "effort",
+)
+PAIRED = ("steps", "position_error_mm", "path_length_ratio")
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Interval of 95 % for a share of which so many of so many were seen; NaN where none was.
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    Journal of the American Statistical Association 22 (1927), p. 209.
+    """
+    if count == 0:
+        return math.nan, math.nan
+    share, z2 = successes / count, Z_95 * Z_95
+    middle = (share + z2 / (2.0 * count)) / (1.0 + z2 / count)
+    half = Z_95 / (1.0 + z2 / count) * math.sqrt(share * (1.0 - share) / count + z2 / (4.0 * count * count))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+class Rows:
+    """Columns of a table as they are needed, and what follows from them.
+
+    Parameters
+    ----------
+    table : of a sweep.
+    """
+
+    def __init__(self, table: SweepTable) -> None:
+        self.table = table
+        self.axes: list[tuple[str, list[Any]]] = [(name, values) for name, values in table.attributes["axes"]]
+        self._columns: dict[str, npt.NDArray[Any]] = {}
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        """A column, read once."""
+        if name not in self._columns:
+            self._columns[name] = self._derived(name)
+        return self._columns[name]
+
+    def _derived(self, name: str) -> npt.NDArray[Any]:
+        if name == "success":
+            return np.asarray(self.table.column("verdict") == SUCCESS)
+        if name == "self_occluded":
+            return (self["self_occluded_steps_left"] > 0) | (self["self_occluded_steps_right"] > 0)
+        if name == "left_image":
+            return self["first_outside_image"] >= 0
+        if name == "path_length_ratio":
+            straight = self["distance_mm"]
+            ratio = np.full(straight.shape, np.nan)
+            np.divide(self["path_length_mm"], straight, out=ratio, where=straight > 1.0)
+            return ratio
+        return self.table.column(name)
+
+    def values(self, cell: int) -> dict[str, Any]:
+        """Value of each axis in a cell."""
+        places = np.unravel_index(cell, [len(values) for _, values in self.axes])
+        return {name: values[int(i)] for (name, values), i in zip(self.axes, places, strict=True)}
+
+    def cells(self) -> Iterator[tuple[int, BoolArray]]:
+        """Each cell that has runs, and which they are."""
+        for cell in np.unique(self["cell"]):
+            yield int(cell), self["cell"] == cell
+
+
+def statistics(rows: Rows) -> dict[str, Any]:
+    """Statistics of every cell, and laws against each other, as JSON values."""
+    return {
+        "cells": [
+            {"cell": cell, **rows.values(cell), **of_runs(rows, these)} for cell, these in rows.cells()
+        ],
+        "paired": list(paired(rows)),
+    }
+
+
+def of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
+    """Statistics of some runs; quantiles of those that converged."""
+    count, good = int(these.sum()), these & rows["success"]
+    successes = int(good.sum())
+    verdicts, counts = np.unique(rows["verdict"][these], return_counts=True)
+    return {
+        "runs": count,
+        "converged": successes,
+        "success_rate": successes / count,
+        "success_interval": wilson(successes, count),
+        "self_occluded_rate": float(rows["self_occluded"][these].mean()),
+        "left_image_rate": float(rows["left_image"][these].mean()),
+        "verdicts": dict(zip(verdicts.tolist(), counts.tolist(), strict=True)),
+        "quantiles": {name: quantiles(rows[name][good]) for name in MEASURES},
+    }
+
+
+def quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
+    """Quantiles of values that are numbers; None where there is none."""
+    numbers = values[np.isfinite(values)]
+    found = np.quantile(numbers, QUANTILES).tolist() if len(numbers) else [None] * len(QUANTILES)
+    return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}
+
+
+def paired(rows: Rows) -> Iterator[dict[str, Any]]:
+    """Each two laws on the same tasks with the same noise, in every combination of the other values."""
+    names = [name for name, _ in rows.axes]
+    if LAW not in names:
+        return
+    groups: dict[str, dict[str, tuple[dict[str, Any], BoolArray]]] = {}
+    for cell, these in rows.cells():
+        values = rows.values(cell)
+        law = values.pop(LAW)
+        groups.setdefault(repr(values), {})[law] = (values, these)
+    for laws in groups.values():
+        for first, second in combinations(laws, 2):
+            values, one = laws[first]
+            yield {**values, "laws": [first, second], **compared(rows, one, laws[second][1])}
+
+
+def compared(rows: Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
+    """Runs of two laws that share their draws: how often which arrives, and differences where both do.
+
+    The probabilities are of the exact test of McNemar and of the sign test: how often a difference as
+    large or larger would come about between laws that are alike.
+    """
+    _, i, j = np.intersect1d(rows["draw"][one], rows["draw"][other], return_indices=True)
+    a, b = rows["success"][one][i], rows["success"][other][j]
+    only = [int((a & ~b).sum()), int((b & ~a).sum())]
+    both = a & b
+    differences = {name: (rows[name][one][i] - rows[name][other][j])[both] for name in PAIRED}
+    return {
+        "pairs": len(i),
+        "both": int(both.sum()),
+        "only": only,
+        "neither": int((~a & ~b).sum()),
+        "p_success": chance(*only),
+        "median_difference": {name: median(values) for name, values in differences.items()},
+        "p_difference": {
+            name: chance(int((values > 0).sum()), int((values < 0).sum()))
+            for name, values in differences.items()
+        },
+    }
+
+
+def median(values: FloatArray) -> float | None:
+    """Median of values that are numbers; None where there is none."""
+    numbers = values[np.isfinite(values)]
+    return float(np.median(numbers)) if len(numbers) else None
+
+
+def chance(first: int, second: int) -> float:
+    """Two-sided probability of a split as uneven as this or more, between equals."""
+    return float(binomtest(first, first + second).pvalue) if first + second else 1.0
+
+
+def success_by(rows: Rows, name: str, edges: Sequence[float] | None = None) -> Mapping[str, dict[str, Any]]:
+    """Success of each law over a column: at each of its values, or within edges.
+
+    Returns
+    -------
+    For each law arrays (k,): x, runs, rate, low and high of the interval.
+    """
+    x, success = rows[name], rows["success"]
+    law = rows[LAW] if LAW in rows.table.names else np.full(len(x), "all")
+    found: dict[str, dict[str, Any]] = {}
+    for one in dict.fromkeys(law.tolist()):
+        mine = law == one
+        bins = (
+            [(float(value), mine & (x == value)) for value in np.unique(x[mine])]
+            if edges is None
+            else [(0.5 * (low + high), mine & (x >= low) & (x < high)) for low, high in pairwise(edges)]
+        )
+        rows_of = [(at, int(these.sum()), int((these & success).sum())) for at, these in bins if these.any()]
+        intervals = np.array([wilson(good, count) for _, count, good in rows_of]).reshape(-1, 2)
+        found[one] = {
+            "x": np.array([at for at, _, _ in rows_of]),
+            "runs": np.array([count for _, count, _ in rows_of]),
+            "rate": np.array([good / count for _, count, good in rows_of]),
+            "low": intervals[:, 0],
+            "high": intervals[:, 1],
+        }
+    return found
