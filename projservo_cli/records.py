@@ -330,6 +330,10 @@ class Trace:
     pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
     goal_pose: FloatArray = array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
     center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
+    untested: str = scalar(
+        about="why the images of a robot that is not simulated were not tested against the calibration",
+        default="",
+    )
     q_read: FloatArray | None = array(
         "instant",
         "joint",

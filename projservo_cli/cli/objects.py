@@ -185,7 +185,10 @@ def _servo_words(value: dict[str, Any]) -> list[str]:
         f"{_number(trace['center_deviation_mm']):>10}"
         for trace in value["laws"]
     ]
-    return ["servo: true errors at the end, self-occluded steps left/right", head, *rows]
+    reasons = dict.fromkeys(trace["untested"] for trace in value["laws"] if trace["untested"])
+    said = "images were not tested against the calibration"
+    untested = [wrapped(f"{said}: {reason}", "  ") for reason in reasons]
+    return ["servo: true errors at the end, self-occluded steps left/right", head, *rows, *untested]
 
 
 def _report_words(value: dict[str, Any]) -> list[str]:

@@ -118,9 +118,18 @@ def believed_plant(config: "Config", calibration: Calibration, reach: Reach, joi
     )
 
 
+def untested(config: "Config", calibration: Calibration) -> str:
+    """Why images in the loop are not tested against the calibration; empty where they are."""
+    if config.stop.innovation_factor == 0.0:
+        return "stop.innovation_factor is 0"
+    if not np.isfinite(calibration.covariance).all():
+        return "the calibration has no covariance, which the method refined gives"
+    return ""
+
+
 def innovation_of(config: "Config", calibration: Calibration, max_steps: int) -> Innovation | None:
     """Test of the images in the loop; None where it is switched off or the calibration has no covariance."""
     factor = config.stop.innovation_factor
-    if factor == 0.0 or not np.isfinite(calibration.covariance).all():
+    if untested(config, calibration):
         return None
     return Innovation(calibration, factor * noise_px(config, calibration), max_steps + 1 + WINDOW)

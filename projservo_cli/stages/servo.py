@@ -1,6 +1,7 @@
 """Stage servo: one control law in closed loop with the simulated robot, to its verdict."""
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -116,7 +117,8 @@ def run(
     gains, limits = driven.adapted(config, calibration, gains, limits)
     outcome = driven.run(config, calibration, plan, name, reach, gains, limits)
     found = unknown(outcome.steps + 1)
-    return record_of(law, outcome, reach, gains, limits, found, mode, planned_time(config, mode, plan))
+    trace = record_of(law, outcome, reach, gains, limits, found, mode, planned_time(config, mode, plan))
+    return replace(trace, untested=driven.untested(config, calibration))
 
 
 def planned_time(config: "Config", mode: str, plan: Plan | Sense) -> float | None:

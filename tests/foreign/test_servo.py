@@ -12,9 +12,11 @@ import pytest
 
 from projservo_cli import files
 from projservo_cli.config import load_config
-from projservo_cli.stages.driven import adapted
+from projservo_cli.records import Calibration
+from projservo_cli.stages.driven import adapted, innovation_of, untested
 from projservo_cli.stages.servo import gains_of, limits_of
 from projservo_cli.store import load
+from tests.fake_records import fake
 from tests.foreign import robots
 from tests.foreign.robots import CALLS
 
@@ -178,8 +180,17 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
     assert "nothing was moved, since where the robot stands images are" in answer.err
     assert commands() == []
     assert CALLS[-1] == "stop"
-    assert servo(*faulty("bumped camera"), "--set", "stop.innovation_factor=0", "-q").code in (0, 1)
+    answer = servo(*faulty("bumped camera"), "--set", "stop.innovation_factor=0", "--json")
+    assert answer.json["laws"][0]["untested"] == "stop.innovation_factor is 0"
     assert commands()
+
+
+def test_a_calibration_without_covariance_tests_nothing_and_says_so():
+    config = load_config(UR5)
+    bare = fake(Calibration, covariance=np.full((3, 3), np.nan))
+    assert "has no covariance" in untested(config, bare)
+    assert innovation_of(config, bare, 10) is None
+    assert untested(config, fake(Calibration, covariance=np.eye(3))) == ""
 
 
 def test_single_bad_frames_are_no_disturbance(servo):
