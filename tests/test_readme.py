@@ -37,7 +37,7 @@ def test_both_first_commands_are_those_of_the_newcomer():
     assert commands == [ENVIRONMENT.strip(), CHECKS.strip()]
 
 
-SERVO, PAGES, RECORD, DRIVE = COMMANDS
+SERVO, PAGES, RECORD, DRIVE, SWEEP = COMMANDS
 
 
 def test_a_recording(folder, capsys):
@@ -62,6 +62,15 @@ def test_commands_that_run_laws_and_what_is_read_from_python(folder, capsys):
     assert "converged" in capsys.readouterr().out
     assert names["pixels"].shape == (2, 10, 2)
     assert np.isfinite(names["rates"]).all()
+
+
+@pytest.mark.volume
+def test_a_sweep(folder, capsys):
+    run_commands(SWEEP)
+    told = capsys.readouterr().out
+    assert "sweep: 36 runs in 9 cells, all runs are done" in told
+    assert "report: 36 of 36 runs" in told
+    assert (folder / "results" / "sweep_noise-17" / "run.h5").is_file()
 
 
 @pytest.mark.volume

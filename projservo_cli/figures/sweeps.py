@@ -36,7 +36,7 @@ def draw_success(data: Data, figure: "Figure") -> None:
 
 
 def draw_basin(data: Data, figure: "Figure") -> None:
-    """Success of each law over two start offsets, as a map with a panel for each.
+    """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
 
     ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
     """
@@ -50,7 +50,10 @@ def draw_basin(data: Data, figure: "Figure") -> None:
     for axes, law in zip(panels, laws, strict=False):
         mesh = axes.pcolormesh(x, y, 100.0 * data[f"{law}.share"], vmin=0, vmax=100)
         axes.grid(visible=False)
+        axes.set_facecolor(style.PALE)  # where no run can begin
         axes.set_title(law)
+        axes.set_xticks(data["x"][:: max(1, len(data["x"]) // 5)])
+        axes.set_yticks(data["y"][:: max(1, len(data["y"]) // 5)])
     for axes in panels[len(laws) :]:
         axes.set_visible(False)
     figure.supxlabel(str(data["label_x"]), fontsize=8)

@@ -110,13 +110,13 @@ def _success(rows: Rows, name: str, label: str, edges: Sequence[float] | None) -
 
 
 def _basin(rows: Rows, first: str, second: str) -> Data:
-    x, y = np.unique(rows[first]), np.unique(rows[second])
+    x, y, begun = np.unique(rows[first]), np.unique(rows[second]), rows["steps"] >= 0
     data: Data = {"x": x, "y": y, "label_x": np.array(first), "label_y": np.array(second)}
     for law in dict.fromkeys(rows[LAW].tolist()):
         mine = rows[LAW] == law
         share = np.full((len(y), len(x)), np.nan)
         for i, j in np.ndindex(*share.shape):
-            these = mine & (rows[first] == x[j]) & (rows[second] == y[i])
+            these = mine & begun & (rows[first] == x[j]) & (rows[second] == y[i])
             if these.any():
                 share[i, j] = rows["success"][these].mean()
         data[f"{law}.share"] = share
