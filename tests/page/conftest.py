@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.config import to_yaml
 from projservo_cli.figures import FIGURES
-from projservo_cli.stages import report
+from projservo_cli.stages import drawing, report
 from projservo_cli.store import Result, Run
 from tests.figures.cases import SHORT, case, config_of
 
@@ -34,7 +34,7 @@ def reported(folder, *overrides):
     """A run with its report, which stands in the folder."""
     run = stored(folder, "report.formats=[svg]", *overrides)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "FIGURES", tuple(spec for spec in FIGURES if spec.name in SOME))
+        patch.setattr(drawing, "FIGURES", tuple(spec for spec in FIGURES if spec.name in SOME))
         patch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
         record = report.run(run, folder)
     made = Result("k", "", MADE, {}, {"": record})
