@@ -30,6 +30,9 @@ class Noise(Section):
 
     calibration_px: NotNegative = Field(0.5, description="in the images of trial motions")
     servo_px: NotNegative = Field(0.0, description="in the images of the closed loop")
+    shown_frames: Count = Field(
+        1, description="images averaged of the start and of the goal, where the robot rests"
+    )
 
 
 class CalibrationSettings(Section):
@@ -130,6 +133,9 @@ class Trajectory(Section):
     )
     duration_s: Positive | None = Field(
         None, description="time the motion is given; null for as little as the joint-speed limit lets it take"
+    )
+    ramp_s: NotNegative = Field(
+        0.4, description="time in which a planned motion comes up to its pace, and to rest again at its end"
     )
     border_px: NotNegative = Field(
         5.0, description="in the profile constrained: least distance of a marker from the border of an image"

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,22 @@ if TYPE_CHECKING:
 
 CONSTRAINED = "constrained"
 VIEWS = ("left", "right")
+
+
+class Pace(NamedTuple):
+    """How fast a planned motion is to be.
+
+    Attributes
+    ----------
+    duration : time it is given, s; None for as little as the joint-speed limit lets it take.
+    ramp : time in which it comes up to its pace, and to rest again at its end, s.
+    """
+
+    duration: float | None = None
+    ramp: float = 0.0
+
+
+AS_FAST_AS_ALLOWED = Pace()
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +168,7 @@ def motion_of(
     reaching: Reaching,
     sigma: FloatArray,
     pure_translation: float,
-    duration: float | None = None,
+    pace: Pace = AS_FAST_AS_ALLOWED,
 ) -> Motion:
     """Motion of a profile: one of the paper's, or planned under constraints.
 
@@ -160,7 +176,7 @@ def motion_of(
     ----------
     sigma : (s,) path parameter in [0, 1]; of a planned motion the part of its duration.
     pure_translation : most share of the translation before any rotation, δ τ_0 / τ.
-    duration : time it is given, s; None for as little as the joint-speed limit lets it take.
+    pace : time it is given.
 
     Raises
     ------
@@ -170,12 +186,12 @@ def motion_of(
     if profile == CONSTRAINED:
         path = plan_path(reaching)
         mu = path.at(sigma)
-        time = timed(sigma * path.duration, sigma, duration)
+        time = timed(sigma * path.duration, sigma, pace)
         return Motion(path.reaching, mu, along(path.reaching, mu), path.along, path.mu, time)
     mu = profile_shares(profile, sigma, pure_translation)
     found = along(reaching, mu)
     shortest = least_time(found.q, reaching.demands.speed)
-    return Motion(reaching, mu, found, found, mu, timed(shortest, sigma, duration))
+    return Motion(reaching, mu, found, found, mu, timed(shortest, sigma, pace))
 
 
 def least_time(q: FloatArray, speed: FloatArray) -> FloatArray:
@@ -189,25 +205,45 @@ def least_time(q: FloatArray, speed: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def timed(shortest: FloatArray, sigma: FloatArray, duration: float | None) -> FloatArray:
-    """Time (s,) of a motion that is given a duration, s: its shortest time stretched to that.
+def timed(shortest: FloatArray, sigma: FloatArray, pace: Pace) -> FloatArray:
+    """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
 
-    Where nothing limits the speed, the path parameter sigma (s,) passes evenly.
+    Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
 
     Raises
     ------
     WorkFailed
         If the joints would be too fast.
     """
-    least = float(shortest[-1])
+    duration = pace.duration
+    eased = from_rest(shortest, pace.ramp)
+    least = float(eased[-1])
     if duration is None:
-        return shortest
+        return eased
     if least > duration:
         raise WorkFailed(
             f"trajectory.duration_s {duration:g}: the joint-speed limit lets the motion take {least:.4g} s "
             "or more: give it longer, or null for as short as that"
         )
-    return shortest * (duration / least) if least > 0.0 else sigma * duration
+    if not least > 0.0:
+        eased = from_rest(sigma * duration, pace.ramp)
+    return np.asarray(eased * (duration / eased[-1]))
+
+
+def from_rest(time: FloatArray, ramp: float) -> FloatArray:
+    """Times (s,) of a motion that comes up to its pace evenly in so many s, and so to rest again at its end.
+
+    The pace, seconds of ``time`` a second, is a trapezoid, of a short motion a triangle of the same slope:
+    the motion never is faster, and takes longer by the ramp.
+    """
+    total = float(time[-1])
+    if not (ramp > 0.0 and total > 0.0):
+        return time
+    half = 0.5 * min(total, ramp)
+    end = total + ramp if total >= ramp else 2.0 * math.sqrt(total * ramp)
+    before = np.sqrt(2.0 * ramp * np.maximum(time, 0.0))
+    after = end - np.sqrt(2.0 * ramp * np.maximum(total - time, 0.0))
+    return np.select([time <= half, time >= total - half], [before, after], time + 0.5 * ramp)
 
 
 def constrained_verdict(motion: Motion) -> tuple[bool, str]:

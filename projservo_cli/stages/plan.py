@@ -13,8 +13,10 @@ from projservo_cli.geometry.mechanisms import COORDINATES
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed
 from projservo_cli.stages.beginning import joint_motions, partitioned_at_start
 from projservo_cli.stages.constrained import (
+    AS_FAST_AS_ALLOWED,
     CONSTRAINED,
     VIEWS,
+    Pace,
     constrained_verdict,
     demands_of,
     motion_of,
@@ -44,6 +46,7 @@ DEPENDS_ON = (
     "rig",
     "markers",
     "noise.servo_px",
+    "noise.shown_frames",
     "task",
     "trajectory",
     "control.observation",
@@ -82,7 +85,7 @@ def run(config: "Config", calibration: Calibration) -> Plan:
         config.trajectory.samples,
         demands_of(config, calibration.joint_types),
         sight_for(config, calibration, reach),
-        config.trajectory.duration_s,
+        Pace(config.trajectory.duration_s, config.trajectory.ramp_s),
     )
 
 
@@ -97,7 +100,7 @@ def plan_task(
     samples: int,
     demands: Demands,
     sight: Sight | None = None,
-    duration: float | None = None,
+    pace: Pace = AS_FAST_AS_ALLOWED,
 ) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
@@ -110,7 +113,7 @@ def plan_task(
     profile, delta, samples : which part is driven when, share of τ_0, points of the path.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
     sight : the body to measure with; without it the face is measured point by point.
-    duration : time the motion is given, s; None for as little as the joint-speed limit lets it take.
+    pace : time the motion is given.
 
     Raises
     ------
@@ -137,7 +140,7 @@ def plan_task(
         np.ones(4),
     )
     pure_translation = tau_limit / parts.tau if parts.tau > 0.0 else 1.0
-    motion = motion_of(profile, reaching, sigma, pure_translation, duration)
+    motion = motion_of(profile, reaching, sigma, pure_translation, pace)
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     H_d = np.array([trajectory_displacement(H_hat, (tau, theta_r, theta_p), row) for row in motion.mu])
     images = np.moveaxis(project(model.P, state.A @ np.swapaxes(H_d, 1, 2), model.lens), 0, 1)

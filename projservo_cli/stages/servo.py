@@ -47,6 +47,7 @@ DEPENDS_ON = (
     "rig",
     "markers",
     "noise.servo_px",
+    "noise.shown_frames",
     "task",
     "trajectory.delta",
     "control",

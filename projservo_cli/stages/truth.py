@@ -232,7 +232,7 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
         raise InputError("this stage needs a task: set task.start and task.goal")
     face_numbers(config)
     ends = _ends(config.task, config.robot.joint_types if config.robot is not None else "", truth)
-    sigma = config.noise.servo_px
+    sigma = config.noise.servo_px / math.sqrt(config.noise.shown_frames)
     rng = generator(config, TARGET_NOISE)
     s_start = ends.s_start + sigma * rng.standard_normal(ends.s_start.shape)
     pins_noise = generator(config, PIN_TARGET_NOISE).standard_normal((2, *ends.pins_start.shape))

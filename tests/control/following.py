@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from projservo_cli.records import NO_LENS
+from projservo_cli.stages.constrained import Pace
 from projservo_cli.stages.following import followed
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.task.margins import within
@@ -13,14 +14,14 @@ from tests.scene import GAINS, Run, limits
 SPEED = math.radians(30.0)
 
 
-def planned(sc, G=None, profile="linear", duration=None, speed=SPEED):
+def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
     """Plan of a scene in the frame of its model, at a joint-speed limit."""
     model = sc.seen(G)
     n = len(sc.q_start)
     demands = within(np.full(n, -9.0), np.full(n, 9.0))._replace(speed=np.full(n, speed))
     return plan_task(
         model._replace(lens=NO_LENS), sc.q_start, sc.s_start, sc.s_star, sc.plant.center, profile, 0.9, 101,
-        demands, None, duration,
+        demands, None, Pace(duration, ramp),
     )  # fmt: skip
 
 

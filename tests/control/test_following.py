@@ -4,10 +4,13 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
 from projservo_cli.modes import MODES_OF, TRACK
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages.constrained import from_rest
 from projservo_cli.stages.following import followed, instants
 from projservo_cli.task.reference import NO_REFERENCE, following, place, planned_step
 from projservo_cli.task.reference import planned as planned_at
@@ -174,3 +177,28 @@ def test_a_given_duration_is_kept():
     # At its shortest one joint is always at the limit.
     rate = np.abs(np.diff(shortest.q, axis=0)).max(axis=1) / np.diff(shortest.time)
     assert rate == pytest.approx(np.full(100, SPEED), rel=1e-9)
+
+
+@pytest.mark.parametrize("duration", [None, 6.0])
+def test_a_motion_with_ramps_starts_and_ends_at_rest_and_is_never_faster(duration):
+    sc = scene()
+    shortest, eased = planned(sc), planned(sc, duration=duration, ramp=0.5)
+    assert eased.duration == pytest.approx(duration or shortest.duration + 0.5, abs=1e-12)
+    assert (np.diff(eased.time) > 0.0).all()
+    rate = np.abs(np.diff(eased.q, axis=0)).max(axis=1) / np.diff(eased.time)
+    assert rate.max() <= SPEED * (1.0 + 1e-9)
+    assert max(rate[0], rate[-1]) < 0.35 * rate.max()
+
+
+@given(total=st.floats(0.01, 10.0), ramp=st.floats(0.01, 3.0))
+def test_the_pace_of_a_ramp_is_even(total, ramp):
+    time = np.linspace(0.0, total, 400)
+    eased = from_rest(time, ramp)
+    pace = np.diff(time) / np.diff(eased)
+    change = np.diff(pace) / np.diff(0.5 * (eased[1:] + eased[:-1]))
+    peak = min(1.0, math.sqrt(total / ramp))
+    assert eased[0] == 0.0
+    assert eased[-1] == pytest.approx(total + ramp if total >= ramp else 2.0 * math.sqrt(total * ramp))
+    assert pace.max() <= peak * (1.0 + 1e-9)
+    assert np.abs(change).max() <= (1.0 + 1e-6) / ramp
+    assert eased + eased[::-1] == pytest.approx(np.full(400, eased[-1]), rel=1e-9)
