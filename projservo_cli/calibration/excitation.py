@@ -68,8 +68,12 @@ def describe_joint(i: int, span: float, prismatic: bool, needed: float | None = 
         return f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone{far}"
     if needed is None:
         needed = min(2.0 * reach, max(4.0 * span, 0.5 * reach))
-    alone = "" if needed > span else " alone"
-    return f"joint {i + 1} moved only {moved}: move it{alone} at least {amount(needed, prismatic)}"
+    if needed <= span:
+        return (
+            f"joint {i + 1} moved {moved}, in too few poses: record further ones in which it moves alone, by "
+            f"{amount(needed, prismatic)} or more"
+        )
+    return f"joint {i + 1} moved only {moved}: move it at least {amount(needed, prismatic)}"
 
 
 def describe_still(i: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> str:

@@ -131,7 +131,8 @@ def test_the_left_camera_gives_the_directions():
     ("span", "prismatic", "needed", "text"),
     [
         (0.05, False, 0.2, "joint 4 moved only 2.86°: move it at least 11.5°"),
-        (0.05, False, 0.03, "joint 4 moved only 2.86°: move it alone at least 1.72°"),
+        (0.05, False, 0.03, "joint 4 moved 2.86°, in too few poses: record further ones in which it "
+         "moves alone, by 1.72° or more"),
         (0.01, True, 0.05, "joint 4 moved only 10 mm: move it at least 50 mm"),
         (1.0, False, 0.2, "joint 4 moved 57.3° but hardly apart from the other joints: move it "
          "alone, by 11.5° or more"),
