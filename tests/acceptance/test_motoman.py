@@ -6,6 +6,7 @@ import pytest
 from projservo_cli import cli, store
 from projservo_cli.calibration import residual_statistics
 from tests.acceptance import motoman
+from tests.calibration import damage
 
 
 @pytest.fixture(scope="module")
@@ -105,26 +106,26 @@ def half(tables):
 
 
 def test_shifted_readings_are_listed(tables, half):
-    observation, wrong = motoman.shifted(half, 0.15)
+    observation, wrong = damage.shifted(half, 0.15, motoman.SIGMA)
     calibration = motoman.fit(observation)
     assert held_out(calibration, tables)["median_px"] <= 0.70
-    found = motoman.listed(calibration)[0]
+    found = damage.listed(calibration)[0]
     assert len(wrong & found) >= 0.97 * len(wrong)
     assert len(found - wrong) <= 0.01 * np.isfinite(half.images[..., 0]).sum()
 
 
 def test_exchanged_numbers_are_listed(tables, half):
-    observation, wrong = motoman.exchanged(half)
+    observation, wrong = damage.exchanged(half)
     calibration = motoman.fit(observation)
     assert held_out(calibration, tables)["median_px"] <= 0.70
-    assert motoman.listed(calibration)[1] == wrong
+    assert damage.listed(calibration)[1] == wrong
 
 
 def test_wrong_joint_readings_are_listed(tables, half):
-    observation, wrong = motoman.misread(half)
+    observation, wrong = damage.misread(half)
     calibration = motoman.fit(observation)
     assert held_out(calibration, tables)["median_px"] <= 0.70
-    found = motoman.listed(calibration)[2]
+    found = damage.listed(calibration)[2]
     assert found <= wrong
     # A pose with three wrong joints or few markers is left out without a culprit.
     assert len(found) >= 0.8 * len(wrong)

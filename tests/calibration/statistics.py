@@ -1,19 +1,22 @@
 """Statistics of the calibration over many draws, for the tests in small and by hand in full.
 
-``python -m tests.calibration.statistics draws 100`` takes some ten minutes, ``… robots 200`` as long.
+``python -m tests.calibration.statistics draws 100`` takes some ten minutes, ``… robots 200`` as long,
+``… shifted 20`` one.
 """
 
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from projservo_cli.calibration import calibrate, predict
+from projservo_cli.calibration import calibrate, predict, residual_statistics
 from projservo_cli.records import BoolArray, FloatArray, Observation, WorkFailed
 from projservo_cli.tables import read_table
 from tests.calibration.bound import derivative, spread
+from tests.calibration.damage import listed, shifted
 from tests.calibration.simulated_robot import Robot, around, random_robot, trials
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
@@ -157,6 +160,40 @@ def random_robots(count: int, first: int = 1000) -> Robots:
     return found
 
 
+class Found(NamedTuple):
+    """What became of a table with 5 % of its readings shifted by up to ±50 px.
+
+    Attributes
+    ----------
+    median_px : held-out error.
+    gross, listed : readings shifted by more than 5σ in some coordinate, and how many of them are listed.
+    sound, accused : the other readings, and how many of them are listed.
+    """
+
+    median_px: float
+    gross: int
+    listed: int
+    sound: int
+    accused: int
+
+
+def shifted_readings(seed: int) -> Found:
+    """The UR5 table with 0.5 px of noise, one view and both views of a marker shifted equally often."""
+    table = read_table(SHARED / "ur5" / "trials_0.5px.csv", "RRRRRR")
+    observation, wrong = shifted(table, 0.05, SIGMA, seed, both=True)
+    calibration = calibrate(observation, "RRRRRR", source="recorded")
+    found = listed(calibration)[0]
+    ahead = read_table(SHARED / "ur5" / "validation.csv", "RRRRRR")
+    sound = int(np.isfinite(table.images[..., 0]).sum()) - len(wrong)
+    return Found(
+        residual_statistics(calibration, ahead)["median_px"],
+        len(wrong),
+        len(wrong & found),
+        sound,
+        len(found - wrong),
+    )
+
+
 def main(what: str, count: str) -> None:
     """Print the statistics of so many draws or robots."""
     if what == "robots":
@@ -165,6 +202,12 @@ def main(what: str, count: str) -> None:
         print(f"{robots.good} of {total} good, {len(robots.refused)} refused, {robots.rejected} rejected")
         print("error ÷ bound:", np.percentile(robots.ratio, [50, 95, 99, 100]).round(3))
         print(*robots.refused, sep="\n")
+        return
+    if what == "shifted":
+        found = [shifted_readings(seed) for seed in range(int(count))]
+        _, gross, seen, sound, accused = np.sum(found, axis=0)
+        print(f"median px: {min(f.median_px for f in found):.4f} to {max(f.median_px for f in found):.4f}")
+        print(f"{seen:.0f} of {gross:.0f} gross and {accused:.0f} of {sound:.0f} other readings listed")
         return
     import json
 

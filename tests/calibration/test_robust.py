@@ -7,6 +7,7 @@ import pytest
 
 from projservo_cli.calibration import calibrate, findings, predict
 from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.calibration.statistics import shifted_readings
 
 ROBOT = random_robot("RRRRRR", np.random.default_rng(30))
 VIEWS = {"left": (0,), "right": (1,), "both": (0, 1)}
@@ -99,3 +100,14 @@ def test_a_marker_whose_readings_are_all_wrong_costs_that_marker_alone(lost):
     listed = found.outlier[found.outlier[:, 1] == number]
     assert len(listed) == seen.any(axis=1).sum()
     assert any(f"marker {number}" in text for text in found.advice)
+
+
+@pytest.mark.volume
+def test_shifted_readings_of_another_lab_are_listed(shared_data):
+    """Three of the twenty seeds that ``python -m tests.calibration.statistics shifted 20`` looks at."""
+    found = [shifted_readings(seed) for seed in range(3)]
+    assert max(each.median_px for each in found) <= 0.19
+    _, gross, seen, sound, accused = np.sum(found, axis=0)
+    assert gross > 200
+    assert seen >= 0.97 * gross
+    assert accused <= 0.01 * sound

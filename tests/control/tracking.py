@@ -1,6 +1,7 @@
 """Following a plan with a calibrated, noisy robot: how near the line, and when it arrives.
 
-Run as ``python -m tests.control.tracking [SEEDS] [NAME …]`` for the whole study: one row a seed.
+Run as ``python -m tests.control.tracking [SEEDS] [NAME …] [KEY=VALUE …]`` for the whole study: one row
+a seed.
 """
 
 import sys
@@ -130,11 +131,11 @@ def runs(seed, names, overrides=(), arm="paper"):
     return found
 
 
-def study(seeds=100, names=("exact_track",)):
+def study(seeds=100, names=("exact_track",), overrides=()):
     """Print every run, then how many kept to the line and to the time."""
     found = {name: [] for name in names}
     for seed in range(1, seeds + 1):
-        for name, run in runs(seed, names).items():
+        for name, run in runs(seed, names, overrides).items():
             found[name].append(run)
             print(name, seed, *(f"{value:.4g}" if isinstance(value, float) else value for value in run))
     for name, rows in found.items():
@@ -150,4 +151,6 @@ def study(seeds=100, names=("exact_track",)):
 
 
 if __name__ == "__main__":
-    study(*(int(value) for value in sys.argv[1:2]), *([tuple(sys.argv[2:])] if sys.argv[2:] else []))
+    seeds, *rest = sys.argv[1:] or ["100"]
+    names = tuple(word for word in rest if "=" not in word) or ("exact_track",)
+    study(int(seeds), names, tuple(word for word in rest if "=" in word))
