@@ -37,7 +37,7 @@ from projservo_cli.task.margins import (
     limit_margin,
 )
 from projservo_cli.task.path import follow, straightened, view_path
-from projservo_cli.task.search import searched
+from projservo_cli.task.search import WAYS, carry, traced
 from projservo_cli.task.visibility import margin_coefficients
 
 # Points of a path at which its joints and margins are looked at.
@@ -46,9 +46,6 @@ CHECKS = 151
 ENDLESS = 1e9
 # Shares of this part of the best one are as good, joints being interpolated; the quicker path is better.
 EQUALLY = 0.95
-# Nodes a search for a narrow way may solve for, and shares it tries to keep.
-SOUGHT = 1500
-NARROW = (0.0, 0.05, 0.2)
 # The lattices of joints that were not looked at.
 NOTHING = np.empty(0)
 
@@ -191,19 +188,21 @@ def plan_path(reaching: Reaching) -> Path:
     ----------
     reaching : the task; its scale is not used.
     """
-    theta_p = float(reaching.amplitudes[2])
     n = len(reaching.q_start)
     work, newton = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A)), np.empty(n)
+    theta_p = float(reaching.amplitudes[2])
     reaching = _turned(reaching, turning_sense(reaching), theta_p)
+    other = _turned(reaching, reaching.amplitudes[1], theta_p - math.copysign(2.0 * math.pi, theta_p))
     candidates = [_candidate(reaching, 0.0, work, newton)]
     least = candidates[0].least
     if theta_p != 0.0 and (abs(theta_p) > 0.5 * math.pi or least <= 0.0):
-        other = _turned(reaching, reaching.amplitudes[1], theta_p - math.copysign(2.0 * math.pi, theta_p))
         candidates.append(_candidate(other, max(EQUALLY * least, 0.0), work, newton))
     good = max(EQUALLY * max(candidate.least for candidate in candidates), 0.0)
     paths = [_quickest(candidate) for candidate in candidates if candidate.least > good]
     best = _best(paths)
     if best is None or best.shares().min() <= 0.0:
+        if theta_p != 0.0 and len(candidates) == 1:
+            candidates.append(_candidate(other, 0.0, work, newton))
         best = _best([*paths, *_narrow(candidates, work)])
     if best is None or best.shares().min() <= 0.0:
         best = _best([*paths, _in_view(candidates)])
@@ -253,22 +252,20 @@ def _quickest(candidate: Candidate) -> Path:
 
 
 def _narrow(candidates: list[Candidate], work: Work) -> list[Path]:
-    """Paths that ``searched`` finds; each time one is found it is asked for more distance."""
-    paths = []
-    for candidate in candidates:
-        n = len(candidate.reaching.q_start)
-        joints, came = np.empty((*candidate.views.shape, n)), np.empty(candidate.views.shape, dtype=np.int64)
-        stack, path = np.empty((7 * SOUGHT + 1, 5), dtype=np.int64), np.empty((3 * NODES, 3), dtype=np.int64)
-        scratch = np.empty((4, max(n, 4)))
-        for least in NARROW:
-            arguments = (candidate.reaching, candidate.views, least, SOUGHT, came, joints, stack, scratch)
-            if candidate.in_view <= least:
-                break
-            count = searched(*arguments, work, path)
-            if count == 0:
-                break
-            paths.append(_timed(candidate.reaching, path[:count] / (NODES - 1)))
-    return paths
+    """Widest path for joints carried through all nodes, of the first candidate that has one that holds."""
+    for reaching, views, in_view, *_ in candidates:
+        if not in_view > 0.0:
+            continue
+        n = len(reaching.q_start)
+        value, came = np.empty((*views.shape, WAYS)), np.empty((*views.shape, WAYS), dtype=np.int64)
+        carry(reaching, views, value, np.empty((*value.shape, n)), came, np.empty((4, max(n, 4))), work)
+        path = np.empty((3 * NODES, 3), dtype=np.int64)
+        count = traced(value, came, path)
+        if count > 0:
+            found = _timed(reaching, path[:count] / (NODES - 1))
+            if found.shares().min() > 0.0:
+                return [found]
+    return []
 
 
 def _in_view(candidates: list[Candidate]) -> Path:

@@ -1,7 +1,8 @@
-"""A path for joints that the coarse lattice of joints does not show: depth first over the fine one.
+"""A path for joints that the coarse lattice of joints does not show: all nodes of the fine one, in order.
 
 Between obstacles that lie closer than the nodes at which joints are solved for, ``task.lattice`` sees no
-way. Here joints are carried along from node to node, as far as a bounded number of nodes allows.
+way, and where the way taken decides how far a joint has turned it sees one of several. Here joints are
+carried from node to node, and a node keeps different ones that lead to it.
 """
 
 from projservo_cli.geometry.inverse import reach
@@ -10,30 +11,80 @@ from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.task.lattice import ROUGH
-from projservo_cli.task.margins import CONDITIONING, JOINTS, Reaching, limit_margin, reciprocal_condition
+from projservo_cli.task.margins import (
+    CONDITIONING,
+    JOINTS,
+    WORST,
+    Reaching,
+    limit_margin,
+    reciprocal_condition,
+)
 from projservo_cli.task.trajectory import displaced
 
-# A joint that moves more than this between neighbours, rad or m, has changed its branch.
+# A joint that moves more than this between neighbours, rad or m, has changed its branch; joints at a node
+# that differ by more are different ways to be there.
 MOST_STRIDE = 0.5
+# Different joints that are tried at a node.
+WAYS = 3
+
+
+@njit
+def near(q: FloatArray, other: FloatArray) -> bool:
+    """Whether no joint differs by more than ``MOST_STRIDE``."""
+    for i in range(q.shape[0]):
+        if not abs(q[i] - other[i]) <= MOST_STRIDE:
+            return False
+    return True
+
+
+@njit
+def best_way(
+    value: FloatArray, joints: FloatArray, i: int, j: int, k: int, tried: int
+) -> tuple[float, int, int]:
+    """Best value among the ways to the nodes before, of joints unlike the ``tried`` ones at this node.
+
+    Returns
+    -------
+    Its value, 0 where there is none; the step from there, coded by bits 4, 2, 1 for t, r, p; which way.
+    """
+    best = 0.0
+    step = origin = 0
+    for code in range(7, 0, -1):
+        x, y, z = i - (code >> 2), j - (code >> 1 & 1), k - (code & 1)
+        if min(x, y, z) < 0:
+            continue
+        for way in range(WAYS):
+            if not value[x, y, z, way] > best:
+                continue
+            fresh = True
+            for other in range(tried):
+                fresh = fresh and not near(joints[x, y, z, way], joints[i, j, k, other])
+            if fresh:
+                best, step, origin = value[x, y, z, way], code, way
+    return best, step, origin
 
 
 @njit
 def carried(
     reaching: Reaching, q: FloatArray, before: FloatArray, mu: FloatArray, scratch: FloatArray, work: Work
 ) -> float:
-    """Smallest share of joint limits and conditioning of joints ``q`` carried to mu (3,); −1 for none.
+    """Smallest share of joint limits and conditioning of the joints at mu (3,), continued; −1 for none.
 
-    ``q`` comes with the joints ``before``; scratch (≥ 3, ≥ max(n, 4)) and work are workspaces.
+    Parameters
+    ----------
+    q : (n,) where they are looked for first, rad or m, on return the joints; ``before`` where none are.
+    before : (n,) joints at the node before.
+    scratch, work : workspaces, the former (≥ 3, ≥ max(n, 4)).
     """
     n = reaching.q_start.shape[0]
     newton, M = scratch[0, :n], scratch[1:3, :4]
     H_back = backward(reaching.model, reaching.q_start)
     H = displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2])
-    if not reach(reaching.model, H_back, H, reaching.A, q, work, newton, ROUGH):
+    settled = reach(reaching.model, H_back, H, reaching.A, q, work, newton, ROUGH)
+    if not (settled and near(q, before)):
+        for i in range(n):
+            q[i] = before[i]
         return -1.0
-    for i in range(n):
-        if not abs(q[i] - before[i]) <= MOST_STRIDE:
-            return -1.0
     share = limit_margin(q, reaching.demands) / reaching.scale[JOINTS]
     if share > 0.0:
         condition = reciprocal_condition(reaching, H, work, M, newton) - reaching.demands.conditioning
@@ -42,93 +93,79 @@ def carried(
 
 
 @njit
-def searched(
+def carry(
     reaching: Reaching,
     views: FloatArray,
-    least: float,
-    most: int,
-    came: IntArray,
+    value: FloatArray,
     joints: FloatArray,
-    stack: IntArray,
+    came: IntArray,
     scratch: FloatArray,
     work: Work,
-    path: IntArray,
-) -> int:
-    """Find a monotone path of nodes whose shares are more than ``least``, near the diagonal first.
+) -> None:
+    """Carry joints to every node that they reach along monotone paths, by up to ``WAYS`` different ways.
 
     Parameters
     ----------
     views : (k, k, k) best smallest share in view of the paths up to each node.
-    most : nodes whose joints may be solved for.
-    came, joints, stack, scratch, work : workspaces (k, k, k), (k, k, k, n), (≥ 7 most + 1, 5), as of
-        ``carried`` with a row more, and its own.
-    path : (≥ 3k, 3) on return the nodes, first to last.
+    value : (k, k, k, WAYS) on return the best smallest share of the paths by each way; 0 or less for none.
+    joints : (k, k, k, WAYS, n) on return rad or m.
+    came : (k, k, k, WAYS) on return the step before and 8 times the way it came by.
+    scratch, work : workspaces, the former (≥ 4, ≥ max(n, 4)).
+    """
+    last = views.shape[0] - 1
+    mu = scratch[3]
+    value[:] = WORST
+    for i in range(last + 1):
+        for j in range(last + 1):
+            for k in range(last + 1):
+                if not views[i, j, k] > 0.0:
+                    continue
+                mu[0], mu[1], mu[2] = i / last, j / last, k / last
+                for way in range(WAYS):
+                    best, code, origin = views[i, j, k], 0, 0
+                    before = earlier = reaching.q_start
+                    if i + j + k > 0:
+                        best, code, origin = best_way(value, joints, i, j, k, way)
+                        x, y, z = code >> 2, code >> 1 & 1, code & 1
+                        before = earlier = joints[i - x, j - y, k - z, origin]
+                        if came[i - x, j - y, k - z, origin] == 8 * origin + code:
+                            earlier = joints[i - 2 * x, j - 2 * y, k - 2 * z, origin]
+                    if not best > 0.0 or (way > 0 and i + j + k == 0):
+                        break
+                    q = joints[i, j, k, way]
+                    for l in range(q.shape[0]):
+                        q[l] = 2.0 * before[l] - earlier[l]
+                    share = carried(reaching, q, before, mu, scratch, work)
+                    value[i, j, k, way] = min(share, min(best, views[i, j, k]))
+                    came[i, j, k, way] = 8 * origin + code
+
+
+@njit
+def traced(value: FloatArray, came: IntArray, path: IntArray) -> int:
+    """Write the nodes of the best path to the last node, first to last, to ``path`` (≥ 3k, 3).
 
     Returns
     -------
-    How many nodes the path has, 0 where none was found.
+    How many there are; 0 where no path leads there.
     """
-    n = reaching.q_start.shape[0]
-    last = views.shape[0] - 1
-    mu = scratch[3]
-    came[:] = -1
-    stack[0, :] = 0
-    top = 1
-    for _ in range(most):
-        if top == 0:
-            return 0
-        top -= 1
-        i, j, k, code = stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3]
-        if came[i, j, k] >= 0:
-            continue
-        before = (
-            reaching.q_start if code == 0 else joints[i - (code >> 2), j - (code >> 1 & 1), k - (code & 1)]
-        )
-        q = joints[i, j, k]
-        for l in range(n):
-            q[l] = before[l]
-        mu[0], mu[1], mu[2] = i / last, j / last, k / last
-        if not carried(reaching, q, before, mu, scratch, work) > least:
-            continue
-        came[i, j, k] = code
-        if i + j + k == 3 * last:
-            return traced(came, path)
-        top = pushed(views, least, i, j, k, stack, top)
-    return 0
-
-
-@njit
-def pushed(views: FloatArray, least: float, i: int, j: int, k: int, stack: IntArray, top: int) -> int:
-    """Put the neighbours that come after a node on the stack, that nearest to the diagonal on top."""
-    last = views.shape[0] - 1
-    first = top
-    for code in range(1, 8):
-        x, y, z = i + (code >> 2), j + (code >> 1 & 1), k + (code & 1)
-        if max(x, y, z) > last or not views[x, y, z] > least:
-            continue
-        stack[top, 0], stack[top, 1], stack[top, 2], stack[top, 3] = x, y, z, code
-        stack[top, 4] = 10 * (max(x, y, z) - min(x, y, z)) - (x + y + z)
-        place = top
-        while place > first and stack[place - 1, 4] < stack[place, 4]:
-            for l in range(5):
-                stack[place, l], stack[place - 1, l] = stack[place - 1, l], stack[place, l]
-            place -= 1
-        top += 1
-    return top
-
-
-@njit
-def traced(came: IntArray, path: IntArray) -> int:
-    """Write the path to the last node; returns how many nodes it has."""
-    i = j = k = came.shape[0] - 1
-    count = 1
-    while i + j + k > 0:
-        code = came[i, j, k]
-        i, j, k = i - (code >> 2), j - (code >> 1 & 1), k - (code & 1)
-        count += 1
-    i = j = k = came.shape[0] - 1
-    for node in range(count - 1, -1, -1):
+    i = j = k = value.shape[0] - 1
+    way = 0
+    for other in range(1, WAYS):
+        if value[i, j, k, other] > value[i, j, k, way]:
+            way = other
+    if not value[i, j, k, way] > 0.0:
+        return 0
+    node = path.shape[0]
+    while True:
+        node -= 1
         path[node, 0], path[node, 1], path[node, 2] = i, j, k
-        code = came[i, j, k]
-        i, j, k = i - (code >> 2), j - (code >> 1 & 1), k - (code & 1)
-    return count
+        if i + j + k == 0:
+            break
+        step = came[i, j, k, way]
+        way = step >> 3
+        i, j, k = i - (step >> 2 & 1), j - (step >> 1 & 1), k - (step & 1)
+    count = path.shape[0] - node
+    for step in range(count):
+        for axis in range(3):
+            path[step, axis] = path[node + step, axis]
+    return int(count)
