@@ -258,7 +258,8 @@ def _narrow(candidates: list[Candidate], work: Work) -> list[Path]:
             continue
         n = len(reaching.q_start)
         value, came = np.empty((*views.shape, WAYS)), np.empty((*views.shape, WAYS), dtype=np.int64)
-        carry(reaching, views, value, np.empty((*value.shape, n)), came, np.empty((4, max(n, 4))), work)
+        joints, start, scratch = np.empty((*value.shape, n)), np.empty((n, 4, 4)), np.empty((10, max(n, 4)))
+        carry(reaching, views, value, joints, came, start, scratch, work)
         path = np.empty((3 * NODES, 3), dtype=np.int64)
         count = traced(value, came, path)
         if count > 0:

@@ -7,8 +7,8 @@ carried from node to node, and a node keeps different ones that lead to it.
 
 from projservo_cli.geometry.inverse import reach
 from projservo_cli.geometry.jit import njit
-from projservo_cli.geometry.kinematics import backward
-from projservo_cli.geometry.mechanisms import Work
+from projservo_cli.geometry.kinematics import backward, operators_at
+from projservo_cli.geometry.mechanisms import COORDINATES, Work
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.task.lattice import ROUGH
 from projservo_cli.task.margins import (
@@ -65,8 +65,59 @@ def best_way(
 
 
 @njit
+def orientation(H_hat: FloatArray, start: FloatArray, G: FloatArray) -> float:
+    """Determinant of six operators in terms of those at the start, up to a positive factor.
+
+    Both span the displacements of one frame. On the way the determinant changes its sign where the joints
+    pass a configuration at which the operators are dependent.
+
+    Parameters
+    ----------
+    H_hat, start : (6, 4, 4).
+    G : (≥ 6, ≥ 6) workspace.
+
+    Returns
+    -------
+    1 for arms of other than six joints, whose operators have no determinant.
+    """
+    n = H_hat.shape[0]
+    if n != COORDINATES:
+        return 1.0
+    for i in range(n):
+        for j in range(n):
+            inner = 0.0
+            for a in range(4):
+                for b in range(4):
+                    inner += start[i, a, b] * H_hat[j, a, b]
+            G[i, j] = inner
+    product = 1.0
+    for i in range(n):
+        longest = i
+        for a in range(i + 1, n):
+            if abs(G[a, i]) > abs(G[longest, i]):
+                longest = a
+        pivot = G[longest, i]
+        if pivot == 0.0:
+            return 0.0
+        product *= pivot if longest == i else -pivot
+        for b in range(i, n):
+            G[i, b], G[longest, b] = G[longest, b], G[i, b]
+        for a in range(i + 1, n):
+            factor = G[a, i] / pivot
+            for b in range(i, n):
+                G[a, b] -= factor * G[i, b]
+    return product
+
+
+@njit
 def carried(
-    reaching: Reaching, q: FloatArray, before: FloatArray, mu: FloatArray, scratch: FloatArray, work: Work
+    reaching: Reaching,
+    q: FloatArray,
+    before: FloatArray,
+    mu: FloatArray,
+    start: FloatArray,
+    scratch: FloatArray,
+    work: Work,
 ) -> float:
     """Smallest share of joint limits and conditioning of the joints at mu (3,), continued; −1 for none.
 
@@ -74,14 +125,16 @@ def carried(
     ----------
     q : (n,) where they are looked for first, rad or m, on return the joints; ``before`` where none are.
     before : (n,) joints at the node before.
-    scratch, work : workspaces, the former (≥ 3, ≥ max(n, 4)).
+    start : (n, 4, 4) operators at the start.
+    scratch, work : workspaces, the former (≥ 9, ≥ max(n, 4)).
     """
     n = reaching.q_start.shape[0]
     newton, M = scratch[0, :n], scratch[1:3, :4]
     H_back = backward(reaching.model, reaching.q_start)
     H = displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2])
     settled = reach(reaching.model, H_back, H, reaching.A, q, work, newton, ROUGH)
-    if not (settled and near(q, before)):
+    settled = settled and near(q, before)
+    if not (settled and orientation(work.H_hat, start, scratch[3:]) > 0.0):
         for i in range(n):
             q[i] = before[i]
         return -1.0
@@ -99,6 +152,7 @@ def carry(
     value: FloatArray,
     joints: FloatArray,
     came: IntArray,
+    start: FloatArray,
     scratch: FloatArray,
     work: Work,
 ) -> None:
@@ -110,10 +164,11 @@ def carry(
     value : (k, k, k, WAYS) on return the best smallest share of the paths by each way; 0 or less for none.
     joints : (k, k, k, WAYS, n) on return rad or m.
     came : (k, k, k, WAYS) on return the step before and 8 times the way it came by.
-    scratch, work : workspaces, the former (≥ 4, ≥ max(n, 4)).
+    start, scratch, work : workspaces (n, 4, 4), (≥ 10, ≥ max(n, 4)), and of n joints and the face.
     """
     last = views.shape[0] - 1
-    mu = scratch[3]
+    mu, others = scratch[0], scratch[1:]
+    operators_at(reaching.model, reaching.q_start, start)
     value[:] = WORST
     for i in range(last + 1):
         for j in range(last + 1):
@@ -135,7 +190,7 @@ def carry(
                     q = joints[i, j, k, way]
                     for l in range(q.shape[0]):
                         q[l] = 2.0 * before[l] - earlier[l]
-                    share = carried(reaching, q, before, mu, scratch, work)
+                    share = carried(reaching, q, before, mu, start, others, work)
                     value[i, j, k, way] = min(share, min(best, views[i, j, k]))
                     came[i, j, k, way] = 8 * origin + code
 

@@ -2,8 +2,9 @@
 
 In metres and radians, by the rigid motions of the true screws; nothing here calls the code under test.
 Joints are carried from node to node by Newton's method on the pose, each node from the best one before
-it. They can follow where they keep their limits, move by at most ``MOST_STRIDE`` from node to node, and
-the image Jacobian of the face stays as well conditioned as is asked for.
+it. They can follow where they keep their limits, move by at most ``MOST_STRIDE`` from node to node, do not
+jump over a singular configuration on the way (the determinant of the twists keeps its sign), and the
+image Jacobian of the face stays as well conditioned as is asked for.
 """
 
 import math
@@ -101,6 +102,7 @@ def flood(arm, free, c_start, c, onto, within, q_start):
     B = np.empty((JOINTS, 4 * arm.M.shape[0]))
     start, goal, here = np.empty((3, 4)), np.empty((3, 4)), np.empty((3, 4))
     pose(arm, q_start, start, J)
+    sign = np.sign(np.linalg.det(J))
     for i in range(k):
         for j in range(k):
             for l in range(k):
@@ -118,7 +120,7 @@ def flood(arm, free, c_start, c, onto, within, q_start):
                     if best <= 0.0:
                         continue
                 displaced(onto[j], within[l], c[i], c_start, start, goal)
-                if solve(arm, goal, q, here, J, G):
+                if solve(arm, goal, q, here, J, G) and np.linalg.det(J) * sign > 0.0:
                     worth[i, j, l] = min(best, margin(arm, q, here, J, B))
                     joints[i, j, l] = q
     return worth > 0.0

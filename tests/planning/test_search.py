@@ -10,17 +10,16 @@ from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.truth import truth_of
 from projservo_cli.task.lattice import view_shares, widest
 from projservo_cli.task.margins import limit_margin
-from projservo_cli.task.search import MOST_STRIDE, WAYS, best_way, carry, near, traced
+from projservo_cli.task.search import MOST_STRIDE, WAYS, best_way, carry, near, orientation, traced
 from projservo_cli.task.trajectory import displaced
 from tests.planning.arm import arm_of, feasible
 from tests.planning.cases import reaching_of
 from tests.planning.driven import configured, true_task
-from tests.samples import poe
+from tests.samples import arm, frame, in_frame, operators, poe
 
 NODES = 11
 # Tasks of the second robot, deg: the first passes beside a joint limit; in the second the turn within the
-# plane has to take the longer sense; in the third the turn onto the plane comes first, or a wrist that
-# turns too far.
+# plane has to take the longer sense.
 HIDDEN = [
     (
         [168.461, -221.345, -97.337, -138.973, 70.816, 217.991],
@@ -30,11 +29,12 @@ HIDDEN = [
         [-92.08, -3.255, -57.914, -212.501, -3.028, 104.43],
         [55.284, 154.109, -53.146, -323.938, -186.197, -136.277],
     ),
-    (
-        [219.601, 156.604, 152.68, -319.261, -41.8, -140.096],
-        [68.604, -184.647, 63.518, -239.498, 112.226, 100.466],
-    ),
 ]
+# One in which joint 5 would have to pass 180°, where joints 4 and 6 are one axis.
+JUMP = (
+    [219.601, 156.604, 152.68, -319.261, -41.8, -140.096],
+    [68.604, -184.647, 63.518, -239.498, 112.226, 100.466],
+)
 
 
 @pytest.mark.volume
@@ -69,7 +69,7 @@ def carried(request):
     value, came = np.empty((*shape, WAYS)), np.empty((*shape, WAYS), dtype=np.int64)
     joints = np.empty((*shape, WAYS, 6))
     work = workspace(6, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
-    carry(reaching, views, value, joints, came, np.empty((4, 6)), work)
+    carry(reaching, views, value, joints, came, np.empty((6, 4, 4)), np.empty((10, 6)), work)
     return reaching, views, value, joints, came
 
 
@@ -124,3 +124,37 @@ def test_another_way_is_one_of_other_joints():
     assert best_way(value, joints, 1, 1, 1, 1) == (0.3, 4, 0)
     joints[1, 1, 1, 1, 3] = 2.0 * np.pi
     assert best_way(value, joints, 1, 1, 1, 2)[0] == 0.0
+
+
+def test_orientation_changes_its_sign_where_operators_are_dependent(rng):
+    """In any frame it has the sign of the determinant of the screws over that at the start."""
+    model = arm()
+    frames = [model, in_frame(model, frame(3, mirrored=True))]
+    G = np.empty((6, 6))
+    signs = []
+    for _ in range(60):
+        q_start, q = rng.uniform(-3.0, 3.0, (2, 6))
+        wanted = np.linalg.det(screws(model, q)) * np.linalg.det(screws(model, q_start))
+        for there in frames:
+            found = orientation(operators(there, q), operators(there, q_start), G)
+            assert np.sign(found) == np.sign(wanted)
+        signs.append(wanted > 0.0)
+    assert 10 < sum(signs) < 50
+    assert orientation(np.zeros((7, 4, 4)), np.zeros((7, 4, 4)), G) == 1.0
+
+
+def screws(model, q):
+    """Axes and moments (6, 6) of the operators of a metric model."""
+    H = operators(model, q)
+    return np.stack([H[:, 2, 1], H[:, 0, 2], H[:, 1, 0], *H[:, :3, 3].T])
+
+
+@pytest.mark.volume
+def test_no_path_jumps_over_a_singular_configuration(truth_and_demands):
+    """Without the sign of the determinant the joints jump from a wrist to the flipped one between nodes."""
+    truth, demands = truth_and_demands
+    q_start, q_goal = np.radians(JUMP)
+    assert not feasible(arm_of(truth, demands.conditioning), true_task(truth, q_start, q_goal), q_start)
+    s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
+    plan = plan_task(truth.model, q_start, s_start, s_star, truth.center, "constrained", 0.9, 101, demands)
+    assert not plan.feasible
