@@ -48,7 +48,7 @@ def test_it_sees_pixels_and_joint_readings_only():
     parameters = inspect.signature(calibrate).parameters
     assert set(parameters) == {
         "observation", "joint_types", "method", "sigma_px", "source", "image_size", "seed",
-        "lens", "init", "fitted",
+        "lens", "init", "fitted", "tell",
     }  # fmt: skip
     assert parameters["init"].default is None
 
