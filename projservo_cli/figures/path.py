@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 NODES = 81
 TURNS = 41  # shares μ_p tried at each μ_t, μ_r
 TICKS = 11  # points at equal steps of σ on the path
+WIDE = 4.0  # margins beyond are drawn in powers of ten
+LABEL = 0.05  # room that the number on a contour needs, in shares
 
 SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider shows beneath
     r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
@@ -27,7 +29,7 @@ MARGINS: dict[str, style.Look] = {
     "visibility": {"color": style.BLUE, "linestyle": "-"},
     "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
     "joints": {"color": style.GREEN, "linestyle": (0, (4, 1, 1, 1))},
-    "conditioning": {"color": style.PURPLE, "linestyle": (0, (1, 1))},
+    "conditioning (start = 1)": {"color": style.PURPLE, "linestyle": (0, (1, 1))},
 }
 
 
@@ -104,6 +106,10 @@ def draw(data: Data, figure: "Figure") -> None:
     axes[1, 0].set_ylabel(r"share $\mu$ (1)")
     handles += _lines(axes[1, 1], data["sigma"], data["along"], MARGINS)
     axes[1, 1].axhline(0.0, color=style.BLACK, linewidth=0.6)
+    if np.nanmax(data["along"]) > WIDE:  # conditioning may grow a hundredfold
+        axes[1, 1].set_yscale("symlog", linthresh=1.0)
+        axes[1, 1].yaxis.set_major_formatter("{x:g}")
+    axes[1, 1].set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
     axes[1, 1].set_ylabel("margin (1)")
     style.legend_below(figure, handles, 4)
 
@@ -120,7 +126,8 @@ def _map(axes: "Axes", data: Data, view: int) -> None:
         share, share, data["margin"][view].T, levels=[0.25, 0.5, 0.75, 1.0, 1.5, 2.0],
         colors=[style.BLACK], linewidths=0.4, linestyles="dotted",
     )  # fmt: skip
-    axes.clabel(seen, fmt="%g", fontsize=6.5)
+    lines = np.concatenate([data["mu"][:, :2], np.repeat(share[:, None], 2, axis=1)])
+    axes.clabel(seen, fmt="%g", fontsize=6.5, manual=_clear(seen.allsegs, lines))
     t, r = data["mu"][:, 0], data["mu"][:, 1]
     axes.plot([0.0, 1.0], [0.0, 1.0], color=style.BLACK, linewidth=0.5)
     axes.plot(t, r, color=style.VERMILION, linewidth=1.6)
@@ -131,6 +138,17 @@ def _map(axes: "Axes", data: Data, view: int) -> None:
     axes.set_ylim(-0.02, 1.02)
     axes.set_xlabel(r"translation $\mu_t$ (1)")
     axes.set_ylabel(r"turn onto the plane $\mu_r$ (1)")
+
+
+def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
+    """A place (2,) on each piece of each contour as far from the points (k, 2) and the border as there is."""
+    places = []
+    for piece in (piece for pieces in contours for piece in pieces if len(piece) > 1):
+        room = np.linalg.norm(piece[:, None] - lines, axis=2).min(axis=1)
+        room = np.minimum(room, np.minimum(piece, 1.0 - piece).min(axis=1))
+        if room.max() > LABEL:
+            places.append(piece[room.argmax()])
+    return places
 
 
 def _lines(axes: "Axes", sigma: FloatArray, columns: FloatArray, looks: dict[str, style.Look]) -> list[Any]:

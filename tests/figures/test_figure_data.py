@@ -3,7 +3,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.figures import drift, errors, images, joints, partition, path, planned, scene, visibility
+from projservo_cli.figures import (
+    drift,
+    errors,
+    images,
+    joints,
+    partition,
+    path,
+    planned,
+    scene,
+    style,
+    visibility,
+)
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.plants.robot import camera_center, look_at_camera
 from projservo_cli.records import PRISMATIC, REVOLUTE
@@ -211,3 +222,22 @@ def test_the_map_of_sight_is_the_margin_of_the_displaced_face(material):
     s = project(material.calibrated.P, plan.A @ H.T)
     border = np.minimum(s + 0.5, material.plant.image_size - 0.5 - s).min(axis=(1, 2))
     assert data["border_px"][:, 20, 60].min() >= border.min() - 1e-9
+
+
+def test_numbers_on_the_map_of_sight_keep_off_the_path(material):
+    figure = style.new_figure(6.0)
+    data = path.data(material)
+    path.draw(data, figure)
+    for axes in figure.axes[:2]:
+        for text in axes.texts:
+            assert np.linalg.norm(data["mu"][:, :2] - text.get_position(), axis=1).min() > path.LABEL
+    assert sum(len(axes.texts) for axes in figure.axes[:2]) > 0
+
+
+def test_margins_that_grow_a_hundredfold_leave_the_others_to_be_read(material):
+    data, figure = path.data(material), style.new_figure(6.0)
+    data["along"][-1, 3] = 200.0
+    path.draw(data, figure)
+    axes = figure.axes[3]
+    one, zero, most = (axes.transData.transform((0.0, y))[1] for y in (1.0, 0.0, 200.0))
+    assert one - zero > 0.15 * (most - zero)
