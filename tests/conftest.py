@@ -9,6 +9,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
+CONFIGS = sorted((ROOT / "configs").glob("*.yaml"))
+SWEEPS = [path for path in CONFIGS if path.match("sweep_*") or path.stem == "benchmark"]
+SHIPPED = [path for path in CONFIGS if path not in SWEEPS]  # configurations of single runs
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}
 
 

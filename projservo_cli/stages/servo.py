@@ -129,6 +129,29 @@ def planned_time(config: "Config", mode: str, plan: Plan | Sense) -> float | Non
     return plan.duration / config.plant.speed_scale
 
 
+class Scene(NamedTuple):
+    """What a run of the simulated robot takes place in: all that laws compared on one task share."""
+
+    truth: Truth
+    reach: Reach
+    sight: Sight | None
+
+
+def scene_of(config: "Config", calibration: Calibration) -> Scene:
+    """Robot, rig and markers as they are, the ends of the task, and the body that laws may measure with.
+
+    Raises
+    ------
+    InputError
+        If the configuration lacks a part of the simulation.
+    WorkFailed
+        If the goal cannot be reached, or the body not be measured with.
+    """
+    truth = truth_of(config)
+    reach = reach_of(config, truth)
+    return Scene(truth, reach, sight_of(config, calibration, truth, reach))
+
+
 class Simulated(NamedTuple):
     """A run of the simulated robot: how it ended, and what it was made with."""
 
@@ -138,13 +161,16 @@ class Simulated(NamedTuple):
     reach: Reach
 
 
-def simulate(config: "Config", calibration: Calibration, plan: Plan | Sense, name: str) -> Simulated:
+def simulate(
+    config: "Config", calibration: Calibration, plan: Plan | Sense, name: str, scene: Scene | None = None
+) -> Simulated:
     """Drive the simulated robot from the start of the task to the verdict of one run.
 
     Parameters
     ----------
     plan : of the task; the sense of its rotations is enough for a built-in law that does not follow it.
     name : as of ``run``.
+    scene : where it was made already.
 
     Raises
     ------
@@ -155,11 +181,11 @@ def simulate(config: "Config", calibration: Calibration, plan: Plan | Sense, nam
     """
     law, mode = law_and_mode(name)
     gains, limits = gains_of(config), limits_of(config)
-    truth = truth_of(config)
-    reach = reach_of(config, truth)
+    truth, reach, sight = scene_of(config, calibration) if scene is None else scene
+    if law not in BODY_LAWS:
+        sight = None
     plant = plant_of(config, truth, reach.q_start)
     plant = plant._replace(disturbance=disturbance_of(config, len(reach.q_start)))
-    sight = sight_of(config, calibration, truth, reach) if law in BODY_LAWS else None
     noise = servo_noise(config, len(truth.face), 0 if sight is None else len(sight.pins))
     pins = [] if sight is None else known_pins(calibration, truth)
     lose_markers(config, noise, [truth.number[i] for i in (*truth.face, *pins)])

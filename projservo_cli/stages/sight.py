@@ -1,6 +1,7 @@
 """How the face is watched: point by point, or with the whole body it belongs to."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,10 +60,15 @@ def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Re
     known = calibration.marker.tolist()
     indices = [*truth.face, *known_pins(calibration, truth)]
     pins = [truth.pins.index(i) for i in indices[len(truth.face) :]]
-    M = calibration.M[[known.index(truth.number[index]) for index in indices]]
     return Sight(
-        body_of(calibration.model(), M),
+        _body(calibration, tuple(known.index(truth.number[index]) for index in indices)),
         np.ascontiguousarray(truth.M[indices[len(truth.face) :]]),
         np.concatenate([reach.s_start, reach.pins_start[:, pins]], axis=1),
         np.concatenate([reach.s_star, reach.pins_star[:, pins]], axis=1),
     )
+
+
+@lru_cache(maxsize=64)
+def _body(calibration: Calibration, indices: tuple[int, ...]) -> Body:
+    """Body of markers of a calibration, by their indices in it, the same for every run with it."""
+    return body_of(calibration.model(), calibration.M[list(indices)])

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -57,24 +57,32 @@ class Truth:
     center: int
     image_size: FloatArray
 
-    @property
+    @cached_property
     def model(self) -> Model:
         """Metric model, for the plant and for the law that is given one."""
         return self.robot.model(self.P)
 
-    @property
+    @cached_property
     def M_face(self) -> FloatArray:
         """Face markers (k, 4) at the robot's reference, m."""
         return np.ascontiguousarray(self.M[list(self.face)])
 
-    @property
+    @cached_property
     def pins(self) -> tuple[int, ...]:
         """Indices of the markers that are not on the face."""
         return tuple(i for i in range(len(self.M)) if i not in self.face)
 
     def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
         """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
-        return project(self.P, M @ (self.robot.pose(q) @ np.linalg.inv(self.robot.base_tool)).T)
+        return project(self.P, M @ self.displacement(q).T)
+
+    def displacement(self, q: FloatArray) -> FloatArray:
+        """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
+        return self.robot.pose(q) @ self._from_tool
+
+    @cached_property
+    def _from_tool(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
 
 
 def generator(config: "Config", *stream: int) -> np.random.Generator:
@@ -217,7 +225,6 @@ class _Ends(NamedTuple):
     pins_star: FloatArray
 
 
-@lru_cache(maxsize=4)
 def reach_of(config: "Config", truth: Truth) -> Reach:
     """Start, goal and their images, with the servo noise of the configuration.
 
@@ -318,7 +325,7 @@ def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
 def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
     q_start = np.frombuffer(start_bytes)
     M = truth.M_face
-    start = M @ (truth.robot.pose(q_start) @ np.linalg.inv(truth.robot.base_tool)).T
+    start = M @ truth.displacement(q_start).T
     order = cyclic_order(start)
     O = optical_centers(truth.P, METRIC_A_INF)
     sides = O @ np.array(face_plane(start, order, center_of(start, truth.center)))

@@ -18,8 +18,9 @@ from projservo_cli.files import replacing
 from projservo_cli.records import InputError
 from projservo_cli.stages import Progress
 from projservo_cli.sweep import preparation
+from projservo_cli.sweep.compiling import compile_once
 from projservo_cli.sweep.design import Design, from_recipe
-from projservo_cli.sweep.engine import Engine, completed
+from projservo_cli.sweep.engine import Engine, LocalEngine, completed
 from projservo_cli.sweep.runs import Made, Part, columns_of, run_part
 from projservo_cli.sweepfile import TABLE, SweepTable, assemble, write_part
 
@@ -195,6 +196,8 @@ def _make(
     say: Callable[[str], None],
 ) -> None:
     tasks = preparation.tasks_of(design, folder.path, say)
+    if isinstance(engine, LocalEngine):
+        compile_once(design, tasks, engine, say)
     missing = list(preparation.missing_calibrations(design, folder.path))
     for count, calibrated in enumerate(completed(engine, preparation.calibrate_one, missing)):
         preparation.keep_calibration(folder.path, calibrated)

@@ -16,16 +16,14 @@ from projservo_cli.config.sweep import Distribution
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.records import Calibration, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.reach import sight_for
 from projservo_cli.stages.sense import Sense, rotation_sense
-from projservo_cli.stages.servo import Simulated, record, sense_is_enough, simulate
+from projservo_cli.stages.servo import Simulated, record, scene_of, sense_is_enough, simulate
 from projservo_cli.stages.traces import (
     effort_of,
     motion_of,
     path_between_mm,
     rotation_between,
 )
-from projservo_cli.stages.truth import reach_of, truth_of
 from projservo_cli.sweep.design import Design, TaskSet, name_of_run
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
@@ -218,14 +216,13 @@ def trial(config: Config, calibration: Calibration) -> Trial:
         If the task cannot be begun.
     """
     name = name_of_run(config)
+    scene = scene_of(config, calibration)
     plan: Plan | Sense
     if sense_is_enough(config, name):
-        reach = reach_of(config, truth_of(config))
-        sight = sight_for(config, calibration, reach)
-        plan = rotation_sense(config, calibration, reach, sight)
+        plan = rotation_sense(config, calibration, scene.reach, scene.sight)
     else:
         plan = planning.run(config, calibration)
-    return Trial(simulate(config, calibration, plan, name), plan)
+    return Trial(simulate(config, calibration, plan, name, scene), plan)
 
 
 def measures(config: Config, made: Simulated, *, between_samples: bool) -> dict[str, Any]:

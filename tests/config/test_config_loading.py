@@ -8,6 +8,7 @@ import yaml
 
 from projservo_cli.config import Config, digest, load_config, to_yaml
 from projservo_cli.records import LAWS, InputError
+from tests.conftest import SHIPPED
 
 ROOT = Path(__file__).parents[2]
 GOOD = """\
@@ -71,9 +72,6 @@ def test_resolved_yaml_loads_to_an_equal_configuration(good):
     again = load_config("stored.yaml", text=to_yaml(config))
     assert again == config
     assert digest(again, list(Config.model_fields)) == digest(config, list(Config.model_fields))
-
-
-SHIPPED = sorted(path for path in (ROOT / "configs").glob("*.yaml") if not path.match("sweep_*"))
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

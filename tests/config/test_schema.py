@@ -10,9 +10,9 @@ from projservo_cli.config import Config, digest, load_config
 from projservo_cli.config.fields import Section
 from projservo_cli.config.schema import STARTER, json_schema, schema_text
 from projservo_cli.config.sweep import SweepConfig
+from tests.conftest import SHIPPED
 
 ROOT = Path(__file__).parents[2]
-SHIPPED = sorted(path for path in (ROOT / "configs").glob("*.yaml") if not path.match("sweep_*"))
 WRONG = {
     "unknown key": ("control", "gian_t", 2.5),
     "negative gain": ("control", "gain_t", -1),
