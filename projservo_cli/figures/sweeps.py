@@ -32,7 +32,7 @@ def draw_success(data: Data, figure: "Figure") -> None:
     axes.set_ylim(-3, 103)
     axes.set_xlabel(str(data["label"]))
     axes.set_ylabel("converged (%), bars: 95 %")
-    style.legend_below(figure, handles, min(4, len(handles)))
+    style.legend_below(figure, handles, min(3, len(handles)))
 
 
 def draw_basin(data: Data, figure: "Figure") -> None:
@@ -76,7 +76,7 @@ def draw_final_errors(data: Data, figure: "Figure") -> None:
     axes.set_ylim(-3, 103)
     axes.set_xlabel("distance of the centre from the goal at the end (mm)")
     axes.set_ylabel("runs within it (%)")
-    style.legend_below(figure, handles, min(4, len(handles)))
+    style.legend_below(figure, handles, min(3, len(handles)))
 
 
 def _laws(data: Data, ending: str) -> list[str]:
