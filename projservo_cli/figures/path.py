@@ -141,10 +141,11 @@ def _map(axes: "Axes", data: Data, view: int) -> None:
 
 
 def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
-    """A place (2,) on each piece of each contour as far from the points (k, 2) and the border as there is."""
-    places = []
+    """A place (2,) on each piece of each contour, away from the points (k, 2), the border and one another."""
+    places: list[FloatArray] = []
     for piece in (piece for pieces in contours for piece in pieces if len(piece) > 1):
-        room = np.linalg.norm(piece[:, None] - lines, axis=2).min(axis=1)
+        taken = np.concatenate([lines, np.reshape(places, (-1, 2))])
+        room = np.linalg.norm(piece[:, None] - taken, axis=2).min(axis=1)
         room = np.minimum(room, np.minimum(piece, 1.0 - piece).min(axis=1))
         if room.max() > LABEL:
             places.append(piece[room.argmax()])
