@@ -73,7 +73,10 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
     kept = rows[sizes <= INVARIANT * max(sizes[0], 1.0)]
     Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
     if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
-        raise WorkFailed("the joints keep no metric of the calibrated frame: calibrate anew")
+        raise WorkFailed(
+            "the joints keep no metric of the calibrated frame: calibrate anew, or measure point by point "
+            "with control.observation: points"
+        )
     C = np.linalg.cholesky(Q).T
     return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])
 

@@ -174,7 +174,8 @@ def test_a_goal_known_by_images_of_the_face_is_reached_with_the_body():
 
 def test_a_body_that_cannot_be_known_says_what_to_set():
     example, calibration, _ = calibrated()
-    plane = np.repeat(calibration.H_hat_0[:1], 6, axis=0)
+    across = np.linalg.svd(calibration.a_inf[None])[2][1]
+    stretch = np.repeat(np.outer(across, across)[None], 6, axis=0)
     with pytest.raises(WorkFailed, match=r"control\.observation: points"):
-        sight_of(example.config, replace(calibration, H_hat_0=plane), example.truth, example.reach)
+        sight_of(example.config, replace(calibration, H_hat_0=stretch), example.truth, example.reach)
     assert len(plant_of(example.config, example.truth, example.reach.q_start).pins) == 0
