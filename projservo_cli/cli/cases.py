@@ -65,8 +65,8 @@ def _show(console: Console, rows: list[dict[str, Any]]) -> None:
     """The table, a row a case."""
     from projservo_cli.stages.cases import LAWS
 
-    console.show(f"{'':38}" + "".join(f"{law:43}" for law in LAWS).rstrip())
-    head = f"{'verdict':14}{'steps':>5}{'mm':>9}{'deg':>8}{'occl.':>6} "
+    console.show(f"{'':38}" + "".join(f"{law:44}" for law in LAWS).rstrip())
+    head = f"{'verdict':14}{'steps':>5}{'mm':>9}{'deg':>9}{'occl.':>6} "
     console.show(f"{'case':38}" + (head * len(LAWS)).rstrip())
     for row in rows:
         console.show(f"{row['case']:38}" + (_cells(row) or f"refused: {row['refused']}"))
@@ -75,7 +75,7 @@ def _show(console: Console, rows: list[dict[str, Any]]) -> None:
 def _cells(row: dict[str, Any]) -> str:
     """Verdict, steps, errors and self-occluded steps of both cameras, for each law."""
     return "".join(
-        f"{run['verdict']:14}{run['steps']:5}{run['position_error_mm']:9.3g}{run['rotation_error_deg']:8.3g}"
+        f"{run['verdict']:14}{run['steps']:5}{run['position_error_mm']:9.3g}{run['rotation_error_deg']:9.3g}"
         f"{run['self_occluded_steps_left'] + run['self_occluded_steps_right']:6} "
         for run in row["laws"].values()
     ).rstrip()

@@ -202,7 +202,7 @@ def test_a_translation_first_stops_short_of_where_the_face_is_lost() -> None:
 @pytest.mark.parametrize("gain", PER_STEP)
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_calibration_alone_sets_how_far_the_exact_law_strays(arm: str, gain: float) -> None:
-    """Half a pixel of noise in the trials; a prototype strays by 0.5 to 1 mm at every gain."""
+    """Half a pixel of noise in the trials: what is left comes from the calibration alone."""
     gains = [f"control.gain_{part}={gain / 0.04}" for part in "ts"]
     trace = servo.run(configured(arm, "seed=1", *gains), *calibrated(arm, 1), "exact")
     assert trace.verdict == "converged"

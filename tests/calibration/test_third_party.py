@@ -24,7 +24,7 @@ def table(path):
     return Observation(np.array(list(poses)), np.array(list(markers)), q, images)
 
 
-# Held-out medians and 95th percentiles to reach, px: maximum likelihood by a research prototype.
+# Held-out medians and 95th percentiles to reach, px: maximum likelihood a little widened.
 NUMBERS = [
     ("ur5", "RRRRRR", "0.0", 1e-4, 1e-4),
     ("ur5", "RRRRRR", "0.1", 0.035, 0.12),
