@@ -35,9 +35,19 @@ def whole(tmp_path_factory):
     return config, folder / "out"
 
 
-def test_killed_and_run_again_equals_the_uninterrupted_one(whole, tmp_path):
+@pytest.fixture(scope="module")
+def long(tmp_path_factory):
+    """Configuration and folder of a sweep of 300 runs, which takes long enough to be ended in its midst."""
+    folder = tmp_path_factory.mktemp("long")
+    config = written(folder, 150)
+    code, _, err = finish(start(config, folder / "out"))
+    assert code == 0, err
+    return config, folder / "out"
+
+
+def test_killed_and_run_again_equals_the_uninterrupted_one(long, tmp_path):
     """Ten kills at random moments are made by ``python -m tests.sweep.processes 10``."""
-    config, reference = whole
+    config, reference = long
     for stored in (1, 4):
         process = start(config, tmp_path)
         wait_for_parts(process, tmp_path, stored)
@@ -47,13 +57,13 @@ def test_killed_and_run_again_equals_the_uninterrupted_one(whole, tmp_path):
     assert not (tmp_path / "sweep.h5").exists()
     code, _, err = finish(start(config, tmp_path, "-j", "2"))
     assert code == 0
-    assert f"{2 * len(left)} of 20 runs are stored already" in err
+    assert f"{2 * len(left)} of 300 runs are stored already" in err
     assert not differences(tmp_path, reference)
     assert not parts(tmp_path)
 
 
-def test_interrupted_it_leaves_a_table_of_what_was_done(whole, tmp_path):
-    config, reference = whole
+def test_interrupted_it_leaves_a_table_of_what_was_done(long, tmp_path):
+    config, reference = long
     process = start(config, tmp_path, "-j", "2")
     wait_for_parts(process, tmp_path, 2)
     process.send_signal(signal.SIGINT)
@@ -62,12 +72,12 @@ def test_interrupted_it_leaves_a_table_of_what_was_done(whole, tmp_path):
     assert "Traceback" not in err
     table, full = SweepTable(tmp_path / "sweep.h5"), SweepTable(reference / "sweep.h5")
     rows = table.column("run")
-    assert 4 <= len(rows) < 20
+    assert 4 <= len(rows) < 300
     for name in table.names:
         assert table.column(name).tobytes() == full.column(name)[rows].tobytes()
     code, out, _ = finish(start(config, tmp_path, "--json"))
     told = json.loads(out)
-    assert (code, told["complete"], told["runs"], told["done"], told["cells"]) == (0, True, 20, 20, 2)
+    assert (code, told["complete"], told["runs"], told["done"], told["cells"]) == (0, True, 300, 300, 2)
     assert not differences(tmp_path, reference)
 
 
