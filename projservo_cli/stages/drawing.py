@@ -106,7 +106,7 @@ def draw_all(
 def _prepare(
     material: Fit, folder: Path, formats: tuple[str, ...], left_out: list[dict[str, str]]
 ) -> list[Drawing]:
-    """What can be drawn; files that will not be written again are removed, numbers are written."""
+    """What can be drawn; files that will not be written again are removed."""
     drawings = []
     for spec in FIGURES:
         reason, partial = lacking(spec, material), partly(spec, material)
