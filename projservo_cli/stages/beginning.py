@@ -10,10 +10,9 @@ from projservo_cli.geometry.span import joint_motion, span_of
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.stages.constrained import CONSTRAINED
 from projservo_cli.stages.half_turn import half_turn_sense
-from projservo_cli.stages.sight import Sight
-from projservo_cli.task.face import Task, task_from_images
+from projservo_cli.stages.sight import Sight, measured_task
+from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts, partition
-from projservo_cli.task.target import task_from_body
 
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
 HALF_TURN_BAND = math.radians(2.0)
@@ -44,11 +43,8 @@ def partitioned_at_start(
         If a marker cannot be triangulated or a motion is not unique.
     """
     m = s_start.shape[1]
-    if sight is None:
-        task, seen = task_from_images(model, s_start, s_star, center), s_start
-    else:
-        task = task_from_body(model, sight.body, q_start, sight.s_start, sight.s_star, center, m)
-        seen = sight.s_start
+    task = measured_task(model, q_start, s_start, s_star, center, sight)
+    seen = s_start if sight is None else sight.s_start
     state = new_state(len(q_start), m, span=span_of(model, task.A_star))
     if not measure(model, task, straight_views(model.lens, seen), q_start, state):
         raise WorkFailed(

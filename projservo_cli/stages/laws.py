@@ -17,10 +17,8 @@ from projservo_cli.records import METRIC_LAWS, Calibration, FloatArray, InputErr
 from projservo_cli.results import ImageModel, image_model
 from projservo_cli.stages.following import followed
 from projservo_cli.stages.reach import face_of
-from projservo_cli.stages.sight import Sight
+from projservo_cli.stages.sight import Sight, measured_task
 from projservo_cli.stages.truth import Reach, center_index, truth_of
-from projservo_cli.task.face import task_from_images
-from projservo_cli.task.target import task_from_body
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -111,11 +109,7 @@ def law_for(
             "control.laws"
         )
     believed = truth_of(config).model if law in METRIC_LAWS else calibration.model()
-    center, m = center_index(config), reach.s_star.shape[1]
-    if sight is None:
-        task = task_from_images(believed, reach.s_start, reach.s_star, center)
-    else:
-        task = task_from_body(believed, sight.body, reach.q_start, sight.s_start, sight.s_star, center, m)
+    task = measured_task(believed, reach.q_start, reach.s_start, reach.s_star, center_index(config), sight)
     if mode != REPLAN:
         task = followed(believed, task, plan, gains.period, config.plant.speed_scale)
     built_in = BuiltInLaw(CODES[law], believed, task, gains)

@@ -23,7 +23,7 @@ from projservo_cli.stages.laws import law_for
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.reach import reach_for
 from projservo_cli.stages.sense import Sense
-from projservo_cli.stages.sight import Sight, known_pins, sight_of
+from projservo_cli.stages.sight import Sight, known_pins, measured_task, sight_of
 from projservo_cli.stages.traces import Outcome, known, record_of, unknown
 from projservo_cli.stages.truth import (
     PIN_NOISE,
@@ -35,8 +35,7 @@ from projservo_cli.stages.truth import (
     reach_of,
     truth_of,
 )
-from projservo_cli.task.face import Task, task_from_images
-from projservo_cli.task.target import task_from_body
+from projservo_cli.task.face import Task
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -256,14 +255,6 @@ def drive(
     return record_of(law, outcome, reach, gains, limits, found, mode, planned_s)
 
 
-def measured_task(model: Model, reach: Reach, center: int, sight: Sight | None) -> Task:
-    """The task as the images at start and goal show it, by the body or point by point."""
-    if sight is None:
-        return task_from_images(model, reach.s_start, reach.s_star, center)
-    m = reach.s_star.shape[1]
-    return task_from_body(model, sight.body, reach.q_start, sight.s_start, sight.s_star, center, m)
-
-
 def outcome_of(
     law: str,
     model: Model,
@@ -292,7 +283,7 @@ def outcome_of(
     """
     n, m, observed = len(reach.q_start), len(truth.face), len(truth.face)
     if task is None:
-        task = measured_task(model, reach, truth.center, sight)
+        task = measured_task(model, reach.q_start, reach.s_start, reach.s_star, truth.center, sight)
     if sight is not None:
         plant = plant._replace(pins=sight.pins)
         observed += len(sight.pins)

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.records import Calibration, FloatArray
+from projservo_cli.records import Calibration, FloatArray, Model
 from projservo_cli.stages.truth import Reach, Truth
 from projservo_cli.task.body import Body, body_of
+from projservo_cli.task.face import Task, task_from_images
+from projservo_cli.task.target import task_from_body
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -72,3 +74,30 @@ def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Re
 def _body(calibration: Calibration, indices: tuple[int, ...]) -> Body:
     """Body of markers of a calibration, by their indices in it, the same for every run with it."""
     return body_of(calibration.model(), calibration.M[list(indices)])
+
+
+def measured_task(
+    model: Model,
+    q_start: FloatArray,
+    s_start: FloatArray,
+    s_star: FloatArray,
+    center: int,
+    sight: Sight | None,
+) -> Task:
+    """The task as the images at start and goal show it, by the body or point by point.
+
+    Parameters
+    ----------
+    q_start : (n,) joint readings at the start, rad or m.
+    s_start, s_star : (2, m, 2) pixels of the face.
+    center : index of the centre marker, or ``MIDPOINT``.
+
+    Raises
+    ------
+    WorkFailed
+        If the images do not show where the face or its body is.
+    """
+    if sight is None:
+        return task_from_images(model, s_start, s_star, center)
+    m = s_star.shape[1]
+    return task_from_body(model, sight.body, q_start, sight.s_start, sight.s_star, center, m)
