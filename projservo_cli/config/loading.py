@@ -184,8 +184,8 @@ def _unknown(key: str, values: dict[str, Any]) -> str:
 def _alone(name: str) -> type[Section]:
     """A model of one section by itself."""
     field = Config.model_fields[name]
-    model: type[Section] = create_model("Part", __base__=Section, **{name: (field.annotation, field)})  # type: ignore[call-overload]
-    return model
+    definition: dict[str, Any] = {name: (field.annotation, field)}
+    return create_model("Part", __base__=Section, **definition)
 
 
 def problem_lines(document: Document, found: Sequence[Problem]) -> list[str]:

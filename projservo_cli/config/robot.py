@@ -79,7 +79,8 @@ class Robot(Section):
     @property
     def joints(self) -> tuple[Joint, ...]:
         """The joints from base to tool."""
-        return (self.dh or self.screws).joints if self.dh or self.screws else ()  # type: ignore[union-attr]
+        kinematics = self.dh or self.screws
+        return kinematics.joints if kinematics is not None else ()
 
     @property
     def joint_types(self) -> str:

@@ -163,7 +163,7 @@ def as_mat(H: FloatArray) -> Mat4:
     values = [float(x) for x in np.asarray(H, dtype=np.float64).ravel()]
     if len(values) != 16:
         raise ValueError(f"expected a 4×4 matrix, got shape {np.shape(H)}")
-    return tuple(values)  # type: ignore[return-value]
+    return tuple(values)  # type: ignore[return-value]  # sixteen, as checked; the type knows any number
 
 
 def as_array(H: Mat4) -> FloatArray:
