@@ -19,16 +19,13 @@ import numpy as np
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
-COMPILED_PACKAGES = ("geometry", "task", "control", "loop", "plants")
+COMPILED_PACKAGES = ("records", "geometry", "task", "control", "loop", "plants")
 
 
 def source_hash(root: Path) -> str:
     """Hash of the sources that machine code depends on, and of the compiler's version."""
     digest = hashlib.sha256(f"{sys.version}|{numba.__version__}|{np.__version__}".encode())
-    files = [root / "records.py"]
-    for package in COMPILED_PACKAGES:
-        files += sorted((root / package).glob("*.py"))
-    for file in files:
+    for file in (file for package in COMPILED_PACKAGES for file in sorted((root / package).glob("*.py"))):
         digest.update(file.relative_to(root).as_posix().encode())
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]

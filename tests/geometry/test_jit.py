@@ -33,13 +33,11 @@ def test_an_edited_helper_makes_another_cache(copy, package):
     assert source_hash(copy) != before
 
 
-def test_records_and_new_files_count(copy):
+def test_new_files_count(copy):
     hashes = {source_hash(copy)}
-    (copy / "records.py").write_text("# edited\n", encoding="utf-8")
-    hashes.add(source_hash(copy))
     (copy / "control" / "new_law.py").write_text("", encoding="utf-8")
     hashes.add(source_hash(copy))
-    assert len(hashes) == 3
+    assert len(hashes) == 2
 
 
 def test_every_compiled_function_lies_in_a_hashed_package():
