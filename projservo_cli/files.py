@@ -1,12 +1,19 @@
 """Writing files so that a reader never meets half of one."""
 
+import hashlib
 import os
+import platform
+import re
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from projservo_cli.records import InputError
+
+_SUFFIX = ".part"
+_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<machine>[0-9a-f]{8})\.(?P<process>[0-9]+)\.[^.]+\.part")
 
 
 @contextmanager
@@ -25,6 +32,7 @@ def replacing(path: Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+    clear_leftovers(path.parent, path.name)
     handle, temporary = _neighbour(path, path.parent)
     os.close(handle)
     try:
@@ -56,9 +64,10 @@ def require_writable(path: Path) -> None:
 
 
 def _neighbour(path: Path, folder: Path) -> tuple[int, Path]:
-    """An open temporary file in ``folder`` for what shall become ``path``."""
+    """An open temporary file in ``folder`` for what shall become ``path``, named after who writes it."""
+    prefix = f".{path.name}.{_machine()}.{os.getpid()}."
     try:
-        handle, name = tempfile.mkstemp(dir=folder, prefix=f".{path.name}.", suffix=".part")
+        handle, name = tempfile.mkstemp(dir=folder, prefix=prefix, suffix=_SUFFIX)
     except NotADirectoryError as error:
         raise InputError(f"{path}: cannot be written: {folder} is no folder; choose another") from error
     except OSError as error:
@@ -66,6 +75,57 @@ def _neighbour(path: Path, folder: Path) -> tuple[int, Path]:
             f"{path}: cannot be written: {error.strerror or error}; choose a folder you can write to"
         ) from error
     return handle, Path(name)
+
+
+def clear_leftovers(folder: Path, name: str | None = None) -> None:
+    """Remove temporary files whose writers were killed, of one file or of all in a folder.
+
+    Those of processes that run, or that ran on another machine, stay.
+    """
+    if sys.platform == "win32" or not folder.is_dir():  # no process can be asked for there
+        return
+    for path in folder.iterdir():
+        found = _TEMPORARY.fullmatch(path.name)
+        if found is None or found["machine"] != _machine() or name not in (None, found["name"]):
+            continue
+        if not _runs(int(found["process"])):
+            path.unlink(missing_ok=True)
+
+
+def _machine() -> str:
+    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):
+        return True
+    return True
+
+
+def require_inside(path: Path, folder: Path) -> None:
+    """Refuse a path that symbolic links lead out of a folder.
+
+    Raises
+    ------
+    InputError
+        When it does.
+    """
+    if not inside(path, folder):
+        raise InputError(
+            f"{path}: a symbolic link leads out of {folder}; remove it, or choose another folder with -o"
+        )
+
+
+def inside(path: Path, folder: Path) -> bool:
+    """Whether a path lies in a folder when all symbolic links are followed."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # links that lead in a circle
+        return False
 
 
 def _synchronise(path: Path) -> None:

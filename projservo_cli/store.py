@@ -3,27 +3,42 @@
 One group a result (``calibrate``, ``plan``, ``servo/<law>``, ``report``), with the records in it or
 in subgroups. Arrays are netCDF-4 variables with dimension scales, units and a description; scalars
 and texts are attributes of the group. A file is written anew and put in place as a whole.
+
+A field may be added to a record where it may be absent. Whatever else changes the file raises
+``SCHEMA_VERSION``; files of the version before are then read as well, or refused with what to do.
 """
 
 import dataclasses
 import json
-import types
-import typing
+import re
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 
-from projservo_cli import records as record_types
-from projservo_cli.files import replacing
-from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Plan, Trace
+from projservo_cli.hdf5 import attribute, new_file, opened, sealed, text
+from projservo_cli.quarantine import copied
+from projservo_cli.recordfile import joints_of, load_record, save_record
+from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Plan, Report, Trace
 
 SCHEMA = "projservo run"
 SCHEMA_VERSION = 1
 SERVO = "servo/"
-_NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable. {:10d}"
+REMEDY = "delete it or use another"
+# What results hold, by the name of the record; with a calibration, the others may be absent.
+RECORDS: dict[str, dict[str, type]] = {
+    "calibrate": {
+        "observation": Observation,
+        "calibration": Calibration,
+        "cross_validation": CrossValidation,
+    },
+    "plan": {"": Plan},
+    "servo": {"": Trace},
+    "report": {"": Report},
+}
+_NAME = re.compile(r"calibrate|plan|report|servo/[\w.:-]+")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,10 +100,10 @@ class Run:
         return {name.removeprefix(SERVO): result.records[""] for name, result in found.items()}
 
     def _record(self, result: str, name: str) -> Any:
-        if result not in self.results:
+        if result not in self.results or name not in self.results[result].records:
             stage = result.split("/")[0]
             raise InputError(
-                f"{self.path}: holds no {stage}; make it first: projservo {stage} -o {self.path}"
+                f"{self.path}: holds no {name or stage}; make it first: projservo {stage} -o {self.path}"
             )
         return self.results[result].records[name]
 
@@ -107,7 +122,7 @@ def save(run: Run) -> None:
     InputError
         When it cannot be written; the file that stood there stays.
     """
-    with replacing(run.path) as temporary, h5py.File(temporary, "w") as file:
+    with new_file(run.path) as file:
         file.attrs["schema"] = SCHEMA
         file.attrs["schema_version"] = SCHEMA_VERSION
         file.attrs["configuration"] = run.configuration
@@ -124,7 +139,10 @@ def save(run: Run) -> None:
 
 
 def load(target: Path | str) -> Run:
-    """Read a run file.
+    """Read a run file, whoever made it.
+
+    One that is as ``save`` wrote it is read here; one that another program changed is read and written
+    anew by a process of its own, since damaged files can crash the library that reads them.
 
     Raises
     ------
@@ -134,145 +152,82 @@ def load(target: Path | str) -> Run:
     path = run_path(target)
     if not path.is_file():
         raise InputError(f"{path}: there is no run file; make one with: projservo calibrate -o {path.parent}")
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            _check_schema(path, file)
-            names = json.loads(_text(file, "order"))
-            results = {name: _load_result(path, file[name]) for name in names}
-            return Run(path, _text(file, "configuration"), results)
-    except InputError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        what = " ".join(str(error).split())
-        raise InputError(
-            f"{path}: cut short, damaged or not a run file ({what}); delete it or use another"
-        ) from error
+    if sealed(path, REMEDY):
+        return read(path)
+    with tempfile.TemporaryDirectory(prefix="projservo-") as folder:
+        copy = Path(folder) / "run.h5"
+        copied(path, copy)
+        return dataclasses.replace(read(copy), path=path)
 
 
-def _check_schema(path: Path, file: h5py.File) -> None:
-    if _text(file, "schema", "") != SCHEMA:
-        raise InputError(f"{path}: an HDF5 file, but not a run file of projservo")
-    version = int(file.attrs.get("schema_version", 0))
-    if version != SCHEMA_VERSION:
+def read(path: Path) -> Run:
+    """Read a run file in this process; an InputError where it makes no sense."""
+    with opened(path, REMEDY) as file:
+        _require_version(path, file)
+        results = {name: _load_result(path, file[name]) for name in _names(path, file)}
+        _require_one_robot(path, results)
+        return Run(path, text(file, "configuration"), results)
+
+
+def _require_version(path: Path, file: h5py.File) -> None:
+    """Refuse what is no run file, or one of another schema, with what to do."""
+    if "schema" not in file.attrs or text(file, "schema") != SCHEMA:
+        raise InputError(f"{path}: an HDF5 file, but not a run file of projservo; {REMEDY}")
+    version = int(attribute(file, "schema_version"))
+    if version > SCHEMA_VERSION:
         raise InputError(
-            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}; use another run"
+            f"{path}: run file of schema {version}, this projservo reads up to {SCHEMA_VERSION}: it was made "
+            "by a newer one; upgrade: pip install --upgrade projservo"
+        )
+    if version < SCHEMA_VERSION:
+        raise InputError(
+            f"{path}: run file of schema {version}, which this projservo does not read any more; make it "
+            "again: projservo calibrate plan servo report -c FILE -o DIR"
         )
 
 
+def _names(path: Path, file: h5py.File) -> list[str]:
+    """Names of the results, in the order they were made."""
+    names = _json(file, "order", list)
+    for name in names:
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise InputError(f"{path}: there is no result {name!r}; {REMEDY}")
+    return list(dict.fromkeys(names))
+
+
 def _load_result(path: Path, group: h5py.Group) -> Result:
-    labels = json.loads(_text(group, "records"))
-    return Result(
-        _text(group, "key"),
-        _text(group, "configuration"),
-        json.loads(_text(group, "provenance")),
-        json.loads(_text(group, "inputs")),
-        {label: load_record(path, group[label] if label else group) for label in labels},
-    )
+    known = RECORDS[group.name.split("/")[1]]
+    records = {}
+    for label in _json(group, "records", list):
+        if label not in known:
+            raise InputError(f"{path}: {group.name} holds an unknown {label!r}; {REMEDY}")
+        records[label] = load_record(path, group[label] if label else group)
+        if not isinstance(records[label], known[label]):
+            raise InputError(f"{path}: {group.name}/{label} is no {known[label].__name__}; {REMEDY}")
+    if not {"", "calibration"} & set(records):
+        raise InputError(f"{path}: {group.name} lacks its record; {REMEDY}")
+    inputs = _json(group, "inputs", dict)
+    if not all(isinstance(value, str) for value in inputs.values()):
+        raise InputError(f"{path}: inputs of {group.name} are not texts; {REMEDY}")
+    provenance = _json(group, "provenance", dict)
+    return Result(text(group, "key"), text(group, "configuration"), provenance, inputs, records)
 
 
-def _text(group: h5py.Group, name: str, default: str | None = None) -> str:
-    value = group.attrs[name] if default is None else group.attrs.get(name, default)
-    if not isinstance(value, str):
-        raise ValueError(f"attribute {name} of {group.name} is not text")
+def _json(group: h5py.Group, name: str, kind: type) -> Any:
+    value = json.loads(text(group, name))
+    if not isinstance(value, kind):
+        raise ValueError(f"attribute {name} of {group.name} is no {kind.__name__}")
     return value
 
 
-def save_record(group: h5py.Group, record: Any) -> None:
-    """Store each field of a record by its metadata; None is stored as nothing."""
-    group.attrs["record"] = type(record).__name__
-    arrays = {}
-    for field in dataclasses.fields(record):
-        value = getattr(record, field.name)
-        if value is None:
-            continue
-        if "dims" in field.metadata:
-            arrays[field.name] = (field, np.asarray(value))
-        else:
-            group.attrs[field.name] = _encoded(value)
-    for name, (field, value) in arrays.items():
-        _save_array(group, name, value, field.metadata)
-    _attach_scales(group, _distinct({name: field.metadata["dims"] for name, (field, _) in arrays.items()}))
-
-
-def _encoded(value: Any) -> Any:
-    """An attribute of HDF5 and netCDF: number or text; everything else as JSON text."""
-    if isinstance(value, (bool, np.bool_)):
-        return np.int8(value)
-    if isinstance(value, (str, int, float, np.integer, np.floating)):
-        return value
-    return json.dumps(value)
-
-
-def _save_array(group: h5py.Group, name: str, value: Any, metadata: Mapping[str, Any]) -> None:
-    if value.ndim != len(metadata["dims"]):
-        raise ValueError(f"{group.name}/{name}: shape {value.shape} for dimensions {metadata['dims']}")
-    boolean = value.dtype == np.bool_
-    data = group.create_dataset(name, data=value.astype(np.int8) if boolean else value)
-    if boolean:  # netCDF has no booleans; this is how xarray marks them
-        data.attrs["dtype"] = "bool"
-    data.attrs["units"] = metadata["units"]
-    data.attrs["long_name"] = metadata["about"]
-
-
-def _distinct(dims: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Dimension names that no array over other dimensions bears, since both are datasets of a group."""
-    taken = {name for name, own in dims.items() if own != (name,)}
-    return {name: tuple(f"{dim}_index" if dim in taken else dim for dim in own) for name, own in dims.items()}
-
-
-def _attach_scales(group: h5py.Group, dims: Mapping[str, tuple[str, ...]]) -> None:
-    """Name the dimensions of all arrays; an array named as its only dimension is its coordinate."""
-    for name, own in dims.items():
-        for axis, dim in enumerate(own):
-            size = group[name].shape[axis]
-            if dim not in group:
-                scale = group.create_dataset(dim, data=np.zeros(size, dtype=np.float32))
-                scale.make_scale(_NO_VARIABLE.format(size))
-            elif not group[dim].is_scale:
-                group[dim].make_scale(dim)
-            if group[dim].shape != (size,):
-                raise ValueError(f"{group.name}/{name}: dimension {dim} has {size} entries, elsewhere others")
-            if dim != name:
-                group[name].dims[axis].attach_scale(group[dim])
-
-
-def load_record(path: Path, group: h5py.Group) -> Any:
-    """Read a record that ``save_record`` stored; an InputError where it is of another version."""
-    kind = getattr(record_types, _text(group, "record"), None)
-    if not dataclasses.is_dataclass(kind):
-        raise InputError(f"{path}: {group.name} holds a record this version does not know; use another run")
-    hints = typing.get_type_hints(kind)
-    values: dict[str, Any] = {}
-    for field in dataclasses.fields(kind):
-        present = field.name in (group if "dims" in field.metadata else group.attrs)
-        if not present and not _optional(hints[field.name]):
-            raise InputError(
-                f"{path}: {group.name} lacks {field.name}; another version made it; use another run"
-            )
-        if not present:
-            values[field.name] = None
-        elif "dims" in field.metadata:
-            values[field.name] = _load_array(path, group[field.name], field.metadata["dims"])
-        else:
-            values[field.name] = _decoded(group.attrs[field.name], hints[field.name])
-    return kind(**values)  # type: ignore[operator]
-
-
-def _load_array(path: Path, data: h5py.Dataset, dims: tuple[str, ...]) -> Any:
-    if data.ndim != len(dims):
-        raise InputError(f"{path}: {data.name} has {data.ndim} dimensions instead of {len(dims)}")
-    value = data[()]
-    return value.astype(np.bool_) if data.attrs.get("dtype") == "bool" else value
-
-
-def _optional(hint: Any) -> bool:
-    return type(None) in typing.get_args(hint)
-
-
-def _decoded(value: Any, hint: Any) -> Any:
-    if _optional(hint) and typing.get_origin(hint) in (typing.Union, types.UnionType):
-        hint = next(inner for inner in typing.get_args(hint) if inner is not type(None))
-    if hint in (bool, int, float, str):
-        return hint(value)
-    decoded = json.loads(value)
-    return tuple(decoded) if typing.get_origin(hint) is tuple else decoded
+def _require_one_robot(path: Path, results: Mapping[str, Result]) -> None:
+    """Refuse records that are about robots with different joints."""
+    first: tuple[str, int] | None = None
+    for name, result in results.items():
+        for record in result.records.values():
+            joints = joints_of(record)
+            if isinstance(record, Calibration) and not re.fullmatch(f"[RP]{{{joints}}}", record.joint_types):
+                raise InputError(f"{path}: joint_types are not {joints} letters R and P; {REMEDY}")
+            first = first or (None if joints is None else (name, joints))
+            if joints is not None and first is not None and joints != first[1]:
+                raise InputError(f"{path}: {name} is of {joints} joints, {first[0]} of {first[1]}; {REMEDY}")

@@ -13,9 +13,9 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.files import replacing
+from projservo_cli.hdf5 import checksummed, new_file, sealed
+from projservo_cli.recordfile import load_record, save_record
 from projservo_cli.records import InputError, Trace
-from projservo_cli.store import load_record, save_record
 
 SCHEMA = "projservo sweep"
 SCHEMA_VERSION = 1
@@ -37,9 +37,9 @@ def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Tr
     InputError
         If the file cannot be written.
     """
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_file(path) as file:
         for name, values in columns.items():
-            file.create_dataset(name, data=values)
+            file.create_dataset(name, data=values, **checksummed(values.shape))
         for run, trace in traces.items():
             save_record(file.create_group(f"{TRACES}/{run}"), trace)
 
@@ -59,7 +59,7 @@ def assemble(
         If a part is damaged or the file cannot be written; the table that stood there stays.
     """
     rows = sum(_rows(part) for part in parts)
-    with replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_file(path) as file:
         file.attrs["schema"] = SCHEMA
         file.attrs["schema_version"] = SCHEMA_VERSION
         for name, value in attributes.items():
@@ -88,6 +88,7 @@ def _make_column(file: h5py.File, rows: int, heading: Heading) -> None:
         chunks=(max(1, min(rows, ROWS)), *width),
         compression=1,
         shuffle=True,
+        fletcher32=True,
     )
     data.attrs["long_name"] = about
     if width:
@@ -144,7 +145,15 @@ def _read_part(path: Path, names: Sequence[str]) -> dict[str, Array]:
 
 
 def _rows(path: Path) -> int:
+    _require_whole(path)
     return len(_read_part(path, ["run"])["run"])
+
+
+def _require_whole(path: Path) -> None:
+    """Refuse a file that is not as it was written; nothing of it is read before."""
+    remedy = "delete it and run the sweep again"
+    if not sealed(path, remedy):
+        raise InputError(f"{path}: changed by another program, so that its checksum is gone; {remedy}")
 
 
 def _copy_traces(file: h5py.File, parts: Sequence[Path]) -> None:
@@ -178,6 +187,7 @@ class SweepTable:
         self.path = path
         if not path.is_file():
             raise InputError(f"{path}: there is no table of a sweep; make one with projservo sweep")
+        _require_whole(path)
         try:
             with h5py.File(path, "r", locking=False) as file:
                 if file.attrs.get("schema") != SCHEMA:

@@ -6,26 +6,20 @@ from typing import Any
 
 import numpy as np
 
-SIZES = {
-    "view": 2,
-    "xy": 2,
-    "image_row": 3,
-    "coordinate": 4,
-    "row": 4,
-    "axis": 3,
-    "part": 3,
-    "solution": 2,
-    "constraint": 4,
-}
+from projservo_cli.records import SIZES
+
+EXTENTS = {"joint": 6, "marker": 4, "pose": 5, "instant": 7, "step": 6, "constraint": 4}
 SCALARS = {float: 1.5, int: 3, str: "text ä", bool: True}
 
 
 def fake(kind: type, seed: int = 0, sizes: dict[str, int] | None = None, **given: Any) -> Any:
     """A record of a kind: random arrays, plain scalars, and the fields that are given."""
     rng = np.random.default_rng(seed)
-    extent = {"joint": 6, "marker": 4, "pose": 5, "instant": 7, "step": 6, **SIZES, **(sizes or {})}
+    extent = {**EXTENTS, **SIZES, **(sizes or {})}
     hints = typing.get_type_hints(kind)
     values: dict[str, Any] = {}
+    if "joint_types" in hints:
+        given.setdefault("joint_types", "R" * extent["joint"])
     for field in dataclasses.fields(kind):
         hint = hints[field.name]
         if field.name in given:

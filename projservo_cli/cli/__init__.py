@@ -17,7 +17,7 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from projservo_cli.cli.commands import COMMANDS, allowed, help_text
-from projservo_cli.cli.options import LEFT_OUT, OPTIONS
+from projservo_cli.cli.options import LEFT_OUT, OPTIONS, visible
 from projservo_cli.version import __version__
 
 DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
@@ -93,7 +93,7 @@ def _failure(error: Exception, *, verbose: bool) -> int:
 def _complain(text: str, code: int) -> int:
     """One line a finding, so that a message can be searched for and clicked on."""
     for line in text.splitlines():
-        click.echo(f"projservo: {line}", err=True)
+        click.echo(f"projservo: {visible(line)}", err=True)
     return code
 
 

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from projservo_cli.config import Config, Override, load_config, to_yaml
+from projservo_cli.files import require_inside
 from projservo_cli.records import InputError
 from projservo_cli.store import Run, load, run_path
 
 SHIPPED = "paper.yaml"
+RESULTS = Path("results")
 
 
 def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
@@ -31,7 +33,7 @@ def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
         config = load_config(None, overrides)
     else:
         config = load_config(shipped(SHIPPED), overrides)
-    target = run_path(options["output"] or Path("results") / config.name)
+    target = _target(options, config)
     return config, stored or stored_run(target) or Run(target)
 
 
@@ -44,12 +46,21 @@ def _from_sweep(origin: str, options: dict[str, Any], overrides: list[Override])
     config, calibration = run_of(origin)
     if overrides:
         config = load_config(config.name, overrides, text=to_yaml(config))
-    target = run_path(options["output"] or Path("results") / config.name)
+    target = _target(options, config)
     run = stored_run(target) or Run(target)
     stored = run.results.get("calibrate")
     if calibration is not None and (stored is None or stored.key != calibration.key):
         run = Run(target, run.configuration, {"calibrate": calibration})
     return config, run
+
+
+def _target(options: dict[str, Any], config: Config) -> Path:
+    """The run file: where the user says, else in the folder of the configuration's name."""
+    if options["output"]:
+        return run_path(options["output"])
+    folder = RESULTS / config.name
+    require_inside(folder, RESULTS)
+    return run_path(folder)
 
 
 def stored_run(target: str | Path) -> Run | None:

@@ -1,9 +1,11 @@
 """Options of all commands, and text in lines."""
 
+import re
 import textwrap
 
 import click
 
+_UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 LEFT_OUT = {"--suggest": "5"}  # what an option means whose value is left out
 
 
@@ -169,3 +171,11 @@ def wrapped(text: str, indent: str = "") -> str:
         break_long_words=False,
         break_on_hyphens=False,
     )
+
+
+def visible(text: str) -> str:
+    """Text whose control characters and changes of direction are written out, line ends apart.
+
+    Texts come from files of others too; a terminal that is sent them must not obey them.
+    """
+    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)

@@ -10,7 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
-from projservo_cli.cli.options import wrapped
+from projservo_cli.cli.options import visible, wrapped
 
 TICK_S = 0.5
 
@@ -32,7 +32,7 @@ def plain(value: Any) -> Any:
 
 def print_json(value: Any) -> None:
     """Print one object of strict JSON in UTF-8, whatever the locale."""
-    text = json.dumps(plain(value), ensure_ascii=False, allow_nan=False, indent=2)
+    text = visible(json.dumps(plain(value), ensure_ascii=False, allow_nan=False, indent=2))
     sys.stdout.buffer.write(f"{text}\n".encode())
 
 
@@ -54,7 +54,7 @@ class Console:
         with self._lock:
             if self._bar is not None:
                 self._bar.clear()
-            click.echo(wrapped(text), err=True)
+            click.echo(wrapped(visible(text)), err=True)
             if self._bar is not None:
                 self._bar.refresh()
 
@@ -66,7 +66,7 @@ class Console:
     def show(self, text: str) -> None:
         """A line of data on standard output."""
         if not self.quiet:
-            click.echo(text)
+            click.echo(visible(text))
 
     def progress(self, what: str, done: int, total: int) -> None:
         """Move a progress bar; silent where standard error is not a terminal."""

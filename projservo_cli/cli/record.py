@@ -19,6 +19,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     require_terminal(options)
     from projservo_cli.cli.configuration import SHIPPED, given_overrides, shipped
     from projservo_cli.config import load_config
+    from projservo_cli.lock import working_in
     from projservo_cli.stages.record import prepare, record
     from projservo_cli.tables import read_joints
 
@@ -29,9 +30,13 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         types = config.robot.joint_types if config.robot is not None else None
         motions = read_joints(options["motions"], types, options["joint_unit"])
     path = Path(options["output"])
-    recording = prepare(config, path, motions=motions, force=options["force"])
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
-    if not options["dry_run"]:
+    recording = prepare(config, path, motions=motions, force=options["force"])
+    if options["dry_run"]:
+        _tell(recording, console, options)
+        return 0
+    with working_in(path.parent, name=f".{path.name}.lock"):
+        recording = prepare(config, path, motions=motions, force=options["force"])
         if recording.pending:
             confirm(options, config, "record", console)
         if recording.found and recording.pending:
@@ -46,7 +51,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
             raise
         finally:
             console.finish()
-    _tell(recording, console, options)
+        _tell(recording, console, options)
     return 0
 
 

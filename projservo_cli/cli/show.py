@@ -43,10 +43,11 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
 
 
 def _made(provenance: Any) -> str:
-    commit = (provenance["git_commit"] or "")[:10]
-    source = f" at {commit}{' with changes' if provenance['git_dirty'] else ''}" if commit else ""
-    versions = ", ".join(f"{name} {provenance[name]}" for name in ("python", "numpy", "numba"))
+    told = {name: str(value or "") for name, value in provenance.items()}
+    commit = told.get("git_commit", "")[:10]
+    source = f" at {commit}{' with changes' if told.get('git_dirty') else ''}" if commit else ""
+    versions = ", ".join(f"{name} {told.get(name, '?')}" for name in ("python", "numpy", "numba"))
     return (
-        f"made {provenance['date']} on {provenance['host']} "
-        f"with projservo {provenance['projservo']}{source}, {versions}"
+        f"made {told.get('date', '?')} on {told.get('host', '?')} "
+        f"with projservo {told.get('projservo', '?')}{source}, {versions}"
     )

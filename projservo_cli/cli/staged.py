@@ -37,32 +37,52 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     require_terminal(options)
     given = law_names(options["laws"])
+    from projservo_cli.config import to_yaml
+    from projservo_cli.lock import working_in
+
+    console = Console(quiet=options["quiet"], verbose=options["verbose"])
+    call = _asked(names, given, options, console)
+    if options["dry_run"]:
+        return _dry(call, as_json=options["json"])
+    if not any(step.why for step in call.steps) and call.run.configuration == to_yaml(call.config):
+        return _done(call, options)
+    with working_in(call.run.path.parent, "figures"):
+        # Anew, since another process may have written the run until now.
+        return _done(_asked(names, given, options, console), options)
+
+
+def _done(call: _Call, options: dict[str, Any]) -> int:
+    """Make what has to be made, and tell what came out; the exit code."""
+    from projservo_cli.cli.suggested import suggested
+
+    try:
+        with _compilation(call):
+            _work(call, options)
+        if options["suggest"] is not None and not _lacking(call, "calibrate"):
+            call.suggested = suggested(call.config, call.run, options["suggest"])
+    finally:
+        call.console.finish()
+    return _tell(call, as_json=options["json"])
+
+
+def _asked(names: list[str], given: Sequence[str], options: dict[str, Any], console: Console) -> _Call:
+    """What is to be done, by the configuration and what the run holds; refused where it must not be."""
     from projservo_cli.cli.configuration import resolve
-    from projservo_cli.cli.suggested import require_covariance, suggested
+    from projservo_cli.cli.suggested import require_covariance
     from projservo_cli.files import require_writable
     from projservo_cli.stages.chain import steps_for
 
-    console = Console(quiet=options["quiet"], verbose=options["verbose"])
     config, stored = resolve(options)
     if options["suggest"] is not None:
         require_covariance(config)
     steps = steps_for(config, stored, names, laws=given, force=options["force"])
     laws = tuple(step.law for step in steps if step.law)
-    call = _Call(names, laws, config, stored, steps, console)
-    if options["dry_run"]:
-        return _dry(call, as_json=options["json"])
-    require_named(config, steps, names)
-    require_asked(options, config, steps)
-    if any(step.why for step in steps):
-        require_writable(stored.path)
-    try:
-        with _compilation(call):
-            _work(call, options)
-        if options["suggest"] is not None and not _lacking(call, "calibrate"):
-            call.suggested = suggested(config, call.run, options["suggest"])
-    finally:
-        console.finish()
-    return _tell(call, as_json=options["json"])
+    if not options["dry_run"]:
+        require_named(config, steps, names)
+        require_asked(options, config, steps)
+        if any(step.why for step in steps):
+            require_writable(stored.path)
+    return _Call(names, laws, config, stored, steps, console)
 
 
 def _dry(call: _Call, *, as_json: bool) -> int:

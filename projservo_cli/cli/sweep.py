@@ -18,6 +18,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config.sweep import load_sweep
     from projservo_cli.files import require_writable
+    from projservo_cli.lock import working_in
     from projservo_cli.sweep.again import folder_of
     from projservo_cli.sweep.design import read_design
     from projservo_cli.sweep.driver import run as run_sweep
@@ -37,7 +38,8 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     where = f"{engine.workers} workers of {options['scheduler']}" if options["scheduler"] else "here"
     console.say(f"{design.total} runs, {design.sweep.runs} in each of {design.cells} cells, {where}")
     try:
-        status = run_sweep(design, folder, engine, console.progress, console.say, force=options["force"])
+        with working_in(folder.path, "parts", "calibrations"):
+            status = run_sweep(design, folder, engine, console.progress, console.say, force=options["force"])
     except KeyboardInterrupt:
         console.finish()
         console.say(f"{folder.table}: the runs done so far; the same command goes on with the others")

@@ -17,13 +17,15 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
             flag = name.replace("_", "-").removesuffix("s")
             raise InputError(f"--{flag}: not used by report {rest[0]}, which is of a sweep")
     from projservo_cli.figures.style import FORMATS
+    from projservo_cli.lock import working_in
     from projservo_cli.sweep.again import folder_of
     from projservo_cli.sweep.report import report
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
     folder = folder_of(rest[0])
     try:
-        found, files = report(folder, FORMATS, console.progress)
+        with working_in(folder.path):
+            found, files = report(folder, FORMATS, console.progress)
     finally:
         console.finish()
     if options["json"]:

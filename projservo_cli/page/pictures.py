@@ -9,6 +9,7 @@ from markupsafe import Markup
 
 from projservo_cli.figures import FIGURES, FigureSpec
 from projservo_cli.figures.style import FORMATS
+from projservo_cli.files import inside
 from projservo_cli.page.vector import inline
 
 SECTIONS = ("calibration", "plan", "control")
@@ -67,7 +68,7 @@ def _section(spec: FigureSpec) -> str:
 def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> Picture:
     drawing = None
     for kind in ("svg", "png"):
-        content = _content(directory / _file(spec, kind)) if kind in kinds and drawing is None else None
+        content = _content(directory, _file(spec, kind)) if kind in kinds and drawing is None else None
         if content is not None:
             drawing = _drawn(content, kind, f"{prefix}{spec.name}-", spec.alt or spec.title)
     links = [(kind.upper(), folder + _file(spec, kind)) for kind in kinds]
@@ -79,9 +80,11 @@ def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, p
     )
 
 
-def _content(path: Path) -> bytes | None:
+def _content(directory: Path, name: str) -> bytes | None:
+    """Content of a figure; None where it is none, or one that a link takes from elsewhere."""
+    path = directory / name
     try:
-        return path.read_bytes() if path.stat().st_size <= _MOST_BYTES else None
+        return path.read_bytes() if inside(path, directory) and path.stat().st_size <= _MOST_BYTES else None
     except OSError:
         return None
 

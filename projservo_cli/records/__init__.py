@@ -16,7 +16,7 @@ from projservo_cli.records.calibration import (
     Observation,
 )
 from projservo_cli.records.errors import InputError, WorkFailed
-from projservo_cli.records.fields import BoolArray, FloatArray, IntArray, array, scalar
+from projservo_cli.records.fields import SIZES, BoolArray, FloatArray, IntArray, array, scalar
 from projservo_cli.records.report import Report
 from projservo_cli.records.task import BODY_LAWS, LAWS, METRIC_LAWS, POINT_LAWS, Plan, Trace, signed
 
@@ -29,6 +29,7 @@ __all__ = [
     "POINT_LAWS",
     "PRISMATIC",
     "REVOLUTE",
+    "SIZES",
     "BoolArray",
     "Calibration",
     "CrossValidation",

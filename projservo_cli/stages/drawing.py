@@ -19,7 +19,7 @@ import numpy as np
 from projservo_cli.columns import to_csv
 from projservo_cli.figures import FIGURES, FigureSpec, style
 from projservo_cli.figures.material import Data, Fit, Material
-from projservo_cli.files import replacing
+from projservo_cli.files import replacing, require_inside
 from projservo_cli.stages import Progress, silent
 
 FOLDER = "figures"
@@ -53,7 +53,7 @@ def drawing_beside() -> Iterator[Process | None]:
     if _processors() < 2:
         yield None
         return
-    command = [sys.executable, "-P", "-m", __name__]
+    command = [sys.executable, "-P", "-m", __name__, str(os.getpid())]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -91,6 +91,7 @@ def draw_all(
     -------
     Files written, relative to the folder.
     """
+    require_inside(directory / FOLDER, directory)
     drawings = _prepare(material, directory / FOLDER, formats, left_out)
     theirs = drawings[1::2] if beside is not None else []
     mine = drawings[::2] if beside is not None else drawings
@@ -131,9 +132,11 @@ def _send(process: Process, drawings: Sequence[Drawing]) -> None:
         pass  # it has ended; its return code tells
 
 
-def _draw(drawings: Sequence[Drawing], progress: Progress, total: int) -> None:
+def _draw(drawings: Sequence[Drawing], progress: Progress, total: int, parent: int | None = None) -> None:
     with style.styled():
         for done, drawing in enumerate(drawings):
+            if parent is not None and os.getppid() != parent:
+                return  # it was killed, and another process may work in the folder
             progress("figures", total - len(drawings) + done, total)
             draw(drawing)
 
@@ -202,4 +205,4 @@ def _stop(number: int, frame: Any) -> None:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that waits decides
     signal.signal(signal.SIGTERM, _stop)
-    _draw(pickle.load(sys.stdin.buffer), silent, 0)
+    _draw(pickle.load(sys.stdin.buffer), silent, 0, int(sys.argv[1]))

@@ -80,14 +80,14 @@ class Stages:
     def plan(self, config: Any, calibration: Any) -> Any:
         self._make("plan")
         feasible = self.verdicts.get("plan") != "infeasible"
-        return fake(
-            Plan, config.seed, profile=config.trajectory.profile, feasible=feasible, reason="too near"
-        )
+        given = {"profile": config.trajectory.profile, "feasible": feasible, "reason": "too near"}
+        return fake(Plan, config.seed, {"joint": len(calibration.q_reference)}, **given)
 
     def servo(self, config: Any, calibration: Any, plan: Any, law: str, *, progress: Any) -> Any:
         self._make(law)
         name, mode = law_and_mode(law)
-        return fake(Trace, config.seed, law=name, mode=mode, verdict=self.verdicts.get(law, "converged"))
+        given = {"law": name, "mode": mode, "verdict": self.verdicts.get(law, "converged")}
+        return fake(Trace, config.seed, {"joint": len(calibration.q_reference)}, **given)
 
     def report(self, run: Any, directory: Any, *, progress: Any) -> Any:
         self._make("report")

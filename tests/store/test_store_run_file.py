@@ -85,6 +85,7 @@ class Odd:
 
 def test_optional_nested_and_special_values_come_back(tmp_path, monkeypatch):
     monkeypatch.setattr(records, "Odd", Odd, raising=False)
+    monkeypatch.setitem(store.RECORDS, "report", {"": Odd})
     odd = Odd(
         np.array([3, -1]),
         np.array([[True, False], [False, False]]),
@@ -204,5 +205,5 @@ def test_an_alien_or_damaged_file_is_refused_in_one_line(run, what):
 def test_what_a_run_lacks_is_named(tmp_path):
     with pytest.raises(InputError, match="there is no run file"):
         store.load(tmp_path)
-    with pytest.raises(InputError, match="holds no calibrate"):
+    with pytest.raises(InputError, match="holds no calibration"):
         _ = store.Run(tmp_path / "run.h5").calibration
