@@ -2,12 +2,12 @@
 
 from projservo_cli.control.image_based import pseudo_inverse, put_view
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
 
-@njit
+@merged
 def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity −λ (J_left⁺ e_left + J_right⁺ e_right), each view by itself.
 

@@ -1,12 +1,12 @@
 """Direct control of translation and two rotations: the paper's directTHREE."""
 
 from projservo_cli.control.law import OK, SINGULAR, Gains, State, follow, partitioned, translation_rate
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
 
-@njit
+@merged
 def direct_three(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity λ_t τ q̂_t + λ_r θ_r q̂_r + λ_p θ_p q̂_p, [RH00] eq. (20) as corrected."""
     status, parts = partitioned(model, task, s, q, state)

@@ -3,14 +3,14 @@
 from projservo_cli.control.law import OK, SINGULAR, Gains, State, follow, partitioned, translation_rate
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, inner, mul, unit, vec
 from projservo_cli.geometry.composition import composed_angle, composed_operator
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.geometry.mechanisms import Work, rotation_mechanism
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
 
 
-@njit
+@merged
 def axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
     """Point at infinity on the axis of a rotation about the centre, of unit norm.
 
@@ -31,7 +31,7 @@ def axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
     return unit(best)
 
 
-@njit
+@merged
 def rotation_about_center(
     work: Work, H_s: Mat4, a_inf: FloatArray, A_c: Vec4, q_hat: FloatArray
 ) -> tuple[bool, float]:
@@ -76,7 +76,7 @@ def single_rotation(
     return found, theta_s, sense, H_s
 
 
-@njit
+@merged
 def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity λ_t τ q̂_t + λ_s θ_s q̂_s, [RH00] eqs. (23)–(25) as corrected."""
     status, parts = partitioned(model, task, s, q, state)

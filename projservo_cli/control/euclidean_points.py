@@ -3,12 +3,12 @@
 from projservo_cli.control.image_based import pseudo_inverse
 from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
 from projservo_cli.geometry.algebra import apply, mat, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
 
-@njit
+@merged
 def euclidean_points(
     model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
 ) -> int:

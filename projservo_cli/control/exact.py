@@ -22,7 +22,7 @@ from projservo_cli.control.law import (
 from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
 from projservo_cli.geometry.inverse import SETTLED, reach
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.geometry.kinematics import backward, blocked_joint
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
@@ -38,7 +38,7 @@ HALVINGS = 48
 BRANCH_FACTOR = 2.0
 
 
-@njit
+@merged
 def desired(parts: Parts, H_s: Mat4, tau: float, theta: float, share: float) -> Mat4:
     """Share of the displacement of one period, exp(share τ Ĥ_t) exp(share θ Ĥ_s)."""
     return mul(translation(parts.H_t, share * tau), rotation(H_s, mul(H_s, H_s), share * theta))
@@ -108,7 +108,7 @@ def continued(
     return True
 
 
-@njit
+@merged
 def up_to_limit(
     model: Model,
     task: Task,
@@ -150,7 +150,7 @@ def up_to_limit(
     return share
 
 
-@njit
+@merged
 def first_order_only(
     parts: Parts, tau: float, theta: float, sense: float, share: float, gains: Gains, state: State
 ) -> int:
@@ -164,7 +164,7 @@ def first_order_only(
     return OK
 
 
-@njit
+@merged
 def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
     """Joint velocity whose step moves the face by exp(λ_t τ T Ĥ_t) exp(λ_s θ_s T Ĥ_s) exactly.
 

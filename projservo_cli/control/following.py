@@ -2,12 +2,12 @@
 
 from projservo_cli.control.law import OK, Gains, State
 from projservo_cli.geometry.algebra import apply, put_vec, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import merged, merged
 from projservo_cli.records import FloatArray
 from projservo_cli.task.reference import Reference, between, place, planned
 
 
-@njit
+@merged
 def aim(reference: Reference, gains: Gains, state: State) -> None:
     """Write where the face should be now, where its images should go, and how the joints lead there.
 
@@ -31,7 +31,7 @@ def aim(reference: Reference, gains: Gains, state: State) -> None:
         state.q_ahead[l] = between(reference.q[:, l], j, y) - between(reference.q[:, l], i, x)
 
 
-@njit
+@merged
 def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
     """Share of the amplitude at which the first-order joint step keeps the joint-speed limit."""
     share = 1.0
@@ -42,7 +42,7 @@ def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
     return share
 
 
-@njit
+@merged
 def go_on(reference: Reference, gains: Gains, status: int, limited: bool, state: State) -> None:
     """Advance the plan by as much of a period as the joint-speed limit leaves of the step.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
 from projservo_cli.geometry.composition import composed_angle
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.geometry.kinematics import operators_at, row
 from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work, workspace
 from projservo_cli.geometry.span import joint_motion
@@ -191,7 +191,7 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
     return True
 
 
-@njit
+@merged
 def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State) -> bool:
     """Measure the face by all markers of the body, predicted at the displacement H of the joints.
 
@@ -230,7 +230,7 @@ def predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
     return math.sqrt(total / (2 * A.shape[0]))
 
 
-@njit
+@merged
 def aimed(task: Task, state: State) -> Task:
     """The task whose target is where the plan is now; the task itself where none is followed."""
     if not following(task.reference):

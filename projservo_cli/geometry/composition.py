@@ -4,7 +4,7 @@ import math
 
 from projservo_cli.geometry.algebra import Mat4, combine, mul
 from projservo_cli.geometry.displacement import as_array, as_mat
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.records import FloatArray, WorkFailed
 
 
@@ -54,7 +54,7 @@ def composed_angle(theta_r: float, theta_p: float) -> tuple[float, float, float,
     return 2.0 * math.atan2(sine, cr * cp), cbh_a, cbh_b, cbh_c
 
 
-@njit
+@merged
 def composed_operator(H_r: Mat4, H_p: Mat4, cbh_a: float, cbh_b: float, cbh_c: float) -> tuple[bool, Mat4]:
     """Operator Ĥ_s of the single rotation equal to both, [RH00] eq. (24).
 

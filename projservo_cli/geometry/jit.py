@@ -86,3 +86,11 @@ def allocating(function: Callable[_Params, _Result]) -> Callable[_Params, _Resul
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     """Compile a small helper that is always merged into its caller by the optimiser."""
     return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS, forceinline=True)(function))
+
+
+def merged(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Merge a function into its only caller before the compiler proper sees it.
+
+    On its own it is compiled only where it is called from Python.
+    """
+    return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS, inline="always")(function))

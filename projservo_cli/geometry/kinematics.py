@@ -11,7 +11,7 @@ from projservo_cli.geometry.displacement import (
     translation,
     turned,
 )
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.geometry.lens import through
 from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
 
@@ -44,7 +44,7 @@ def backward(model: Model, q: FloatArray) -> Mat4:
     return H
 
 
-@njit
+@merged
 def start_pose(model: Model, q: FloatArray) -> Mat4:
     """Displacement at the first joints; a free-flying rig starts at its reference."""
     if model.joint_types[0] == FREE:
@@ -81,7 +81,7 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     return H
 
 
-@njit
+@merged
 def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
     """First joint outside its limits, or −1."""
     for i in range(q.shape[0]):
@@ -90,7 +90,7 @@ def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
     return -1
 
 
-@njit
+@merged
 def blocked_joint(q: FloatArray, q_next: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
     """First joint that a motion from q to q_next takes beyond a limit, or farther beyond it; else −1."""
     for i in range(q.shape[0]):

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.records import BoolArray, FloatArray
 
 FIRST = 3
@@ -47,14 +47,14 @@ def turning(k1: float, k2: float) -> float:
 _swelling, _swelling_rate, _turning = njit(swelling), njit(swelling_rate), njit(turning)
 
 
-@njit
+@merged
 def _from_center(lens: FloatArray, factor: float, u: float, v: float) -> tuple[float, float]:
     """Pixel whose distance from the image centre is so many times that of another."""
     u0, v0 = float(lens[0]), float(lens[1])
     return u0 + factor * (u - u0), v0 + factor * (v - v0)
 
 
-@njit
+@merged
 def _straight_radius(k1: float, k2: float, radius: float) -> float:
     """Radius that bends to another, before the turn: Newton within a bracket; NaN where there is none."""
     low = 0.0
@@ -100,7 +100,7 @@ def straighten(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     return _from_center(lens, _straight_radius(k1, k2, radius) / radius, u, v)
 
 
-@njit
+@merged
 def bends(lens: FloatArray) -> bool:
     """Whether any of the lenses (2, 5) distorts."""
     for view in range(lens.shape[0]):
@@ -109,7 +109,7 @@ def bends(lens: FloatArray) -> bool:
     return False
 
 
-@njit
+@merged
 def straight(lens: FloatArray, s: FloatArray, found: FloatArray) -> None:
     """Write the straight pixels (2, N, 2) of bent ones by the lenses (2, 5); NaN as of ``straighten``."""
     for view in range(s.shape[0]):

@@ -22,7 +22,7 @@ from projservo_cli.geometry.algebra import (
     sub,
 )
 from projservo_cli.geometry.displacement import as_array
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged, merged
 from projservo_cli.geometry.kernels import kernel_vector
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
 
@@ -114,7 +114,7 @@ def workspace(n: int, rows: int, span: Span = OWN) -> Work:
     )
 
 
-@njit
+@merged
 def put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
     """Write a velocity into four rows of column i."""
     work.B[i, first] = A[0]
@@ -129,7 +129,7 @@ def kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
     return kernel_vector(work.B, 8, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
 
 
-@njit
+@merged
 def operator_of(work: Work, q_hat: FloatArray) -> Mat4:
     """Operator Σ q̂_i Ĥ_i of a joint motion."""
     operators = work.basis
@@ -146,7 +146,7 @@ def operator_of(work: Work, q_hat: FloatArray) -> Mat4:
     return H
 
 
-@njit
+@merged
 def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Translation along the line through A and A + D, [RH00] eq. (8).
 
@@ -178,7 +178,7 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
     return to_radians(work, q_hat)
 
 
-@njit
+@merged
 def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Revolution around a point within a plane, [RH00] eq. (10), scaled to radians."""
     operators = work.basis

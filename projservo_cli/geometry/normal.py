@@ -3,7 +3,7 @@
 The sums are values the compiler keeps in registers; nothing is allocated.
 """
 
-from projservo_cli.geometry.jit import inline, njit
+from projservo_cli.geometry.jit import inline, merged
 from projservo_cli.records import FloatArray
 
 COORDINATES = 6
@@ -40,7 +40,7 @@ def accumulate(N: Sums, a: Row, b: Row) -> Sums:
     )  # fmt: skip
 
 
-@njit
+@merged
 def put_sums(N: FloatArray, sums: Sums) -> None:
     """Write the sums into the upper triangle and the last column of an array (6, 7)."""
     n = 0
@@ -50,7 +50,7 @@ def put_sums(N: FloatArray, sums: Sums) -> None:
             n += 1
 
 
-@njit
+@merged
 def solve_normal(N: FloatArray, tolerance: float) -> bool:
     """Solution of symmetric positive definite equations by the root-free Cholesky factorisation, in place.
 

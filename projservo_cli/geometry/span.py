@@ -9,7 +9,7 @@ fewer by least squares.
 
 import numpy as np
 
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.geometry.kernels import RANK_TOLERANCE, back_substitute, least_squares, orthogonalize
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work
@@ -127,7 +127,7 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     return True
 
 
-@njit
+@merged
 def add_least_norm(work: Work, xi: FloatArray, q_hat: FloatArray) -> None:
     """Add Jᵀ(J Jᵀ)⁻¹ of what q̂ lacks of ξ, with Jᵀ factorised in ``work.B``."""
     n = q_hat.shape[0]

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.geometry.algebra import Vec4, dot, meet, scale, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, WorkFailed
 
 # Rows of a camera that are left without the first, second or third, and signs of the minors.
@@ -14,7 +14,7 @@ _OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
 _SIGNS = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
 
 
-@njit
+@merged
 def plane_of(P: FloatArray, l0: float, l1: float, l2: float) -> Vec4:
     """Plane Pᵀ l that a camera sees as the line l."""
     return (
@@ -25,7 +25,7 @@ def plane_of(P: FloatArray, l0: float, l1: float, l2: float) -> Vec4:
     )
 
 
-@njit
+@merged
 def triangulate(
     P: FloatArray, F: FloatArray, a_inf: FloatArray, left: FloatArray, right: FloatArray
 ) -> tuple[bool, Vec4]:

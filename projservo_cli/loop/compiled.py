@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
 from projservo_cli.geometry.algebra import apply, dot, mat, put_mat, put_vec, sub, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.geometry.kinematics import beyond_limits, start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
@@ -233,7 +233,7 @@ def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
     read_joints(plant.disturbance, k + 1, log.q[k + 1], log.read[k], log.read[k + 1])
 
 
-@njit
+@merged
 def path_along(
     plant: Plant, log: Log, steps: int, start: FloatArray, goal: FloatArray
 ) -> tuple[float, float]:

@@ -22,7 +22,7 @@ in, before all others, where the images no longer agree with the calibration.
 import math
 from typing import NamedTuple
 
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import merged
 from projservo_cli.plants.plant import inside
 from projservo_cli.records import FloatArray
 
@@ -112,7 +112,7 @@ class Instant(NamedTuple):
     singular: bool
 
 
-@njit
+@merged
 def image_error(s: FloatArray, s_star: FloatArray) -> float:
     """Root mean square of the Euclidean pixel error over the markers and views of the face seen.
 
@@ -130,7 +130,7 @@ def image_error(s: FloatArray, s_star: FloatArray) -> float:
     return math.sqrt(total / seen) if seen > 0 else math.nan
 
 
-@njit
+@merged
 def outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
     """Whether one of the first m markers was seen outside an image."""
     for view in range(2):
@@ -141,7 +141,7 @@ def outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
     return False
 
 
-@njit
+@merged
 def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
     """Scale the command uniformly to the joint-speed limit; returns the factor, 1 where it holds."""
     factor = 1.0
@@ -155,7 +155,7 @@ def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
     return factor
 
 
-@njit
+@merged
 def tolerance(limits: Limits, views: float) -> float:
     """Image error that counts as converged, px rms per marker and view.
 
@@ -167,7 +167,7 @@ def tolerance(limits: Limits, views: float) -> float:
     return limits.image_px - limits.noise_px * max(0.0, 1.0 - math.sqrt(3.0 / views))
 
 
-@njit
+@merged
 def shorten(q: FloatArray, dq: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
     """Scale a joint step so that it ends where the first joint meets its limit; that joint, or −1.
 
@@ -186,7 +186,7 @@ def shorten(q: FloatArray, dq: FloatArray, lower: FloatArray, upper: FloatArray)
     return joint
 
 
-@njit
+@merged
 def stands_still(dq: FloatArray) -> bool:
     """Whether a joint step is too short to count as motion."""
     for i in range(dq.shape[0]):
@@ -195,7 +195,7 @@ def stands_still(dq: FloatArray) -> bool:
     return True
 
 
-@njit
+@merged
 def finite(q_dot: FloatArray) -> bool:
     """Whether every entry is a finite number."""
     for i in range(q_dot.shape[0]):
@@ -204,7 +204,7 @@ def finite(q_dot: FloatArray) -> bool:
     return True
 
 
-@njit
+@merged
 def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
     """Whether the image error fell by less than 1 % over the last ``window`` steps."""
     if k < window:
@@ -212,7 +212,7 @@ def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
     return bool(errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window])
 
 
-@njit
+@merged
 def verdict_at(now: Instant, limits: Limits) -> int:
     """Verdict of one instant before its command, in the order the module states; RUNNING for none."""
     if not now.in_front:

@@ -18,7 +18,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.displacement import twist_exponential
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.geometry.kinematics import forward, row
 from projservo_cli.geometry.lens import bend
 from projservo_cli.records import FREE, FloatArray, IntArray, Model
@@ -103,7 +103,7 @@ def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: Flo
     return mul(twist_exponential(X), H)
 
 
-@njit
+@merged
 def knock(disturbance: Disturbance, instant: int, dq: FloatArray) -> None:
     """Add to a joint step, rad or m, what knocks the joints until the instant it ends at."""
     if instant == disturbance.bump_at:
@@ -111,7 +111,7 @@ def knock(disturbance: Disturbance, instant: int, dq: FloatArray) -> None:
             dq[i] += disturbance.bump[i]
 
 
-@njit
+@merged
 def read_joints(
     disturbance: Disturbance, instant: int, q: FloatArray, before: FloatArray, reading: FloatArray
 ) -> None:
@@ -162,7 +162,7 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
     return in_front
 
 
-@njit
+@merged
 def put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
     """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
     depth = row(camera, 2, A)
@@ -173,14 +173,14 @@ def put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) 
     return True
 
 
-@njit
+@merged
 def put_unseen(pixel: FloatArray) -> None:
     """Write what stands for an unseen marker, NaN."""
     pixel[0] = math.nan
     pixel[1] = math.nan
 
 
-@njit
+@merged
 def inside(pixel: FloatArray, image_size: FloatArray) -> bool:
     """Whether a pixel lies within an image; pixel centres reach from −½ to size − ½."""
     for j in range(2):
@@ -189,7 +189,7 @@ def inside(pixel: FloatArray, image_size: FloatArray) -> bool:
     return True
 
 
-@njit
+@merged
 def rig_distance(plant: Plant, M: FloatArray) -> float:
     """Distance of the centre of the face M (m, 4) from the middle of the optical centres, m."""
     middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
@@ -227,7 +227,7 @@ def center_deviation(
     return most
 
 
-@njit
+@merged
 def line_distance(A: tuple[float, float, float, float], start: FloatArray, goal: FloatArray) -> float:
     """Distance of a metric point from the line through start and goal; from start where they agree."""
     way = axpy(-1.0, vec(start), vec(goal))

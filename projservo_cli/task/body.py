@@ -24,7 +24,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.displacement import twist_exponential
-from projservo_cli.geometry.jit import inline, njit
+from projservo_cli.geometry.jit import inline, njit, merged
 from projservo_cli.geometry.normal import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
 from projservo_cli.geometry.span import invariant_rotations
 from projservo_cli.records import BoolArray, FloatArray, Model
@@ -160,7 +160,7 @@ def image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: 
     )
 
 
-@njit
+@merged
 def normal_equations(
     P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool, normal: FloatArray
 ) -> tuple[float, int]:
@@ -226,7 +226,7 @@ def displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
     return mul(H, twist_exponential(X))
 
 
-@njit
+@merged
 def fit_body(
     P: FloatArray,
     body: Body,

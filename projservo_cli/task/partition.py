@@ -23,7 +23,7 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.composition import incidence_angles
 from projservo_cli.geometry.displacement import rotation
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged, merged
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,
     Work,
@@ -75,7 +75,7 @@ class Parts(NamedTuple):
     A_c: Vec4
 
 
-@njit
+@merged
 def no_parts() -> Parts:
     """Partition of a task that could not be measured."""
     nothing = (0.0, 0.0, 0.0, 0.0)
@@ -89,14 +89,14 @@ def clear(q_hat: FloatArray) -> None:
         q_hat[i] = 0.0
 
 
-@njit
+@merged
 def negate(q_hat: FloatArray) -> None:
     """Reverse a joint motion."""
     for i in range(q_hat.shape[0]):
         q_hat[i] = -q_hat[i]
 
 
-@njit
+@merged
 def agreement(q_hat: FloatArray, previous: FloatArray) -> float:
     """Positive where a joint motion goes on with the previous one, 0 where there was none."""
     total = 0.0
@@ -105,7 +105,7 @@ def agreement(q_hat: FloatArray, previous: FloatArray) -> float:
     return total
 
 
-@njit
+@merged
 def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tuple[bool, float, Mat4]:
     """Translation of the centre onto its target, [RH00] eqs. (8), (11).
 
@@ -129,7 +129,7 @@ def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tu
     return True, tau, H_t
 
 
-@njit
+@merged
 def onto_plane_part(
     work: Work, task: Task, A: FloatArray, a: Vec4, a_t: Vec4, A_c: Vec4, q_hat: FloatArray, memory: Memory
 ) -> tuple[bool, float, Mat4]:
@@ -167,7 +167,7 @@ def onto_plane_part(
     return True, theta, H_r
 
 
-@njit
+@merged
 def oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, float]:
     """Angle of [RH00] eq. (15), in (−π, π], that brings the front of a onto the front of a_t.
 
@@ -197,7 +197,7 @@ def oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, 
     return True, plus if dot(turned, a_t) > 0.0 else minus
 
 
-@njit
+@merged
 def within_plane_part(
     work: Work, A: FloatArray, A_r: FloatArray, a: Vec4, A_c: Vec4, q_hat: FloatArray, memory: Memory
 ) -> tuple[bool, float, Mat4]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, mat, mul
 from projservo_cli.geometry.displacement import rotation, translation
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.records import FloatArray
 from projservo_cli.task.trajectory import displaced
 
@@ -49,13 +49,13 @@ NO_REFERENCE = Reference(
 )
 
 
-@njit
+@merged
 def following(reference: Reference) -> bool:
     """Whether there is a plan to follow."""
     return bool(reference.mu.shape[0] > 0)
 
 
-@njit
+@merged
 def place(reference: Reference, clock: float) -> tuple[int, float]:
     """Row before a time in periods, and how far on towards the next; the plan stays where it arrived."""
     last = reference.mu.shape[0] - 1
@@ -63,7 +63,7 @@ def place(reference: Reference, clock: float) -> tuple[int, float]:
     return i, min(clock, float(last)) - i
 
 
-@njit
+@merged
 def between(column: FloatArray, i: int, x: float) -> float:
     """Value between two rows; the rows themselves to the bit."""
     return (1.0 - x) * float(column[i]) + x * float(column[i + 1])
@@ -79,7 +79,7 @@ def planned(reference: Reference, clock: float) -> Mat4:
     return displaced(reference.H_hat, reference.amplitudes, mu_t, mu_r, mu_p)
 
 
-@njit
+@merged
 def planned_step(reference: Reference, clock: float, share: float) -> Mat4:
     """Displacement that the plan makes from a time on in a share of a period."""
     mu = reference.mu

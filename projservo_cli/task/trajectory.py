@@ -4,7 +4,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, mat, mul
 from projservo_cli.geometry.displacement import as_array, rotation, translation
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged
 from projservo_cli.records import FloatArray
 
 # Share of the path that a part driven first, or last, has to itself.
@@ -52,7 +52,7 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
     return np.stack([t, r, p], axis=1)
 
 
-@njit
+@merged
 def rotated(H_hat: FloatArray, amplitudes: FloatArray, mu_r: float, mu_p: float) -> Mat4:
     """Rotations of the planned displacement, exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p) of [RH00] eq. (17)."""
     H_r = mat(H_hat[1])

@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, vec
 from projservo_cli.geometry.composition import incidence_angles
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import njit, merged, merged
 from projservo_cli.records import FloatArray
 from projservo_cli.task.face import Task
 
@@ -28,7 +28,7 @@ def margin_coefficients(a: Vec4, H_hat: Mat4, O: Vec4) -> tuple[float, float, fl
     return dot(a, O) + dot(a, second), -dot(a, first), -dot(a, second)
 
 
-@njit
+@merged
 def arc_minimum(c_0: float, c_s: float, c_c: float, theta: float) -> float:
     """Least value of c_0 + c_s sin t + c_c cos t for t between 0 and θ, |θ| ≤ 2π."""
     least = min(c_0 + c_c, c_0 + c_s * math.sin(theta) + c_c * math.cos(theta))
@@ -44,7 +44,7 @@ def arc_minimum(c_0: float, c_s: float, c_c: float, theta: float) -> float:
     return least
 
 
-@njit
+@merged
 def translation_limit(a: Vec4, H_t: Mat4, O: Vec4) -> tuple[bool, float]:
     """Amplitude τ_0 at which a translated face changes visibility, [RH00] eq. (11) on the optical centre."""
     rate = dot(a, apply(H_t, O))
@@ -53,7 +53,7 @@ def translation_limit(a: Vec4, H_t: Mat4, O: Vec4) -> tuple[bool, float]:
     return True, dot(a, O) / rate
 
 
-@njit
+@merged
 def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: Task) -> float:
     """Amplitude of a pure translation kept within δ τ_0 of both cameras, [RH00] section 4.2.
 
@@ -68,7 +68,7 @@ def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: T
     return amount
 
 
-@njit
+@merged
 def violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, float]:
     """Cameras that lose sight of the face while it turns by θ, and the worst margin over its start's."""
     lost = 0
