@@ -22,7 +22,7 @@ from projservo_cli.control.law import (
 from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
 from projservo_cli.geometry.inverse import SETTLED, reach
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import backward, blocked_joint
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task

@@ -13,7 +13,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
 from projservo_cli.geometry.composition import composed_angle
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import operators_at, row
 from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work, workspace
 from projservo_cli.geometry.span import joint_motion

@@ -4,7 +4,7 @@ import math
 
 from projservo_cli.geometry.algebra import Mat4, combine, mul
 from projservo_cli.geometry.displacement import as_array, as_mat
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.records import FloatArray, WorkFailed
 
 

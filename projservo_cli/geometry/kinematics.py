@@ -11,7 +11,7 @@ from projservo_cli.geometry.displacement import (
     translation,
     turned,
 )
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.lens import through
 from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
 

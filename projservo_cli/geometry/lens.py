@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.records import BoolArray, FloatArray
 
 FIRST = 3

@@ -22,7 +22,7 @@ from projservo_cli.geometry.algebra import (
     sub,
 )
 from projservo_cli.geometry.displacement import as_array
-from projservo_cli.geometry.jit import njit, merged, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kernels import kernel_vector
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
 

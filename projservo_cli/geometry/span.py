@@ -9,7 +9,7 @@ fewer by least squares.
 
 import numpy as np
 
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kernels import RANK_TOLERANCE, back_substitute, least_squares, orthogonalize
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work

@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
 from projservo_cli.geometry.algebra import apply, dot, mat, put_mat, put_vec, sub, vec
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import beyond_limits, start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,

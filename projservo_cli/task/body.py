@@ -24,7 +24,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.displacement import twist_exponential
-from projservo_cli.geometry.jit import inline, njit, merged
+from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.geometry.normal import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
 from projservo_cli.geometry.span import invariant_rotations
 from projservo_cli.records import BoolArray, FloatArray, Model

@@ -23,7 +23,7 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.composition import incidence_angles
 from projservo_cli.geometry.displacement import rotation
-from projservo_cli.geometry.jit import njit, merged, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,
     Work,

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, mat, mul
 from projservo_cli.geometry.displacement import rotation, translation
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.records import FloatArray
 from projservo_cli.task.trajectory import displaced
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, mat, mul
 from projservo_cli.geometry.displacement import as_array, rotation, translation
-from projservo_cli.geometry.jit import njit, merged
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.records import FloatArray
 
 # Share of the path that a part driven first, or last, has to itself.
