@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.stats import chi2, f
 
 from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import LENS
+from projservo_cli.calibration.chance import chi2_beyond, f_beyond
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
 from projservo_cli.calibration.fit import RAYLEIGH, Solution, cauchy, distances, hopeless_px, least_squares
@@ -82,7 +82,7 @@ def share_explained(solution: Solution, frame: Frame) -> float:
     flat = columns.reshape(d, -1)
     share = float(total @ np.linalg.solve(flat @ flat.T, total)) / max(agreement.chi2, LEAST_CHI2)
     square = float(total @ np.linalg.solve(K * np.cov(by_pose), total))
-    chance = float(f.isf(TAIL, d, K - d)) * d * (K - 1) / (K - d)
+    chance = float(f_beyond(TAIL, d, K - d)) * d * (K - 1) / (K - d)
     return share if square > chance and share >= LEAST_SHARE else 0.0
 
 
@@ -191,7 +191,7 @@ def advice(calibration: Calibration, share: float, centered: bool) -> tuple[str,
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
     k = calibration.lens[:, FIRST:].ravel()
     statistic = k @ np.linalg.solve(calibration.covariance[-COEFFICIENTS:, -COEFFICIENTS:], k)
-    if statistic < chi2.isf(NO_LENS_TAIL, COEFFICIENTS):
+    if statistic < chi2_beyond(NO_LENS_TAIL, COEFFICIENTS):
         return ("the images show no lens distortion: leave out --lens",)
     if not centered:
         return (

@@ -1,8 +1,8 @@
 """The error of predicted images that a calibration has to reckon with, and how large chance may make it."""
 
 import numpy as np
-from scipy.stats import chi2
 
+from projservo_cli.calibration.chance import chi2_quantile
 from projservo_cli.calibration.prediction import marker_pixels, prediction_derivative
 from projservo_cli.records import FloatArray, Model
 
@@ -57,4 +57,4 @@ def quantile(variances: FloatArray, probability: float) -> float:
     if cube == 0.0:
         return mean
     freedom = square**3 / cube**2
-    return mean + float(np.sqrt(square / freedom) * (chi2.ppf(probability, freedom) - freedom))
+    return mean + float(np.sqrt(square / freedom) * (chi2_quantile(probability, freedom) - freedom))

@@ -14,8 +14,8 @@ Navigation", Wiley 2001, section 5.4 (innovation as a test of the filter).
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import chi2
 
+from projservo_cli.calibration.chance import chi2_beyond
 from projservo_cli.calibration.prediction import predict, prediction_derivative
 from projservo_cli.records import BoolArray, Calibration, FloatArray
 
@@ -53,7 +53,7 @@ class Innovation:
         self._mean, self._C = np.zeros(known.sum()), np.eye(known.sum())
         m = len(self.calibration.marker)
         tail = FALSE_ALARM / (self.observations * (2 + m))
-        self._threshold: FloatArray = np.asarray(chi2.isf(tail, np.maximum(np.arange(4 * m + 1), 1)))
+        self._threshold: FloatArray = np.asarray(chi2_beyond(tail, np.maximum(np.arange(4 * m + 1), 1)))
 
     def disturbed(self, q: FloatArray, images: FloatArray) -> str:
         """What is wrong, in words; empty while nothing is.

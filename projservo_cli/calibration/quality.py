@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
+from projservo_cli.calibration.chance import chi2_beyond, chi2_quantile
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.excitation import REACH_M, REACH_RAD, WEAK_NOISE, describe_joint
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
@@ -151,7 +151,7 @@ def require_off_line(M: FloatArray, factor: FloatArray) -> None:
 
 def chi2_band(dof: int) -> tuple[float, float]:
     """Quantiles of χ² per degree of freedom between which a true model stays, all but 2e-4 of the time."""
-    return float(chi2.ppf(CHI2_TAIL, dof)) / dof, float(chi2.isf(CHI2_TAIL, dof)) / dof
+    return float(chi2_quantile(CHI2_TAIL, dof)) / dof, float(chi2_beyond(CHI2_TAIL, dof)) / dof
 
 
 def require_explained(unexplained: int, sightings: int, suspect_poses: int, poses: int) -> None:

@@ -1,8 +1,8 @@
 """What the images show before any geometry: places that differ, off a line, moving as the readings say."""
 
 import numpy as np
-from scipy.stats import chi2
 
+from projservo_cli.calibration.chance import chi2_quantile
 from projservo_cli.calibration.epipolar import MAD
 from projservo_cli.calibration.excitation import LEAST_MOTION, describe_still
 from projservo_cli.calibration.quality import LEAST_SIGMA, ON_A_LINE
@@ -139,6 +139,6 @@ def _require_no_line(readings: Readings, sigma: float) -> None:
             pixels = readings.pixels[v][readings.seen[v] & (readings.pose_of == k)]
             if len(pixels) > 2:
                 offset = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
-                off.append(offset**2 > sigma**2 * chi2.ppf(OFF_LINE, len(pixels) - 2))
+                off.append(offset**2 > sigma**2 * chi2_quantile(OFF_LINE, len(pixels) - 2))
     if off and np.mean(off) < 0.5:
         raise WorkFailed(ON_A_LINE)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import binomtest
 
 from projservo_cli.config.sweep import LAW
 from projservo_cli.records import BoolArray, FloatArray
@@ -168,6 +167,8 @@ def median(values: FloatArray) -> float | None:
 
 def chance(first: int, second: int) -> float:
     """Two-sided probability of a split as uneven as this or more, between equals."""
+    from scipy.stats import binomtest  # a second of importing, for comparisons alone
+
     return float(binomtest(first, first + second).pvalue) if first + second else 1.0
 
 
