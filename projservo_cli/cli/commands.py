@@ -83,11 +83,15 @@ COMMANDS = {
         "Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; "
         "and report.html, one page that tells it all and needs no other file. Makes every stage before it "
         "where needed.\n\n"
+        "--view adds view.html, a 3D view of robot, rig, face and paths with a time slider, which needs no "
+        "network; it needs pip install 'projservo[view]' and a robot described in metres. --animation adds "
+        "animation.gif, what both cameras see under the direct and the classical laws. The page links to "
+        "both; a report that is up to date is not made again for them.\n\n"
         "projservo report SWEEP, with the folder of a sweep, writes its statistics and figures instead: "
         "success with intervals, final errors, laws compared on the same tasks.",
-        _OF_STAGES,
+        (*_OF_STAGES, "view", "animation"),
         stage=True,
-        example="projservo calibrate plan servo report -c configs/ur5.yaml -o results/ur5",
+        example="projservo calibrate plan servo report -c configs/ur5.yaml -o results/ur5 --view",
     ),
     "record": Command(
         "Drive the robot through trial motions and write a table.",

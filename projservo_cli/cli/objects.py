@@ -202,7 +202,7 @@ def _report_words(value: dict[str, Any]) -> list[str]:
     return [
         f"report: {len(value['figures'])} files of figures; {holding} of {len(claims)} claims hold",
         *(wrapped(text, "  ") for text in (*claims, *left_out)),
-        *([f"page: {value['page']}"] if value["page"] else []),
+        *(f"{name}: {value[name]}" for name in ("page", "view", "animation") if value.get(name)),
     ]
 
 

@@ -133,6 +133,16 @@ OPTIONS: dict[str, click.Option] = {
             help="On servo: the run of that number of a sweep, made anew as a run of its own.",
         ),
         click.Option(
+            ["--view"],
+            is_flag=True,
+            help="On report: a 3D view of robot, rig and paths with a time slider, view.html.",
+        ),
+        click.Option(
+            ["--animation"],
+            is_flag=True,
+            help="On report: both camera images under several laws over time, animation.gif.",
+        ),
+        click.Option(
             ["--scheduler"],
             metavar="ADDRESS",
             help="On sweep: the Dask scheduler whose workers do the work, such as tcp://host:8786.",

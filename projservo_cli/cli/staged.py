@@ -28,6 +28,7 @@ class _Call:
     failed: str = ""
     laws_done: tuple[str, ...] = ()
     suggested: dict[str, Any] = field(default_factory=dict)
+    extras: dict[str, Any] = field(default_factory=dict)
 
 
 def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
@@ -37,6 +38,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     require_terminal(options)
     given = law_names(options["laws"])
+    from projservo_cli.cli.extras import wanted_of
     from projservo_cli.config import to_yaml
     from projservo_cli.lock import working_in
 
@@ -44,7 +46,8 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     call = _asked(names, given, options, console)
     if options["dry_run"]:
         return _dry(call, as_json=options["json"])
-    if not any(step.why for step in call.steps) and call.run.configuration == to_yaml(call.config):
+    nothing = not any(step.why for step in call.steps) and call.run.configuration == to_yaml(call.config)
+    if nothing and not wanted_of(options):
         return _done(call, options)
     with working_in(call.run.path.parent, "figures"):
         # Anew, since another process may have written the run until now.
@@ -53,6 +56,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
 
 def _done(call: _Call, options: dict[str, Any]) -> int:
     """Make what has to be made, and tell what came out; the exit code."""
+    from projservo_cli.cli.extras import made_extras, wanted_of
     from projservo_cli.cli.suggested import suggested
 
     try:
@@ -60,6 +64,8 @@ def _done(call: _Call, options: dict[str, Any]) -> int:
             _work(call, options)
         if options["suggest"] is not None and not _lacking(call, "calibrate"):
             call.suggested = suggested(call.config, call.run, options["suggest"])
+        if (wanted := wanted_of(options)) and not _lacking(call, "report"):
+            call.extras = made_extras(call.config, call.run, call.laws, wanted, call.console)
     finally:
         call.console.finish()
     return _tell(call, as_json=options["json"])
@@ -68,6 +74,7 @@ def _done(call: _Call, options: dict[str, Any]) -> int:
 def _asked(names: list[str], given: Sequence[str], options: dict[str, Any], console: Console) -> _Call:
     """What is to be done, by the configuration and what the run holds; refused where it must not be."""
     from projservo_cli.cli.configuration import resolve
+    from projservo_cli.cli.extras import require
     from projservo_cli.cli.suggested import require_covariance
     from projservo_cli.files import require_writable
     from projservo_cli.stages.chain import steps_for
@@ -75,6 +82,7 @@ def _asked(names: list[str], given: Sequence[str], options: dict[str, Any], cons
     config, stored = resolve(options)
     if options["suggest"] is not None:
         require_covariance(config)
+    require(config, options)
     steps = steps_for(config, stored, names, laws=given, force=options["force"])
     laws = tuple(step.law for step in steps if step.law)
     if not options["dry_run"]:
@@ -160,7 +168,7 @@ def _tell(call: _Call, *, as_json: bool) -> int:
             values[name] = failed_object(name, call.run, call.reason, call.failed, call.laws_done)
         else:
             values[name] = stage_object(name, call.run, call.config, call.laws)
-            values[name] |= call.suggested if name == "calibrate" else {}
+            values[name] |= {"calibrate": call.suggested, "report": call.extras}.get(name, {})
     if as_json:
         print_json(values if len(call.names) > 1 else values[call.names[0]])
     else:

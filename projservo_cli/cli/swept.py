@@ -6,7 +6,7 @@ from projservo_cli.cli.options import wrapped
 from projservo_cli.cli.output import Console, print_json
 from projservo_cli.records import InputError
 
-UNUSED = ("config", "sets", "output", "data", "dry_run")
+UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")
 
 
 def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:

@@ -48,7 +48,7 @@ def draw_classical(data: Data, figure: "Figure") -> None:
         np.concatenate([data[f"s_{law}"].reshape(-1, 2), data[f"s_star_{law}"].reshape(-1, 2)])
         for law in laws
     ]
-    heights = [PANEL_WIDTH * style.aspect(_near(pixels, data["image_size"])) for pixels in shown]
+    heights = [PANEL_WIDTH * style.aspect(near_pixels(pixels, data["image_size"])) for pixels in shown]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
     axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
     for row, law in enumerate(laws):
@@ -65,7 +65,7 @@ def draw_classical(data: Data, figure: "Figure") -> None:
             _frame(panel, np.concatenate([s.reshape(-1, 2), goal]), data["image_size"])
     handles = _classical_handles()
     handles += [style.line_handle("end of the run", color=style.BLACK, marker="x", linestyle="none")]
-    every = _near(np.concatenate(shown), data["image_size"]) / data["image_size"]
+    every = near_pixels(np.concatenate(shown), data["image_size"]) / data["image_size"]
     if (np.abs(every - 0.5) > 0.5 - BORDER_SHOWN).any():
         handles += [style.line_handle("border of the image", color=style.GREY, linewidth=0.8)]
     style.legend_below(figure, handles, 4)
@@ -84,7 +84,7 @@ def _draw_paths(axes: "Axes", s: FloatArray, hidden: FloatArray, plateau: FloatA
 
 def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
     """Show the paths as far as they stay near the image, and the image border where it is near."""
-    style.frame_pixels(axes, _near(pixels, size))
+    style.frame_pixels(axes, near_pixels(pixels, size))
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
     limits = axes.get_xlim(), axes.get_ylim()
     axes.plot(*style.closed(border).T, color=style.GREY, linewidth=0.8)
@@ -92,7 +92,7 @@ def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
     axes.set_ylim(limits[1])
 
 
-def _near(pixels: FloatArray, size: FloatArray) -> FloatArray:
+def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
     """Pixels (k, 2) that were measured, none farther outside the image than is drawn."""
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     return np.clip(seen, -OUTSIDE * size, (1.0 + OUTSIDE) * size)

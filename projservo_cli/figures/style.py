@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from projservo_cli.records import FloatArray
 
@@ -133,6 +134,13 @@ def _equal_scales(axes: "Axes") -> None:
 def save(figure: "Figure", path: Path, kind: str) -> None:
     """Write an arranged figure as ``svg``, ``pdf`` or ``png``."""
     figure.savefig(path, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
+
+
+def pixels(figure: "Figure") -> npt.NDArray[np.uint8]:
+    """Pixels (height, width, 3) of a figure as it is now."""
+    canvas: Any = figure.canvas
+    canvas.draw()
+    return np.array(canvas.buffer_rgba(), dtype=np.uint8)[:, :, :3]
 
 
 def legend_below(figure: "Figure", handles: Any, columns: int) -> None:

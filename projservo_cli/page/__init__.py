@@ -3,19 +3,22 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from projservo_cli.files import replacing
-from projservo_cli.page.content import View, claim_rows, differences, picture_rows, view_of
-from projservo_cli.page.words import number, short
+from projservo_cli.page.content import (
+    ANIMATION_FILE,
+    VIEW_FILE,
+    View,
+    claim_rows,
+    differences,
+    picture_rows,
+    view_of,
+)
+from projservo_cli.page.template import template
 from projservo_cli.store import Run
 
-if TYPE_CHECKING:
-    from jinja2 import Template
-
-__all__ = ["PAGE_FILE", "write_comparison", "write_page"]
+__all__ = ["ANIMATION_FILE", "PAGE_FILE", "VIEW_FILE", "write_comparison", "write_page"]
 
 PAGE_FILE = "report.html"
 
@@ -55,24 +58,8 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
 
 
 def _write(path: Path, views: list[View]) -> None:
-    text = _template().render(
+    text = template("page.html").render(
         views=views, claims=claim_rows(views), differences=differences(views), pictures=picture_rows(views)
     )
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
-
-
-@cache
-def _template() -> "Template":
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters |= {"number": number, "short": short}
-    return environment.get_template("page.html")

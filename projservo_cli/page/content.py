@@ -17,6 +17,9 @@ from projservo_cli.page.words import calibration_words, held_out_words, law_word
 from projservo_cli.records import Calibration, Plan, Report, Trace
 from projservo_cli.store import Run
 
+VIEW_FILE, ANIMATION_FILE = "view.html", "animation.gif"
+# What may lie beside the page, and what the page calls it.
+_EXTRAS = {VIEW_FILE: "3D view with a time slider", ANIMATION_FILE: "animation of both camera images (GIF)"}
 # What made a run: key in the provenance, and what the page calls it.
 _MADE = {
     "date": "date",
@@ -43,6 +46,7 @@ class View:
     calibration, plan, laws : of each stage.
     claims, drift, left_out : of the report; what was left out for each reason.
     pictures : the figures by section.
+    extras : (label, path) of what lies beside the page.
     """
 
     name: str
@@ -58,6 +62,7 @@ class View:
     left_out: dict[str, list[str]] = field(default_factory=dict)
     reported: bool = False
     pictures: dict[str, list[Picture]] = field(default_factory=lambda: {name: [] for name in SECTIONS})
+    extras: tuple[tuple[str, str], ...] = ()
 
 
 def view_of(run: Run, *, folder: str = "", prefix: str = "") -> View:
@@ -85,6 +90,9 @@ def view_of(run: Run, *, folder: str = "", prefix: str = "") -> View:
         calibration=_calibration(run, config) if "calibrate" in run.results else None,
         plan=_plan(run.plan) if "plan" in run.results else None,
         laws=[_law(trace, config) for trace in run.traces.values()],
+        extras=tuple(
+            (label, folder + name) for name, label in _EXTRAS.items() if (run.path.parent / name).is_file()
+        ),
     )
     if report is None:
         return shown

@@ -212,6 +212,10 @@ def _records(step: Step, config: Config, run: Run, laws: Sequence[str], progress
         return {"": module.run(config, run.calibration)}
     if step.stage == "servo":
         return {"": module.run(config, run.calibration, run.plan, step.law, progress=progress)}
+    return {"": module.run(reported(config, run, laws), run.path.parent, progress=progress)}
+
+
+def reported(config: Config, run: Run, laws: Sequence[str]) -> Run:
+    """What a report is about: of the results before it those that the named runs of laws rest on."""
     names = ["calibrate", *(["plan", *(SERVO + law for law in laws)] if has_task(config) else [])]
-    reported = replace(run, results={name: run.results[name] for name in names})
-    return {"": module.run(reported, run.path.parent, progress=progress)}
+    return replace(run, results={name: run.results[name] for name in names})

@@ -12,7 +12,7 @@ from projservo_cli.config import load_config
 from projservo_cli.figures.drift import converged, drift_rows, table
 from projservo_cli.figures.material import DIRECT, Fit, Material, Studies
 from projservo_cli.files import replacing
-from projservo_cli.page import PAGE_FILE, write_page
+from projservo_cli.page import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, write_page
 from projservo_cli.records import Report, WorkFailed
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task
@@ -71,6 +71,8 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
 def _told(report: Report, run: "Run", directory: Path) -> Report:
     """The report, after writing its claims and its page beside the figures."""
     _write_claims(report, directory / CLAIMS_FILE)
+    for name in (VIEW_FILE, ANIMATION_FILE):  # of other runs than those that are reported on now
+        (directory / name).unlink(missing_ok=True)
     config = load_config(run.path, text=run.configuration)
     made = Result("", run.configuration, provenance.collect(seed=config.seed), {}, {"": report})
     write_page(replace(run, results={**run.results, "report": made}))
