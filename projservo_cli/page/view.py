@@ -150,11 +150,12 @@ def _layout(motion: Motion, still: int, choices: list[tuple[str, Driven, list[st
 
 def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
     """A step for each instant; what it is labelled with stands above the slider."""
+    labels = [_label(seconds, hidden) for seconds, hidden in zip(run.seconds, run.hidden, strict=True)]
+    labels[-1] += f", {run.verdict}"
     steps = [
-        {"label": _label(seconds, hidden), "method": "animate", "args": [[frame], AT_ONCE], "value": frame}
-        for frame, seconds, hidden in zip(own, run.seconds, run.hidden, strict=True)
+        {"label": label, "method": "animate", "args": [[frame], AT_ONCE], "value": frame}
+        for frame, label in zip(own, labels, strict=True)
     ]
-    steps[-1]["label"] += f", {run.verdict}"
     return {
         "steps": steps,
         "active": 0,

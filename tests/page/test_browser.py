@@ -1,87 +1,165 @@
-"""The page in a real browser: nothing is complained about, every figure is seen at every width."""
+"""The pages in a real browser: nothing is complained about, nothing is fetched, everything is seen, and moves."""
 
-import json
+import io
 import os
-import re
 import shutil
-import subprocess
+from contextlib import contextmanager
 
+import numpy as np
 import pytest
+from PIL import Image
 
-from projservo_cli.page import PAGE_FILE
+from projservo_cli.page import PAGE_FILE, VIEW_FILE, write_comparison
+from projservo_cli.stages import extras
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-POLICY = re.compile(r'<meta http-equiv="Content-Security-Policy"[^>]*>')
-# What the page looks like once it is laid out, told to the frame around it.
-MEASURE = """<script>
-addEventListener("load", () => {
+# A machine without a graphics processor draws three dimensions by software.
+ARGUMENTS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+A4_PX = 680  # width of the text of a page of paper, 180 mm
+# Boxes of all figures, and whether their lines are drawn; elements that reach beyond the page, but those
+# within what scrolls by itself.
+FIGURES = """() => [...document.querySelectorAll("figure")].map(figure => {
+  const box = figure.querySelector("svg, img").getBoundingClientRect();
   const wide = path => path.getBoundingClientRect().width > 20;
-  const boxes = [...document.querySelectorAll("figure")].map(figure => {
-    const box = figure.querySelector("svg, img").getBoundingClientRect();
-    const ink = [...figure.querySelectorAll("svg path")].some(wide);
-    return [box.left, box.right, box.width, box.height, ink];
-  });
-  parent.postMessage({boxes, width: innerWidth, scroll: document.documentElement.scrollWidth,
-    ground: getComputedStyle(document.body).backgroundColor}, "*");
-});
-</script></body>"""
-# A window has a least width; a frame has none. The text of this page is what --dump-dom prints.
-FRAME = """<!DOCTYPE html><title>frame</title><body><script>
-addEventListener("message", event => document.body.dataset.measured = JSON.stringify(event.data));
-</script><iframe src="report.html" width="WIDTH" height="900" style="border: 0"></iframe></body>"""
+  return [box.left, box.right, box.width, box.height, [...figure.querySelectorAll("svg path")].some(wide)];
+})"""
+BEYOND = """width => [...document.querySelectorAll("body *")]
+  .filter(e => e.getBoundingClientRect().right > width + 1 && !e.closest("svg, .scene")
+    && !(e.parentElement.closest(".wide, pre") && getComputedStyle(e.parentElement.closest(".wide, pre"))
+         .overflowX === "auto"))
+  .map(e => `${e.tagName} ${e.className} ${e.textContent.trim().slice(0, 40)}`)"""
+ROBOT = """() => {
+  const trace = document.getElementById("scene")._fullData.find(t => t.name === "robot" && t.visible === true);
+  return [trace.index, Array.from(trace.x), Array.from(trace.y), Array.from(trace.z)];
+}"""
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    """Function that opens a file and returns what the browser prints and what it says."""
+def browser():
+    """A Chromium: that of the variable CHROMIUM, else the first there is."""
     program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip("no Chromium is installed; set CHROMIUM to one")
-    profile = tmp_path_factory.mktemp("profile")
-    common = [
-        *("--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"),
-        *("--hide-scrollbars", "--enable-logging=stderr", f"--user-data-dir={profile}"),
-    ]
-
-    def show(path, *options):
-        done = subprocess.run(
-            [program, *common, *options, path.as_uri()],
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=True,
-        )
-        return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
-
-    return show
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with playwright.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=program, args=ARGUMENTS)
+        yield started
+        started.close()
 
 
-def test_the_browser_has_nothing_to_say(browser, run):
-    text, console = browser(run.path.parent / PAGE_FILE, "--dump-dom")
-    assert console == []
-    assert "</html>" in text
+@contextmanager
+def opened(browser, path, width=1400, dark=False):
+    """A page as it is shown; on leaving, it must have had nothing to say and nothing to fetch."""
+    context = browser.new_context(
+        viewport={"width": width, "height": 900}, color_scheme="dark" if dark else "light"
+    )
+    page = context.new_page()
+    said, fetched = [], []
+    page.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: fetched.append(request.url))
+    page.goto(path.as_uri())
+    yield page
+    context.close()
+    assert said == []
+    assert [url for url in fetched if not url.startswith(("data:", "blob:"))] == [path.as_uri()]
+
+
+@pytest.fixture(scope="module")
+def view(run):
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    return extras.view(run)
+
+
+@pytest.fixture(scope="module")
+def pages(run, view, tmp_path_factory):
+    comparison = tmp_path_factory.mktemp("comparison") / "compare.html"
+    write_comparison([run, run], comparison)
+    return {"report": run.path.parent / PAGE_FILE, "comparison": comparison, "view": view}
 
 
 @pytest.mark.parametrize("width", [390, 1400])
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
-def test_every_figure_is_seen(browser, run, tmp_path, width, dark):
-    text = (run.path.parent / PAGE_FILE).read_text(encoding="utf-8")
-    text, count = POLICY.subn("", text)
-    assert count == 1
-    page = tmp_path / PAGE_FILE
-    page.write_text(text.replace("</body>", MEASURE), encoding="utf-8")
-    frame = tmp_path / "frame.html"
-    frame.write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")
-    scheme = f"--blink-settings=preferredColorScheme={0 if dark else 1}"
-    text, _ = browser(frame, "--dump-dom", "--virtual-time-budget=5000", scheme, "--window-size=1600,1000")
-    found = json.loads(re.search(r'data-measured="([^"]*)"', text)[1].replace("&quot;", '"'))
-    assert found["width"] == width
-    assert found["scroll"] <= width
-    assert (found["ground"] == "rgb(255, 255, 255)") != dark
-    assert len(found["boxes"]) == 4
-    for left, right, wide, high, ink in found["boxes"]:
+@pytest.mark.parametrize(("name", "figures"), [("report", 4), ("comparison", 8), ("view", 0)])
+def test_everything_is_seen_at_every_width(browser, pages, name, figures, width, dark):
+    with opened(browser, pages[name], width, dark) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= width, page.evaluate(BEYOND, width)
+        ground = page.evaluate("getComputedStyle(document.body).backgroundColor")
+        assert (ground == "rgb(255, 255, 255)") != dark
+        boxes = page.evaluate(FIGURES)
+    assert len(boxes) == figures
+    share = 0.4 if name == "comparison" and width > 390 else 0.85
+    for left, right, wide, high, ink in boxes:
         assert left >= 0
         assert right <= width
-        assert wide >= 0.85 * min(width, 700)
+        assert wide >= share * min(width, 700)
         assert high > 100
         assert ink
+
+
+@pytest.mark.parametrize("name", ["report", "comparison"])
+def test_nothing_is_cut_off_on_paper(browser, pages, name):
+    with opened(browser, pages[name], A4_PX) as page:
+        page.emulate_media(media="print")
+        assert page.evaluate(BEYOND, A4_PX) == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= A4_PX
+        assert page.pdf(format="A4").startswith(b"%PDF")
+
+
+def robot(page):
+    index, *places = page.evaluate(ROBOT)
+    return index, np.transpose(places)
+
+
+def picture(page):
+    return np.asarray(Image.open(io.BytesIO(page.locator(".scene").screenshot())).convert("L"), dtype=float)
+
+
+def to_the_end(page):
+    """Move the slider to its end, as a pointer does."""
+    box = page.locator(".slider-rail-touch-rect").bounding_box()
+    page.mouse.click(box["x"] + box["width"] - 2, box["y"] + box["height"] / 2)
+
+
+def drawn(page):
+    page.wait_for_function("document.querySelector('#scene canvas') !== null")
+    page.wait_for_timeout(1000)
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_the_slider_moves_the_robot(browser, run, view, width):
+    with opened(browser, view, width) as page:
+        drawn(page)
+        first, before = robot(page)
+        seen = picture(page)
+        to_the_end(page)
+        drawn(page)
+        last, after = robot(page)
+        moved = picture(page)
+        label = page.locator(".slider-label").first.text_content()
+    trace = run.traces["direct_three"]
+    assert first == last
+    # A tenth of a millimetre is what the page keeps.
+    np.testing.assert_allclose(before[-1], trace.pose[0, :3, 3], atol=1e-4)
+    np.testing.assert_allclose(after[-1], trace.pose[-1, :3, 3], atol=1e-4)
+    assert np.linalg.norm(after[-1] - before[-1]) > 1e-2
+    scene = slice(80, -150)  # without the slider, which moves too
+    assert np.count_nonzero(np.abs(moved - seen)[scene] > 60) > 30
+    assert label == f"time {trace.period * trace.steps:.2f} s, {trace.verdict}, {trace.steps} steps"
+
+
+def test_every_law_can_be_chosen(browser, run, view):
+    names = list(run.traces)
+    ends = []
+    with opened(browser, view) as page:
+        drawn(page)
+        for number in range(len(names)):
+            page.locator(".updatemenu-header").click()
+            page.locator(".updatemenu-dropdown-button").nth(number).click()
+            page.wait_for_timeout(300)
+            to_the_end(page)
+            page.wait_for_timeout(300)
+            ends.append(robot(page))
+    assert len({index for index, _ in ends}) == len(names)
+    for name, (_, places) in zip(names, ends, strict=True):
+        np.testing.assert_allclose(places[-1], run.traces[name].pose[-1, :3, 3], atol=1e-4)
