@@ -15,6 +15,7 @@ FRAMES = 60
 DPI = 100
 MOST_COLUMNS = 4
 PANEL = 2.3  # inches across one panel
+LEAST_WIDTH = 5.2  # inches, of the legend
 HIDDEN_COLOR = style.ORANGE
 SEEN_COLOR = style.GREEN
 
@@ -88,7 +89,8 @@ def frames(columns: list[Strip], size: FloatArray, at: FloatArray) -> Iterator[n
     """
     every = np.concatenate([np.concatenate([c.s.reshape(-1, 2), c.s_star.reshape(-1, 2)]) for c in columns])
     near = near_pixels(every, size)
-    figure = style.new_figure(2.0 * PANEL * style.aspect(near) + 1.5, PANEL * len(columns) + 0.5)
+    width = max(LEAST_WIDTH, PANEL * len(columns) + 0.5)
+    figure = style.new_figure(2.0 * PANEL * style.aspect(near) + 1.5, width)
     figure.set_dpi(DPI)
     axes = figure.subplots(2, len(columns), squeeze=False, sharex=True, sharey=True)
     for column, strip in enumerate(columns):

@@ -85,15 +85,17 @@ def motion(
 
 
 def instants(q: FloatArray) -> IntArray:
-    """At most ``MOST_INSTANTS`` instants of the joints q (t, n), first and last included.
+    """At most ``MOST_INSTANTS`` instants of the joints q (t, n), all of a shorter run.
 
-    They are spread evenly half over the time and half over the way of the joints, so that neither the
-    beginning of a long run nor its end is passed over.
+    First and last are among them. They are spread evenly half over the time and half over the way of the
+    joints, so that neither the beginning of a long run nor its end is passed over.
     """
+    if len(q) <= MOST_INSTANTS:
+        return np.arange(len(q))
     even = np.linspace(0.0, 1.0, len(q))
     way = np.append(0.0, np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1)))
     done = 0.5 * (even + (way / way[-1] if way[-1] > 0.0 else even))
-    marks = np.linspace(0.0, 1.0, min(MOST_INSTANTS, len(q)))
+    marks = np.linspace(0.0, 1.0, MOST_INSTANTS)
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -17,7 +18,7 @@ from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, run_page
 
 PAGES = sorted(DOCS.glob("*.md"))
 # Those that run laws or plan: only with the compiler.
-DRIVING = {"api", "commands", "law", "run-file", "tutorial"}
+DRIVING = {"api", "commands", "law", "report", "run-file", "tutorial"}
 LANGUAGES = {"sh", "python", "text", "yaml"}
 # What cannot be run by a test, and how often it stands there.
 NOT_RUN = {"installation": 1}
@@ -122,6 +123,13 @@ def check_run_file(folder, names, read):
     assert {"calibrate/observation", "calibrate/calibration", "plan", "servo/direct_two"} <= set(held)
 
 
+def check_report(folder, names, read):
+    for name in ("view.html", "animation.gif"):
+        assert f'<a href="{name}">' in Path("results/turn/report.html").read_text(encoding="utf-8")
+        assert Path("results/turn", name).stat().st_size > 10_000
+    assert Path("both.html").is_file()
+
+
 HAS = {"tables": (put_tags, put_sheet)}
 CHECK = {
     "installation": check_installation,
@@ -129,6 +137,7 @@ CHECK = {
     "diagnostics": check_diagnostics,
     "commands": check_commands,
     "law": check_law,
+    "report": check_report,
     "api": check_api,
     "run-file": check_run_file,
 }
@@ -145,6 +154,8 @@ def test_page(folder, page, capsys):
     if page.stem == "run-file":
         pytest.importorskip("xarray")
         pytest.importorskip("h5netcdf")
+    if page.stem == "report":
+        pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
     for put in HAS.get(page.stem, ()):
         put(folder)
 

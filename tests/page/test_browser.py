@@ -1,4 +1,4 @@
-"""The pages in a real browser: nothing is complained about, nothing is fetched, everything is seen, and moves."""
+"""The pages in a real browser: no complaints, nothing fetched, everything seen, and the robot moves."""
 
 import io
 import os
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from projservo_cli.page import PAGE_FILE, VIEW_FILE, write_comparison
+from projservo_cli.page import PAGE_FILE, write_comparison
 from projservo_cli.stages import extras
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -29,7 +29,8 @@ BEYOND = """width => [...document.querySelectorAll("body *")]
          .overflowX === "auto"))
   .map(e => `${e.tagName} ${e.className} ${e.textContent.trim().slice(0, 40)}`)"""
 ROBOT = """() => {
-  const trace = document.getElementById("scene")._fullData.find(t => t.name === "robot" && t.visible === true);
+  const traces = document.getElementById("scene")._fullData;
+  const trace = traces.find(trace => trace.name === "robot" && trace.visible === true);
   return [trace.index, Array.from(trace.x), Array.from(trace.y), Array.from(trace.z)];
 }"""
 

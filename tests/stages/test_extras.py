@@ -1,0 +1,123 @@
+"""The 3D view and the animation beside a report, without a browser."""
+
+import dataclasses
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from projservo_cli.figures import film
+from projservo_cli.page import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, write_page
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages import extras, report
+from projservo_cli.store import Result
+from tests.figures.cases import case, config_of
+from tests.page.conftest import MADE, read, stored
+
+MOST_BYTES = {VIEW_FILE: 8_000_000, ANIMATION_FILE: 3_000_000}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return stored(tmp_path_factory.mktemp("extras"))
+
+
+@pytest.fixture(scope="module")
+def view(run):
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    return extras.view(run)
+
+
+def test_the_view_is_one_file_that_loads_nothing(view):
+    assert view.stat().st_size < MOST_BYTES[VIEW_FILE]
+    root = read(view)
+    assert not list(root.all("link", "iframe", "object", "embed", "base", "img"))
+    for element in root.all():
+        assert "src" not in element.attributes
+        assert not any(name.startswith("on") for name in element.attributes)
+        assert element.attributes.get("href", PAGE_FILE) == PAGE_FILE
+    (policy,) = [e for e in root.all("meta") if "http-equiv" in e.attributes]
+    allowed = dict(part.split(maxsplit=1) for part in policy.attributes["content"].split("; "))
+    assert allowed["default-src"] == "'none'"
+    assert not re.search(r"https?:|\*|'self'", policy.attributes["content"])
+
+
+def test_the_view_holds_every_instant_of_every_law(run, view):
+    text = view.read_text(encoding="utf-8")
+    frames = json.loads(re.search(r"Plotly\.addFrames\('scene',\s*(\[.*?\])\s*\);", text, re.S)[1])
+    named = {frame["name"]: frame for frame in frames}
+    assert list(named) == [
+        f"{name}/{k}" for name, trace in run.traces.items() for k in range(trace.steps + 1)
+    ]
+    for name, trace in run.traces.items():
+        places = np.transpose([named[f"{name}/{trace.steps}"]["data"][0][axis] for axis in "xyz"])
+        # A tenth of a millimetre is what the file keeps.
+        np.testing.assert_allclose(places[-1], trace.pose[-1, :3, 3], atol=1e-4)
+
+
+def test_without_plotly_the_view_says_what_to_install(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    with pytest.raises(InputError, match=r"pip install 'projservo\[view\]'"):
+        extras.require(config_of("paper"), ["view"])
+    extras.require(config_of("paper"), ["animation"])
+
+
+def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    config = config_of("paper")
+    projective = config.model_copy(update={"robot": None})
+    with pytest.raises(InputError, match=r"--view: .*no metres.*robot\.dh or robot\.screws.*--animation"):
+        extras.require(projective, ["view"])
+    extras.require(projective, ["animation"])
+    with pytest.raises(InputError, match=r"--animation: .*task"):
+        extras.require(config.model_copy(update={"task": None}), ["animation"])
+
+
+def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
+    monkeypatch.setattr(film, "FRAMES", 6)  # a tenth of them, each of which takes its time
+    told = []
+    path = extras.animation(run, lambda *progress: told.append(progress))
+    assert told == [("animation", k, 6) for k in range(1, 7)]
+    assert path.stat().st_size < MOST_BYTES[ANIMATION_FILE] / 10
+    with Image.open(path) as image:
+        assert image.format == "GIF"
+        assert image.info["loop"] == 0
+        assert image.n_frames == 6
+        last = []
+        for k in range(image.n_frames):
+            image.seek(k)
+            last.append(image.info["duration"])
+        assert last == [extras.FRAME_MS] * 5 + [extras.LAST_MS]
+        assert image.convert("RGB").getpixel((1, 1)) == (255, 255, 255)
+    before = path.read_bytes()
+    extras.animation(run)
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("make", [extras.view, extras.animation])
+def test_runs_without_a_step_have_nothing_to_show(run, make):
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    kept = {name: result for name, result in run.results.items() if not name.startswith("servo/")}
+    with pytest.raises(WorkFailed, match="projservo servo"):
+        make(dataclasses.replace(run, results=kept))
+
+
+def test_the_page_links_to_what_there_is_and_a_new_report_removes_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(report, "draw_all", lambda *arguments: [])
+    monkeypatch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
+    run = stored(tmp_path)
+    made = Result("k", "", MADE, {}, {"": report.run(run, tmp_path)})
+    run = dataclasses.replace(run, results={**run.results, "report": made})
+    assert "See it move" not in (tmp_path / PAGE_FILE).read_text(encoding="utf-8")
+    (tmp_path / VIEW_FILE).touch()
+    (tmp_path / ANIMATION_FILE).touch()
+    write_page(run)
+    links = {a.attributes["href"] for a in read(tmp_path / PAGE_FILE).all("a")}
+    assert {VIEW_FILE, ANIMATION_FILE} <= links
+    report.run(run, tmp_path)
+    assert not (tmp_path / VIEW_FILE).exists()
+    assert not (tmp_path / ANIMATION_FILE).exists()
+    assert "See it move" not in (tmp_path / PAGE_FILE).read_text(encoding="utf-8")
