@@ -17,8 +17,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", *(f"extensions.{name}" for na
 exclude_patterns = ["extensions"]
 nitpicky = True
 
-myst_enable_OWN = ("docstrings", "links", "mathml", "reference")
-extensions = ["myst_parser", "sphinx.ext.autodoc", *(f"extensions.{name}" for name in OWN)]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 myst_dmath_double_inline = True
 

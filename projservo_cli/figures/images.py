@@ -163,9 +163,9 @@ def draw_errors(data: Data, figure: "Figure") -> None:
     for view, name in enumerate(VIEWS):
         e = data["e"][:, view]
         for k in range(e.shape[1]):
-            color = style.CURVES[k % len(style.CURVES)][0]
-            axes[view].plot(t, e[:, k, 0], color=color, linewidth=0.9)
-            axes[view].plot(t, e[:, k, 1], color=color, linewidth=0.9, linestyle=(0, (3, 1.2)))
+            look = _marker_look(k) | {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
+            axes[view].plot(t, e[:, k, 0], **look)
+            axes[view].plot(t, e[:, k, 1], linestyle=(0, (3, 1.2)), **look)
         center = data["center_e"][:, view]
         axes[view].plot(t, center[:, 0], color=style.GREY, linewidth=3.0, alpha=0.6)
         axes[view].plot(t, center[:, 1], color=style.GREY, linewidth=3.0, alpha=0.6, linestyle=(0, (2, 1)))
@@ -173,8 +173,7 @@ def draw_errors(data: Data, figure: "Figure") -> None:
         axes[view].set_xlabel("time (s)")
     axes[0].set_ylabel("image error $s - s_*$ (px)")
     handles = [
-        style.line_handle(f"marker {number}", color=style.CURVES[k % len(style.CURVES)][0])
-        for k, number in enumerate(data["marker"])
+        style.line_handle(f"marker {number}", **_marker_look(k)) for k, number in enumerate(data["marker"])
     ]
     handles += [
         style.line_handle("centre", color=style.GREY, linewidth=3.0, alpha=0.6),
@@ -182,3 +181,9 @@ def draw_errors(data: Data, figure: "Figure") -> None:
         style.line_handle("v", color=style.BLACK, linewidth=0.9, linestyle=(0, (3, 1.2))),
     ]
     style.legend_below(figure, handles, min(len(handles), 8))
+
+
+def _marker_look(k: int) -> style.Look:
+    """Colour and symbol of a marker; how its curve is broken says u or v."""
+    color, _, symbol = style.CURVES[k % len(style.CURVES)]
+    return {"color": color, "linewidth": 0.9, "marker": symbol, "markersize": 3.0}

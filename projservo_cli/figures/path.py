@@ -25,6 +25,10 @@ SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider 
     r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
     r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
 }
+REGIONS: dict[str, style.Look] = {  # hatched, so that they differ in grey too
+    "margin": {"facecolor": style.GREY, "hatch": ""},
+    "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
+}
 MARGINS: dict[str, style.Look] = {
     "visibility": {"color": style.BLUE, "linestyle": "-"},
     "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
@@ -98,8 +102,8 @@ def draw(data: Data, figure: "Figure") -> None:
         _map(axes[0, view], data, view)
         axes[0, view].set_title(f"{name} camera, {data['profile']} profile")
     handles = [
-        style.line_handle("hidden from this camera", color=style.GREY, linewidth=6),
-        style.line_handle(r"outside this image at every $\mu_p$", color=style.ORANGE, linewidth=6),
+        _region("hidden from this camera", "margin"),
+        _region(r"outside this image at every $\mu_p$", "border_px"),
         style.line_handle(r"path, at tenths of $\sigma$", color=style.VERMILION, marker="o"),
     ]
     handles += _lines(axes[1, 0], data["sigma"], data["mu"], SHARES)
@@ -114,12 +118,21 @@ def draw(data: Data, figure: "Figure") -> None:
     style.legend_below(figure, handles, 4)
 
 
+def _region(label: str, name: str) -> Any:
+    from matplotlib.patches import Patch
+
+    return Patch(label=label, alpha=0.6, edgecolor=style.BLACK, linewidth=0.0, **REGIONS[name])
+
+
 def _map(axes: "Axes", data: Data, view: int) -> None:
     share = data["share"]
-    for values, color in ((data["margin"][view], style.GREY), (data["border_px"][view], style.ORANGE)):
-        finite = np.maximum(values, -1e6)
+    for name, look in REGIONS.items():
+        finite = np.maximum(data[name][view], -1e6)
         if finite.min() < 0.0:
-            axes.contourf(share, share, finite.T, levels=[-1e9, 0.0], colors=[color], alpha=0.6)
+            color, hatch = look["facecolor"], look["hatch"]
+            axes.contourf(
+                share, share, finite.T, levels=[-1e9, 0.0], colors=[color], hatches=[hatch], alpha=0.6
+            )
         if finite.min() < 0.0 < finite.max():
             axes.contour(share, share, finite.T, levels=[0.0], colors=[style.BLACK], linewidths=0.6)
     seen = axes.contour(

@@ -43,7 +43,7 @@ CURVES: tuple[tuple[str, Any, str], ...] = (
     (VERMILION, (0, (5, 1.5)), "s"),
     (BLUE, (0, (1, 1)), "^"),
     (ORANGE, (0, (5, 1.5, 1, 1.5)), "D"),
-    (GREEN, (0, (8, 2)), "v"),
+    (GREEN, (0, (3, 3)), "v"),
     (PURPLE, (0, (3, 1, 1, 1, 1, 1)), "P"),
 )
 

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,9 @@ def _told(key: str, made: Any) -> str:
         return ""
     if key == "argv":
         return " ".join(["projservo", *value[1:]])
+    if key == "date":
+        moment = datetime.fromisoformat(value)
+        return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC" if moment.tzinfo else str(value)
     if key == "git_commit":
         return f"{value}{', with changes' if made.get('git_dirty') else ''}"
     return str(value)
