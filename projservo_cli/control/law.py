@@ -165,6 +165,27 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
 
 
 @njit
+def reset(state: State) -> None:
+    """Make a state as fresh as a new one, for another run."""
+    for part in range(2):
+        for i in range(state.memory.rotation.shape[1]):
+            state.memory.rotation[part, i] = 0.0
+    for i in range(state.q_dot.shape[0]):
+        state.q_dot[i] = 0.0
+        state.q_ahead[i] = 0.0
+    for i in range(state.errors.shape[0]):
+        state.errors[i] = math.nan
+    for i in range(state.fit.shape[0]):
+        state.fit[i] = math.nan
+    state.face_px[0] = math.nan
+    state.limited[0] = 0.0
+    state.share[0] = -1.0
+    state.parts[0] = 0
+    state.blocked[0] = -1
+    state.clock[0] = 0.0
+
+
+@njit
 def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> bool:
     """Measure the face, with the body or point by point, and move the operators to the current joints.
 

@@ -15,6 +15,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.extending import register_jitable
 
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
@@ -81,6 +82,16 @@ def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
 def allocating(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     """Compile a function that makes arrays of its own, for sweeps that take milliseconds a call."""
     return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": True})(function))
+
+
+def composed(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+    """Compile a function as a part of those compiled ones that call it.
+
+    Called from Python it is interpreted and calls compiled functions, so that a single run needs no machine
+    code but theirs.
+    """
+    options = {name: value for name, value in _OPTIONS.items() if name != "cache"}
+    return register_jitable(**options)(function)
 
 
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:

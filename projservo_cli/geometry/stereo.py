@@ -5,10 +5,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Vec4, dot, meet, scale, vec
-from projservo_cli.geometry.jit import merged
+from projservo_cli.geometry.algebra import Vec4, dot, meet, put_vec, scale, vec
+from projservo_cli.geometry.jit import composed, merged
 from projservo_cli.records import FloatArray, WorkFailed
 
+NO_POINT = "marker {} of the face: its two rays do not meet in a finite point"
 # Rows of a camera that are left without the first, second or third, and signs of the minors.
 _OTHERS = np.array([[1, 2], [0, 2], [0, 1]])
 _SIGNS = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
@@ -161,11 +162,19 @@ def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> Float
     WorkFailed
         If the rays of a marker do not determine a finite point.
     """
-    F = fundamental_matrix(P)
     M = np.empty((s.shape[1], 4))
-    for k in range(s.shape[1]):
+    lost = put_points(P, fundamental_matrix(P), a_inf, s, M)
+    if lost >= 0:
+        raise WorkFailed(NO_POINT.format(lost))
+    return M
+
+
+@composed
+def put_points(P: FloatArray, F: FloatArray, a_inf: FloatArray, s: FloatArray, M: FloatArray) -> int:
+    """Write the points M (m, 4) of the first m stereo pixels; the first that has none, or −1."""
+    for k in range(M.shape[0]):
         found, point = triangulate(P, F, a_inf, s[0, k], s[1, k])
         if not found:
-            raise WorkFailed(f"marker {k} of the face: its two rays do not meet in a finite point")
-        M[k] = point
-    return M
+            return k
+        put_vec(M[k], point)
+    return -1

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
-from projservo_cli.geometry.algebra import apply, dot, mat, put_mat, put_vec, sub, vec
+from projservo_cli.geometry.algebra import Vec4, apply, dot, mat, put_mat, put_vec, sub, vec
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import beyond_limits, start_pose
 from projservo_cli.loop.step import (
@@ -125,18 +125,21 @@ def run(
     ----------
     code : of the law.
     model : what the law believes; its frame is that of the task.
-    noise : (≥ max_steps + 1, 2, m + p, 2) added to the true pixels, px.
+    noise : (k, 2, m + p, 2) added to the true pixels of the first k instants, px.
     q_start : (n,) first joints, rad or m.
-    log : filled up to the last instant.
+    log : filled up to the last instant, whatever it held before.
 
     Returns
     -------
-    verdict : code of the verdict.
+    verdict : code of the verdict; ``RUNNING`` where the noise ended before the run, which needs more of it
+        to be made anew.
     steps : commands sent; the log has one instant more.
     """
     n = q_start.shape[0]
     M = log.M[: plant.M.shape[0]]
     dq = log.scratch[0, :n]
+    for i in range(log.events.shape[0]):
+        log.events[i] = -1.0
     for i in range(n):
         log.q[0, i] = q_start[i]
         log.read[0, i] = q_start[i]
@@ -145,6 +148,9 @@ def run(
     first_error = math.nan
     waited = 0
     for k in range(limits.max_steps + 1):
+        if k == noise.shape[0]:
+            return RUNNING, k - 1
+        begin_row(log, k)
         s = log.s[k]
         in_front = observe(plant, mat(log.H[k]), M, s, log.hidden[k])
         distance = rig_distance(plant, M)
@@ -226,6 +232,19 @@ def run(
 
 
 @njit
+def begin_row(log: Log, k: int) -> None:
+    """Make the row of an instant say that nothing was measured nor commanded."""
+    for i in range(log.errors.shape[1]):
+        log.errors[k, i] = math.nan
+    for i in range(log.fit.shape[1]):
+        log.fit[k, i] = math.nan
+    for i in range(log.q_dot.shape[1]):
+        log.q_dot[k, i] = 0.0
+    log.factor[k] = 1.0
+    log.parts[k] = 0
+
+
+@njit
 def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
     """Move the robot by a joint step, rad or m, overwritten, and whatever befalls it; read its joints."""
     knock(plant.disturbance, k + 1, dq)
@@ -234,14 +253,12 @@ def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
 
 
 @merged
-def path_along(
-    plant: Plant, log: Log, steps: int, start: FloatArray, goal: FloatArray
-) -> tuple[float, float]:
+def path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> tuple[float, float]:
     """Length of the true centre's path from sample to sample, and its largest distance from start–goal, m."""
     M = log.M[: plant.M.shape[0]]
     length = 0.0
     most = 0.0
-    last = vec(start)
+    last = start
     for k in range(steps + 1):
         H = mat(log.H[k])
         for j in range(M.shape[0]):
@@ -266,18 +283,19 @@ def path_deviation(
     M = log.M[: plant.M.shape[0]]
     dq = log.scratch[2, : log.q.shape[1]]
     part = log.scratch[3, : log.q.shape[1]]
+    A_c, A_cs = vec(start), vec(goal)
     most = 0.0
     for k in range(steps):
         for i in range(dq.shape[0]):
             dq[i] = log.q_dot[k, i] * period
         H = mat(log.H[k])
         if log.parts[k] == 0:
-            stray = center_deviation(plant, H, log.q[k], dq, start, goal, samples, M, log.scratch)
+            stray = center_deviation(plant, H, log.q[k], dq, A_c, A_cs, samples, M, log.scratch)
             most = max(most, stray)
         for j in range(log.parts[k]):
             for i in range(dq.shape[0]):
                 part[i] = log.path[k, j + 1, i] - log.path[k, j, i]
             share = max(1, samples // log.parts[k])
-            stray = center_deviation(plant, H, log.path[k, j], part, start, goal, share, M, log.scratch)
+            stray = center_deviation(plant, H, log.path[k, j], part, A_c, A_cs, share, M, log.scratch)
             most = max(most, stray)
     return most

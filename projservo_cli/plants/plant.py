@@ -203,8 +203,8 @@ def center_deviation(
     H: Mat4,
     q: FloatArray,
     dq: FloatArray,
-    start: FloatArray,
-    goal: FloatArray,
+    start: Vec4,
+    goal: Vec4,
     samples: int,
     M: FloatArray,
     scratch: FloatArray,
@@ -228,10 +228,10 @@ def center_deviation(
 
 
 @merged
-def line_distance(A: tuple[float, float, float, float], start: FloatArray, goal: FloatArray) -> float:
+def line_distance(A: Vec4, start: Vec4, goal: Vec4) -> float:
     """Distance of a metric point from the line through start and goal; from start where they agree."""
-    way = axpy(-1.0, vec(start), vec(goal))
-    off = axpy(-1.0, vec(start), A)
+    way = axpy(-1.0, start, goal)
+    off = axpy(-1.0, start, A)
     length = dot(way, way)
     if length > 0.0:
         off = axpy(-dot(off, way) / length, way, off)

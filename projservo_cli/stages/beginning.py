@@ -1,21 +1,16 @@
 """The task at its start: measured and split into a translation and two rotations."""
 
-import math
-
 import numpy as np
 
-from projservo_cli.control.law import State, measure, new_state
+from projservo_cli.control.law import State, new_state
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.span import joint_motion, span_of
-from projservo_cli.records import FloatArray, Model, WorkFailed
+from projservo_cli.loop.beginning import begin, new_stage
+from projservo_cli.records import FloatArray, Model
 from projservo_cli.stages.constrained import CONSTRAINED
-from projservo_cli.stages.half_turn import half_turn_sense
 from projservo_cli.stages.sight import Sight, measured_task
-from projservo_cli.task.face import Task
-from projservo_cli.task.partition import Parts, partition
-
-# Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
-HALF_TURN_BAND = math.radians(2.0)
+from projservo_cli.task.face import Task, require_found
+from projservo_cli.task.partition import Parts
 
 
 def partitioned_at_start(
@@ -42,26 +37,19 @@ def partitioned_at_start(
     WorkFailed
         If a marker cannot be triangulated or a motion is not unique.
     """
-    m = s_start.shape[1]
+    n, m = len(q_start), s_start.shape[1]
     task = measured_task(model, q_start, s_start, s_star, center, sight)
-    seen = s_start if sight is None else sight.s_start
-    state = new_state(len(q_start), m, span=span_of(model, task.A_star))
-    if not measure(model, task, straight_views(model.lens, seen), q_start, state):
-        raise WorkFailed(
-            "the face cannot be triangulated at the start: both cameras must see all its markers"
-        )
-    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
-    if not parts.found:
-        raise WorkFailed(
-            "the joint motion of the task is not unique at the start: the robot is near a singularity "
-            "or moves the face in fewer than six ways"
-        )
-    note = ""
-    if profile != CONSTRAINED and math.pi - abs(parts.theta_p) < HALF_TURN_BAND:
-        forward_sense = state.q_hat[2].copy()
-        state.memory.rotation[1], note = half_turn_sense(model, task, state.A, q_start, forward_sense, bounds)
-        parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
-    return state, task, parts, note
+    seen = straight_views(model.lens, s_start if sight is None else sight.s_start)
+    span = span_of(model, task.A_star)
+    state, stage = new_state(n, m, span=span), new_stage(model, m, *bounds, span)
+    status, parts, arrives = begin(model, task, seen, q_start, rehearses(profile), state, stage)
+    require_found(status, 0)
+    return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
+
+
+def rehearses(profile: str) -> bool:
+    """Whether half turns are rehearsed; the profile constrained compares both senses by itself."""
+    return profile != CONSTRAINED
 
 
 def joint_motions(state: State) -> FloatArray:

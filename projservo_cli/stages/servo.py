@@ -30,9 +30,9 @@ from projservo_cli.stages.truth import (
     SERVO_NOISE,
     Reach,
     Truth,
-    generator,
     plant_of,
     reach_of,
+    stream_of,
     truth_of,
 )
 from projservo_cli.task.face import Task
@@ -227,12 +227,18 @@ def sense_is_enough(config: "Config", name: str) -> bool:
 
 def servo_noise(config: "Config", m: int, pins: int = 0) -> FloatArray:
     """Pixel noise of m face markers and of pins at every instant, the same for every law, px."""
-    parts = []
-    for count, stream in ((m, SERVO_NOISE), (pins, PIN_NOISE)):
-        shape = (config.stop.max_steps + 1, 2, count, 2)
-        drawn = config.noise.servo_px > 0.0
-        parts.append(generator(config, stream).standard_normal(shape) if drawn else np.zeros(shape))
-    return config.noise.servo_px * np.concatenate(parts, axis=2)
+    return noise_of(config.seed, config.noise.servo_px, config.stop.max_steps + 1, m, pins)
+
+
+def noise_of(seed: int, sigma: float, instants: int, m: int, pins: int) -> FloatArray:
+    """Pixel noise (instants, 2, m + pins, 2) of a seed, px; fewer instants are the first of more."""
+    noise = np.zeros((instants, 2, m + pins, 2))
+    if sigma > 0.0:
+        for these, count, stream in ((slice(m), m, SERVO_NOISE), (slice(m, None), pins, PIN_NOISE)):
+            if count > 0:
+                drawn = stream_of(seed, stream).standard_normal((instants, 2, count, 2))
+                np.multiply(sigma, drawn, out=noise[:, :, these])
+    return noise
 
 
 def drive(

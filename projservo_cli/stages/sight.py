@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -57,17 +57,32 @@ def sight_of(config: "Config", calibration: Calibration, truth: Truth, reach: Re
     WorkFailed
         If the displacements of the body cannot be told from the calibration.
     """
+    found = watched_body(config, calibration, truth)
+    if found is None:
+        return None
+    return Sight(
+        found.body,
+        found.pins,
+        np.concatenate([reach.s_start, reach.pins_start[:, found.which]], axis=1),
+        np.concatenate([reach.s_star, reach.pins_star[:, found.which]], axis=1),
+    )
+
+
+class Watched(NamedTuple):
+    """The body of a calibration: its pins (p, 4) at the robot's reference, m, and which of the true ones."""
+
+    body: Body
+    pins: FloatArray
+    which: list[int]
+
+
+def watched_body(config: "Config", calibration: Calibration, truth: Truth) -> Watched | None:
+    """The body by which the simulated face is measured, as of ``sight_of``; it is the same for every run."""
     if by_points(config, calibration):
         return None
-    known = calibration.marker.tolist()
-    indices = [*truth.face, *known_pins(calibration, truth)]
-    pins = [truth.pins.index(i) for i in indices[len(truth.face) :]]
-    return Sight(
-        _body(calibration, tuple(known.index(truth.number[index]) for index in indices)),
-        np.ascontiguousarray(truth.M[indices[len(truth.face) :]]),
-        np.concatenate([reach.s_start, reach.pins_start[:, pins]], axis=1),
-        np.concatenate([reach.s_star, reach.pins_star[:, pins]], axis=1),
-    )
+    known, pins = calibration.marker.tolist(), known_pins(calibration, truth)
+    body = _body(calibration, tuple(known.index(truth.number[index]) for index in (*truth.face, *pins)))
+    return Watched(body, np.ascontiguousarray(truth.M[pins]), [truth.pins.index(i) for i in pins])
 
 
 @lru_cache(maxsize=64)

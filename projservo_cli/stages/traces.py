@@ -6,13 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S, Gains
+from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.geometry.normal import COORDINATES
-from projservo_cli.loop.compiled import Log, path_along, path_deviation
+from projservo_cli.loop.compiled import Log, path_deviation
 from projservo_cli.loop.step import Limits, tolerance
+from projservo_cli.loop.summary import MM, Ends, Summary, angle_between, effort, summary
 from projservo_cli.modes import REPLAN
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.stages.truth import Reach, Truth
+from projservo_cli.task.face import center_of
 
 # Points of a joint step at which the deviation between samples is measured.
 SUBSAMPLES = 50
@@ -66,54 +69,29 @@ def unknown(instants: int) -> Known:
     return Known(np.full((instants, 4, 4), np.nan), np.full((4, 4), np.nan), np.full((instants, 3), np.nan))
 
 
-class Motion(NamedTuple):
-    """How the true face went from start to goal.
-
-    Attributes
-    ----------
-    position_mm, rotation_deg : errors at the end.
-    at_samples_mm : largest distance of the centre from its line, at the samples.
-    path_mm : length of the centre's path, from sample to sample.
-    start, goal : (4,) centre at both, m.
-    """
-
-    position_mm: float
-    rotation_deg: float
-    at_samples_mm: float
-    path_mm: float
-    start: FloatArray
-    goal: FloatArray
+def ends_of(plant: Plant, truth: Truth, goal_pose: FloatArray | None) -> Ends:
+    """Where the true robot holds the tool at its reference and at the goal."""
+    base_tool, unknown_pose = truth.robot.base_tool, np.full((4, 4), np.nan)
+    if goal_pose is None:
+        return Ends(base_tool, unknown_pose, unknown_pose[0])
+    return Ends(base_tool, goal_pose, goal_pose @ np.linalg.solve(base_tool, middle_of(plant)))
 
 
-def motion_of(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach) -> Motion | None:
-    """How the simulated face moved; None where the true goal is not known."""
-    if reach.goal_pose is None:
-        return None
-    log, steps = outcome.log, outcome.steps
-    middle = middle_of(plant)
-    start, end = log.H[0] @ middle, log.H[steps] @ middle
-    goal = reach.goal_pose @ np.linalg.solve(truth.robot.base_tool, middle)
-    length, at_samples = path_along(plant, log, steps, start, goal)
-    return Motion(
-        1e3 * float(np.linalg.norm(end[:3] - goal[:3])),
-        rotation_between(log.H[steps] @ truth.robot.base_tool, reach.goal_pose),
-        1e3 * at_samples,
-        1e3 * length,
-        start,
-        goal,
-    )
+def summary_of(outcome: Outcome, plant: Plant, ends: Ends, period: float) -> Summary:
+    """Numbers of a run of the simulated robot."""
+    return summary(plant, outcome.log, outcome.steps, outcome.limited, period, ends)
 
 
-def path_between_mm(outcome: Outcome, plant: Plant, motion: Motion, period: float) -> float:
+def path_between_mm(outcome: Outcome, plant: Plant, ends: Ends, period: float) -> float:
     """Largest distance of the centre from its line, between the samples too, mm."""
     log, steps = outcome.log, outcome.steps
-    between = path_deviation(plant, log, steps, period, motion.start, motion.goal, SUBSAMPLES)
-    return max(1e3 * between, motion.at_samples_mm)
+    start = log.H[0] @ middle_of(plant)
+    return MM * path_deviation(plant, log, steps, period, start, ends.goal, SUBSAMPLES)
 
 
 def middle_of(plant: Plant) -> FloatArray:
     """Centre (4,) of the face at the reference, m."""
-    return np.asarray(plant.M.mean(axis=0) if plant.center < 0 else plant.M[plant.center])
+    return np.array(center_of(plant.M, plant.center))
 
 
 def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gains) -> Known:
@@ -121,18 +99,20 @@ def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gai
     H = outcome.log.H[: outcome.steps + 1]
     center = (H @ middle_of(plant))[:, :3]
     pose = H @ truth.robot.base_tool
-    motion = motion_of(outcome, plant, truth, reach)
-    if motion is None or reach.goal_pose is None:
-        return Known(pose, np.full((4, 4), np.nan), center)
+    ends = ends_of(plant, truth, reach.goal_pose)
+    if reach.goal_pose is None:
+        return Known(pose, ends.goal_pose, center)
+    found = summary_of(outcome, plant, ends, gains.period)
+    at_samples = found.center_deviation_at_samples_mm
     return Known(
         pose,
         reach.goal_pose,
         center,
-        motion.position_mm,
-        motion.rotation_deg,
-        path_between_mm(outcome, plant, motion, gains.period),
-        motion.at_samples_mm,
-        motion.path_mm,
+        found.position_error_mm,
+        found.rotation_error_deg,
+        max(path_between_mm(outcome, plant, ends, gains.period), at_samples),
+        at_samples,
+        found.path_length_mm,
     )
 
 
@@ -173,7 +153,7 @@ def record_of(
         center_deviation_mm=truth.between_mm,
         center_deviation_at_samples_mm=truth.at_samples_mm,
         path_length_mm=truth.path_mm,
-        effort=effort_of(log, steps, gains.period),
+        effort=effort(log, steps, gains.period),
         plateau_steps=longest_plateau(log.error[:rows], limits.plateau_steps),
         speed_limited_steps=int((log.factor[:steps] < 1.0).sum()),
         visibility_limited_steps=int(outcome.limited),
@@ -219,12 +199,6 @@ def words_left(log: Log, steps: int, remaining: Remaining) -> str:
     return f"{' and '.join([*parts, f'an image error of {float(log.judged[steps]):.3g} px'])} are left"
 
 
-def effort_of(log: Log, steps: int, period: float) -> float:
-    """Integral of the squared joint velocities, rad²/s and m²/s added."""
-    q_dot = log.q_dot[:steps].ravel()
-    return float(q_dot @ q_dot) * period
-
-
 def rms(squares: FloatArray, count: FloatArray) -> FloatArray:
     """Root of the mean of sums of squares; NaN where the count is not positive."""
     mean = np.full(squares.shape, math.nan)
@@ -234,9 +208,7 @@ def rms(squares: FloatArray, count: FloatArray) -> FloatArray:
 
 def rotation_between(pose: FloatArray, goal: FloatArray) -> float:
     """Angle between the rotations of two poses (4, 4), deg."""
-    R = pose[:3, :3].T @ goal[:3, :3]
-    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return math.degrees(math.atan2(float(sine), float(np.trace(R)) - 1.0))
+    return math.degrees(angle_between(as_mat(pose), as_mat(goal)))
 
 
 def longest_plateau(image_error: FloatArray, window: int) -> int:

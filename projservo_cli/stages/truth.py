@@ -87,7 +87,12 @@ class Truth:
 
 def generator(config: "Config", *stream: int) -> np.random.Generator:
     """Random numbers of one stream of the configuration's seed."""
-    return np.random.default_rng(np.random.SeedSequence(config.seed, spawn_key=stream))
+    return stream_of(config.seed, *stream)
+
+
+def stream_of(seed: int, *stream: int) -> np.random.Generator:
+    """Random numbers of one stream of a seed."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=stream))
 
 
 def calibration_seed(config: "Config") -> int:
@@ -214,7 +219,7 @@ class Reach:
     pins_star: FloatArray
 
 
-class _Ends(NamedTuple):
+class Ends(NamedTuple):
     """Start and goal without noise: joints (n,), pose (4, 4) and pixels (2, m, 2) of face and pins."""
 
     q_start: FloatArray
@@ -235,14 +240,21 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     WorkFailed
         If the goal cannot be reached.
     """
-    if config.task is None:
-        raise InputError("this stage needs a task: set task.start and task.goal")
-    face_numbers(config)
-    ends = _ends(config.task, config.robot.joint_types if config.robot is not None else "", truth)
-    sigma = config.noise.servo_px / math.sqrt(config.noise.shown_frames)
-    rng = generator(config, TARGET_NOISE)
+    return shown_at(ends_of(config, truth), config.seed, shown_px(config))
+
+
+def shown_px(config: "Config") -> float:
+    """Noise of the images of the start and of the goal, which are averages, px."""
+    return config.noise.servo_px / math.sqrt(config.noise.shown_frames)
+
+
+def shown_at(ends: Ends, seed: int, sigma: float) -> Reach:
+    """Start and goal as a seed shows them, with noise σ, px."""
+    if sigma == 0.0:
+        return Reach(*ends)
+    rng = stream_of(seed, TARGET_NOISE)
     s_start = ends.s_start + sigma * rng.standard_normal(ends.s_start.shape)
-    pins_noise = generator(config, PIN_TARGET_NOISE).standard_normal((2, *ends.pins_start.shape))
+    pins_noise = stream_of(seed, PIN_TARGET_NOISE).standard_normal((2, *ends.pins_start.shape))
     pins_start = ends.pins_start + sigma * pins_noise[0]
     if ends.goal_pose is None:
         return Reach(ends.q_start, None, s_start, ends.s_star, pins_start, ends.pins_star)
@@ -251,8 +263,24 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     return Reach(ends.q_start, ends.goal_pose, s_start, s_star, pins_start, pins_star)
 
 
+def ends_of(config: "Config", truth: Truth) -> Ends:
+    """Start and goal of the simulated task without noise.
+
+    Raises
+    ------
+    InputError
+        If the configuration has no task.
+    WorkFailed
+        If the goal cannot be reached.
+    """
+    if config.task is None:
+        raise InputError("this stage needs a task: set task.start and task.goal")
+    face_numbers(config)
+    return _ends(config.task, config.robot.joint_types if config.robot is not None else "", truth)
+
+
 @lru_cache(maxsize=64)
-def _ends(task: "Task", types: str, truth: Truth) -> _Ends:
+def _ends(task: "Task", types: str, truth: Truth) -> Ends:
     """What the ends of a task look like, for any seed and noise."""
     q_from = np.array(task.start.values(types))
     _require_limits(truth.robot, q_from, "task.start")
@@ -264,10 +292,10 @@ def _ends(task: "Task", types: str, truth: Truth) -> _Ends:
     s_start, pins_start = truth.images(q_start, truth.M_face), truth.images(q_start, M_pins)
     if task.goal.images is not None:
         s_star = np.array([task.goal.images.left, task.goal.images.right])
-        return _Ends(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
+        return Ends(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
     q_goal = goal_joints(task, types, truth, q_from)
     _require_limits(truth.robot, q_goal, "task.goal")
-    return _Ends(
+    return Ends(
         q_start,
         truth.robot.pose(q_goal),
         s_start,

@@ -18,10 +18,11 @@ from projservo_cli.files import replacing
 from projservo_cli.records import InputError
 from projservo_cli.stages import Progress
 from projservo_cli.sweep import preparation
+from projservo_cli.sweep.columns import columns_of
 from projservo_cli.sweep.compiling import compile_once
 from projservo_cli.sweep.design import Design, from_recipe
 from projservo_cli.sweep.engine import Engine, LocalEngine, completed
-from projservo_cli.sweep.runs import Made, Part, columns_of, run_part
+from projservo_cli.sweep.runs import Made, Part, run_part
 from projservo_cli.sweepfile import TABLE, SweepTable, assemble, write_part
 
 PART_S = 1.0  # what making a part should take

@@ -1,9 +1,8 @@
 """A part of a sweep: runs with consecutive numbers, each to one row of the table."""
 
-import json
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -12,96 +11,29 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
-from projservo_cli.config.sweep import Distribution
 from projservo_cli.loop.step import VERDICTS
-from projservo_cli.records import Calibration, Plan, Trace, WorkFailed
+from projservo_cli.loop.trial import NUMBERS, VERDICT
+from projservo_cli.records import Calibration, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.sense import Sense, rotation_sense
 from projservo_cli.stages.servo import Simulated, record, scene_of, sense_is_enough, simulate
-from projservo_cli.stages.traces import (
-    effort_of,
-    motion_of,
-    path_between_mm,
-    rotation_between,
+from projservo_cli.stages.traces import ends_of, path_between_mm, summary_of
+from projservo_cli.stages.trials import is_compiled, numbers_of, prepare
+from projservo_cli.sweep.columns import (
+    BETWEEN,
+    MEASURED,
+    NONE,
+    NOT_CALIBRATED,
+    NOT_STARTED,
+    columns_of,
+    shown,
 )
-from projservo_cli.sweep.design import Design, TaskSet, name_of_run
-
-NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
-ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
-NONE = -1  # in columns of counts, where a run did not begin
+from projservo_cli.sweep.design import RUNS, Design, TaskSet, name_of_run, seed_of
 
 Columns = dict[str, npt.NDArray[Any]]
-
-
-@dataclass(frozen=True)
-class Column:
-    """One column of the table: its name, NumPy type, unit and what it holds."""
-
-    name: str
-    dtype: str
-    units: str
-    about: str
-
-
-def text(name: str, values: Sequence[str], about: str) -> Column:
-    """A column of texts, as wide as the longest of the possible ones."""
-    return Column(name, f"S{max(len(value.encode()) for value in values)}", "1", about)
-
-
-NUMBERS = (
-    Column("run", "i8", "1", "number of the run"),
-    Column("cell", "i8", "1", "number of its cell of the grid"),
-    Column("draw", "i8", "1", "number of the run in its cell; runs of one number share task and noise"),
-    Column("calibration", "i8", "1", "number of the calibration in the cell"),
-    Column("task", "i8", "1", "number of the random task, -1 for that of the base"),
-    Column("seed", "i8", "1", "seed of the run"),
-)
-MEASURED = (
-    text("verdict", ALL_VERDICTS, "how the run ended"),
-    Column("usable", "i1", "1", "whether its calibration is usable"),
-    Column("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
-    Column("rotation_deg", "f8", "deg", "true rotation from start to goal"),
-    Column("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
-    Column("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
-    Column("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
-    Column("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
-    Column("self_occluded_steps_left", "i8", "1", "instants at which the left camera is behind the face"),
-    Column("self_occluded_steps_right", "i8", "1", "instants at which the right camera is behind the face"),
-    Column("first_outside_image", "i8", "1", "first instant with a marker outside an image, -1 for never"),
-    Column("first_beyond_limit", "i8", "1", "first instant beyond a joint limit, -1 for never"),
-    Column("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
-    Column("visibility_limited_steps", "i8", "1", "commands whose translation was kept within delta·tau_0"),
-    Column("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
-    Column("center_deviation_at_samples_mm", "f8", "mm", "largest distance of the centre from the line"),
-    Column("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
-)
-BETWEEN = Column("center_deviation_mm", "f8", "mm", "largest distance of the centre, between samples too")
-
-
-def columns_of(design: Design) -> tuple[Column, ...]:
-    """All columns of the table of a sweep: numbers, inputs, what was measured."""
-    about = "value of the grid"
-    axes = [_input(axis.name, axis.values, about) for axis in design.axes]
-    drawn = [_drawn(key, distribution) for key, distribution in design.sweep.random.items()]
-    between = (BETWEEN,) if design.sweep.between_samples else ()
-    return (*NUMBERS, *axes, *drawn, *MEASURED, *between)
-
-
-def _drawn(key: str, distribution: Distribution) -> Column:
-    if distribution.choice is not None:
-        return _input(key, distribution.choice, "value drawn for the run")
-    return Column(key, "f8", "1", "value drawn for the run")
-
-
-def _input(name: str, values: Sequence[Any], about: str) -> Column:
-    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
-        return Column(name, "f8", "1", about)
-    return text(name, [shown(value) for value in values], about)
-
-
-def shown(value: Any) -> str:
-    """A value as text, texts as they are."""
-    return value if isinstance(value, str) else json.dumps(value)
+# What the table says of a verdict of the kernel.
+SAID = {code: name.encode() for code, name in enumerate(VERDICTS)}
+COUNTS = tuple(column.name for column in MEASURED if column.dtype.startswith("i") and column.name in NUMBERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,18 +74,90 @@ def run_part(part: Part) -> Made:
     """
     began = time.perf_counter()
     design = _interned(part.design)
-    columns = columns_of(design)
-    rows: list[dict[str, Any]] = []
+    runs = np.arange(part.first, part.last)
+    table = _numbered(design, runs)
     traces: dict[int, Trace] = {}
     wanted = set(design.sweep.traces)
     with threadpool_limits(1):  # with more, sums may be taken in another order
-        for run in range(part.first, part.last):
-            row, trace = _run(design, run, part, keep=run in wanted)
-            rows.append(row)
-            if trace is not None:
-                traces[run] = trace
-    table = {column.name: _column(column, rows) for column in columns}
+        for these in alike(design, runs):
+            rows = these - part.first
+            at = design.numbers(int(these[0]))
+            calibration = part.calibrations[design.calibration_key(at.cell, at.calibration)]
+            _put(table, rows, _inputs(design, at.run))
+            if calibration is None:
+                _put(table, rows, {"verdict": NOT_CALIBRATED, "usable": 0})
+                continue
+            _put(table, rows, {"usable": int(calibration.usable)})
+            config = design.config(at.run, part.tasks)
+            if compiled_by(design, config):
+                _put(table, rows, _measured(config, calibration, table["seed"][rows]))
+                these = np.array([run for run in these if run in wanted], dtype=np.int64)
+            for run in these.tolist():
+                row, trace = _run(design, run, part, calibration, keep=run in wanted)
+                _put(table, np.array([run - part.first]), row)
+                if trace is not None:
+                    traces[run] = trace
     return Made(part.first, part.last, table, traces, time.perf_counter() - began)
+
+
+def alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
+    """Runs in groups that differ in their seeds alone."""
+    cell, draw = np.divmod(runs, design.sweep.runs)
+    tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
+    drawn = draw if design.sweep.random else np.zeros_like(draw)
+    keys = np.stack([cell, draw % design.sweep.calibrations, draw % tasks, drawn])
+    _, group = np.unique(keys, axis=1, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    yield from (runs[these] for these in np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
+
+
+def compiled_by(design: Design, config: Config) -> bool:
+    """Whether a run is made by the kernel of whole runs, which leaves no trace."""
+    return not design.sweep.between_samples and is_compiled(config, name_of_run(config))
+
+
+def _numbered(design: Design, runs: IntArray) -> Columns:
+    """Rows of runs that are not made yet, with their numbers and seeds."""
+    missing = {"f8": math.nan, "i8": NONE, "i1": NONE}
+    table = {
+        column.name: np.full(len(runs), missing.get(column.dtype, b""), dtype=column.dtype)
+        for column in columns_of(design)
+    }
+    cell, draw = np.divmod(runs, design.sweep.runs)
+    table["run"][:], table["cell"][:], table["draw"][:] = runs, cell, draw
+    table["calibration"][:] = draw % design.sweep.calibrations
+    if design.sweep.tasks is not None:
+        table["task"][:] = draw % design.sweep.tasks.random
+    table["seed"][:] = [seed_of(design.sweep.seed, RUNS, number) for number in draw.tolist()]
+    return table
+
+
+def _put(table: Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
+    """Write values of columns, texts as bytes, one for all rows or one each."""
+    for name, value in values.items():
+        table[name][rows] = value.encode() if isinstance(value, str) else value
+
+
+def _inputs(design: Design, run: int) -> dict[str, Any]:
+    """Values of the grid and drawn ones, by column."""
+    values = design.values(design.numbers(run).cell) | design.drawn(run)
+    return {
+        name: shown(value) if not isinstance(value, (int, float)) or isinstance(value, bool) else value
+        for name, value in values.items()
+    }
+
+
+def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
+    """What is measured of compiled runs, by column."""
+    try:
+        numbers = numbers_of(prepare(config, calibration, name_of_run(config)), seeds.tolist())
+    except WorkFailed:
+        return {"verdict": NOT_STARTED}
+    found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
+    for name in COUNTS:
+        found[name] = np.where(numbers[:, VERDICT] < 0, NONE, found[name])
+    found["verdict"] = [SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
+    return found
 
 
 _designs: dict[str, Design] = {}
@@ -167,36 +171,16 @@ def _interned(design: Design) -> Design:
     return _designs[design.key]
 
 
-def _column(column: Column, rows: Sequence[dict[str, Any]]) -> npt.NDArray[Any]:
-    missing = math.nan if column.dtype == "f8" else NONE
-    values = [row.get(column.name, missing) for row in rows]
-    if column.dtype.startswith("S"):
-        values = [value.encode() for value in values]
-    return np.array(values, dtype=column.dtype)
-
-
-def _run(design: Design, run: int, part: Part, *, keep: bool) -> tuple[dict[str, Any], Trace | None]:
-    at = design.numbers(run)
+def _run(
+    design: Design, run: int, part: Part, calibration: Calibration, *, keep: bool
+) -> tuple[dict[str, Any], Trace | None]:
+    """What is measured of one run, by column, and its trace where it is kept."""
     config = design.config(run, part.tasks)
-    row: dict[str, Any] = {
-        "run": run,
-        "cell": at.cell,
-        "draw": at.draw,
-        "calibration": at.calibration,
-        "task": at.task,
-        "seed": config.seed,
-    }
-    for name, value in (design.values(at.cell) | design.drawn(run)).items():
-        row[name] = shown(value) if not isinstance(value, (int, float)) or isinstance(value, bool) else value
-    calibration = part.calibrations[design.calibration_key(at.cell, at.calibration)]
-    if calibration is None:
-        return row | {"verdict": NOT_CALIBRATED, "usable": 0}, None
-    row["usable"] = int(calibration.usable)
     try:
         made, plan = trial(config, calibration)
     except WorkFailed:
-        return row | {"verdict": NOT_STARTED}, None
-    row |= measures(config, made, between_samples=design.sweep.between_samples)
+        return {"verdict": NOT_STARTED}, None
+    row = measures(config, made, between_samples=design.sweep.between_samples)
     return row, record(config, name_of_run(config), plan, made) if keep else None
 
 
@@ -227,31 +211,11 @@ def trial(config: Config, calibration: Calibration) -> Trial:
 
 def measures(config: Config, made: Simulated, *, between_samples: bool) -> dict[str, Any]:
     """What is measured of a run, by column."""
-    log, steps = made.outcome.log, made.outcome.steps
-    hidden = (log.hidden[: steps + 1] > 0.5).sum(axis=0)
-    found = {
-        "verdict": made.outcome.verdict,
-        "steps": steps,
-        "image_error_px": float(log.error[steps]),
-        "self_occluded_steps_left": int(hidden[0]),
-        "self_occluded_steps_right": int(hidden[1]),
-        "first_outside_image": int(log.events[0]),
-        "first_beyond_limit": int(log.events[1]),
-        "speed_limited_steps": int((log.factor[:steps] < 1.0).sum()),
-        "visibility_limited_steps": int(made.outcome.limited),
-        "effort": effort_of(log, steps, config.control.period_s),
-    }
-    motion = motion_of(made.outcome, made.plant, made.truth, made.reach)
-    if motion is None or made.reach.goal_pose is None:
-        return found
-    found |= {
-        "rotation_deg": rotation_between(log.H[0] @ made.truth.robot.base_tool, made.reach.goal_pose),
-        "distance_mm": 1e3 * float(np.linalg.norm(motion.goal[:3] - motion.start[:3])),
-        "position_error_mm": motion.position_mm,
-        "rotation_error_deg": motion.rotation_deg,
-        "path_length_mm": motion.path_mm,
-        "center_deviation_at_samples_mm": motion.at_samples_mm,
-    }
+    outcome, period = made.outcome, config.control.period_s
+    ends = ends_of(made.plant, made.truth, made.reach.goal_pose)
+    summary = summary_of(outcome, made.plant, ends, period)
+    found = {"verdict": outcome.verdict, "steps": outcome.steps, **summary._asdict()}
     if between_samples:
-        found[BETWEEN.name] = path_between_mm(made.outcome, made.plant, motion, config.control.period_s)
+        between = path_between_mm(outcome, made.plant, ends, period)
+        found[BETWEEN.name] = max(between, summary.center_deviation_at_samples_mm)
     return found

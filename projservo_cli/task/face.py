@@ -1,18 +1,63 @@
 """The face: its centre, its oriented plane, and what a task fixes about it."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Vec4, add, meet, scale, unit, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry import stereo
+from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, sub, unit, vec
+from projservo_cli.geometry.jit import composed, njit
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, triangulate_points
+from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, put_points
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
 from projservo_cli.task.reference import NO_REFERENCE, Reference
 
 MIDPOINT = -1
+# Offsets that leave less than this share of the longest beside it lie on one line.
+ON_A_LINE = 1e-6
+NO_AXIS: Vec4 = (0.0, 0.0, 0.0, 0.0)
+
+# What is wrong with the images of a task.
+FOUND = 0
+(
+    NO_POINT,
+    ONE_LINE,
+    OTHER_SIDE_LEFT,
+    OTHER_SIDE_RIGHT,
+    NOT_UNIQUE,
+    UNSEEN_START,
+    UNSEEN_GOAL,
+    MISFIT_START,
+    MISFIT_GOAL,
+    NOT_MEASURED,
+) = range(1, 11)
+_OTHER_SIDE = (
+    "the {} camera sees opposite sides of the face at the start and at the goal: choose a goal from which "
+    "both cameras see the side they see at the start"
+)
+_UNSEEN = (
+    "the images at the {} show too few markers, {{}} in both views together, to tell where the body is: show "
+    "three or more, not on one line"
+)
+_MISFIT = (
+    "the images at the {} fit no place of the calibrated body: check the numbers of the markers, or measure "
+    "point by point with control.observation: points"
+)
+PROBLEMS = {
+    NO_POINT: stereo.NO_POINT,
+    ONE_LINE: "the face markers lie on one line: choose markers.face that span a plane",
+    OTHER_SIDE_LEFT: _OTHER_SIDE.format("left"),
+    OTHER_SIDE_RIGHT: _OTHER_SIDE.format("right"),
+    NOT_UNIQUE: "the joint motion of the task is not unique at the start: the robot is near a singularity or "
+    "moves the face in fewer than six ways",
+    UNSEEN_START: _UNSEEN.format("start"),
+    UNSEEN_GOAL: _UNSEEN.format("goal"),
+    MISFIT_START: _MISFIT.format("start"),
+    MISFIT_GOAL: _MISFIT.format("goal"),
+    NOT_MEASURED: "the face cannot be triangulated at the start: both cameras must see all its markers",
+}
 
 
 class Task(NamedTuple):
@@ -68,10 +113,62 @@ def face_plane(A: FloatArray, order: IntArray, A_c: Vec4) -> Vec4:
     return unit(total)
 
 
-def cyclic_order(A: FloatArray) -> IntArray:
-    """Order of the face markers around their midpoint.
+@composed
+def put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
+    """Write the order of the markers around their midpoint; False where they lie on one line.
 
-    Angles within the plane of the face are measured in affine coordinates, which keep the order.
+    Angles are measured in affine coordinates of the plane of the face, which keep the order: along the
+    offset from the midpoint that is longest, and along the one that lies farthest off it. The order begins
+    with the first marker and goes on to the lower of its neighbours, whatever the frame.
+
+    Parameters
+    ----------
+    A : (m, 4) points of the face scaled to a_inf·A = 1, three or more.
+    order : (m,) on return the indices.
+    angle : (m,) workspace.
+    """
+    m = A.shape[0]
+    middle = center_of(A, MIDPOINT)
+    x_axis = longest_offset(A, middle, NO_AXIS)
+    y_axis = longest_offset(A, middle, x_axis)
+    if not dot(y_axis, y_axis) > ON_A_LINE * ON_A_LINE * dot(x_axis, x_axis):
+        return False
+    x_axis, y_axis = unit(x_axis), unit(y_axis)
+    for k in range(m):
+        offset = sub(vec(A[k]), middle)
+        angle[k] = math.atan2(dot(offset, y_axis), dot(offset, x_axis))
+    order[0] = 0
+    for k in range(1, m):
+        angle[k] -= angle[0]
+        if angle[k] < 0.0:
+            angle[k] += 2.0 * math.pi
+        place = k
+        while place > 1 and angle[order[place - 1]] > angle[k]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = k
+    if order[1] > order[m - 1]:
+        for i in range(1, (m + 1) // 2):
+            order[i], order[m - i] = order[m - i], order[i]
+    return True
+
+
+@composed
+def longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
+    """Longest of what the offsets of points (m, 4) from the middle leave perpendicular to an axis, if any."""
+    size = dot(axis, axis)
+    longest = NO_AXIS
+    for k in range(A.shape[0]):
+        offset = sub(vec(A[k]), middle)
+        if size > 0.0:
+            offset = axpy(-dot(offset, axis) / size, axis, offset)
+        if dot(offset, offset) > dot(longest, longest):
+            longest = offset
+    return longest
+
+
+def cyclic_order(A: FloatArray) -> IntArray:
+    """Order of the face markers around their midpoint, as of ``put_order``.
 
     Parameters
     ----------
@@ -86,19 +183,97 @@ def cyclic_order(A: FloatArray) -> IntArray:
     WorkFailed
         If there are fewer than three points or they lie on one line.
     """
-    if len(A) < 3:
-        raise WorkFailed(f"a face needs three markers or more, not {len(A)}: add to markers.face")
-    offsets = A - A.mean(axis=0)
-    _, sizes, axes = np.linalg.svd(offsets, full_matrices=False)
-    if not sizes[1] > 1e-6 * sizes[0]:
-        raise WorkFailed("the face markers lie on one line: choose markers.face that span a plane")
-    x, y = axes[:2] @ offsets.T
-    order = np.argsort(np.arctan2(y, x), kind="stable")
-    # The axes have arbitrary signs: begin with the first marker and go on to the lower of its neighbours.
-    order = np.roll(order, -int(np.argmin(order)))
-    if order[1] > order[-1]:
-        order = np.roll(order[::-1], 1)
-    return order.astype(np.int64)
+    require_three(len(A))
+    order = np.zeros(len(A), dtype=np.int64)
+    if not put_order(A, order, np.zeros(len(A))):
+        raise WorkFailed(PROBLEMS[ONE_LINE])
+    return order
+
+
+def require_three(m: int) -> None:
+    """Refuse a face of fewer than three markers."""
+    if m < 3:
+        raise WorkFailed(f"a face needs three markers or more, not {m}: add to markers.face")
+
+
+@composed
+def put_task(
+    P: FloatArray,
+    a_inf: FloatArray,
+    start: FloatArray,
+    goal: FloatArray,
+    A: FloatArray,
+    angle: FloatArray,
+    task: Task,
+) -> tuple[int, int]:
+    """What the images at start and goal say of a task: target points, order of the markers, visible side.
+
+    Parameters
+    ----------
+    P, a_inf : (2, 3, 4), (4,) cameras and plane at infinity of the model.
+    start, goal : (2, ≥m, 2) straight pixels, the m markers of the face first.
+    A : (m, 4) on return the face at the start.
+    angle : (m,) workspace.
+    task : with target pixels, fundamental matrix and optical centres; on return with the rest.
+
+    Returns
+    -------
+    What is wrong, ``FOUND`` for nothing, and with which marker.
+    """
+    lost = put_points(P, task.F, a_inf, start, A)
+    if lost < 0:
+        lost = put_points(P, task.F, a_inf, goal, task.A_star)
+    if lost >= 0:
+        return NO_POINT, lost
+    if not put_order(task.A_star, task.order, angle):
+        return ONE_LINE, 0
+    a = face_plane(A, task.order, center_of(A, task.center))
+    a_star = face_plane(task.A_star, task.order, center_of(task.A_star, task.center))
+    for view in range(2):
+        O = vec(task.O[view])
+        task.visible[view] = 1.0 if dot(O, a) > 0.0 else -1.0
+        if task.visible[view] * dot(O, a_star) <= 0.0:
+            return OTHER_SIDE_LEFT if view == 0 else OTHER_SIDE_RIGHT, 0
+    return FOUND, 0
+
+
+def require_found(status: int, detail: int) -> None:
+    """Say what is wrong with the images of a task.
+
+    Raises
+    ------
+    WorkFailed
+        If the status is not ``FOUND``.
+    """
+    if status != FOUND:
+        raise WorkFailed(PROBLEMS[status].format(detail))
+
+
+def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
+    """A task whose target is not known yet.
+
+    Parameters
+    ----------
+    model : calibrated (or metric) model.
+    s_star : (2, m, 2) pixels of the face at the goal.
+    center : index of the centre marker, or ``MIDPOINT``.
+
+    Raises
+    ------
+    WorkFailed
+        If there are fewer than three markers, or both cameras are in one place.
+    """
+    m = s_star.shape[1]
+    require_three(m)
+    return Task(
+        np.array(s_star, dtype=np.float64, order="C"),
+        np.zeros((m, 4)),
+        np.zeros(m, dtype=np.int64),
+        center,
+        fundamental_matrix(model.P),
+        optical_centers(model.P, model.a_inf),
+        np.zeros(2),
+    )
 
 
 def task_from_images(model: Model, s_start: FloatArray, s_star: FloatArray, center: int) -> Task:
@@ -115,25 +290,8 @@ def task_from_images(model: Model, s_start: FloatArray, s_star: FloatArray, cent
     WorkFailed
         If a marker cannot be triangulated, the face is degenerate, or a camera looks along it.
     """
-    A = triangulate_points(model.P, model.a_inf, straight_views(model.lens, s_start))
-    A_star = triangulate_points(model.P, model.a_inf, straight_views(model.lens, s_star))
-    order = cyclic_order(A_star)
-    O = optical_centers(model.P, model.a_inf)
-    start = O @ np.array(face_plane(A, order, center_of(A, center)))
-    goal = O @ np.array(face_plane(A_star, order, center_of(A_star, center)))
-    visible = np.where(start > 0.0, 1.0, -1.0)
-    for view, name in enumerate(("left", "right")):
-        if visible[view] * goal[view] <= 0.0:
-            raise WorkFailed(
-                f"the {name} camera sees opposite sides of the face at the start and at the goal: "
-                "choose a goal from which both cameras see the side they see at the start"
-            )
-    return Task(
-        np.ascontiguousarray(s_star, dtype=np.float64),
-        A_star,
-        order,
-        center,
-        fundamental_matrix(model.P),
-        O,
-        visible,
-    )
+    task = new_task(model, s_star, center)
+    start, goal = straight_views(model.lens, s_start), straight_views(model.lens, s_star)
+    A, angle = np.zeros_like(task.A_star), np.zeros(len(task.A_star))
+    require_found(*put_task(model.P, model.a_inf, start, goal, A, angle, task))
+    return task

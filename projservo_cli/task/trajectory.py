@@ -52,15 +52,16 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
     return np.stack([t, r, p], axis=1)
 
 
+@njit
+def turned(H_r: Mat4, H_p: Mat4, theta_r: float, theta_p: float) -> Mat4:
+    """Rotations of the planned displacement, exp(θ_r Ĥ_r) exp(θ_p Ĥ_p) of [RH00] eq. (17)."""
+    return mul(rotation(H_r, mul(H_r, H_r), theta_r), rotation(H_p, mul(H_p, H_p), theta_p))
+
+
 @merged
 def rotated(H_hat: FloatArray, amplitudes: FloatArray, mu_r: float, mu_p: float) -> Mat4:
-    """Rotations of the planned displacement, exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p) of [RH00] eq. (17)."""
-    H_r = mat(H_hat[1])
-    H_p = mat(H_hat[2])
-    return mul(
-        rotation(H_r, mul(H_r, H_r), mu_r * float(amplitudes[1])),
-        rotation(H_p, mul(H_p, H_p), mu_p * float(amplitudes[2])),
-    )
+    """Rotations of the planned displacement at shares μ_r, μ_p of the angles, [RH00] eqs. (17), (18)."""
+    return turned(mat(H_hat[1]), mat(H_hat[2]), mu_r * float(amplitudes[1]), mu_p * float(amplitudes[2]))
 
 
 @njit

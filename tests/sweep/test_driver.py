@@ -8,8 +8,8 @@ import pytest
 
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.sweep import engine
+from projservo_cli.sweep.columns import columns_of
 from projservo_cli.sweep.driver import Folder, read_manifest, status_of
-from projservo_cli.sweep.runs import columns_of
 from projservo_cli.sweepfile import SweepTable
 from tests.sweep.cases import columns, design, make
 from tests.sweep.processes import (

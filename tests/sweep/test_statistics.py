@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError
+from projservo_cli.sweep.columns import MEASURED, NUMBERS, Column
 from projservo_cli.sweep.driver import Folder
 from projservo_cli.sweep.report import pictures_of, report
-from projservo_cli.sweep.runs import MEASURED, NUMBERS, Column
 from projservo_cli.sweep.statistics import Rows, chance, compared, of_runs, paired, success_by, wilson
 from projservo_cli.sweepfile import SweepTable, assemble, write_part
 from tests.sweep.cases import design, make

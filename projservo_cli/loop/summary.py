@@ -1,0 +1,124 @@
+"""What is told of a run in numbers, from its log and the truth."""
+
+import math
+from typing import NamedTuple
+
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, mul, sub, vec
+from projservo_cli.geometry.jit import njit
+from projservo_cli.loop.compiled import Log, path_along
+from projservo_cli.plants.plant import Plant
+from projservo_cli.records import FloatArray
+from projservo_cli.task.face import center_of
+
+MM = 1e3
+
+
+class Summary(NamedTuple):
+    """Numbers of a run that ended; NaN where they need the true goal and that is not known.
+
+    Attributes
+    ----------
+    image_error_px : at the end, rms over markers and views.
+    self_occluded_steps_left, self_occluded_steps_right : instants at which a camera is behind the face.
+    first_outside_image, first_beyond_limit : instants, −1 for never.
+    speed_limited_steps, visibility_limited_steps : commands.
+    effort : integral of the squared joint velocities, rad²/s and m²/s added.
+    rotation_deg, distance_mm : true rotation, and distance of the centre, from start to goal.
+    position_error_mm, rotation_error_deg : what is left of both at the end.
+    path_length_mm : of the centre, from sample to sample.
+    center_deviation_at_samples_mm : largest distance of the centre from its line.
+    """
+
+    image_error_px: float
+    self_occluded_steps_left: int
+    self_occluded_steps_right: int
+    first_outside_image: int
+    first_beyond_limit: int
+    speed_limited_steps: int
+    visibility_limited_steps: int
+    effort: float
+    rotation_deg: float
+    distance_mm: float
+    position_error_mm: float
+    rotation_error_deg: float
+    path_length_mm: float
+    center_deviation_at_samples_mm: float
+
+
+class Ends(NamedTuple):
+    """Where the true robot holds the tool.
+
+    Attributes
+    ----------
+    base_tool : (4, 4) pose of the tool at the reference, m.
+    goal_pose : (4, 4) pose at the goal, m; NaN where it is not known.
+    goal : (4,) centre of the face there, m.
+    """
+
+    base_tool: FloatArray
+    goal_pose: FloatArray
+    goal: FloatArray
+
+
+@njit
+def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, ends: Ends) -> Summary:
+    """Numbers of a run of so many steps, whose translation visibility limited so often."""
+    hidden_left, hidden_right, slowed = 0, 0, 0
+    for k in range(steps + 1):
+        if log.hidden[k, 0] > 0.5:
+            hidden_left += 1
+        if log.hidden[k, 1] > 0.5:
+            hidden_right += 1
+        if k < steps and log.factor[k] < 1.0:
+            slowed += 1
+    middle, goal = center_of(plant.M, plant.center), vec(ends.goal)
+    first, last = mat(log.H[0]), mat(log.H[steps])
+    start, end = apply(first, middle), apply(last, middle)
+    length, at_samples = math.nan, math.nan
+    if math.isfinite(goal[0]):
+        length, at_samples = path_along(plant, log, steps, start, goal)
+    base_tool, goal_pose = mat(ends.base_tool), mat(ends.goal_pose)
+    return Summary(
+        float(log.error[steps]),
+        hidden_left,
+        hidden_right,
+        int(log.events[0]),
+        int(log.events[1]),
+        slowed,
+        int(limited),
+        effort(log, steps, period),
+        math.degrees(angle_between(mul(first, base_tool), goal_pose)),
+        MM * distance(start, goal),
+        MM * distance(end, goal),
+        math.degrees(angle_between(mul(last, base_tool), goal_pose)),
+        MM * length,
+        MM * at_samples,
+    )
+
+
+@njit
+def effort(log: Log, steps: int, period: float) -> float:
+    """Integral of the squared joint velocities, rad²/s and m²/s added."""
+    total = 0.0
+    for k in range(steps):
+        for i in range(log.q_dot.shape[1]):
+            total += log.q_dot[k, i] * log.q_dot[k, i]
+    return total * period
+
+
+@njit
+def distance(A: Vec4, B: Vec4) -> float:
+    """Distance of two metric points, m."""
+    way = sub(A, B)
+    return math.sqrt(dot(way, way))
+
+
+@njit
+def angle_between(A: Mat4, B: Mat4) -> float:
+    """Angle of the rotation from pose A to pose B, rad."""
+    trace = (A[0] * B[0] + A[4] * B[4] + A[8] * B[8]) + (A[1] * B[1] + A[5] * B[5] + A[9] * B[9])
+    trace += A[2] * B[2] + A[6] * B[6] + A[10] * B[10]
+    x = (A[2] * B[1] + A[6] * B[5] + A[10] * B[9]) - (A[1] * B[2] + A[5] * B[6] + A[9] * B[10])
+    y = (A[0] * B[2] + A[4] * B[6] + A[8] * B[10]) - (A[2] * B[0] + A[6] * B[4] + A[10] * B[8])
+    z = (A[1] * B[0] + A[5] * B[4] + A[9] * B[8]) - (A[0] * B[1] + A[4] * B[5] + A[8] * B[9])
+    return math.atan2(math.sqrt(x * x + y * y + z * z), trace - 1.0)
