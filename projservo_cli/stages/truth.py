@@ -279,7 +279,7 @@ def ends_of(config: "Config", truth: Truth) -> Ends:
     return _ends(config.task, config.robot.joint_types if config.robot is not None else "", truth)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=2048)
 def _ends(task: "Task", types: str, truth: Truth) -> Ends:
     """What the ends of a task look like, for any seed and noise."""
     q_from = np.array(task.start.values(types))
@@ -349,7 +349,7 @@ def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
     return _plant(truth, q_start.tobytes(), config.plant.self_occlusion == "opaque")
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=2048)
 def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
     q_start = np.frombuffer(start_bytes)
     M = truth.M_face

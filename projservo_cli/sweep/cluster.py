@@ -52,6 +52,9 @@ class ClusterEngine:
         self._pool: Executor = self._client.get_executor(retries=RETRIES, pure=False)
         self.workers = sum(self._client.nthreads().values())
 
+    def suit(self, workers: int, *, threads: bool) -> None:
+        """Nothing: the workers wait for jobs anyway."""
+
     def pool(self, *, anew: bool = False) -> Executor:
         """The scheduler as a pool, the same as long as there is the scheduler."""
         if anew:

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from projservo_cli import provenance
 from projservo_cli.files import replacing
 from projservo_cli.records import InputError
@@ -22,11 +24,13 @@ from projservo_cli.sweep.columns import columns_of
 from projservo_cli.sweep.compiling import compile_once
 from projservo_cli.sweep.design import Design, from_recipe
 from projservo_cli.sweep.engine import Engine, LocalEngine, completed
-from projservo_cli.sweep.runs import Made, Part, run_part
+from projservo_cli.sweep.runs import Made, Part, compiled_by, run_part
 from projservo_cli.sweepfile import TABLE, SweepTable, assemble, write_part
 
 PART_S = 1.0  # what making a part should take
-PILOT_RUNS = 24
+PILOTS, PILOT_RUNS = 5, 8  # parts that are made to see how long a run takes, and their runs
+CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
+SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 MOST_RUNS = 50_000  # in a part, whose rows are in memory
 SAME = ("projservo", "python", "numpy", "scipy", "numba", "jit")
 MANIFEST = "manifest.json"
@@ -200,17 +204,19 @@ def _make(
     if isinstance(engine, LocalEngine):
         compile_once(design, tasks, engine, say)
     missing = list(preparation.missing_calibrations(design, folder.path))
+    engine.suit(1 + len(missing) // CALIBRATIONS, threads=False)
     for count, calibrated in enumerate(completed(engine, preparation.calibrate_one, missing)):
         preparation.keep_calibration(folder.path, calibrated)
         progress("calibrations", count + 1, len(missing))
     calibrations = preparation.calibrations_of(design, folder.path)
 
     def part(first: int, last: int) -> Part:
-        keys = {
-            design.calibration_key(at.cell, at.calibration) for at in map(design.numbers, range(first, last))
-        }
+        cell, draw = np.divmod(np.arange(first, last), design.sweep.runs)
+        pairs = set(zip(cell.tolist(), (draw % design.sweep.calibrations).tolist(), strict=True))
+        keys = {design.calibration_key(*pair) for pair in pairs}
         return Part(design, first, last, {key: calibrations[key] for key in keys}, tasks)
 
+    engine.suit(status.total, threads=shares_settings(design))
     chunk = status.chunk or design.sweep.chunk or _measured_chunk(design, engine, part)
     if not status.chunk:
         _begin(design, folder, chunk)
@@ -226,12 +232,21 @@ def _make(
         progress("runs", done, left)
 
 
+def shares_settings(design: Design) -> bool:
+    """Whether all runs are compiled ones, of which many differ in nothing but their images."""
+    tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
+    settings = math.lcm(design.sweep.calibrations, tasks)
+    if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:
+        return False
+    return all(compiled_by(design, design.cell(cell)) for cell in range(design.cells))
+
+
 def _measured_chunk(design: Design, engine: Engine, part: Callable[[int, int], Part]) -> int:
     """Runs that take about ``PART_S``, from a few spread over the sweep."""
-    places = sorted({i * (design.total - 1) // (PILOT_RUNS - 1) for i in range(PILOT_RUNS)})
-    pilots = [part(place, place + 1) for place in places]
-    seconds = sorted(made.seconds for made in completed(engine, _second_time, pilots))
-    typical = seconds[len(seconds) // 2]
+    places = sorted({i * design.total // PILOTS for i in range(PILOTS)})
+    pilots = [part(place, min(place + PILOT_RUNS, design.total)) for place in places]
+    timed = [(made.seconds / (made.last - made.first)) for made in completed(engine, _second_time, pilots)]
+    typical = sorted(timed)[len(timed) // 2]
     return max(1, min(MOST_RUNS, math.ceil(PART_S / typical)))
 
 

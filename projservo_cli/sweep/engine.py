@@ -7,8 +7,11 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from concurrent.futures.process import ProcessPoolExecutor
+from concurrent.futures.thread import ThreadPoolExecutor
 from itertools import islice
 from typing import Any, Protocol, TypeVar
+
+from threadpoolctl import threadpool_limits
 
 from projservo_cli.records import InputError, WorkFailed
 
@@ -23,6 +26,9 @@ class Engine(Protocol):
 
     workers: int
     losses: tuple[type[Exception], ...]
+
+    def suit(self, workers: int, *, threads: bool) -> None:
+        """Make ready for jobs worth so many workers, and whose threads seldom wait for each other."""
 
     def pool(self, *, anew: bool = False) -> Executor:
         """The pool to submit jobs to; another one after workers of the first were lost."""
@@ -48,7 +54,7 @@ class Here(Executor):
 
 
 class LocalEngine:
-    """Processes of this machine; a single one is this process.
+    """Processes or threads of this machine; a single one is this process.
 
     Parameters
     ----------
@@ -58,15 +64,24 @@ class LocalEngine:
     losses: tuple[type[Exception], ...] = ()
 
     def __init__(self, workers: int) -> None:
-        self.workers = workers
+        self.workers = self.most = workers
+        self._threads = False
         self._pool: Executor | None = None
 
+    def suit(self, workers: int, *, threads: bool) -> None:
+        """Threads take the memory of one process, and share what it has compiled and worked out."""
+        self.close()
+        self.workers, self._threads = min(self.most, workers), threads
+
     def pool(self, *, anew: bool = False) -> Executor:
-        """The processes, started when they are first asked for."""
+        """The workers, started when they are first asked for."""
         if anew:
             self.close()
         if self._pool is None and self.workers == 1:
             self._pool = Here()
+        elif self._pool is None and self._threads:
+            self._limits = threadpool_limits(1)  # for all threads together, or one would end that of another
+            self._pool = ThreadPoolExecutor(self.workers)
         elif self._pool is None:
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(self.workers, context, _follow_the_parent)
@@ -76,7 +91,10 @@ class LocalEngine:
         """A pool tells by itself."""
 
     def close(self) -> None:
-        """End the processes at once."""
+        """End processes at once, threads with their jobs."""
+        if isinstance(self._pool, ThreadPoolExecutor):
+            self._pool.shutdown(cancel_futures=True)
+            self._limits.restore_original_limits()
         if isinstance(self._pool, ProcessPoolExecutor):
             processes = list((self._pool._processes or {}).values())
             self._pool.shutdown(wait=False, cancel_futures=True)

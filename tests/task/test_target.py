@@ -8,7 +8,8 @@ import pytest
 from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import body_of, new_normal
-from projservo_cli.task.target import settled, task_from_body
+from projservo_cli.task.face import UNSEEN_GOAL, require_found
+from projservo_cli.task.target import TOO_FEW, settled, task_from_body
 from tests.samples import frame, pixels, poe
 from tests.scene import scene, with_pins
 
@@ -77,8 +78,10 @@ def test_too_few_markers_at_a_place_are_told():
     shown = Shown()
     few = np.full_like(shown.star, math.nan)
     few[0, :2] = shown.star[0, :2]
+    ended, views, _ = fitted(shown, few)
+    assert (ended, views) == (TOO_FEW, 2)
     with pytest.raises(WorkFailed, match="the images at the goal show too few markers, 2 in both views"):
-        shown.task(star=few)
+        require_found(UNSEEN_GOAL, views)
 
 
 def test_a_start_without_unique_motions_is_told():
