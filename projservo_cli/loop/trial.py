@@ -175,7 +175,7 @@ def opened(
     return FOUND if parts.found else NOT_UNIQUE, parts.theta_r, parts.theta_p
 
 
-def trial(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> None:
+def trial(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> int:
     """One run: measure the task, partition it, drive the law to its verdict, and sum up.
 
     Parameters
@@ -184,6 +184,10 @@ def trial(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, nu
     noise : (k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too short.
     desk : workspace.
     numbers : (``NUMBERS``,) on return the numbers of the run.
+
+    Returns
+    -------
+    Its verdict.
     """
     model, q_start, at = setting.model, setting.q_start, desk.measuring
     status, theta_r, theta_p = opened(model, setting.believed, setting.shares_task, q_start, shown, at)
@@ -193,7 +197,7 @@ def trial(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, nu
     if status != FOUND:
         numbers[:] = math.nan
         numbers[VERDICT] = NOT_STARTED
-        return
+        return NOT_STARTED
     at.own_state.memory.rotation[:] = signed(theta_r, theta_p, at.state.q_hat[1:3])
     numbers[VERDICT], numbers[STEPS] = verdict, steps = run(
         setting.code,
@@ -210,3 +214,4 @@ def trial(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, nu
     if verdict != RUNNING:
         limited = float(at.own_state.limited[0])
         numbers[2:] = summary(setting.plant, desk.log, steps, limited, setting.gains.period, setting.ends)
+    return verdict

@@ -1,6 +1,6 @@
 """Many simulated runs of one configuration that differ in their seeds alone, without their traces."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -8,9 +8,9 @@ import numpy as np
 from projservo_cli.control import CODES
 from projservo_cli.geometry.mechanisms import COORDINATES
 from projservo_cli.loop.step import RUNNING
-from projservo_cli.loop.trial import NUMBERS, VERDICT, Desk, Setting, new_desk, trial
+from projservo_cli.loop.trial import NUMBERS, Setting, new_desk, trial
 from projservo_cli.modes import law_and_mode
-from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray, IntArray
+from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray
 from projservo_cli.stages.beginning import rehearses
 from projservo_cli.stages.disturbed import disturbance_of, lose_markers
 from projservo_cli.stages.motion import joints_of
@@ -24,7 +24,6 @@ from projservo_cli.task.body import NO_BODY
 if TYPE_CHECKING:
     from projservo_cli.config import Config
 
-BATCH = 32  # runs of a call, whose noise is in memory
 # Noise is drawn for so many instants, and for so many times as many where a run is not over then.
 INSTANTS, FURTHER = 192, 4
 
@@ -101,35 +100,26 @@ def numbers_of(prepared: Prepared, seeds: Sequence[int]) -> FloatArray:
     WorkFailed
         If the task cannot be begun, whatever the seed.
     """
+    config, m = prepared.config, prepared.ends.s_start.shape[1]
+    desk = new_desk(prepared.setting, m + len(prepared.pins))
     found = np.empty((len(seeds), len(NUMBERS)))
-    desk = new_desk(prepared.setting, prepared.ends.s_start.shape[1] + len(prepared.pins))
-    for these in _batches(np.arange(len(seeds))):
-        instants, most = INSTANTS, prepared.setting.limits.max_steps + 1
-        while len(these) > 0:
-            found[these] = _batch(prepared, [seeds[i] for i in these], min(instants, most), desk)
-            these = these[found[these, VERDICT] == RUNNING]
+    most = prepared.setting.limits.max_steps + 1
+    for numbers, seed in zip(found, seeds, strict=True):
+        shown = images_of(prepared, seed)
+        instants, verdict = INSTANTS, RUNNING
+        while verdict == RUNNING:
+            noise = noise_of(seed, config.noise.servo_px, min(instants, most), m, len(prepared.numbers) - m)
+            lose_markers(config, noise, prepared.numbers)
+            verdict = trial(prepared.setting, shown, noise, desk, numbers)
             instants *= FURTHER
     return found
 
 
-def _batches(runs: IntArray) -> Iterator[IntArray]:
-    for first in range(0, len(runs), BATCH):
-        yield runs[first : first + BATCH]
-
-
-def _batch(prepared: Prepared, seeds: Sequence[int], instants: int, desk: Desk) -> FloatArray:
-    """Numbers of runs with noise for so many instants."""
-    config, ends, pins = prepared.config, prepared.ends, prepared.pins
-    m, observed = ends.s_start.shape[1], len(prepared.numbers)
-    shown = np.empty((len(seeds), 2, 2, m + len(pins), 2))
-    noise = np.empty((len(seeds), instants, 2, observed, 2))
-    for i, seed in enumerate(seeds):
-        reach = shown_at(ends, seed, shown_px(config))
-        shown[i, 0, :, :m], shown[i, 1, :, :m] = reach.s_start, reach.s_star
-        shown[i, 0, :, m:], shown[i, 1, :, m:] = reach.pins_start[:, pins], reach.pins_star[:, pins]
-        noise[i] = noise_of(seed, config.noise.servo_px, instants, m, observed - m)
-        lose_markers(config, noise[i], prepared.numbers)
-    numbers = np.empty((len(seeds), len(NUMBERS)))
-    for i in range(len(seeds)):
-        trial(prepared.setting, shown[i], noise[i], desk, numbers[i])
-    return numbers
+def images_of(prepared: Prepared, seed: int) -> FloatArray:
+    """Images (2, 2, b, 2) at the start and at the goal as a seed shows them, the face first, px."""
+    reach = shown_at(prepared.ends, seed, shown_px(prepared.config))
+    m, pins = reach.s_start.shape[1], prepared.pins
+    shown = np.empty((2, 2, m + len(pins), 2))
+    shown[0, :, :m], shown[1, :, :m] = reach.s_start, reach.s_star
+    shown[0, :, m:], shown[1, :, m:] = reach.pins_start[:, pins], reach.pins_star[:, pins]
+    return shown
