@@ -114,10 +114,10 @@ class Run:
             self.state.memory.rotation[:] = memory
         task = scene.task(G) if task is None else task
         gains = gains._replace(speed=bounds.speed)
-        verdict, self.steps = run(
+        self.code, self.steps = run(
             CODES[law], scene.seen(G), task, gains, bounds, scene.plant, noise, scene.q_start.copy(),
             self.state, self.full,
         )  # fmt: skip
-        self.verdict = VERDICTS[verdict]
+        self.verdict = VERDICTS[self.code] if self.code >= 0 else None
         self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-3]), *self.full[-3:])
         self.center = (self.log.H @ np.array(center_of(scene.plant.M, scene.plant.center)))[:, :3]

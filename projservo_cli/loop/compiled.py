@@ -7,8 +7,8 @@ import numpy as np
 
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
-from projservo_cli.geometry.algebra import Vec4, apply, dot, mat, put_mat, put_vec, sub, vec
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.algebra import mat, put_mat
+from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import beyond_limits, start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
@@ -30,16 +30,14 @@ from projservo_cli.loop.step import (
 )
 from projservo_cli.plants.plant import (
     Plant,
-    center_deviation,
     knock,
-    line_distance,
     observe,
     pose_after,
     read_joints,
     rig_distance,
 )
 from projservo_cli.records import FloatArray, IntArray, Model
-from projservo_cli.task.face import Task, center_of
+from projservo_cli.task.face import Task
 
 
 class Log(NamedTuple):
@@ -250,52 +248,3 @@ def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
     knock(plant.disturbance, k + 1, dq)
     put_mat(log.H[k + 1], pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1]))
     read_joints(plant.disturbance, k + 1, log.q[k + 1], log.read[k], log.read[k + 1])
-
-
-@merged
-def path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> tuple[float, float]:
-    """Length of the true centre's path from sample to sample, and its largest distance from start–goal, m."""
-    M = log.M[: plant.M.shape[0]]
-    length = 0.0
-    most = 0.0
-    last = start
-    for k in range(steps + 1):
-        H = mat(log.H[k])
-        for j in range(M.shape[0]):
-            put_vec(M[j], apply(H, vec(plant.M[j])))
-        A_c = center_of(M, plant.center)
-        way = sub(A_c, last)
-        last = A_c
-        if k > 0:
-            length += math.sqrt(dot(way, way))
-            most = max(most, line_distance(A_c, start, goal))
-    return length, most
-
-
-@njit
-def path_deviation(
-    plant: Plant, log: Log, steps: int, period: float, start: FloatArray, goal: FloatArray, samples: int
-) -> float:
-    """Largest distance of the true centre from the line start–goal, between the samples too, m.
-
-    Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
-    """
-    M = log.M[: plant.M.shape[0]]
-    dq = log.scratch[2, : log.q.shape[1]]
-    part = log.scratch[3, : log.q.shape[1]]
-    A_c, A_cs = vec(start), vec(goal)
-    most = 0.0
-    for k in range(steps):
-        for i in range(dq.shape[0]):
-            dq[i] = log.q_dot[k, i] * period
-        H = mat(log.H[k])
-        if log.parts[k] == 0:
-            stray = center_deviation(plant, H, log.q[k], dq, A_c, A_cs, samples, M, log.scratch)
-            most = max(most, stray)
-        for j in range(log.parts[k]):
-            for i in range(dq.shape[0]):
-                part[i] = log.path[k, j + 1, i] - log.path[k, j, i]
-            share = max(1, samples // log.parts[k])
-            stray = center_deviation(plant, H, log.path[k, j], part, A_c, A_cs, share, M, log.scratch)
-            most = max(most, stray)
-    return most

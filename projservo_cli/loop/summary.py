@@ -3,10 +3,10 @@
 import math
 from typing import NamedTuple
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, mul, sub, vec
-from projservo_cli.geometry.jit import njit
-from projservo_cli.loop.compiled import Log, path_along
-from projservo_cli.plants.plant import Plant
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, mul, put_vec, sub, vec
+from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.loop.compiled import Log
+from projservo_cli.plants.plant import Plant, center_deviation, line_distance
 from projservo_cli.records import FloatArray
 from projservo_cli.task.face import center_of
 
@@ -122,3 +122,52 @@ def angle_between(A: Mat4, B: Mat4) -> float:
     y = (A[0] * B[2] + A[4] * B[6] + A[8] * B[10]) - (A[2] * B[0] + A[6] * B[4] + A[10] * B[8])
     z = (A[1] * B[0] + A[5] * B[4] + A[9] * B[8]) - (A[0] * B[1] + A[4] * B[5] + A[8] * B[9])
     return math.atan2(math.sqrt(x * x + y * y + z * z), trace - 1.0)
+
+
+@merged
+def path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> tuple[float, float]:
+    """Length of the true centre's path from sample to sample, and its largest distance from start–goal, m."""
+    M = log.M[: plant.M.shape[0]]
+    length = 0.0
+    most = 0.0
+    last = start
+    for k in range(steps + 1):
+        H = mat(log.H[k])
+        for j in range(M.shape[0]):
+            put_vec(M[j], apply(H, vec(plant.M[j])))
+        A_c = center_of(M, plant.center)
+        way = sub(A_c, last)
+        last = A_c
+        if k > 0:
+            length += math.sqrt(dot(way, way))
+            most = max(most, line_distance(A_c, start, goal))
+    return length, most
+
+
+@njit
+def path_deviation(
+    plant: Plant, log: Log, steps: int, period: float, start: FloatArray, goal: FloatArray, samples: int
+) -> float:
+    """Largest distance of the true centre from the line start–goal, between the samples too, m.
+
+    Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
+    """
+    M = log.M[: plant.M.shape[0]]
+    dq = log.scratch[2, : log.q.shape[1]]
+    part = log.scratch[3, : log.q.shape[1]]
+    A_c, A_cs = vec(start), vec(goal)
+    most = 0.0
+    for k in range(steps):
+        for i in range(dq.shape[0]):
+            dq[i] = log.q_dot[k, i] * period
+        H = mat(log.H[k])
+        if log.parts[k] == 0:
+            stray = center_deviation(plant, H, log.q[k], dq, A_c, A_cs, samples, M, log.scratch)
+            most = max(most, stray)
+        for j in range(log.parts[k]):
+            for i in range(dq.shape[0]):
+                part[i] = log.path[k, j + 1, i] - log.path[k, j, i]
+            share = max(1, samples // log.parts[k])
+            stray = center_deviation(plant, H, log.path[k, j], part, A_c, A_cs, share, M, log.scratch)
+            most = max(most, stray)
+    return most

@@ -8,9 +8,9 @@ import numpy as np
 from projservo_cli.control.law import TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.geometry.normal import COORDINATES
-from projservo_cli.loop.compiled import Log, path_deviation
+from projservo_cli.loop.compiled import Log
 from projservo_cli.loop.step import Limits, tolerance
-from projservo_cli.loop.summary import MM, Ends, Summary, angle_between, effort, summary
+from projservo_cli.loop.summary import MM, Ends, Summary, angle_between, effort, path_deviation, summary
 from projservo_cli.modes import REPLAN
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Trace

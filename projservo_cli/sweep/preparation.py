@@ -18,7 +18,8 @@ from projservo_cli.stages.chain import steps_for
 from projservo_cli.stages.random_tasks import STRATA, random_tasks
 from projservo_cli.stages.truth import truth_of
 from projservo_cli.store import Result, Run, load, save
-from projservo_cli.sweep.design import TASKS, Design, TaskSet
+from projservo_cli.sweep.design import Design, TaskSet
+from projservo_cli.sweep.draws import TASKS
 
 REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
 

@@ -28,7 +28,8 @@ from projservo_cli.sweep.columns import (
     columns_of,
     shown,
 )
-from projservo_cli.sweep.design import RUNS, Design, TaskSet, name_of_run, seed_of
+from projservo_cli.sweep.design import Design, TaskSet, name_of_run
+from projservo_cli.sweep.draws import RUNS, seed_of
 
 Columns = dict[str, npt.NDArray[Any]]
 # What the table says of a verdict of the kernel.

@@ -5,7 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.loop.compiled import path_along, path_deviation
+from projservo_cli.control import CODES
+from projservo_cli.control.law import reset
+from projservo_cli.geometry.algebra import as_vec
+from projservo_cli.loop.compiled import run as run_loop
+from projservo_cli.loop.step import RUNNING
+from projservo_cli.loop.summary import path_along, path_deviation
 from projservo_cli.records import LAWS
 from tests.samples import displacement, pixels, poe
 from tests.scene import GAINS, STEP, Run, limits, scene
@@ -31,6 +36,38 @@ def test_log_describes_the_run_it_belongs_to():
     assert (log.events == [-1, -1, -1, -1]).all()
     # Beyond its last instant the log is untouched.
     assert not run.full.s[run.steps + 1 :].any()
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
+    """Whatever log and state hold, a run is the same to the bit, and so is what it tells of itself."""
+    sc, bounds = scene(), limits(max_steps=30)
+    noise = 0.3 * rng.normal(size=(31, 2, 4, 2))
+    noise[4:6] = math.nan  # rows of lost markers have no errors
+    fresh = Run(sc, law, bounds=bounds._replace(lost_steps=5), noise=noise)
+    used = Run(sc, law, bounds=bounds, noise=7.0 * rng.normal(size=noise.shape))
+    reset(used.state)
+    verdict, steps = run_loop(
+        CODES[law], sc.model, sc.task(None), GAINS._replace(speed=bounds.speed),
+        bounds._replace(lost_steps=5), sc.plant, noise, sc.q_start.copy(), used.state, used.full,
+    )  # fmt: skip
+    assert (verdict, steps) == (fresh.code, fresh.steps)
+    for name, rows in fresh.log._asdict().items():
+        if name not in ("M", "scratch", "path"):
+            again = getattr(used.full, name)
+            assert again[: len(rows)].tobytes() == rows.tobytes(), name
+    assert used.state.limited[0] == fresh.state.limited[0]
+
+
+def test_a_run_that_lasts_longer_than_its_noise_says_so():
+    """Noise for fewer instants gives the same instants, and no verdict."""
+    whole = Run(scene(), "direct_two", bounds=limits(max_steps=30, image_px=1e-9))
+    cut = Run(
+        scene(), "direct_two", bounds=limits(max_steps=30, image_px=1e-9), noise=np.zeros((12, 2, 4, 2))
+    )
+    assert (cut.code, cut.steps) == (RUNNING, 11)
+    assert whole.steps == 30
+    assert np.array_equal(cut.log.error[:12], whole.log.error[:12])
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -225,7 +262,7 @@ def test_deviation_from_the_line():
     A_c = sc.plant.M.mean(axis=0)
     start, goal = (poe(sc.model, q) @ A_c for q in (sc.q_start, sc.q_goal))
     between = path_deviation(sc.plant, run.log, run.steps, GAINS.period, start, goal, 10)
-    length, at_samples = path_along(sc.plant, run.log, run.steps, start, goal)
+    length, at_samples = path_along(sc.plant, run.log, run.steps, as_vec(start), as_vec(goal))
     way = (goal - start)[:3] / np.linalg.norm((goal - start)[:3])
 
     def distance(q):
@@ -243,7 +280,7 @@ def test_deviation_of_a_task_without_translation_is_the_distance_from_the_start(
     sc = scene()
     run = Run(sc, "direct_three", bounds=limits(max_steps=10))
     start = np.append(run.center[0], 1.0)
-    _, at_samples = path_along(sc.plant, run.log, run.steps, start, start)
+    _, at_samples = path_along(sc.plant, run.log, run.steps, as_vec(start), as_vec(start))
     assert at_samples == pytest.approx(np.linalg.norm(run.center - run.center[0], axis=1).max(), abs=1e-12)
 
 

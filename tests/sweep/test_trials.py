@@ -1,0 +1,59 @@
+"""Runs without traces: each a function of its seed, whatever was made before it in the same arrays."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.loop.trial import NUMBERS, VERDICT
+from projservo_cli.records import WorkFailed
+from projservo_cli.stages import calibrate, trials
+from projservo_cli.stages.trials import is_compiled, numbers_of, prepare
+from projservo_cli.sweep.changes import changed
+from projservo_cli.sweep.design import name_of_run
+from tests.sweep.cases import design
+
+pytestmark = pytest.mark.volume
+
+
+def prepared(**settings):
+    """What runs of a small sweep share, with a value or two of its configuration changed."""
+    config = changed(design().calibrated(0, 0), settings, "test")
+    _, calibration, _ = calibrate.run(config)
+    return prepare(config, calibration, name_of_run(config))
+
+
+def test_numbers_depend_on_the_seed_alone():
+    found = prepared()
+    together = numbers_of(found, [5, 6, 7])
+    apart = np.concatenate([numbers_of(found, [seed]) for seed in (7, 6, 5)])[::-1]
+    assert together.tobytes() == apart.tobytes()
+    assert len(np.unique(together[:, NUMBERS.index("image_error_px")])) == 3
+
+
+def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
+    """A run that outlasts its noise is made anew with more of it."""
+    found = prepared()
+    whole = numbers_of(found, [1, 2])
+    assert whole[:, NUMBERS.index("steps")].min() > 8
+    monkeypatch.setattr(trials, "INSTANTS", 2)
+    assert numbers_of(found, [1, 2]).tobytes() == whole.tobytes()
+
+
+def test_a_task_that_cannot_be_begun_has_a_verdict_and_no_numbers():
+    """Images so noisy that markers have no place leave nothing to count; a goal out of reach is an error."""
+    numbers = numbers_of(prepared(**{"noise.servo_px": 3000.0}), [1, 2, 3])
+    assert (numbers[:, VERDICT] < 0).any()
+    lost = numbers[numbers[:, VERDICT] < 0]
+    assert np.isnan(np.delete(lost, VERDICT, axis=1)).all()
+    with pytest.raises(WorkFailed, match="limits"):
+        prepared(**{"task.start_offset": {"joints": [0, 0, 400, 0, 0, 0], "unit": "deg"}})
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("plant.speed_scale", 0.5), ("trajectory.profile", "constrained"), ("control.mode", "track")],
+)
+def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
+    config = design(grid={"law": ["exact"]}).cell(0)
+    assert is_compiled(config, name_of_run(config))
+    config = changed(config, {key: value}, "test")
+    assert not is_compiled(config, name_of_run(config))
