@@ -54,9 +54,14 @@ def new_file(path: Path) -> Iterator[h5py.File]:
                 yield file
         except (OSError, RuntimeError) as error:  # of a full disk, the library tells either
             _raise_unwritable(path, error)
-        digest = digest_of(temporary)
-        with temporary.open("ab") as stream:
-            stream.write(_SEAL % digest.encode())
+        seal(temporary)
+
+
+def seal(path: Path) -> None:
+    """Append the line that tells the checksum of a file's data."""
+    digest = digest_of(path)
+    with path.open("ab") as stream:
+        stream.write(_SEAL % digest.encode())
 
 
 def _raise_unwritable(path: Path, error: Exception) -> None:
@@ -101,19 +106,19 @@ def sealed(path: Path, remedy: str) -> bool:
         with path.open("rb") as stream:
             head = stream.read(_HEAD)
             stream.seek(max(0, size - _SEAL_SIZE))
-            seal = _SEALED.fullmatch(stream.read(_SEAL_SIZE))
-        digest = digest_of(path, size - _SEAL_SIZE) if seal else ""
+            found = _SEALED.fullmatch(stream.read(_SEAL_SIZE))
+        digest = digest_of(path, size - _SEAL_SIZE) if found else ""
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
     if size == 0:
         raise InputError(f"{path}: is empty; {remedy}")
     if not head.startswith(SIGNATURE):
         raise InputError(f"{path}: no HDF5 file, so not a run file or sweep of projservo; name another")
-    if seal is not None and seal[1].decode() != digest:
+    if found is not None and found[1].decode() != digest:
         raise InputError(f"{path}: damaged: its checksum is not that of its data; {remedy}")
-    if seal is None and _end(head) != size:
+    if found is None and _end(head) != size:
         raise InputError(f"{path}: cut short or damaged: its size is not the one it states; {remedy}")
-    return seal is not None
+    return found is not None
 
 
 def _end(head: bytes) -> int:
