@@ -11,7 +11,10 @@ from projservo_cli.records import InputError
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_JOINT = re.compile(r"q[1-9][0-9]*")
+MAX_JOINTS = 64  # as many as a configuration may have
+MAX_COLUMNS = 10_000
+MAX_BYTES = 100_000_000  # of a table; more would not be calibrated from
+_JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 
 
 class Sheet:
@@ -39,6 +42,8 @@ class Sheet:
         header = self._next()
         if header is None:
             raise InputError(f"{self.where}: the table is empty; expected a header {expected}")
+        if len(header) > MAX_COLUMNS:
+            raise InputError(f"{self.where}:1: {len(header)} columns; a table has at most {MAX_COLUMNS}")
         self.names = [name.strip().lower() for name in header]
         if len(self.names) == 1 and ";" in self.names[0]:
             raise InputError(
@@ -82,6 +87,8 @@ class Sheet:
         joints = sorted(
             (name for name in set(self.names) if _JOINT.fullmatch(name)), key=lambda name: int(name[1:])
         )
+        if len(joints) > MAX_JOINTS:
+            raise InputError(f"{self.where}:1: {len(joints)} joint columns; a robot has at most {MAX_JOINTS}")
         missing = [name for name in needed if name not in self.names] + ([] if joints else ["q1"])
         if missing:
             raise InputError(f"{self.where}:1: the header lacks the column(s) {', '.join(missing)}")
@@ -121,9 +128,14 @@ def number(where: str, column: str, text: str) -> float:
 
 def _text(path: Path) -> str:
     try:
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected a table") from error
+    if len(content) > MAX_BYTES:
+        raise InputError(
+            f"{path}: larger than {MAX_BYTES // 1_000_000} MB; expected a table of trial motions"
+        )
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

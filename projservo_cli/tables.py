@@ -18,7 +18,7 @@ from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 
 PIXELS = ("u_left", "v_left", "u_right", "v_right")
 RECORDING = "recording"  # column that says which recording a row belongs to
-MAX_CELLS = 50_000_000  # poses × markers: a mistyped number of a pose must not fill the memory
+MAX_CELLS = 5_000_000  # poses × markers: mistyped numbers of poses must not fill the memory
 TWO_TURNS = 4.0 * math.pi  # rad; no arm with stops turns a joint that far from its zero
 
 

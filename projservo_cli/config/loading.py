@@ -14,13 +14,17 @@ from pydantic import ValidationError, create_model
 from projservo_cli.config.checks import problems
 from projservo_cli.config.fields import Section
 from projservo_cli.config.foreign import written_out
-from projservo_cli.config.messages import nearest, translated
+from projservo_cli.config.messages import MOST, nearest, translated
 from projservo_cli.config.models import Config
-from projservo_cli.config.yaml_source import Document, Path, Problem
+from projservo_cli.config.yaml_source import MAX_BYTES, MAX_DEPTH, Document, Path, Problem, shortened
 from projservo_cli.records import InputError
 
 # Values that name files, relative to the configuration.
 FILES = (("data", "table"), ("calibration", "init"))
+
+
+_DIGITS = 9  # of a position in a list
+MOST_LINES = 50  # that are told of what is wrong
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,8 @@ class Override:
         steps = [step.strip() for step in key.split(".")]
         if not sign or not all(steps):
             raise InputError(f"{flag}: expected KEY=VALUE, with a key such as control.gain_t")
+        if len(steps) > MAX_DEPTH or any(step.isdecimal() and len(step) > _DIGITS for step in steps):
+            raise InputError(f"{shortened(flag)}: there is no such key")
         document = Document(value, flag)
         if document.problems:
             raise InputError(f"{flag}: the value is {document.problems[0].what}")
@@ -102,9 +108,14 @@ def load_config(
 def read_text(path: pathlib.Path | str) -> str:
     """Text of a configuration; an InputError where there is none."""
     try:
-        return pathlib.Path(path).read_text(encoding="utf-8-sig")
+        with pathlib.Path(path).open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if len(content) > MAX_BYTES:
+        raise InputError(f"{path}: larger than {MAX_BYTES} bytes; this is no configuration")
+    try:
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text; expected a YAML configuration") from error
 
@@ -167,9 +178,8 @@ def _defects(values: dict[str, Any]) -> Iterable[Problem]:
         except ValidationError as error:
             broken.add(name)
             found += translated(Config, error.errors(include_url=False), part)
-    for key in values:
-        if key not in Config.model_fields:
-            found.append(Problem((key,), _unknown(key, values)))
+    unknown = [key for key in values if key not in Config.model_fields]
+    found += [Problem((key,), _unknown(key, values)) for key in unknown[:MOST]]
     return found + [Problem(path, what) for path, what in problems(good, frozenset(broken))]
 
 
@@ -189,14 +199,20 @@ def _alone(name: str) -> type[Section]:
 
 
 def problem_lines(document: Document, found: Sequence[Problem]) -> list[str]:
-    """One line a problem, flags last, otherwise in the order of the file."""
+    """One line a problem, flags last, otherwise in the order of the file; of very many the first."""
     placed = [(problem.source or document.place(problem.path), problem) for problem in found]
     placed.sort(key=lambda item: _position(item[0]))
     lines = [
-        ": ".join(part for part in (place, ".".join(map(str, problem.path)), problem.what) if part)
+        ": ".join(part for part in (place, _dotted(problem.path), shortened(problem.what, 1000)) if part)
         for place, problem in placed
     ]
-    return list(dict.fromkeys(lines))
+    different = list(dict.fromkeys(lines))
+    left = len(different) - MOST_LINES
+    return [*different[:MOST_LINES], f"{document.name}: and {left} more"] if left > 0 else different
+
+
+def _dotted(path: Path) -> str:
+    return shortened(".".join(map(str, path)), 200)
 
 
 def _position(place: str) -> tuple[float, float]:

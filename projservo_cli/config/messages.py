@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
-from projservo_cli.config.yaml_source import Path, Problem
+from projservo_cli.config.yaml_source import Path, Problem, shortened
 
 _PHRASES = {
     "missing": "is missing",
@@ -37,16 +37,19 @@ _PHRASES = {
 }
 
 
+MOST = 200  # problems that are looked at; who has more has taken another file
+
+
 def nearest(word: object, valid: Sequence[str]) -> str:
     """The end of a message: the nearest valid word, or all of them."""
-    close = difflib.get_close_matches(str(word), valid, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(str(word)[:80], valid, n=1, cutoff=0.5)
     return f"did you mean {close[0]}?" if close else f"valid: {', '.join(valid)}"
 
 
 def translated(model: type[BaseModel], errors: Sequence[ErrorDetails], values: Any) -> Iterator[Problem]:
     """One problem for each wrong value, whatever number of alternatives pydantic tried on it."""
     seen: dict[Path, Problem] = {}
-    for error in errors:
+    for error in errors[:MOST]:
         path = _plain(error["loc"], values)
         if path in seen and error["type"] != "literal_error":  # of alternatives, the named ones say most
             continue
@@ -94,8 +97,7 @@ def _given(value: Any) -> str:
 
 def _shown(value: Any) -> str:
     """A value as it would stand in YAML, shortened."""
-    text = json.dumps(value) if value is None or isinstance(value, bool) else repr(value)
-    return text if len(text) <= 40 else text[:37] + "…"
+    return shortened(json.dumps(value) if value is None or isinstance(value, bool) else repr(value), 40)
 
 
 def valid_keys(model: type[BaseModel], path: Path) -> list[str]:

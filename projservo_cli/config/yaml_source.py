@@ -11,6 +11,11 @@ from typing import Any
 
 import yaml
 
+try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
+    from yaml import CSafeLoader as _Parser
+except ImportError:
+    from yaml import SafeLoader as _Parser  # type: ignore[assignment]  # either will do
+
 Path = tuple[str | int, ...]
 
 MAX_BYTES = 1_000_000
@@ -31,7 +36,13 @@ class Problem:
     source: str = ""
 
 
+def shortened(text: str, most: int = 80) -> str:
+    """A text for a message, cut where it is long."""
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
 _STANDARD = "tag:yaml.org,2002:"
+_COLLECTIONS = (f"{_STANDARD}map", f"{_STANDARD}seq")
 
 
 def _boolean(text: str) -> bool:
@@ -57,7 +68,7 @@ _CORE: dict[str, tuple[Callable[[str], Any], str, str]] = {
 _SCALARS: dict[str, Callable[[str], Any]] = {_STANDARD + "str": str}
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(_Parser):
     """Scalars of the YAML 1.2 core schema."""
 
 
@@ -82,15 +93,17 @@ class Document:
         self._count = 0
         try:
             self._parse(text)
-        except _TooMuchError as error:
+        except _UnfitError as error:
             self.problems.append(Problem((), str(error), name))
 
     def _parse(self, text: str) -> None:
         if len(text) > MAX_BYTES:
-            raise _TooMuchError(f"larger than {MAX_BYTES} bytes; this is no configuration")
+            raise _UnfitError(f"larger than {MAX_BYTES} bytes; this is no configuration")
+        if any("\ud800" <= character <= "\udfff" for character in text):
+            raise _UnfitError("not UTF-8 text")
         try:
-            loader = _Loader(text)
-            root = loader.get_single_node()
+            _require_bounded(text)
+            root = _Loader(text).get_single_node()
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             place = self._place(mark) if mark else self.name
@@ -100,8 +113,6 @@ class Document:
             what = " ".join(str(error).split())
             self.problems.append(Problem((), f"not valid YAML: {what}", self.name))
             return
-        except RecursionError:
-            raise _TooMuchError(f"nested more than {MAX_DEPTH} levels deep") from None
         if root is not None:
             self.values = self._value(root, ())
 
@@ -111,10 +122,12 @@ class Document:
     def _value(self, node: yaml.Node, path: Path) -> Any:
         self._count += 1
         if self._count > MAX_VALUES:
-            raise _TooMuchError(f"more than {MAX_VALUES} values, aliases expanded")
+            raise _UnfitError(f"more than {MAX_VALUES} values, aliases expanded")
         if len(path) > MAX_DEPTH:
-            raise _TooMuchError(f"nested more than {MAX_DEPTH} levels deep, or an alias holds itself")
+            raise _UnfitError(f"nested more than {MAX_DEPTH} levels deep, or an alias holds itself")
         self.places.setdefault(path, self._place(node.start_mark))
+        if isinstance(node, yaml.CollectionNode) and node.tag not in _COLLECTIONS:
+            return self._refused(node, path)
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, path)
         if isinstance(node, yaml.SequenceNode):
@@ -142,15 +155,17 @@ class Document:
     def _scalar(self, node: yaml.ScalarNode, path: Path) -> Any:
         convert = _SCALARS.get(node.tag)
         if convert is None:
-            what = f"the tag {node.tag.replace(_STANDARD, '!!')} is not allowed; plain values only"
-            self.problems.append(Problem(path, what, self._place(node.start_mark)))
-            return None
+            return self._refused(node, path)
         try:
             return convert(node.value)
         except (ValueError, KeyError):
             what = f"cannot be read as {node.tag.removeprefix(_STANDARD)}"
             self.problems.append(Problem(path, what, self._place(node.start_mark)))
             return None
+
+    def _refused(self, node: yaml.Node, path: Path) -> None:
+        what = f"the tag {shortened(node.tag.replace(_STANDARD, '!!'))} is not allowed; plain values only"
+        self.problems.append(Problem(path, what, self._place(node.start_mark)))
 
     def overridden(self, path: Path, flag: str) -> None:
         """Note that the value at ``path``, and all inside it, now comes from elsewhere."""
@@ -164,5 +179,17 @@ class Document:
         return self.places.get(path, self.name)
 
 
-class _TooMuchError(ValueError):
-    """The text is beyond the bounds of a configuration."""
+def _require_bounded(text: str) -> None:
+    """Refuse what is nested too deep or too long before nodes are made of it, which recurses in C."""
+    depth = count = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        count += isinstance(event, yaml.NodeEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MAX_DEPTH:
+            raise _UnfitError(f"nested more than {MAX_DEPTH} levels deep")
+        if count > 2 * MAX_VALUES:  # keys and values
+            raise _UnfitError(f"more than {MAX_VALUES} values")
+
+
+class _UnfitError(ValueError):
+    """The text cannot be that of a configuration."""
