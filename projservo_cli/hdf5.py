@@ -7,8 +7,11 @@ at the structure before anything is read. Data sets carry a checksum of their ow
 from HDF5 1.10 on, so do all structures, for the readers of other programs.
 """
 
+import errno
 import hashlib
+import os
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from math import prod
@@ -24,7 +27,7 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _SEAL = b"\nprojservo sha256 %s\n"
 _SEAL_SIZE = len(_SEAL % bytes(64))
 _SEALED = re.compile(rb"\nprojservo sha256 ([0-9a-f]{64})\n")
-_VERSION = "v110"  # that of the file format, from 2016, with checksums in its structures
+_VERSION = ("v110", "v110")  # that of the file format, from 2016, with checksums in its structures
 _END = {0: 40, 1: 44, 2: 28, 3: 28}  # where files of each version of the format say how long they are
 _HEAD = 52  # bytes, with that number in each of them
 _OBJECT = 64  # bytes that a group or an array takes at least
@@ -40,8 +43,14 @@ class DamagedError(ValueError):
 
 
 @contextmanager
-def new_file(path: Path) -> Iterator[h5py.File]:
+def new_file(path: Path, size: int | None = None) -> Iterator[h5py.File]:
     """A file to be filled, that takes the place of the one at ``path`` when the block succeeds.
+
+    It is made in memory, since the library neither survives a full disk nor tells of it in one line.
+
+    Parameters
+    ----------
+    size : bytes it may have, where it is too large for that: the disk must then have them to begin with.
 
     Raises
     ------
@@ -49,11 +58,17 @@ def new_file(path: Path) -> Iterator[h5py.File]:
         When it cannot be written; the file that stood there stays.
     """
     with replacing(path) as temporary:
-        try:
-            with h5py.File(temporary, "w", libver=(_VERSION, _VERSION), locking=False) as file:
+        if size is None:
+            with h5py.File(temporary, "w", libver=_VERSION, driver="core", backing_store=False) as file:
                 yield file
-        except (OSError, RuntimeError) as error:  # of a full disk, the library tells either
-            _raise_unwritable(path, error)
+                file.flush()
+                image = file.id.get_file_image()
+            temporary.write_bytes(image)
+        else:
+            if shutil.disk_usage(temporary.parent).free < size:
+                raise InputError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC)}")
+            with h5py.File(temporary, "w", libver=_VERSION, locking=False) as file:
+                yield file
         seal(temporary)
 
 

@@ -59,7 +59,9 @@ def assemble(
         If a part is damaged or the file cannot be written; the table that stood there stays.
     """
     rows = sum(_rows(part) for part in parts)
-    with new_file(path) as file:
+    size = rows * sum(np.dtype(dtype).itemsize for _, dtype, _, _ in headings)
+    size += sum(part.stat().st_size for part in parts)  # their traces
+    with new_file(path, size) as file:
         file.attrs["schema"] = SCHEMA
         file.attrs["schema_version"] = SCHEMA_VERSION
         for name, value in attributes.items():

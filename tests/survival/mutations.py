@@ -6,13 +6,11 @@ turned, something else altogether, or made with h5py to deceive. Half of the lat
 than with exit code 2 and one line, within 500 MB.
 """
 
-import gzip
 import struct
 import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Callable
-from functools import cache
 from pathlib import Path
 
 import h5py
@@ -20,9 +18,9 @@ import numpy as np
 
 from projservo_cli import hdf5
 from projservo_cli.store import load
+from tests.store.first_release import first_release
 from tests.survival.calls import Ending, call, prepare
 
-FIRST = Path(__file__).parents[1] / "store" / "data" / "first_release.h5.gz"
 MEGABYTES = 500.0
 COMMANDS = (
     ("show", "{run}", "--json"),
@@ -214,12 +212,6 @@ EDITS: dict[str, Edit] = {
     "named type": _many,
 }
 KINDS = (*BYTES, *EDITS)
-
-
-@cache
-def first_release() -> bytes:
-    """The run file that the first release wrote."""
-    return gzip.decompress(FIRST.read_bytes())
 
 
 def mutate(number: int, path: Path) -> str:

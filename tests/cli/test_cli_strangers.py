@@ -1,0 +1,129 @@
+"""Folders, names and texts of strangers: nothing leads out of the output folder or commands the terminal."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from projservo_cli.lock import working_in
+from projservo_cli.page import write_page
+from projservo_cli.store import load, save
+
+ESCAPES = "\x1b[2J\x07\x9b31m\u202egnp.exe\u2028</script><img src=x onerror=alert(1)>"
+
+
+@pytest.fixture
+def hostile(projservo, stages, tmp_path):
+    """A run whose texts are meant for a terminal and a browser."""
+    projservo("calibrate", "plan", "-c", "tiny.yaml", "-o", "out")
+    run = load("out")
+    plan = run.results["plan"]
+    records = {"": replace(plan.records[""], reason=ESCAPES, profile=ESCAPES)}
+    provenance = {**plan.provenance, "host": ESCAPES, "argv": ["x", ESCAPES]}
+    save(replace(run, results={**run.results, "plan": replace(plan, records=records, provenance=provenance)}))
+    return tmp_path / "out"
+
+
+def plain(text):
+    return all(character.isprintable() or character in "\n\u202f" for character in text)
+
+
+def test_texts_of_a_run_do_not_command_the_terminal(projservo, hostile):
+    for arguments in (["show", "out"], ["show", "out", "-v"], ["show", "out", "--json"]):
+        answer = projservo(*arguments)
+        assert answer.code == 0
+        assert plain(answer.out + answer.err), [c for c in answer.out if not c.isprintable()]
+    assert projservo("show", "out", "--json").json["plan"]["reason"] == ESCAPES
+
+
+def test_texts_of_a_run_do_not_become_part_of_the_page(hostile):
+    text = write_page(load(hostile)).read_text(encoding="utf-8")
+    assert "<img src=x" not in text
+    assert "</script>" not in text
+    assert "&lt;img src=x" in text
+
+
+def test_messages_about_files_do_not_command_the_terminal(projservo, stages, tmp_path):
+    (tmp_path / "bad.yaml").write_text('"\\e[2J": 1\nname: "\\e[31m"\n', encoding="utf-8")
+    answer = projservo("calibrate", "-c", "bad.yaml")
+    assert answer.code == 2
+    assert plain(answer.err)
+    assert "\\u001b[2J" in answer.err
+
+
+@pytest.mark.parametrize("name", ["../out", "/tmp/out", "a/b", "..", ".", "a\\b", "", "x\n", "~/x:y"])
+def test_a_name_is_that_of_one_folder(projservo, stages, tmp_path, name):
+    before = sorted(tmp_path.rglob("*"))
+    answer = projservo("calibrate", "-c", "tiny.yaml", "--set", f"name={json.dumps(name)}")
+    assert answer.code == 2
+    assert "name" in answer.err
+    assert stages.made == []
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_result_folder_that_a_link_takes_elsewhere_is_refused(projservo, stages, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "tiny").symlink_to(tmp_path / "elsewhere")
+    answer = projservo("calibrate", "-c", "tiny.yaml")
+    assert answer.code == 2
+    assert "symbolic link" in answer.err
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "results/tiny").code == 0  # asked for by its name
+
+
+def test_a_run_file_that_is_a_link_is_replaced_not_written_through(projservo, stages, tmp_path):
+    projservo("calibrate", "-c", "tiny.yaml", "-o", "other")
+    theirs = (tmp_path / "other" / "run.h5").read_bytes()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "run.h5").symlink_to(tmp_path / "other" / "run.h5")
+    assert projservo("plan", "-c", "tiny.yaml", "-o", "out").code == 0
+    assert (tmp_path / "other" / "run.h5").read_bytes() == theirs
+    assert not (tmp_path / "out" / "run.h5").is_symlink()
+    assert "plan" in load("out").results
+
+
+@pytest.mark.parametrize("words", [["calibrate"], ["report"], ["plan", "--force"]])
+def test_a_second_process_is_refused_and_nothing_is_lost(projservo, stages, tmp_path, words):
+    with working_in(tmp_path / "out"):
+        answer = projservo(*words, "-c", "tiny.yaml", "-o", "out")
+        assert answer.code == 2
+        assert "is at work there" in answer.err
+        assert stages.made == []
+        assert projservo("calibrate", "-n", "-c", "tiny.yaml", "-o", "out").code == 0  # reads only
+    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out").code == 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["run.h5"]
+
+
+def test_what_another_process_made_meanwhile_is_kept(projservo, stages, tmp_path, monkeypatch):
+    """Between reading the run and having the folder for itself, another process made the plan."""
+    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    from projservo_cli import lock
+
+    waiting = lock.working_in
+
+    def meanwhile(*arguments):
+        monkeypatch.setattr(lock, "working_in", waiting)
+        projservo("servo", "--law", "stacked", "-c", "tiny.yaml", "-o", "out")
+        return waiting(*arguments)
+
+    monkeypatch.setattr(lock, "working_in", meanwhile)
+    projservo("servo", "--law", "direct_three", "-c", "tiny.yaml", "-o", "out")
+    assert stages.made == ["calibrate", "plan", "stacked", "direct_three"]
+    assert list(load("out").traces) == ["stacked", "direct_three"]
+
+
+def test_up_to_date_is_told_also_where_nothing_can_be_locked(projservo, stages, tmp_path):
+    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    with working_in(tmp_path / "out"):
+        assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out").code == 0
+
+
+@pytest.mark.parametrize(
+    "value", ["a" + ".b" * 5000 + "=1", "task.start.joints." + "9" * 6000 + "=1", "x=\udc80"]
+)
+def test_overrides_of_any_length_end_in_one_line(projservo, stages, value):
+    answer = projservo("calibrate", "-c", "tiny.yaml", "--set", value)
+    assert answer.code == 2
+    assert len(answer.err.splitlines()) == 1
+    assert len(answer.err) < 7000

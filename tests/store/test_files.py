@@ -1,0 +1,172 @@
+"""Writing files: what killed processes leave is removed, links do not lead out, a full disk is told."""
+
+import contextlib
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from projservo_cli import files
+from projservo_cli.export import write_csv, write_mat, write_npz
+from projservo_cli.files import clear_leftovers, inside, replacing, require_inside
+from projservo_cli.lock import LOCK, working_in
+from projservo_cli.page import write_comparison
+from projservo_cli.records import InputError
+from projservo_cli.store import load, save
+from projservo_cli.tables import write_table
+from tests.conftest import ROOT
+from tests.store.first_release import first_release
+
+unix = pytest.mark.skipif(sys.platform == "win32", reason="processes and links as Unix knows them")
+
+
+def ended_process():
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def temporary(folder, name, process, machine=None):
+    path = folder / f".{name}.{machine or files._machine()}.{process}.abcd.part"
+    path.write_text("half", encoding="utf-8")
+    return path
+
+
+@unix
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
+    ended = ended_process()
+    gone = temporary(tmp_path, "run.h5", ended)
+    stay = [
+        temporary(tmp_path, "run.h5", os.getpid()),
+        temporary(tmp_path, "run.h5", ended, "00000000"),
+        temporary(tmp_path, "other.h5", ended),
+        tmp_path / ".mine.part",
+    ]
+    stay[-1].write_text("mine", encoding="utf-8")
+    with replacing(tmp_path / "run.h5") as path:
+        path.write_text("whole", encoding="utf-8")
+    assert not gone.exists()
+    assert all(path.exists() for path in stay)
+    clear_leftovers(tmp_path)
+    assert [path.exists() for path in stay] == [True, True, False, True]
+
+
+@unix
+def test_temporary_files_are_those_that_are_cleared(tmp_path):
+    with replacing(tmp_path / "run.h5") as path:
+        path.write_text("x", encoding="utf-8")
+        found = files._TEMPORARY.fullmatch(path.name)
+        assert found["name"] == "run.h5"
+        assert int(found["process"]) == os.getpid()
+
+
+@unix
+def test_links_that_lead_out_are_refused(tmp_path):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    out.mkdir()
+    elsewhere.mkdir()
+    (out / "figures").symlink_to(elsewhere)
+    (out / "circle").symlink_to(out / "circle")
+    (out / "within").symlink_to(out)
+    (tmp_path / "link").symlink_to(out)
+    assert inside(out / "within", out)
+    assert inside(tmp_path / "link" / "x", tmp_path / "link")  # the folder itself may be a link
+    assert not inside(out / ".." / "elsewhere", out)
+    for name in ("figures", "circle"):
+        with pytest.raises(InputError, match="symbolic link"):
+            require_inside(out / name, out)
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from projservo_cli.lock import working_in
+with working_in(Path(sys.argv[1])):
+    print("in", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextlib.contextmanager
+def held(folder):
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    assert process.stdout.readline() == b"in\n"
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_a_folder_is_worked_in_by_one_process_and_free_when_that_is_killed(tmp_path):
+    with held(tmp_path) as process:
+        with pytest.raises(InputError, match=f"process {process.pid} is at work there"), working_in(tmp_path):
+            pass
+        process.kill()
+        process.wait()
+        with working_in(tmp_path):
+            assert (tmp_path / LOCK).exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_nothing_was_written_into_goes_again(tmp_path):
+    with working_in(tmp_path / "new"):
+        assert (tmp_path / "new").is_dir()
+    assert not (tmp_path / "new").exists()
+    with working_in(tmp_path / "new"):
+        (tmp_path / "new" / "file").touch()
+    assert (tmp_path / "new" / "file").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="cannot be written"), working_in(tmp_path / "file" / "folder"):
+        pass
+
+
+@pytest.fixture
+def little_disk(tmp_path):
+    """A disk of 256 kB."""
+    mounted = (
+        subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(tmp_path)],
+            capture_output=True,
+            check=False,
+        )
+        if Path("/proc/mounts").exists() and os.geteuid() == 0
+        else None
+    )
+    if mounted is None or mounted.returncode != 0:
+        pytest.skip("no file system can be mounted here")
+    yield tmp_path
+    subprocess.run(["umount", str(tmp_path)], check=True)
+
+
+def test_a_full_disk_is_told_and_the_old_file_stays(little_disk, tmp_path_factory):
+    source = tmp_path_factory.mktemp("source") / "run.h5"
+    source.write_bytes(first_release())  # larger than that disk
+    run = load(source)
+    path = little_disk / "file"
+    path.write_bytes(b"old")
+    (little_disk / "filling").write_bytes(bytes(240_000))
+    writers = [
+        lambda: save(replace(run, path=path)),
+        lambda: write_npz(run, path),
+        lambda: write_mat(run, path),
+        lambda: write_csv(run, little_disk / "csv"),
+        lambda: write_comparison([run, run], path),
+        lambda: write_table(run.observation, path),
+    ]
+    for write in writers:
+        with pytest.raises(InputError, match=": cannot be written: No space left on device"):
+            write()
+    assert path.read_bytes() == b"old"
+    assert {found.name for found in little_disk.iterdir()} <= {"file", "filling", "csv"}
