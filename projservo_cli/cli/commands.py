@@ -240,8 +240,9 @@ COMMANDS = {
     "schema": Command(
         "Print the JSON Schema of the configuration.",
         "Editors that speak YAML complete and check a configuration whose first line names the schema: "
-        "# yaml-language-server: $schema=FILE",
+        "# yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.",
         ("output",),
+        ("[sweep]",),
         example="projservo schema -o schema.json",
         variants=_variants("FILE", output="File to write. Default: standard output."),
     ),

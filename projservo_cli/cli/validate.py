@@ -4,6 +4,7 @@ from typing import Any
 
 import click
 
+from projservo_cli.cli.options import wrapped
 from projservo_cli.cli.output import Console, print_json
 
 # Predictions so many times the noise away come from another robot, or from other units.
@@ -44,7 +45,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         print_json(value)
         return 0
     skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
-    console.show(f"validate: {value['count']} marker-view pairs; skipped: {skipped}")
+    console.show(wrapped(f"validate: {value['count']} marker-view pairs; skipped: {skipped}"))
     if value["count"]:
         console.show(
             "  residual px: rms {rms_px:.4g}, median {median_px:.4g}, p95 {p95_px:.4g}".format_map(value)

@@ -1,10 +1,11 @@
-"""The JSON Schema of a configuration, by which editors complete and check it."""
+"""JSON Schemas of a configuration and of a sweep, by which editors complete and check them."""
 
 import json
 from pathlib import Path
 from typing import Any
 
 from projservo_cli.config.models import Config
+from projservo_cli.config.sweep import SweepConfig
 
 # A configuration with a comment on every key, to start from.
 STARTER = Path(__file__).with_name("starter.yaml")
@@ -27,9 +28,21 @@ def json_schema() -> dict[str, Any]:
     return {"$schema": DRAFT, **schema, "title": "Configuration of projservo"}
 
 
-def schema_text() -> str:
-    """The schema as the text of a file."""
-    return json.dumps(json_schema(), ensure_ascii=False, indent=2) + "\n"
+def sweep_schema() -> dict[str, Any]:
+    """The schema of the configuration of a sweep."""
+    schema: dict[str, Any] = _plain(SweepConfig.model_json_schema())
+    schema["required"].remove("name")
+    keys = schema["properties"]
+    described = keys["base"].pop("description")
+    keys["base"] = {"anyOf": [keys["base"], {"type": "string"}], "description": described}
+    values = schema["$defs"]["Linked"]["properties"]["values"]  # alone: of the key that names the axis
+    keys["grid"]["additionalProperties"] = {"anyOf": [keys["grid"]["additionalProperties"], values]}
+    return {"$schema": DRAFT, **schema, "title": "Sweep of projservo"}
+
+
+def schema_text(schema: dict[str, Any]) -> str:
+    """A schema as the text of a file."""
+    return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
 def _plain(value: Any) -> Any:

@@ -8,9 +8,9 @@ import yaml
 
 from projservo_cli.config import Config, digest, load_config
 from projservo_cli.config.fields import Section
-from projservo_cli.config.schema import STARTER, json_schema, schema_text
-from projservo_cli.config.sweep import SweepConfig
-from tests.conftest import SHIPPED
+from projservo_cli.config.schema import STARTER, json_schema, schema_text, sweep_schema
+from projservo_cli.config.sweep import SweepConfig, load_sweep
+from tests.conftest import SHIPPED, SWEEPS
 
 ROOT = Path(__file__).parents[2]
 WRONG = {
@@ -32,7 +32,11 @@ def validator():
 
 def test_the_shipped_schema_is_the_one_of_the_models():
     shipped = (ROOT / "configs" / "schema.json").read_text(encoding="utf-8")
-    assert shipped == schema_text(), "outdated: projservo schema -o configs/schema.json"
+    assert shipped == schema_text(json_schema()), "outdated: projservo schema -o configs/schema.json"
+    sweeps = (ROOT / "configs" / "sweep.schema.json").read_text(encoding="utf-8")
+    assert sweeps == schema_text(sweep_schema()), (
+        "outdated: projservo schema sweep -o configs/sweep.schema.json"
+    )
 
 
 @pytest.mark.parametrize("path", [*SHIPPED, STARTER], ids=lambda path: path.stem)
@@ -42,6 +46,38 @@ def test_configurations_name_their_schema_and_satisfy_it(validator, path):
     assert named
     assert path == STARTER or (path.parent / named[1]).is_file()
     assert not list(validator.iter_errors(yaml.safe_load(text)))
+
+
+@pytest.fixture(scope="module")
+def of_sweeps():
+    jsonschema = pytest.importorskip("jsonschema", reason="jsonschema is not installed")
+    jsonschema.Draft202012Validator.check_schema(sweep_schema())
+    return jsonschema.Draft202012Validator(sweep_schema())
+
+
+@pytest.mark.parametrize("path", SWEEPS, ids=lambda path: path.stem)
+def test_sweeps_name_their_schema_and_satisfy_it(of_sweeps, path):
+    text = path.read_text(encoding="utf-8")
+    assert text.splitlines()[0] == "# yaml-language-server: $schema=sweep.schema.json"
+    values = yaml.safe_load(text)
+    assert not list(of_sweeps.iter_errors(values))
+    linked = {"keys": ["noise.servo_px", "noise.calibration_px"], "values": [0, 1]}
+    assert not list(of_sweeps.iter_errors(values | {"base": "paper.yaml", "grid": {"noise": linked}}))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("runs", 0), ("bases", "paper.yaml"), ("grid", {"law": []}), ("base", 1), ("tasks", {"random": 0.5})],
+)
+def test_the_schema_of_sweeps_refuses_what_loading_refuses(of_sweeps, tmp_path, key, value):
+    values = {"base": "paper.yaml", key: value}
+    if key == "bases":
+        del values["base"]
+    assert list(of_sweeps.iter_errors(values))
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump(values), encoding="utf-8")
+    with pytest.raises(ValueError, match=key):
+        load_sweep(path)
 
 
 @pytest.mark.parametrize("case", WRONG)
@@ -57,7 +93,7 @@ def test_the_schema_refuses_what_loading_refuses(validator, case):
 
 def test_vectors_are_said_in_the_form_of_every_draft_and_names_are_optional():
     schema = json_schema()
-    assert "prefixItems" not in schema_text()
+    assert "prefixItems" not in schema_text(schema)
     assert "name" not in schema.get("required", [])
     assert schema["additionalProperties"] is False
     size = schema["$defs"]["Rig"]["properties"]["image_size_px"]
