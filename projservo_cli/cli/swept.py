@@ -32,7 +32,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         print_json({"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]})
         return 0
     console.show(
-        f"report: {found['runs']} of {found['total']} runs; converged with 95 % interval, medians of those"
+        f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; medians of converged runs"
     )
     for line in (*_cells(found["cells"]), *_pairs(found["paired"])):
         console.show(line)
@@ -45,26 +45,27 @@ def _cells(cells: list[dict[str, Any]]) -> list[str]:
     axes = [name for name in cells[0] if name not in known and not name.endswith("_rate")]
     widths = [max(len(name), *(len(str(cell[name])) for cell in cells)) + 2 for name in axes]
     head = "".join(f"{name:<{width}}" for name, width in zip(axes, widths, strict=True))
-    lines = [f"  {head}{'converged %':>24}{'hidden %':>10}{'outside %':>11}{'steps':>7}{'mm':>10}{'path':>7}"]
+    lines = [f"  {head}{'converged %':>15}{'hidden':>7}{'outside':>8}{'steps':>6}{'mm':>8}{'path':>7}"]
     for cell in cells:
         low, high = (100.0 * value for value in cell["success_interval"])
-        rate = f"{100.0 * cell['success_rate']:.1f} ({low:.1f} to {high:.1f})"
+        rate = f"{100.0 * cell['success_rate']:.1f} ({low:.0f}-{high:.0f})"
         middle = [
             cell["quantiles"][name]["0.5"] for name in ("steps", "position_error_mm", "path_length_ratio")
         ]
         numbers = [
             f"{'-' if value is None else format(value, '.3g'):>{w}}"
-            for value, w in zip(middle, (7, 10, 7), strict=True)
+            for value, w in zip(middle, (6, 8, 7), strict=True)
         ]
         text = "".join(f"{cell[name]!s:<{width}}" for name, width in zip(axes, widths, strict=True))
         hidden, outside = 100.0 * cell["self_occluded_rate"], 100.0 * cell["left_image_rate"]
-        lines.append(f"  {text}{rate:>24}{hidden:>10.1f}{outside:>11.1f}{''.join(numbers)}")
+        lines.append(f"  {text}{rate:>15}{hidden:>7.1f}{outside:>8.1f}{''.join(numbers)}")
     return lines
 
 
 def _pairs(pairs: list[dict[str, Any]]) -> list[str]:
     lines = [
-        "paired on the same tasks: both, only the first, only the second, neither converged; chance if alike"
+        "paired on the same tasks: both converged, only the first, only the second,",
+        "neither; p: chance if alike",
     ]
     for pair in pairs:
         known = ("laws", "pairs", "both", "only", "neither", "p_success", "median_difference", "p_difference")
