@@ -32,7 +32,8 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         print_json({"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]})
         return 0
     console.show(
-        f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; medians of converged runs"
+        f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; "
+        "medians of converged runs"
     )
     for line in (*_cells(found["cells"]), *_pairs(found["paired"])):
         console.show(line)
