@@ -14,6 +14,10 @@ from projservo_cli.store import Run
 
 NEAREST = ("visibility", "border_px", "joints", "condition")  # smallest along the planned motion
 LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
+NOTES = {  # on runs, and their reasons
+    "unplanned": "driven without a plan",
+    "untested": "images were not tested against the calibration",
+}
 COUNTS = ("merged_poses", "merged_markers")
 NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
 
@@ -101,7 +105,12 @@ def _plan(run: Run) -> dict[str, Any]:
         name: {"least": value, "mu": mu}
         for name, value, mu in zip(NEAREST, plan.least, plan.least_mu, strict=True)
     }
-    found = {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0), "margins": nearest}
+    found = {
+        "tau_0": plan.tau_0,
+        "smallest_margin": plan.margin.min(axis=0),
+        "margins": nearest,
+        "most_miss_px": plan.miss.max(),
+    }
     return rest | angles | found
 
 
@@ -185,10 +194,12 @@ def _servo_words(value: dict[str, Any]) -> list[str]:
         f"{_number(trace['center_deviation_mm']):>10}"
         for trace in value["laws"]
     ]
-    reasons = dict.fromkeys(trace["untested"] for trace in value["laws"] if trace["untested"])
-    said = "images were not tested against the calibration"
-    untested = [wrapped(f"{said}: {reason}", "  ") for reason in reasons]
-    return ["servo: true errors at the end, self-occluded steps left/right", head, *rows, *untested]
+    notes = [
+        wrapped(f"{said}: {reason}", "  ")
+        for name, said in NOTES.items()
+        for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name])
+    ]
+    return ["servo: true errors at the end, self-occluded steps left/right", head, *rows, *notes]
 
 
 def _report_words(value: dict[str, Any]) -> list[str]:

@@ -219,11 +219,16 @@ def _verdict(call: _Call) -> int:
 
 
 def _infeasible(call: _Call) -> bool:
-    """Say that no motion keeps the constraints asked for; True where the call was to plan one."""
-    if "plan" not in call.run.results or call.run.plan.profile != "constrained" or call.run.plan.feasible:
+    """Say that no motion keeps the constraints asked for; True where the call was to plan one.
+
+    A plan that gives some of them up so that the joints can follow is one.
+    """
+    if "plan" not in call.run.results or call.run.plan.profile != "constrained":
         return False
-    click.echo(f"projservo: plan: {call.run.plan.reason}", err=True)
-    return "plan" in call.names
+    plan = call.run.plan
+    if not plan.feasible or plan.relaxed:
+        click.echo(f"projservo: plan: {plan.reason}", err=True)
+    return not plan.feasible and "plan" in call.names
 
 
 def _unusable(call: _Call) -> bool:

@@ -144,6 +144,11 @@ class Trajectory(Section):
         0.001,
         description="in the profile constrained: least reciprocal condition of the face's image Jacobian",
     )
+    most_miss_px: NotNegative = Field(
+        5.0,
+        description="in the profile constrained, where no path keeps everything: least_condition is "
+        "given up, and joints may stay behind the planned images by less than this; 0 gives up neither",
+    )
 
 
 class Control(Section):
@@ -158,6 +163,9 @@ class Control(Section):
         ("replan",),
         description="whether each step plans anew or the plan is followed; with a list, each law in those "
         "of the modes that it has",
+    )
+    without_plan: Literal["replan", "refuse"] = Field(
+        "replan", description="whether a law that no joints could follow the plan with replans, or is not run"
     )
     must_converge: tuple[Law, ...] = Field(
         ("direct_three", "direct_two"), description="laws whose failure is that of the call, exit code 1"

@@ -29,9 +29,12 @@ class Plan:
     profile: str = scalar(about="which part is driven when")
     feasible: bool = scalar(
         about="whether both cameras see the face all along; in the profile constrained, whether all "
-        "constraints hold"
+        "constraints hold, but for what ``relaxed`` says"
     )
     reason: str = scalar(about="what makes the plan feasible or not, in words")
+    relaxed: str = scalar(
+        about="what was given up since no path keeps all constraints, and where; empty where nothing was"
+    )
     tau: float = scalar(about="amplitude of the translation, unit-norm kernel of (8)")
     theta_r: float = scalar(units="rad", about="angle onto the target plane, in the sense chosen")
     theta_p: float = scalar(units="rad", about="angle within the plane")
@@ -59,6 +62,12 @@ class Plan:
     )
     joint_margin: FloatArray = array("sample", about="least distance from a joint limit over half the range")
     condition: FloatArray = array("sample", about="reciprocal condition of the image Jacobian of the face")
+    miss: FloatArray = array(
+        "sample", units="px", about="how far the images stay behind the planned ones; 0 where joints follow"
+    )
+    given_up: BoolArray = array(
+        "sample", about="whether conditioning is below its bound there or the joints stay behind"
+    )
     least: FloatArray = array(
         "constraint",
         about="smallest visibility margin, border distance in px, joint margin, reciprocal condition",
@@ -160,6 +169,9 @@ class Trace:
     pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
     goal_pose: FloatArray = array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
     center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
+    unplanned: str = scalar(
+        about="why a run that was to follow the plan went without it; empty where it followed", default=""
+    )
     untested: str = scalar(
         about="why the images of a robot that is not simulated were not tested against the calibration",
         default="",

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 import numpy as np
 
 from projservo_cli.records import NO_LENS, Model
+from projservo_cli.task.along import along
 from projservo_cli.task.margins import CONSTRAINTS, Reaching, within
-from projservo_cli.task.planning import along
 
 JOINTS = 6
 

@@ -2,13 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.records import FloatArray, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray
 from projservo_cli.stages.calibrate import image_size_of
 from projservo_cli.stages.motion import joints_of
+from projservo_cli.stages.pace import AS_FAST_AS_ALLOWED, Pace, least_time, timed
+from projservo_cli.task.along import Along, along
 from projservo_cli.task.margins import (
     CONSTRAINTS,
     IMAGE,
@@ -18,7 +20,7 @@ from projservo_cli.task.margins import (
     Reaching,
     limit_margin,
 )
-from projservo_cli.task.planning import Along, along, plan_path
+from projservo_cli.task.planning import plan_path
 from projservo_cli.task.trajectory import profile_shares
 
 if TYPE_CHECKING:
@@ -28,29 +30,14 @@ CONSTRAINED = "constrained"
 VIEWS = ("left", "right")
 
 
-class Pace(NamedTuple):
-    """How fast a planned motion is to be.
-
-    Attributes
-    ----------
-    duration : time it is given, s; None for as little as the joint-speed limit lets it take.
-    ramp : time in which it comes up to its pace, and to rest again at its end, s.
-    """
-
-    duration: float | None = None
-    ramp: float = 0.0
-
-
-AS_FAST_AS_ALLOWED = Pace()
-
-
 @dataclass(frozen=True, eq=False)
 class Motion:
     """Shares of a plan at equal steps of σ, with their margins.
 
     Attributes
     ----------
-    reaching : the task in the senses that were chosen.
+    reaching : the task in the senses that were chosen, with the demands that the motion keeps to.
+    asked : the demands that it was to keep to.
     mu : (s, 3) shares.
     along : margins at the shares.
     checked, checked_mu : margins and shares (k, 3) by which the motion is judged.
@@ -58,6 +45,7 @@ class Motion:
     """
 
     reaching: Reaching
+    asked: Demands
     mu: FloatArray
     along: Along
     checked: Along
@@ -94,6 +82,27 @@ class Motion:
         least = float(column.min())
         instant = int(np.argmax(column <= 0.0)) if least <= 0.0 else int(np.argmin(shares[:, constraint]))
         return constraint, least, instant
+
+    def given_up(self, found: Along) -> BoolArray:
+        """Where (s,) along the motion something asked for was given up, so that the joints can follow."""
+        if self.reaching.demands.miss_px == 0.0:
+            return np.zeros(len(found.miss), dtype=np.bool_)
+        return np.asarray((found.condition <= self.asked.conditioning) | (found.miss > 0.0))
+
+    def relaxed(self) -> str:
+        """What was given up, in words; empty where nothing was."""
+        where = np.flatnonzero(self.given_up(self.checked))
+        if not len(where):
+            return ""
+        first, last = ("{:.2f}, {:.2f}, {:.2f}".format(*self.checked_mu[i]) for i in where[[0, -1]])
+        condition, miss = self.checked.condition.min(), self.checked.miss.max()
+        said = []
+        if condition <= self.asked.conditioning:
+            said += [f"with conditioning below its bound ({condition:.2g} of {self.asked.conditioning:.2g})"]
+        if miss > 0.0:
+            allowed = self.asked.miss_px
+            said += [f"with joints up to {miss:.2g} px behind the planned images ({allowed:g} px allowed)"]
+        return f"{' and '.join(said)}, from mu_t, mu_r, mu_p {first} to {last}"
 
     def words(self, constraint: int, instant: int) -> str:
         """What one constraint says at one instant, and where that is."""
@@ -160,6 +169,7 @@ def demands_of(config: "Config", joint_types: str = "") -> Demands:
         np.array(image_size_of(config) or (math.inf, math.inf), dtype=np.float64),
         config.trajectory.border_px,
         config.trajectory.least_condition,
+        config.trajectory.most_miss_px,
     )
 
 
@@ -187,69 +197,23 @@ def motion_of(
         path = plan_path(reaching)
         mu = path.at(sigma)
         time = timed(sigma * path.duration, sigma, pace)
-        return Motion(path.reaching, mu, along(path.reaching, mu), path.along, path.mu, time)
+        found = along(path.reaching, mu)
+        return Motion(path.reaching, reaching.demands, mu, found, path.along, path.mu, time)
     mu = profile_shares(profile, sigma, pure_translation)
+    demands = reaching.demands._replace(miss_px=0.0)
+    reaching = reaching._replace(demands=demands)
     found = along(reaching, mu)
     shortest = least_time(found.q, reaching.demands.speed)
-    return Motion(reaching, mu, found, found, mu, timed(shortest, sigma, pace))
-
-
-def least_time(q: FloatArray, speed: FloatArray) -> FloatArray:
-    """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s.
-
-    NaN throughout where no joint has a limit.
-    """
-    if not np.isfinite(speed).any():
-        return np.full(len(q), math.nan)
-    steps = (np.abs(np.diff(q, axis=0)) / speed).max(axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def timed(shortest: FloatArray, sigma: FloatArray, pace: Pace) -> FloatArray:
-    """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
-
-    Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
-
-    Raises
-    ------
-    WorkFailed
-        If the joints would be too fast.
-    """
-    duration = pace.duration
-    eased = from_rest(shortest, pace.ramp)
-    least = float(eased[-1])
-    if duration is None:
-        return eased
-    if least > duration:
-        raise WorkFailed(
-            f"trajectory.duration_s {duration:g}: the joint-speed limit lets the motion take {least:.4g} s "
-            "or more: give it longer, or null for as short as that"
-        )
-    if not least > 0.0:
-        eased = from_rest(sigma * duration, pace.ramp)
-    return np.asarray(eased * (duration / eased[-1]))
-
-
-def from_rest(time: FloatArray, ramp: float) -> FloatArray:
-    """Times (s,) of a motion that comes up to its pace evenly in so many s, and so to rest again at its end.
-
-    The pace, seconds of ``time`` a second, is a trapezoid, of a short motion a triangle of the same slope:
-    the motion never is faster, and takes longer by the ramp.
-    """
-    total = float(time[-1])
-    if not (ramp > 0.0 and total > 0.0):
-        return time
-    half = 0.5 * min(total, ramp)
-    end = total + ramp if total >= ramp else 2.0 * math.sqrt(total * ramp)
-    before = np.sqrt(2.0 * ramp * np.maximum(time, 0.0))
-    after = end - np.sqrt(2.0 * ramp * np.maximum(total - time, 0.0))
-    return np.select([time <= half, time >= total - half], [before, after], time + 0.5 * ramp)
+    return Motion(reaching, demands, mu, found, found, mu, timed(shortest, sigma, pace))
 
 
 def constrained_verdict(motion: Motion) -> tuple[bool, str]:
     """Whether all constraints hold along a motion, and which is nearest to failing, in words."""
     constraint, least, instant = motion.nearest()
     words = motion.words(constraint, instant)
+    relaxed = motion.relaxed()
+    if least > 0.0 and relaxed:
+        return True, f"no path was found that keeps all constraints; planned {relaxed}; all else holds"
     if least > 0.0:
         return True, f"all constraints hold; nearest is {CONSTRAINTS[constraint]}: {words}"
     return (

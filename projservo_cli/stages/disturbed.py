@@ -1,4 +1,4 @@
-"""The disturbances of a configuration as the simulated robot suffers them."""
+"""The noise and the disturbances of a configuration as the simulated robot suffers them."""
 
 import math
 from collections.abc import Sequence
@@ -8,6 +8,7 @@ import numpy as np
 
 from projservo_cli.plants.plant import NEVER, Disturbance
 from projservo_cli.records import FloatArray
+from projservo_cli.stages.truth import PIN_NOISE, SERVO_NOISE, stream_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -49,3 +50,19 @@ def lose_markers(config: "Config", noise: FloatArray, numbers: Sequence[int]) ->
         return
     those = [i for i, number in enumerate(numbers) if lost.markers is None or number in lost.markers]
     noise[lost.from_step : _end(lost.from_step, lost.steps), :, those] = np.nan
+
+
+def servo_noise(config: "Config", m: int, pins: int = 0) -> FloatArray:
+    """Pixel noise of m face markers and of pins at every instant, the same for every law, px."""
+    return noise_of(config.seed, config.noise.servo_px, config.stop.max_steps + 1, m, pins)
+
+
+def noise_of(seed: int, sigma: float, instants: int, m: int, pins: int) -> FloatArray:
+    """Pixel noise (instants, 2, m + pins, 2) of a seed, px; fewer instants are the first of more."""
+    noise = np.zeros((instants, 2, m + pins, 2))
+    if sigma > 0.0:
+        for these, count, stream in ((slice(m), m, SERVO_NOISE), (slice(m, None), pins, PIN_NOISE)):
+            if count > 0:
+                drawn = stream_of(seed, stream).standard_normal((instants, 2, count, 2))
+                np.multiply(sigma, drawn, out=noise[:, :, these])
+    return noise

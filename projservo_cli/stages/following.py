@@ -1,15 +1,21 @@
 """The plan as a reference to follow: once a control period, joints, points and images."""
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.lens import straight_views
+from projservo_cli.modes import REPLAN, law_and_mode
 from projservo_cli.records import FloatArray, InputError, Model, Plan, WorkFailed
+from projservo_cli.stages.sense import Sense
 from projservo_cli.task.face import Task
 from projservo_cli.task.reference import Reference
 from projservo_cli.task.trajectory import trajectory_displacement
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
 
 # A last period that is shorter than this share of one is none.
 ROUND_OFF = 1e-9
@@ -51,6 +57,26 @@ def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -
     return task._replace(reference=reference)
 
 
+def planned_time(config: "Config", mode: str, plan: Plan | Sense) -> float | None:
+    """When a run that follows a plan arrives by it, s; None where it follows none or that has no time."""
+    if mode == REPLAN or not isinstance(plan, Plan) or plan.duration is None:
+        return None
+    return plan.duration / config.plant.speed_scale
+
+
+def unplanned(config: "Config", plan: Plan | Sense, name: str) -> str:
+    """Why a run that was to follow the plan goes without it; empty where it follows, or never was to."""
+    mode = law_and_mode(name)[1]
+    if mode == REPLAN or not isinstance(plan, Plan) or np.isfinite(plan.q).all():
+        return ""
+    return "" if config.control.without_plan == "refuse" else f"no joints can follow the plan: {plan.reason}"
+
+
+def name_driven(config: "Config", plan: Plan | Sense, name: str) -> str:
+    """Name of the run that is driven: where no joints can follow the plan the law's own, which replans."""
+    return law_and_mode(name)[0] if unplanned(config, plan, name) else name
+
+
 def instants(plan: Plan, period: float) -> FloatArray:
     """Times (k,), k ≥ 2, one control period apart, the last that at which the plan arrives, s.
 
@@ -62,7 +88,7 @@ def instants(plan: Plan, period: float) -> FloatArray:
     if not np.isfinite(plan.q).all():
         raise WorkFailed(
             "the joints cannot follow the planned motion to its end, so that there is nothing to track: "
-            "choose another trajectory.profile"
+            "choose another trajectory.profile, or control.without_plan replan to drive without a plan"
         )
     if plan.duration is None:
         raise InputError(

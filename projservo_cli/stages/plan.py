@@ -13,14 +13,13 @@ from projservo_cli.geometry.mechanisms import COORDINATES
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed
 from projservo_cli.stages.beginning import joint_motions, partitioned_at_start
 from projservo_cli.stages.constrained import (
-    AS_FAST_AS_ALLOWED,
     CONSTRAINED,
     VIEWS,
-    Pace,
     constrained_verdict,
     demands_of,
     motion_of,
 )
+from projservo_cli.stages.pace import AS_FAST_AS_ALLOWED, Pace
 from projservo_cli.stages.reach import reach_for, sight_for
 from projservo_cli.stages.reachable import require_in_span
 from projservo_cli.stages.sight import Sight
@@ -160,6 +159,7 @@ def plan_task(
         profile=profile,
         feasible=feasible,
         reason=reason + note,
+        relaxed=motion.relaxed(),
         tau=tau,
         theta_r=theta_r,
         theta_p=theta_p,
@@ -177,6 +177,8 @@ def plan_task(
         q=motion.along.q,
         joint_margin=motion.along.limit,
         condition=motion.along.condition,
+        miss=motion.along.miss,
+        given_up=motion.given_up(motion.along),
         least=least,
         least_mu=least_mu,
         s_start=s_start,

@@ -17,22 +17,19 @@ from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.stages import driven
-from projservo_cli.stages.disturbed import disturbance_of, lose_markers
-from projservo_cli.stages.following import followed
+from projservo_cli.stages.disturbed import disturbance_of, lose_markers, servo_noise
+from projservo_cli.stages.following import followed, name_driven, planned_time, unplanned
 from projservo_cli.stages.laws import law_for
 from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.reach import reach_for
 from projservo_cli.stages.sense import Sense
 from projservo_cli.stages.sight import Sight, known_pins, measured_task, sight_of
-from projservo_cli.stages.traces import Outcome, known, record_of, unknown
+from projservo_cli.stages.traces import Known, Outcome, known, record_of, unknown
 from projservo_cli.stages.truth import (
-    PIN_NOISE,
-    SERVO_NOISE,
     Reach,
     Truth,
     plant_of,
     reach_of,
-    stream_of,
     truth_of,
 )
 from projservo_cli.task.face import Task
@@ -107,25 +104,35 @@ def run(
     InputError
         If the configuration lacks a part of the simulation, or the plan to follow has no time.
     WorkFailed
-        If the goal cannot be reached, or the joints cannot follow the plan.
+        If the goal cannot be reached, or the joints cannot follow the plan and ``control.without_plan``
+        refuses to go without.
     """
     if config.plant.use is None:
         return record(config, name, plan, simulate(config, calibration, plan, name))
-    law, mode = law_and_mode(name)
     gains, limits = gains_of(config), limits_of(config)
     reach = reach_for(config, calibration)
     gains, limits = driven.adapted(config, calibration, gains, limits)
-    outcome = driven.run(config, calibration, plan, name, reach, gains, limits)
-    found = unknown(outcome.steps + 1)
-    trace = record_of(law, outcome, reach, gains, limits, found, mode, planned_time(config, mode, plan))
+    outcome = driven.run(config, calibration, plan, name_driven(config, plan, name), reach, gains, limits)
+    trace = _record(config, name, plan, outcome, reach, gains, limits, unknown(outcome.steps + 1))
     return replace(trace, untested=driven.untested(config, calibration))
 
 
-def planned_time(config: "Config", mode: str, plan: Plan | Sense) -> float | None:
-    """When a run that follows a plan arrives by it, s; None where it follows none or that has no time."""
-    if mode == REPLAN or not isinstance(plan, Plan) or plan.duration is None:
-        return None
-    return plan.duration / config.plant.speed_scale
+def _record(
+    config: "Config",
+    name: str,
+    plan: Plan | Sense,
+    outcome: Outcome,
+    reach: Reach,
+    gains: Gains,
+    limits: Limits,
+    found: Known,
+) -> Trace:
+    """Trace of a run of a name, and why it went without the plan if it did."""
+    law, mode = law_and_mode(name)
+    why = unplanned(config, plan, name)
+    planned_s = None if why else planned_time(config, mode, plan)
+    trace = record_of(law, outcome, reach, gains, limits, found, mode, planned_s)
+    return replace(trace, unplanned=why)
 
 
 class Scene(NamedTuple):
@@ -176,8 +183,10 @@ def simulate(
     InputError
         If the configuration lacks a part of the simulation, or the plan to follow has no time.
     WorkFailed
-        If the goal cannot be reached, or the joints cannot follow the plan.
+        If the goal cannot be reached, or the joints cannot follow the plan and ``control.without_plan``
+        refuses to go without.
     """
+    name = name_driven(config, plan, name)
     law, mode = law_and_mode(name)
     gains, limits = gains_of(config), limits_of(config)
     truth, reach, sight = scene_of(config, calibration) if scene is None else scene
@@ -207,11 +216,9 @@ def simulate(
 
 def record(config: "Config", name: str, plan: Plan | Sense, made: Simulated) -> Trace:
     """Trace of a run of the simulated robot."""
-    law, mode = law_and_mode(name)
     gains, limits = gains_of(config), limits_of(config)
     found = known(made.outcome, made.plant, made.truth, made.reach, gains)
-    planned_s = planned_time(config, mode, plan)
-    return record_of(law, made.outcome, made.reach, gains, limits, found, mode, planned_s)
+    return _record(config, name, plan, made.outcome, made.reach, gains, limits, found)
 
 
 def in_compiled_loop(config: "Config", law: str) -> bool:
@@ -223,22 +230,6 @@ def sense_is_enough(config: "Config", name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
     return mode == REPLAN and in_compiled_loop(config, law)
-
-
-def servo_noise(config: "Config", m: int, pins: int = 0) -> FloatArray:
-    """Pixel noise of m face markers and of pins at every instant, the same for every law, px."""
-    return noise_of(config.seed, config.noise.servo_px, config.stop.max_steps + 1, m, pins)
-
-
-def noise_of(seed: int, sigma: float, instants: int, m: int, pins: int) -> FloatArray:
-    """Pixel noise (instants, 2, m + pins, 2) of a seed, px; fewer instants are the first of more."""
-    noise = np.zeros((instants, 2, m + pins, 2))
-    if sigma > 0.0:
-        for these, count, stream in ((slice(m), m, SERVO_NOISE), (slice(m, None), pins, PIN_NOISE)):
-            if count > 0:
-                drawn = stream_of(seed, stream).standard_normal((instants, 2, count, 2))
-                np.multiply(sigma, drawn, out=noise[:, :, these])
-    return noise
 
 
 def drive(

@@ -12,9 +12,9 @@ from projservo_cli.loop.trial import NUMBERS, Setting, new_desk, trial
 from projservo_cli.modes import law_and_mode
 from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray
 from projservo_cli.stages.beginning import rehearses
-from projservo_cli.stages.disturbed import disturbance_of, lose_markers
+from projservo_cli.stages.disturbed import disturbance_of, lose_markers, noise_of
 from projservo_cli.stages.motion import joints_of
-from projservo_cli.stages.servo import gains_of, limits_of, noise_of, sense_is_enough
+from projservo_cli.stages.servo import gains_of, limits_of, sense_is_enough
 from projservo_cli.stages.sight import watched_body
 from projservo_cli.stages.traces import ends_of
 from projservo_cli.stages.truth import Ends, plant_of, shown_at, shown_px, truth_of

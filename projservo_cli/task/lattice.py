@@ -13,6 +13,7 @@ from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import backward, row
 from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.task.approach import approach
 from projservo_cli.task.margins import (
     CONDITIONING,
     IMAGE,
@@ -26,6 +27,7 @@ from projservo_cli.task.margins import (
     reciprocal_condition,
     visibility_margin,
 )
+from projservo_cli.task.strides import near, put, stride
 from projservo_cli.task.trajectory import displaced, rotated
 
 NODES = 41
@@ -33,8 +35,10 @@ NODES = 41
 COARSE = 9
 # A joint that moves more than this between two such nodes, rad or m, has changed its branch.
 MOST_STRIDE = 1.5
-# Newton step, rad or m, after which joints at such a node are good enough.
-ROUGH = 1e-3
+# Newton step, rad or m, after which joints at such a node are good enough: they are off by its square.
+ROUGH = 1e-2
+# Margin of conditioning, at most, where the joints stay behind by an allowed miss: below that of any other.
+NEARLY = 1e-6
 # Of two paths equally short, that with longer straight steps: a share of the duration of a rad at 1 rad/s.
 STRAIGHTER = 1e-4
 
@@ -153,16 +157,20 @@ def solve_joints(
                 reached = best > WORST and reach(
                     reaching.model, H_back, H, reaching.A, q, work, newton, ROUGH
                 )
-                for l in range(n):
-                    reached = reached and abs(q[l] - before[l]) <= MOST_STRIDE
-                if not reached:
-                    for l in range(n):
-                        q[l] = before[l]
+                if reached and near(q, before, MOST_STRIDE):
+                    condition = reciprocal_condition(reaching, H, work, M, newton)
+                    field[i, j, k, n] = condition - reaching.demands.conditioning
+                else:
+                    put(q, before)
                     field[i, j, k, n] = WORST
-                    value[i, j, k] = WORST
-                    continue
-                condition = reciprocal_condition(reaching, H, work, M, newton)
-                field[i, j, k, n] = condition - reaching.demands.conditioning
+                    if best > WORST and reaching.demands.miss_px > 0.0:
+                        miss = approach(reaching, H_back, H, q, work, M, newton) / reaching.demands.miss_px
+                        if miss < 1.0 and near(q, before, MOST_STRIDE):
+                            field[i, j, k, n] = NEARLY * (1.0 - miss)
+                    if field[i, j, k, n] == WORST:
+                        put(q, before)
+                        value[i, j, k] = WORST
+                        continue
                 within = limit_margin(q, reaching.demands)
                 value[i, j, k] = max(min(best, min(within, field[i, j, k, n])), WORST + 1.0)
 
@@ -207,26 +215,6 @@ def with_joints(
                 within = limit_margin(joints[i, j, k], reaching.demands)
                 least = min(condition / reaching.scale[CONDITIONING], within / reaching.scale[JOINTS])
                 shares[i, j, k] = min(shares[i, j, k], least)
-
-
-@njit
-def slowness(speed: FloatArray, weight: FloatArray) -> None:
-    """Seconds a rad or m of each joint takes at the joint-speed limit; 1 for all where nothing limits."""
-    limited = False
-    for i in range(speed.shape[0]):
-        weight[i] = 1.0 / speed[i] if math.isfinite(speed[i]) else 0.0
-        limited = limited or weight[i] > 0.0
-    if not limited:
-        weight[:] = 1.0
-
-
-@njit
-def stride(q: FloatArray, other: FloatArray, weight: FloatArray) -> float:
-    """Time between joints, s: that of the joint that takes longest."""
-    longest = 0.0
-    for i in range(weight.shape[0]):
-        longest = max(longest, weight[i] * abs(other[i] - q[i]))
-    return longest
 
 
 @njit

@@ -45,6 +45,8 @@ class Demands(NamedTuple):
     image_size : (2,) width and height of both images, px; infinite where an image has no border.
     border_px : least distance of a marker from the border of an image, px.
     conditioning : least reciprocal condition of the image Jacobian of the face.
+    miss_px : how far the images of the face may stay behind the planned ones where the joints cannot
+        follow them, px; 0 where they have to.
     """
 
     lower: FloatArray
@@ -53,6 +55,7 @@ class Demands(NamedTuple):
     image_size: FloatArray
     border_px: float
     conditioning: float
+    miss_px: float = 0.0
 
 
 def within(lower: FloatArray, upper: FloatArray) -> Demands:
@@ -170,29 +173,41 @@ def limit_margin(q: FloatArray, demands: Demands) -> float:
 
 
 @njit
-def reciprocal_condition(
-    reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray, norms: FloatArray
-) -> float:
-    """Reciprocal condition of the image Jacobian of the displaced face, [RH00] eq. (7).
-
-    The ratio of the last to the first pivot of an orthogonalisation, which no projective frame changes.
+def image_jacobian(reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray) -> None:
+    """Image Jacobian of the displaced face in the workspace, a column a joint, [RH00] eq. (7).
 
     Parameters
     ----------
     H : displacement from the start.
     jacobian : workspace of 4m rows with the operators at the current joints in ``H_hat``.
-    M, norms : (2, 4) and (n,) workspaces.
+    M : (2, 4) workspace.
     """
-    n = jacobian.H_hat.shape[0]
-    m = reaching.A.shape[0]
-    for k in range(m):
+    for k in range(reaching.A.shape[0]):
         put_vec(M[0], apply(H, vec(reaching.A[k])))
-        for i in range(n):
+        for i in range(jacobian.H_hat.shape[0]):
             put_vec(M[1], apply(mat(jacobian.H_hat[i]), vec(M[0])))
             for view in range(2):
                 _, _, du, dv = image_velocity(reaching.model.P[view], M[0], M[1])
                 jacobian.B[i, 4 * k + 2 * view] = du
                 jacobian.B[i, 4 * k + 2 * view + 1] = dv
+
+
+@njit
+def reciprocal_condition(
+    reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray, norms: FloatArray
+) -> float:
+    """Reciprocal condition of the image Jacobian of the displaced face.
+
+    The ratio of the last to the first pivot of an orthogonalisation, which no projective frame changes.
+
+    Parameters
+    ----------
+    H, jacobian, M : as of ``image_jacobian``.
+    norms : (n,) workspace.
+    """
+    n = jacobian.H_hat.shape[0]
+    m = reaching.A.shape[0]
+    image_jacobian(reaching, H, jacobian, M)
     first, _, last = orthogonalize(
         jacobian.B, 4 * m, n, norms, jacobian.z, jacobian.pivot, jacobian.rhs, False
     )

@@ -9,7 +9,7 @@ from projservo_cli.geometry.jit import allocating, njit
 from projservo_cli.geometry.kinematics import backward, operators_at
 from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.task.lattice import stride
+from projservo_cli.task.approach import approach
 from projservo_cli.task.margins import (
     CONDITIONING,
     JOINTS,
@@ -20,11 +20,16 @@ from projservo_cli.task.margins import (
     view_share,
     visibility_margin,
 )
+from projservo_cli.task.strides import near, put, stride
 from projservo_cli.task.trajectory import displaced
 
 # A joint that moves more than this between neighbours on a path, rad or m, asks for points between.
 MOST_PART = 0.2
 MOST_PARTS = 256
+# Where the joints may stay behind they do so after fewer parts.
+FEW_PARTS = 16
+# A joint that moves more than this where it stays behind, rad or m, has left the path.
+MOST_LEAP = 0.5
 # A straight piece may take this much longer than the steps of the lattice that it replaces.
 DETOUR = 1.01
 ROUND_OFF = 1e-9
@@ -33,8 +38,8 @@ ROUND_OFF = 1e-9
 @njit
 def continued(
     reaching: Reaching,
-    near: FloatArray,
-    far: FloatArray,
+    first: FloatArray,
+    last: FloatArray,
     parts: int,
     q: FloatArray,
     before: FloatArray,
@@ -52,32 +57,39 @@ def continued(
     H_back = backward(reaching.model, reaching.q_start)
     for part in range(1, parts + 1):
         x = part / parts
-        for i in range(q.shape[0]):
-            before[i] = q[i]
-        mu_t = (1.0 - x) * near[0] + x * far[0]
-        mu_r = (1.0 - x) * near[1] + x * far[1]
-        mu_p = (1.0 - x) * near[2] + x * far[2]
+        put(before, q)
+        mu_t = (1.0 - x) * first[0] + x * last[0]
+        mu_r = (1.0 - x) * first[1] + x * last[1]
+        mu_p = (1.0 - x) * first[2] + x * last[2]
         goal = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
         if not reach(reaching.model, H_back, goal, reaching.A, q, work, newton, SETTLED):
             return False
-        for i in range(q.shape[0]):
-            if not abs(q[i] - before[i]) <= MOST_PART:
-                return False
+        if not near(q, before, MOST_PART):
+            return False
     return True
 
 
 @njit
 def follow(
-    reaching: Reaching, mu: FloatArray, q: FloatArray, condition: FloatArray, work: Work, scratch: FloatArray
+    reaching: Reaching,
+    mu: FloatArray,
+    q: FloatArray,
+    condition: FloatArray,
+    miss: FloatArray,
+    work: Work,
+    scratch: FloatArray,
 ) -> int:
     """Joints along a path and the reciprocal condition there, continued from the start.
+
+    Where they cannot follow they come as near as the demands ask for.
 
     Parameters
     ----------
     mu : (s, 3) shares, the first row zero.
     q, condition : (s, n) and (s,) on return rad or m, and reciprocal conditions; NaN where the joints
         cannot follow.
-    work, scratch : workspaces, the latter (≥ 4, ≥ max(n, 4)).
+    miss : (s,) on return how far the images of the face stay behind, px.
+    work, scratch : workspaces, the former of 4m + n rows, the latter (≥ 4, ≥ max(n, 4)).
 
     Returns
     -------
@@ -86,23 +98,28 @@ def follow(
     rows = len(mu)
     n = reaching.q_start.shape[0]
     newton, before, M = scratch[0, :n], scratch[1, :n], scratch[2:4, :4]
+    most_parts = FEW_PARTS if reaching.demands.miss_px > 0.0 else MOST_PARTS
     q[:] = math.nan
     condition[:] = math.nan
+    miss[:] = 0.0
+    H_back = backward(reaching.model, reaching.q_start)
     operators_at(reaching.model, reaching.q_start, work.H_hat)
     for row in range(rows):
         settled = row == 0
         parts = 1
-        for i in range(n):
-            q[row, i] = reaching.q_start[i] if row == 0 else q[row - 1, i]
-        while not settled:
+        put(q[row], reaching.q_start if row == 0 else q[row - 1])
+        while not settled and parts <= most_parts:
             settled = continued(reaching, mu[row - 1], mu[row], parts, q[row], before, work, newton)
             if not settled:
                 parts *= 2
-                for i in range(n):
-                    q[row, i] = q[row - 1, i] if parts <= MOST_PARTS else math.nan
-                if parts > MOST_PARTS:
-                    return row
+                put(q[row], q[row - 1])
         H = displaced(reaching.H_hat, reaching.amplitudes, mu[row, 0], mu[row, 1], mu[row, 2])
+        if not settled:
+            miss[row] = approach(reaching, H_back, H, q[row], work, M, newton)
+            if not (miss[row] < reaching.demands.miss_px and near(q[row], q[row - 1], MOST_LEAP)):
+                q[row, :] = math.nan
+                miss[row] = 0.0
+                return row
         condition[row] = reciprocal_condition(reaching, H, work, M, newton)
     return rows
 

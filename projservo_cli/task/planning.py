@@ -7,20 +7,20 @@ the one whose smallest share (``task.margins``) is largest is taken, among equal
 
 import math
 from functools import lru_cache
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.geometry.algebra import apply, mat, sub, vec
 from projservo_cli.geometry.composition import wrap
-from projservo_cli.geometry.mechanisms import Work, workspace
-from projservo_cli.geometry.span import span_of
+from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray
+from projservo_cli.task.along import EQUALLY, Path, best_of, planning_workspace, timed
 from projservo_cli.task.lattice import (
     COARSE,
     NODES,
     shortest,
-    slowness,
     solve_joints,
     view_shares,
     widest,
@@ -32,86 +32,24 @@ from projservo_cli.task.margins import (
     JOINTS,
     VISIBILITY,
     WORST,
+    Demands,
     Reaching,
     image_margin,
     limit_margin,
 )
-from projservo_cli.task.path import follow, straightened, view_path
+from projservo_cli.task.path import straightened, view_path
 from projservo_cli.task.search import WAYS, carry, traced
+from projservo_cli.task.strides import slowness
 from projservo_cli.task.visibility import margin_coefficients
 
-# Points of a path at which its joints and margins are looked at.
-CHECKS = 151
 # A margin of conditioning that no path is bounded by.
 ENDLESS = 1e9
-# Shares of this part of the best one are as good, joints being interpolated; the quicker path is better.
-EQUALLY = 0.95
+# Joints are carried through every so many nodes of the fine lattice.
+EVERY = (5, 4)
+# How far beside a path, in nodes of the fine lattice, a better one is looked for.
+BESIDE = 2
 # The lattices of joints that were not looked at.
 NOTHING = np.empty(0)
-
-
-class Along(NamedTuple):
-    """Margins along a path of s instants.
-
-    Attributes
-    ----------
-    q : (s, n) joints, rad or m; NaN from where they cannot follow.
-    visibility : (s, 2) margins a·O, 1 at the start.
-    distance : (s, 2) least distance of a marker from the image border, px.
-    limit : (s,) margins of the joint limits, NaN from where the joints cannot follow.
-    condition : (s,) reciprocal conditions of the image Jacobian, NaN likewise.
-    """
-
-    q: FloatArray
-    visibility: FloatArray
-    distance: FloatArray
-    limit: FloatArray
-    condition: FloatArray
-
-    def margins(self, reaching: Reaching) -> FloatArray:
-        """Smallest margin (s, 4) of each of ``CONSTRAINTS``; ``WORST`` where the joints cannot follow."""
-        demands = reaching.demands
-        nearest = self.distance.min(axis=1)
-        columns = np.stack(
-            [
-                self.visibility.min(axis=1),
-                np.array([image_margin(value, demands) for value in nearest]),
-                self.limit,
-                self.condition - demands.conditioning,
-            ],
-            axis=1,
-        )
-        columns[np.isnan(self.condition), CONDITIONING] = WORST
-        return np.where(np.isnan(columns), 1.0, columns)
-
-
-class Path(NamedTuple):
-    """A planned path, looked at in ``CHECKS`` places.
-
-    Attributes
-    ----------
-    reaching : the task with the senses of both rotations that were chosen.
-    mu : (s, 3) shares.
-    time : (s,) when they are reached at the joint-speed limit, s, see ``_timed``.
-    along : margins there.
-    duration : at the joint-speed limit, s; NaN where nothing limits or the joints cannot follow.
-    """
-
-    reaching: Reaching
-    mu: FloatArray
-    time: FloatArray
-    along: Along
-    duration: float
-
-    def shares(self) -> FloatArray:
-        """Smallest share (s, 4) of each of ``CONSTRAINTS``."""
-        return np.asarray(self.along.margins(self.reaching) / self.reaching.scale)
-
-    def at(self, sigma: FloatArray) -> FloatArray:
-        """Shares (k, 3) at parts sigma (k,) of the duration."""
-        mu = np.stack([np.interp(sigma * self.time[-1], self.time, column) for column in self.mu.T], axis=1)
-        mu[sigma <= 0.0], mu[sigma >= 1.0] = self.mu[0], self.mu[-1]
-        return mu
 
 
 class Candidate(NamedTuple):
@@ -134,19 +72,6 @@ class Candidate(NamedTuple):
     joints: FloatArray
     value: FloatArray
     least: float
-
-
-def along(reaching: Reaching, mu: FloatArray) -> Along:
-    """Joints and margins at the shares mu (s, 3), whose first row is zero."""
-    n = len(reaching.q_start)
-    work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
-    q, condition = np.empty((len(mu), n)), np.empty(len(mu))
-    rows = follow(reaching, mu, q, condition, work, np.empty((4, max(n, 4))))
-    visibility, distance = np.empty((len(mu), 2)), np.empty((len(mu), 2))
-    view_path(reaching, mu, visibility, distance)
-    limit = np.full(len(mu), math.nan)
-    limit[:rows] = [limit_margin(row, reaching.demands) for row in q[:rows]]
-    return Along(q, visibility, distance, limit, condition)
 
 
 def turning_sense(reaching: Reaching) -> float:
@@ -182,14 +107,16 @@ def plan_path(reaching: Reaching) -> Path:
 
     Both senses of the rotation within the plane are looked at where either may be the better: from a
     quarter turn on, or where the shorter one leads through an image border. Where no path keeps all
-    constraints, one that keeps at least the face in sight and in both images is taken, if there is one.
+    constraints, one is taken that the joints can follow all the same (``_relaxed``), and where there is
+    none, one that keeps at least the face in sight and in both images.
 
     Parameters
     ----------
     reaching : the task; its scale is not used.
     """
-    n = len(reaching.q_start)
-    work, newton = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A)), np.empty(n)
+    relaxed = reaching.demands
+    reaching = reaching._replace(demands=relaxed._replace(miss_px=0.0))
+    work, newton = planning_workspace(reaching), np.empty(len(reaching.q_start))
     theta_p = float(reaching.amplitudes[2])
     reaching = _turned(reaching, turning_sense(reaching), theta_p)
     other = _turned(reaching, reaching.amplitudes[1], theta_p - math.copysign(2.0 * math.pi, theta_p))
@@ -199,13 +126,15 @@ def plan_path(reaching: Reaching) -> Path:
         candidates.append(_candidate(other, max(EQUALLY * least, 0.0), work, newton))
     good = max(EQUALLY * max(candidate.least for candidate in candidates), 0.0)
     paths = [_quickest(candidate) for candidate in candidates if candidate.least > good]
-    best = _best(paths)
-    if best is None or best.shares().min() <= 0.0:
+    best = best_of(paths)
+    if best is None or not best.holds():
         if theta_p != 0.0 and len(candidates) == 1:
             candidates.append(_candidate(other, 0.0, work, newton))
-        best = _best([*paths, *_narrow(candidates, work)])
-    if best is None or best.shares().min() <= 0.0:
-        best = _best([*paths, _in_view(candidates)])
+        best = best_of([*paths, *_narrow(candidates, work)])
+    if (best is None or not best.holds()) and relaxed.miss_px > 0.0:
+        best = _relaxed(candidates, relaxed._replace(conditioning=0.0), work, newton)
+    if best is None or not best.holds():
+        best = best_of([*paths, _in_view(candidates)])
     assert best is not None
     return best
 
@@ -228,12 +157,17 @@ def _positive(margin: float) -> float:
 
 def _candidate(reaching: Reaching, good: float, work: Work, newton: FloatArray) -> Candidate:
     """Fill the lattices of one choice of senses; those of the joints only where the views let it be good."""
-    n = len(reaching.q_start)
     shares, views = np.empty((NODES, NODES, NODES)), np.empty((NODES, NODES, NODES))
     view_shares(reaching, shares, np.empty((2 * len(reaching.A), 7)))
     in_view = widest(shares, views)
-    if not in_view > good:
-        return Candidate(reaching, views, in_view, NOTHING, NOTHING, NOTHING, -math.inf)
+    found = Candidate(reaching, views, in_view, NOTHING, NOTHING, NOTHING, -math.inf)
+    return _with_joints(found, work, newton) if in_view > good else found
+
+
+def _with_joints(candidate: Candidate, work: Work, newton: FloatArray) -> Candidate:
+    """The candidate with the joints of its nodes."""
+    reaching, shares = candidate.reaching, candidate.views.copy()
+    n = len(reaching.q_start)
     field = np.empty((COARSE, COARSE, COARSE, n + 1))
     solve_joints(reaching, work, newton, np.empty((2, 4)), np.empty(field.shape[:3]), field)
     ends = field[0, 0, 0], field[-1, -1, -1]
@@ -241,32 +175,69 @@ def _candidate(reaching: Reaching, good: float, work: Work, newton: FloatArray) 
     reaching.scale[CONDITIONING] = _positive(min(float(end[n]) for end in ends))
     joints, value = np.empty((*shares.shape, n)), np.empty_like(shares)
     with_joints(reaching, field, np.empty((COARSE, n + 1)), shares, joints)
-    return Candidate(reaching, views, in_view, field, joints, value, widest(shares, value))
+    return candidate._replace(field=field, joints=joints, value=value, least=widest(shares, value))
 
 
 def _quickest(candidate: Candidate) -> Path:
     """Quickest path of a candidate among those of the largest smallest share."""
     reaching, field = candidate.reaching, candidate.field
     mu = _corners(reaching, field, candidate.value, candidate.least, candidate.joints)
-    return _timed(reaching, mu)
+    return timed(reaching, mu)
 
 
 def _narrow(candidates: list[Candidate], work: Work) -> list[Path]:
-    """Widest path for joints carried through all nodes, of the first candidate that has one that holds."""
-    for reaching, views, in_view, *_ in candidates:
-        if not in_view > 0.0:
+    """A path for joints carried from node to node, of the first candidate that has one that holds.
+
+    Through coarse nodes first, and where that does not hold between them, through the fine ones around it.
+    """
+    in_view = [candidate for candidate in candidates if candidate.in_view > 0.0]
+    for every, (reaching, views, *_) in product(EVERY, in_view):
+        corners = _carried(reaching, np.ascontiguousarray(views[::every, ::every, ::every]), work)
+        if not len(corners):
             continue
-        n = len(reaching.q_start)
-        value, came = np.empty((*views.shape, WAYS)), np.empty((*views.shape, WAYS), dtype=np.int64)
-        joints, start, scratch = np.empty((*value.shape, n)), np.empty((n, 4, 4)), np.empty((10, max(n, 4)))
-        carry(reaching, views, value, joints, came, start, scratch, work)
-        path = np.empty((3 * NODES, 3), dtype=np.int64)
-        count = traced(value, came, path)
-        if count > 0:
-            found = _timed(reaching, path[:count] / (NODES - 1))
-            if found.shares().min() > 0.0:
-                return [found]
+        path = timed(reaching, corners)
+        if path.holds():
+            return [path]
+        corners = _carried(reaching, _around(corners, views), work)
+        if len(corners) and (path := timed(reaching, corners)).holds():
+            return [path]
     return []
+
+
+def _carried(reaching: Reaching, views: FloatArray, work: Work) -> FloatArray:
+    """Corners (c, 3) of the widest path for joints carried through the nodes (k, k, k) in view; or none."""
+    n, last = len(reaching.q_start), len(views) - 1
+    value, came = np.empty((*views.shape, WAYS)), np.empty((*views.shape, WAYS), dtype=np.int64)
+    joints, start, scratch = np.empty((*value.shape, n)), np.empty((n, 4, 4)), np.empty((10, max(n, 4)))
+    carry(reaching, views, value, joints, came, (NODES - 1) // last, start, scratch, work)
+    path = np.empty((3 * len(views), 3), dtype=np.int64)
+    return np.asarray(path[: traced(value, came, path)] / last)
+
+
+def _around(corners: FloatArray, views: FloatArray) -> FloatArray:
+    """The views (k, k, k) of the nodes near a path, ``WORST`` elsewhere."""
+    near = np.full_like(views, WORST)
+    for first, last in pairwise(corners):
+        for node in np.rint(np.linspace(first, last, COARSE) * (NODES - 1)).astype(int):
+            box = tuple(slice(max(0, i - BESIDE), i + BESIDE + 1) for i in node)
+            near[box] = views[box]
+    return near
+
+
+def _relaxed(candidates: list[Candidate], demands: Demands, work: Work, newton: FloatArray) -> Path | None:
+    """Path of the smallest miss, then of the best conditioning, that joints can follow at all.
+
+    Where the operators are too dependent the joints stay behind by as much as the demands let them.
+    """
+    paths = []
+    for candidate in candidates:
+        if candidate.in_view > 0.0:
+            reaching = candidate.reaching._replace(demands=demands, scale=candidate.reaching.scale.copy())
+            found = _with_joints(candidate._replace(reaching=reaching), work, newton)
+            if found.least > 0.0:
+                paths.append(_quickest(found))
+    paths = [path for path in paths if path.holds()]
+    return min(paths, key=lambda path: (path.along.miss.max(), -path.along.condition.min()), default=None)
 
 
 def _in_view(candidates: list[Candidate]) -> Path:
@@ -277,7 +248,7 @@ def _in_view(candidates: list[Candidate]) -> Path:
     free = candidate.reaching._replace(demands=demands._replace(lower=-endless, upper=endless, speed=endless))
     shares = _grid(NODES)
     field = np.concatenate([_grid(COARSE), np.full((COARSE,) * 3 + (1,), ENDLESS)], axis=3)
-    return _timed(candidate.reaching, _corners(free, field, candidate.views, candidate.in_view, shares))
+    return timed(candidate.reaching, _corners(free, field, candidate.views, candidate.in_view, shares))
 
 
 @lru_cache(maxsize=2)
@@ -299,36 +270,3 @@ def _corners(
     kept = np.empty(len(path) + 1, dtype=np.int64)
     count = straightened(reaching, field, weight, path, NODES - 1, least, kept)
     return np.asarray(path[kept[:count]] / (NODES - 1))
-
-
-def _timed(reaching: Reaching, corners: FloatArray) -> Path:
-    """Path through corners, with the time it takes at the joint-speed limit.
-
-    Where nothing limits the speed, time counts as the motion of the joint that moves most; where the
-    joints cannot follow or nothing moves, as the length of the path in shares.
-    """
-    length = np.r_[0.0, np.cumsum(np.abs(np.diff(corners, axis=0)).max(axis=1))]
-    places = np.linspace(0.0, length[-1], CHECKS)
-    mu = np.stack([np.interp(places, length, column) for column in corners.T], axis=1)
-    speed = reaching.demands.speed
-    weight = np.empty(len(speed))
-    slowness(speed, weight)
-    found = along(reaching, mu)
-    steps = (np.abs(np.diff(found.q, axis=0)) * weight).max(axis=1)
-    time = np.r_[0.0, np.cumsum(steps)]
-    duration = float(time[-1]) if np.isfinite(speed).any() else math.nan
-    if not time[-1] > 0.0:
-        time = places
-    return Path(reaching, mu, time, found, duration)
-
-
-def _best(paths: list[Path]) -> Path | None:
-    """Of the paths in view, or of all if none is, the quickest whose smallest share is as good as any."""
-    in_view = [path for path in paths if path.shares()[:, [VISIBILITY, IMAGE]].min() > 0.0]
-    paths = in_view or paths
-    if not paths:
-        return None
-    least = [float(path.shares().min()) for path in paths]
-    good = min(EQUALLY * max(least), max(least))
-    paths = [path for path, share in zip(paths, least, strict=True) if share >= good]
-    return min(paths, key=lambda path: path.duration if math.isfinite(path.duration) else math.inf)

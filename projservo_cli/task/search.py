@@ -1,10 +1,11 @@
-"""A path for joints that the coarse lattice of joints does not show: all nodes of the fine one, in order.
+"""A path for joints that the lattice of interpolated joints does not show.
 
-Between obstacles that lie closer than the nodes at which joints are solved for, ``task.lattice`` sees no
-way, and where the way taken decides how far a joint has turned it sees one of several. Here joints are
-carried from node to node, and a node keeps different ones that lead to it.
+Where the way taken decides how far a joint has turned, ``task.lattice`` sees one of several, and between
+nodes of different ways it interpolates what is not there. Here joints are carried from node to node, and a
+node keeps different ones that lead to it.
 """
 
+from projservo_cli.geometry.algebra import Mat4
 from projservo_cli.geometry.inverse import reach
 from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import backward, operators_at
@@ -19,27 +20,21 @@ from projservo_cli.task.margins import (
     limit_margin,
     reciprocal_condition,
 )
+from projservo_cli.task.strides import near, put
 from projservo_cli.task.trajectory import displaced
 
-# A joint that moves more than this between neighbours, rad or m, has changed its branch; joints at a node
-# that differ by more are different ways to be there.
+# A joint that moves more than this between neighbours of the fine lattice, rad or m, has changed its branch;
+# joints at a node that differ by more are different ways to be there. Between neighbours further apart it is
+# as much more as they are, but no more than ``FARTHEST``.
 MOST_STRIDE = 0.5
+FARTHEST = 1.5
 # Different joints that are tried at a node.
 WAYS = 3
 
 
 @njit
-def near(q: FloatArray, other: FloatArray) -> bool:
-    """Whether no joint differs by more than ``MOST_STRIDE``."""
-    for i in range(q.shape[0]):
-        if not abs(q[i] - other[i]) <= MOST_STRIDE:
-            return False
-    return True
-
-
-@njit
 def best_way(
-    value: FloatArray, joints: FloatArray, i: int, j: int, k: int, tried: int
+    value: FloatArray, joints: FloatArray, i: int, j: int, k: int, tried: int, stride: float
 ) -> tuple[float, int, int]:
     """Best value among the ways to the nodes before, of joints unlike the ``tried`` ones at this node.
 
@@ -58,7 +53,7 @@ def best_way(
                 continue
             fresh = True
             for other in range(tried):
-                fresh = fresh and not near(joints[x, y, z, way], joints[i, j, k, other])
+                fresh = fresh and not near(joints[x, y, z, way], joints[i, j, k, other], stride)
             if fresh:
                 best, step, origin = value[x, y, z, way], code, way
     return best, step, origin
@@ -110,11 +105,38 @@ def orientation(H_hat: FloatArray, start: FloatArray, G: FloatArray) -> float:
 
 
 @njit
-def carried(
+def arrive(
     reaching: Reaching,
+    H_back: Mat4,
     q: FloatArray,
     before: FloatArray,
     mu: FloatArray,
+    mu_step: tuple[float, float, float],
+    parts: int,
+    stride: float,
+    newton: FloatArray,
+    work: Work,
+) -> bool:
+    """Carry the joints ``q``, in place, to mu (3,) in equal parts; whether they settle on the branch."""
+    for part in range(1, parts + 1):
+        x = 1.0 - part / parts
+        mu_t, mu_r, mu_p = mu[0] - x * mu_step[0], mu[1] - x * mu_step[1], mu[2] - x * mu_step[2]
+        H = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
+        if not reach(reaching.model, H_back, H, reaching.A, q, work, newton, ROUGH):
+            return False
+    return near(q, before, stride)
+
+
+@njit
+def carried(
+    reaching: Reaching,
+    H_back: Mat4,
+    q: FloatArray,
+    before: FloatArray,
+    mu: FloatArray,
+    mu_step: tuple[float, float, float],
+    parts: int,
+    stride: float,
     start: FloatArray,
     scratch: FloatArray,
     work: Work,
@@ -123,20 +145,24 @@ def carried(
 
     Parameters
     ----------
+    H_back : inverse forward kinematics at the start.
     q : (n,) where they are looked for first, rad or m, on return the joints; ``before`` where none are.
     before : (n,) joints at the node before.
+    mu_step : (3,) shares from there.
+    parts : in which the way is made where it cannot be made in one.
+    stride : most that a joint may move, rad or m.
     start : (n, 4, 4) operators at the start.
     scratch, work : workspaces, the former (≥ 9, ≥ max(n, 4)).
     """
     n = reaching.q_start.shape[0]
     newton, M = scratch[0, :n], scratch[1:3, :4]
-    H_back = backward(reaching.model, reaching.q_start)
     H = displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2])
-    settled = reach(reaching.model, H_back, H, reaching.A, q, work, newton, ROUGH)
-    settled = settled and near(q, before)
+    settled = arrive(reaching, H_back, q, before, mu, mu_step, 1, stride, newton, work)
+    if not settled and parts > 1:
+        put(q, before)
+        settled = arrive(reaching, H_back, q, before, mu, mu_step, parts, stride, newton, work)
     if not (settled and orientation(work.H_hat, start, scratch[3:]) > 0.0):
-        for i in range(n):
-            q[i] = before[i]
+        put(q, before)
         return -1.0
     share = limit_margin(q, reaching.demands) / reaching.scale[JOINTS]
     if share > 0.0:
@@ -152,6 +178,7 @@ def carry(
     value: FloatArray,
     joints: FloatArray,
     came: IntArray,
+    parts: int,
     start: FloatArray,
     scratch: FloatArray,
     work: Work,
@@ -163,10 +190,13 @@ def carry(
     views : (k, k, k) best smallest share in view of the paths up to each node.
     value : (k, k, k, WAYS) on return the best smallest share of the paths by each way; 0 or less for none.
     joints : (k, k, k, WAYS, n) on return rad or m.
+    parts : in which the way to a node is made where it cannot be made in one.
     came : (k, k, k, WAYS) on return the step before and 8 times the way it came by.
     start, scratch, work : workspaces (n, 4, 4), (≥ 10, ≥ max(n, 4)), and of n joints and the face.
     """
     last = views.shape[0] - 1
+    stride = min(parts * MOST_STRIDE, FARTHEST)
+    H_back = backward(reaching.model, reaching.q_start)
     mu, others = scratch[0], scratch[1:]
     operators_at(reaching.model, reaching.q_start, start)
     value[:] = WORST
@@ -178,9 +208,10 @@ def carry(
                 mu[0], mu[1], mu[2] = i / last, j / last, k / last
                 for way in range(WAYS):
                     best, code, origin = views[i, j, k], 0, 0
+                    x = y = z = 0
                     before = earlier = reaching.q_start
                     if i + j + k > 0:
-                        best, code, origin = best_way(value, joints, i, j, k, way)
+                        best, code, origin = best_way(value, joints, i, j, k, way, stride)
                         x, y, z = code >> 2, code >> 1 & 1, code & 1
                         before = earlier = joints[i - x, j - y, k - z, origin]
                         if came[i - x, j - y, k - z, origin] == 8 * origin + code:
@@ -190,7 +221,19 @@ def carry(
                     q = joints[i, j, k, way]
                     for l in range(q.shape[0]):
                         q[l] = 2.0 * before[l] - earlier[l]
-                    share = carried(reaching, q, before, mu, start, others, work)
+                    share = carried(
+                        reaching,
+                        H_back,
+                        q,
+                        before,
+                        mu,
+                        (x / last, y / last, z / last),
+                        parts,
+                        stride,
+                        start,
+                        others,
+                        work,
+                    )
                     value[i, j, k, way] = min(share, min(best, views[i, j, k]))
                     came[i, j, k, way] = 8 * origin + code
 

@@ -12,6 +12,7 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Config, load_config
 from projservo_cli.records import Calibration, FloatArray, Plan, Trace
 from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.disturbed import servo_noise
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
 from projservo_cli.task.margins import within
 
@@ -72,7 +73,7 @@ def true_run(arm: str, law: str, *overrides: str, frame: FloatArray | None = Non
         reach,
         servo.gains_of(config),
         servo.limits_of(config),
-        servo.servo_noise(config, len(truth.face)),
+        servo_noise(config, len(truth.face)),
         planned.rotation_sense(),
     )
 

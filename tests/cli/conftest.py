@@ -79,8 +79,13 @@ class Stages:
 
     def plan(self, config: Any, calibration: Any) -> Any:
         self._make("plan")
-        feasible = self.verdicts.get("plan") != "infeasible"
-        given = {"profile": config.trajectory.profile, "feasible": feasible, "reason": "too near"}
+        verdict = self.verdicts.get("plan", "")
+        given = {
+            "profile": config.trajectory.profile,
+            "feasible": verdict != "infeasible",
+            "reason": "too near",
+            "relaxed": "with less" if verdict == "relaxed" else "",
+        }
         return fake(Plan, config.seed, {"joint": len(calibration.q_reference)}, **given)
 
     def servo(self, config: Any, calibration: Any, plan: Any, law: str, *, progress: Any) -> Any:

@@ -8,6 +8,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.stages import plan, servo
+from projservo_cli.stages.disturbed import servo_noise
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
 from projservo_cli.task.margins import within
 
@@ -34,7 +35,7 @@ def exact_run(arm, gain, limit, *overrides):
         reach,
         servo.gains_of(config),
         servo.limits_of(config),
-        servo.servo_noise(config, len(truth.face)),
+        servo_noise(config, len(truth.face)),
         sense,
     )
 

@@ -11,8 +11,9 @@ from projservo_cli.figures.material import Material
 from projservo_cli.modes import following_mode, name_of
 from projservo_cli.records import LAWS, METRIC_LAWS, Calibration
 from projservo_cli.stages import calibrate, plan, servo, studies, truth
-from projservo_cli.stages.constrained import Pace
+from projservo_cli.stages.disturbed import servo_noise
 from projservo_cli.stages.noisy import noisy_runs
+from projservo_cli.stages.pace import Pace
 from projservo_cli.task.margins import within
 from tests.conftest import ROOT
 from tests.fake_records import fake
@@ -54,7 +55,7 @@ def case(name="paper", steps=SHORT, whole=False):
         pace=Pace(duration=2.0),
     )
     bench = studies.bench_of(config, model, planned)
-    noise = servo.servo_noise(config, len(true.face))
+    noise = servo_noise(config, len(true.face))
     traces = {
         law: servo.drive(
             law,

@@ -117,7 +117,7 @@ def test_what_makes_a_task_infeasible_is_named():
     assert plan.constraint == "joints"
     assert "joint 1 is at" in plan.reason
     assert plan.margin.min() > 0.0  # in sight all the same
-    plan = constrained("paper", conditioning=0.5)
+    plan = constrained("paper", conditioning=0.5, miss_px=0.0)
     assert not plan.feasible
     assert plan.constraint == "conditioning"
     assert "0.5 allowed" in plan.reason

@@ -10,14 +10,17 @@ from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.truth import truth_of
 from projservo_cli.task.lattice import view_shares, widest
 from projservo_cli.task.margins import limit_margin
-from projservo_cli.task.search import MOST_STRIDE, WAYS, best_way, carry, near, orientation, traced
+from projservo_cli.task.search import MOST_STRIDE, WAYS, best_way, carry, orientation, traced
+from projservo_cli.task.strides import near
 from projservo_cli.task.trajectory import displaced
 from tests.planning.arm import arm_of, feasible
 from tests.planning.cases import reaching_of
 from tests.planning.driven import configured, true_task
 from tests.samples import arm, frame, in_frame, operators, poe
 
-NODES = 11
+# A lattice as coarse as those that are looked at first; joints may move twice as far between its nodes.
+NODES, PARTS = 11, 2
+STRIDE = PARTS * MOST_STRIDE
 # Tasks of the second robot, deg: the first passes beside a joint limit; in the second the turn within the
 # plane has to take the longer sense.
 HIDDEN = [
@@ -69,7 +72,7 @@ def carried(request):
     value, came = np.empty((*shape, WAYS)), np.empty((*shape, WAYS), dtype=np.int64)
     joints = np.empty((*shape, WAYS, 6))
     work = workspace(6, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
-    carry(reaching, views, value, joints, came, np.empty((6, 4, 4)), np.empty((10, 6)), work)
+    carry(reaching, views, value, joints, came, PARTS, np.empty((6, 4, 4)), np.empty((10, 6)), work)
     return reaching, views, value, joints, came
 
 
@@ -81,8 +84,8 @@ def test_joints_at_every_node_are_those_of_its_displacement(carried):
     for i, j, k, way in found[::7]:
         mu = np.array([i, j, k]) / (NODES - 1)
         H = np.array(displaced(reaching.H_hat, reaching.amplitudes, *mu)).reshape(4, 4)
-        # The Newton step that is the last was at most 1e-3 rad; its error is of second order.
-        np.testing.assert_allclose(poe(reaching.model, joints[i, j, k, way]) @ start, H, atol=2e-5)
+        # The Newton step that is the last was at most 1e-2 rad; its error is of second order.
+        np.testing.assert_allclose(poe(reaching.model, joints[i, j, k, way]) @ start, H, atol=1e-3)
         assert limit_margin(joints[i, j, k, way], reaching.demands) > 0.0
 
 
@@ -92,9 +95,9 @@ def test_values_are_the_smallest_share_on_the_way(carried):
         step = came[i, j, k, way]
         before = (i - (step >> 2 & 1), j - (step >> 1 & 1), k - (step & 1), step >> 3)
         assert 0.0 < value[i, j, k, way] <= min(value[before], views[i, j, k])
-        assert near(joints[i, j, k, way], joints[before])
+        assert near(joints[i, j, k, way], joints[before], STRIDE)
         for other in range(way):
-            assert not near(joints[before], joints[i, j, k, other])
+            assert not near(joints[before], joints[i, j, k, other], STRIDE)
 
 
 def test_the_traced_path_leads_from_first_to_last(carried):
@@ -118,12 +121,12 @@ def test_another_way_is_one_of_other_joints():
     """Two neighbours lead to a node: of equal joints the better one alone, of different ones both."""
     value, joints = np.full((2, 2, 2, WAYS), -1.0), np.zeros((2, 2, 2, WAYS, 6))
     value[0, 1, 1, 0], value[1, 0, 1, 1] = 0.3, 0.6
-    assert best_way(value, joints, 1, 1, 1, 0) == (0.6, 2, 1)
-    assert best_way(value, joints, 1, 1, 1, 1)[0] == 0.0
+    assert best_way(value, joints, 1, 1, 1, 0, 0.5) == (0.6, 2, 1)
+    assert best_way(value, joints, 1, 1, 1, 1, 0.5)[0] == 0.0
     joints[0, 1, 1, 0, 3] = 2.0 * np.pi
-    assert best_way(value, joints, 1, 1, 1, 1) == (0.3, 4, 0)
+    assert best_way(value, joints, 1, 1, 1, 1, 0.5) == (0.3, 4, 0)
     joints[1, 1, 1, 1, 3] = 2.0 * np.pi
-    assert best_way(value, joints, 1, 1, 1, 2)[0] == 0.0
+    assert best_way(value, joints, 1, 1, 1, 2, 0.5)[0] == 0.0
 
 
 def test_orientation_changes_its_sign_where_operators_are_dependent(rng):
@@ -153,6 +156,7 @@ def screws(model, q):
 def test_no_path_jumps_over_a_singular_configuration(truth_and_demands):
     """Without the sign of the determinant the joints jump from a wrist to the flipped one between nodes."""
     truth, demands = truth_and_demands
+    demands = demands._replace(miss_px=0.0)
     q_start, q_goal = np.radians(JUMP)
     assert not feasible(arm_of(truth, demands.conditioning), true_task(truth, q_start, q_goal), q_start)
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
