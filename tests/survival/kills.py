@@ -1,8 +1,8 @@
 """Calls ended by the system at random moments: ``python -m tests.survival.kills 200`` kills so many.
 
-Three calls, in turn, work in a folder that holds a complete run of other settings: the stages up to the
-laws, the report of a recorded calibration, and, with a further argument ``all``, the whole chain. Each is
-killed (SIGKILL) at a random moment. Then every file must be the complete old or the complete new one, and
+Calls, in turn, work in a folder that holds a complete run of other settings: ``stages`` up to the laws and
+``report`` of a recorded calibration; further arguments name others, such as ``all`` for the whole chain. Each
+is killed (SIGKILL) at a random moment. Then every file must be the complete old or the complete new one, and
 the same call must finish and leave nothing behind that does not belong there. The exit code is 1 where
 that failed.
 """
@@ -169,9 +169,11 @@ def study(count: int, kinds: Sequence[str], seed: int = 1) -> int:
             running, wrong = running + ran, wrong + bool(found)
             if found:
                 print(f"kill {number}, {kind} after {moment:.2f} s: {'; '.join(found)}", flush=True)
+            elif number % 10 == 9:
+                print(f"{number + 1} kills, {wrong} left something wrong", flush=True)
     print(f"{count} kills, {running} while the call ran: {wrong} left something wrong")
     return wrong
 
 
 if __name__ == "__main__":
-    sys.exit(study(int(sys.argv[1]), ["stages", "report", *sys.argv[2:]]) > 0)
+    sys.exit(study(int(sys.argv[1]), sys.argv[2:] or ["stages", "report"]) > 0)

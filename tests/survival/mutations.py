@@ -258,6 +258,8 @@ def study(count: int) -> int:
             ending = call(*(part.format(run=path) for part in command))
             ends[kind].append(ending)
             failures += [f"{kind}: {text}" for text in [wrong(number, ending)] if text]
+            if number % 100 == 99:
+                print(f"{number + 1} files, {len(failures)} ended wrong", file=sys.stderr)
             if left := sorted(other.name for other in Path(folder).iterdir() if other != path):
                 failures.append(f"{kind}: mutation {number}: wrote {', '.join(left)}")
     print(f"{'mutation':<48}{'files':>6}{'exit 2':>8}{'most MB':>9}{'most s':>8}")

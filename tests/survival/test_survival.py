@@ -43,6 +43,7 @@ def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
         assert found == ""
 
 
+@pytest.mark.volume
 def test_a_killed_call_leaves_whole_files_and_is_finished_by_the_next(tmp_path):
     kills = Study(tmp_path)
     kills.begin(["stages"])
