@@ -16,6 +16,7 @@ from projservo_cli.records import FloatArray, InputError
 
 HEIGHT = 640  # px of the scene
 EYE = 1.4  # distance of the eye, in sizes of the scene
+TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
 DOTS = 9  # on the planned path
 # What is wider than high needs more distance where the page is narrow.
 NEARER = """
@@ -24,6 +25,7 @@ const far = Math.min(3, Math.max(1, 900 / plot.clientWidth));
 const {x, y, z} = plot.layout.scene.camera.eye;
 Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
 """
+PAD = 0.03  # around all that is shown, as a share of it
 DIGITS = 4  # of coordinates in m: a tenth of a millimetre
 FRAME_MS = 80
 CAMERA_COLORS = (style.BLUE, style.ORANGE)
@@ -77,7 +79,7 @@ def write_view(motion: Motion, path: Path, name: str, known: str, page: str) -> 
         full_html=False,
         include_plotlyjs=True,
         auto_play=False,
-        config={"displaylogo": False, "responsive": True},
+        config={"displaylogo": False, "responsive": True, "modeBarButtons": [TOOLS]},
         div_id="scene",
         post_script=NEARER,
     )
@@ -108,16 +110,26 @@ def figure(motion: Motion) -> Any:
 
 
 def _layout(motion: Motion, still: int, choices: list[tuple[str, Driven, list[str]]]) -> dict[str, Any]:
-    """Scene, slider and buttons; the first run is shown."""
-    each = 4  # traces a run
+    """Scene, slider and buttons; the first run is shown.
+
+    Parameters
+    ----------
+    motion : what the view shows.
+    still : number of traces that stand still, the first ones; four a run follow.
+    choices : name, run and names of the frames of each run.
+    """
+    each = 4
     buttons = []
     for number, (name, run, own) in enumerate(choices):
         shown = [True] * still + [k // each == number for k in range(each * len(choices))]
-        changed = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": _play(own)}
+        changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": _play(own)}
+        changed |= {f"scene.{axis}.range": reach for axis, reach in _extent(motion, run).items()}
         buttons.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
-    axis: dict[str, Any] = {"backgroundcolor": "#ffffff", "gridcolor": style.PALE, "showbackground": False}
-    towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
-    azimuth = float(np.arctan2(towards[1], towards[0])) - np.radians(58.0)
+    _, first, own = choices[0]
+    place = {"x": 0.0, "xanchor": "left"}
+    above = place | {"y": 1.0, "yanchor": "bottom", "pad": {"b": 8}}
+    below = place | {"y": 0.0, "yanchor": "top", "pad": {"t": 8}}
+    playing = {"type": "buttons", "direction": "left", "showactive": False, "buttons": _play(own)}
     return {
         "height": HEIGHT,
         "margin": {"l": 10, "r": 10, "t": 60, "b": 10},
@@ -125,27 +137,34 @@ def _layout(motion: Motion, still: int, choices: list[tuple[str, Driven, list[st
         "font": {"family": "system-ui, DejaVu Sans, sans-serif", "size": 13, "color": style.BLACK},
         "paper_bgcolor": "#ffffff",
         "uirevision": "kept",  # the view stays as it was turned
-        "scene": {
-            "aspectmode": "data",
-            **{f"{name}axis": axis | {"title": {"text": f"{name} (m)"}} for name in "xyz"},
-            "camera": {"eye": {"x": EYE * np.cos(azimuth), "y": EYE * np.sin(azimuth), "z": 0.5 * EYE}},
-        },
-        "sliders": [_slider(choices[0][1], choices[0][2])],
-        "updatemenus": [
-            {"buttons": buttons, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "bottom", "pad": {"b": 8}},
-            {
-                "type": "buttons",
-                "direction": "left",
-                "buttons": _play(choices[0][2]),
-                "showactive": False,
-                "x": 0.0,
-                "xanchor": "left",
-                "y": 0.0,
-                "yanchor": "top",
-                "pad": {"t": 8},
-            },
-        ],
+        "scene": _scene(motion, first),
+        "sliders": [_slider(first, own)],
+        "updatemenus": [above | {"buttons": buttons}, below | playing],
     }
+
+
+def _scene(motion: Motion, run: Driven) -> dict[str, Any]:
+    """Axes of equal scales, seen from beside the way from the face to the cameras."""
+    axis: dict[str, Any] = {"backgroundcolor": "#ffffff", "gridcolor": style.PALE, "showbackground": False}
+    towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
+    azimuth = float(np.arctan2(towards[1], towards[0])) - np.radians(58.0)
+    scene: dict[str, Any] = {
+        name: axis | {"title": {"text": f"{name[0]} (m)"}, "range": reach}
+        for name, reach in _extent(motion, run).items()
+    }
+    eye = {"x": EYE * np.cos(azimuth), "y": EYE * np.sin(azimuth), "z": 0.5 * EYE}
+    return scene | {"aspectmode": "data", "camera": {"eye": eye}}
+
+
+def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
+    """Range of each coordinate that a run keeps to, so that the scene stands still while the robot moves."""
+    points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
+    points += [] if motion.goal is None else [motion.goal]
+    shown = np.concatenate([some.reshape(-1, 3) for some in points])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    pad = PAD * float((high - low).max())
+    ranges = np.round(np.stack([low - pad, high + pad], axis=1), DIGITS)
+    return {f"{name}axis": [float(low), float(high)] for name, (low, high) in zip("xyz", ranges, strict=True)}
 
 
 def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
@@ -169,7 +188,7 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
 
 def _label(seconds: float, hidden: Any) -> str:
     from_views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
-    return f"{seconds:.2f} s" + (f", face hidden from the {from_views} camera" if from_views else "")
+    return f"{seconds:.2f} s" + (f", hidden from {from_views}" if from_views else "")
 
 
 def _play(own: list[str]) -> list[dict[str, Any]]:
