@@ -17,6 +17,7 @@ from projservo_cli import records
 from projservo_cli.cli.commands import COMMANDS, allowed
 from projservo_cli.cli.options import OPTIONS
 from projservo_cli.equations import REGISTER
+from projservo_cli.sweep.columns import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERS, Column
 
 # Where a run file holds which record.
 GROUPS = {
@@ -110,6 +111,25 @@ def equations() -> Iterator[str]:
     )
 
 
+def sweep_columns() -> Iterator[str]:
+    """The columns that the table of every sweep has, and the one that it may have."""
+    kinds = {"f": "number", "i": "whole number", "S": "text"}
+    yield from table(
+        ("column", "value", "unit", "what it is"),
+        (
+            (f"`{column.name}`", kinds[column.dtype[0]], unit_of(column), text(column.about))
+            for column in (*NUMBERS, *MEASURED, BETWEEN)
+        ),
+    )
+    yield from ("", f"`{BETWEEN.name}` is there with `between_samples`. Verdicts are:", "")
+    yield ", ".join(f"`{verdict}`" for verdict in ALL_VERDICTS) + "."
+
+
+def unit_of(column: Column) -> str:
+    """Unit of a column; empty where it has none."""
+    return "" if column.units == "1" else text(column.units)
+
+
 class _Written(SphinxDirective):
     """Markdown from a function of this module, parsed in place."""
 
@@ -121,6 +141,7 @@ class _Written(SphinxDirective):
 WRITERS = {
     "configuration-keys": keys.configuration,
     "sweep-keys": keys.sweep,
+    "sweep-columns": sweep_columns,
     "run-file-groups": run_file,
     "commands": commands,
     "equations": equations,

@@ -65,7 +65,9 @@ def _tell(console: Console, design: Any, folder: Any, status: Any, options: dict
             }
         )
         return 0
-    left = "all runs are done" if status.complete else f"{status.total - status.done} runs are left"
+    left = (
+        "all runs are done" if status.done == status.total else f"{status.total - status.done} runs are left"
+    )
     console.show(f"sweep: {status.total} runs in {design.cells} cells, {left}")
     if folder.table.exists():
         console.show(f"table: {folder.table}")

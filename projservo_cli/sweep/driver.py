@@ -68,16 +68,19 @@ class Folder:
 
 @dataclass(frozen=True)
 class Status:
-    """How far a sweep is: runs done and runs in all, and how many a part has (0 before it began)."""
+    """How far a sweep is.
+
+    Attributes
+    ----------
+    done, total : runs that are stored, and in all.
+    chunk : runs of a part; 0 before it began.
+    complete : whether nothing is left to do: all runs are in the table, and the parts are removed.
+    """
 
     done: int
     total: int
     chunk: int
-
-    @property
-    def complete(self) -> bool:
-        """Whether nothing is left to do."""
-        return self.done == self.total
+    complete: bool = False
 
 
 def status_of(design: Design, folder: Folder, *, force: bool) -> Status:
@@ -100,7 +103,7 @@ def status_of(design: Design, folder: Folder, *, force: bool) -> Status:
     _same(folder, design, manifest)
     chunk = int(manifest["chunk"])
     if folder.table.exists() and SweepTable(folder.table).rows == design.total:
-        return Status(design.total, design.total, chunk)
+        return Status(design.total, design.total, chunk, complete=not folder.stored())
     names = {path.name for path in folder.stored()}
     done = [last - first for first, last in ranges(design, chunk) if folder.part(first, last).name in names]
     return Status(sum(done), design.total, chunk)
@@ -174,7 +177,7 @@ def run(
         After the table of what was stored has been assembled.
     """
     status = status_of(design, folder, force=force)
-    if status.complete and folder.table.exists() and not folder.stored():
+    if status.complete:
         return status
     if force:
         clear(folder)
@@ -189,7 +192,7 @@ def run(
         engine.close()
     assembled(design, folder)
     shutil.rmtree(folder.parts)
-    return Status(design.total, design.total, status.chunk)
+    return Status(design.total, design.total, status.chunk, complete=True)
 
 
 def _make(

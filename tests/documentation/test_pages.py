@@ -18,10 +18,10 @@ from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, run_page
 
 PAGES = sorted(DOCS.glob("*.md"))
 # Those that run laws or plan: only with the compiler.
-DRIVING = {"api", "commands", "law", "report", "run-file", "tutorial"}
+DRIVING = {"api", "commands", "law", "report", "run-file", "sweeps", "tutorial"}
 LANGUAGES = {"sh", "python", "text", "yaml"}
 # What cannot be run by a test, and how often it stands there.
-NOT_RUN = {"installation": 1}
+NOT_RUN = {"installation": 1, "sweeps": 1}
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from projservo_cli.config import Config
 from projservo_cli.config.schema import json_schema
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.equations import REGISTER
+from projservo_cli.sweep.columns import BETWEEN, MEASURED, NUMBERS
 from tests.documentation.blocks import DOCS, ROOT, imported
 
 pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
@@ -41,6 +42,17 @@ def test_every_key_has_a_row(schema, lines):
     rows = [row for row in cells(lines) if row[0].startswith("`")]
     assert sorted(row[0] for row in rows) == sorted(wanted)
     assert all(len(row) == 5 and row[4] for row in rows)
+
+
+def test_every_column_of_a_sweep_has_a_row():
+    columns = {column.name: column for column in (*NUMBERS, *MEASURED, BETWEEN)}
+    rows = {row[0].strip("`"): row for row in cells(reference.sweep_columns()) if row[0].startswith("`")}
+    assert rows.keys() == columns.keys()
+    assert rows["path_length_mm"] == [
+        "`path_length_mm`", "number", "mm", "length of the path of the centre, from sample to sample"
+    ]  # fmt: skip
+    last = list(reference.sweep_columns())[-1]
+    assert all(f"`{verdict}`" in last for verdict in ("converged", "not started", "not calibrated"))
 
 
 @pytest.mark.parametrize(

@@ -147,6 +147,26 @@ def test_a_damaged_part_is_named(tmp_path):
         make(found, tmp_path)
 
 
+def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypatch):
+    """All runs are done, but there is no table; or there is, and its parts still are."""
+
+    def killed(*_):
+        raise SystemExit
+
+    found, folder = design(runs=2, chunk=2), Folder(tmp_path)
+    for name in ("assembled", "shutil.rmtree"):
+        with monkeypatch.context() as patched:
+            patched.setattr(f"projservo_cli.sweep.driver.{name}", killed)
+            with pytest.raises(SystemExit):
+                make(found, tmp_path)
+        status = status_of(found, folder, force=False)
+        assert (status.done, status.total, status.complete) == (4, 4, False)
+    assert make(found, tmp_path).complete
+    assert status_of(found, folder, force=False).complete
+    assert not parts(tmp_path)
+    assert columns(tmp_path)["run"].tolist() == [0, 1, 2, 3]
+
+
 def slow_or_dead(job):
     """A job that ends its process the first time it is made."""
     number, marker = job
