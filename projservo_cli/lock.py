@@ -59,6 +59,13 @@ def working_in(folder: Path, *parts: str, name: str = LOCK) -> Iterator[None]:
                 folder.rmdir()
 
 
+def tidy(folder: Path, *parts: str) -> None:
+    """Remove what a killed process left in a folder, where no other works there and nothing is to be done."""
+    if (folder / LOCK).exists():
+        with suppress(InputError), working_in(folder, *parts):
+            pass
+
+
 def _owner(path: Path) -> str:
     try:
         return f"process {int(path.read_text(encoding='ascii'))}"

@@ -105,10 +105,12 @@ def load_record(path: Path, group: h5py.Group) -> Any:
     for field in dataclasses.fields(kind):
         where, hint = f"{path}: {group.name}", hints[field.name]
         present = field.name in (group if "dims" in field.metadata else group.attrs)
-        if not present and not _optional(hint):
-            raise InputError(f"{where} lacks {field.name}; {_OTHER}")
-        if not present:
+        if not present and _optional(hint):
             values[field.name] = None
+        elif not present and field.default is not dataclasses.MISSING:
+            values[field.name] = field.default  # an older version made it, which had no such field
+        elif not present:
+            raise InputError(f"{where} lacks {field.name}; {_OTHER}")
         elif "dims" in field.metadata:
             data = group[field.name]
             _require_dimensions(where, field, data, sizes)

@@ -4,8 +4,9 @@ One group a result (``calibrate``, ``plan``, ``servo/<law>``, ``report``), with 
 in subgroups. Arrays are netCDF-4 variables with dimension scales, units and a description; scalars
 and texts are attributes of the group. A file is written anew and put in place as a whole.
 
-A field may be added to a record where it may be absent. Whatever else changes the file raises
-``SCHEMA_VERSION``; files of the version before are then read as well, or refused with what to do.
+A field may be added to a record where it may be absent or has a default. Whatever else changes the
+file raises ``SCHEMA_VERSION``; files of the version before are then read as well, or refused with
+what to do.
 """
 
 import dataclasses

@@ -13,6 +13,8 @@ from projservo_cli.cli.output import Console, print_json
 from projservo_cli.modes import name_of
 from projservo_cli.records import WorkFailed
 
+FIGURES = "figures"  # folder of a run in which a killed report may have left something
+
 
 @dataclass
 class _Call:
@@ -40,7 +42,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     given = law_names(options["laws"])
     from projservo_cli.cli.extras import wanted_of
     from projservo_cli.config import to_yaml
-    from projservo_cli.lock import working_in
+    from projservo_cli.lock import tidy, working_in
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
     call = _asked(names, given, options, console)
@@ -48,8 +50,9 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         return _dry(call, as_json=options["json"])
     nothing = not any(step.why for step in call.steps) and call.run.configuration == to_yaml(call.config)
     if nothing and not wanted_of(options):
+        tidy(call.run.path.parent, FIGURES)
         return _done(call, options)
-    with working_in(call.run.path.parent, "figures"):
+    with working_in(call.run.path.parent, FIGURES):
         # Anew, since another process may have written the run until now.
         return _done(_asked(names, given, options, console), options)
 

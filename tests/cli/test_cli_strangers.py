@@ -113,6 +113,14 @@ def test_what_another_process_made_meanwhile_is_kept(projservo, stages, tmp_path
     assert list(load("out").traces) == ["stacked", "direct_three"]
 
 
+def test_what_a_killed_process_left_goes_also_where_nothing_is_to_be_done(projservo, stages, tmp_path):
+    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    (tmp_path / "out" / ".lock").write_text("1\n", encoding="ascii")
+    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out").code == 0
+    assert stages.made == ["calibrate"]
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["run.h5"]
+
+
 def test_up_to_date_is_told_also_where_nothing_can_be_locked(projservo, stages, tmp_path):
     projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
     with working_in(tmp_path / "out"):
