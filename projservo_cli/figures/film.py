@@ -15,7 +15,7 @@ FRAMES = 60
 DPI = 100
 MOST_COLUMNS = 4
 PANEL = 2.3  # inches across one panel
-LEAST_WIDTH = 5.2  # inches, of the legend
+LEAST_WIDTH = 4.0  # inches, of the legend
 HIDDEN_COLOR = style.ORANGE
 SEEN_COLOR = style.GREEN
 
@@ -90,7 +90,7 @@ def frames(columns: list[Strip], size: FloatArray, at: FloatArray) -> Iterator[n
     every = np.concatenate([np.concatenate([c.s.reshape(-1, 2), c.s_star.reshape(-1, 2)]) for c in columns])
     near = near_pixels(every, size)
     width = max(LEAST_WIDTH, PANEL * len(columns) + 0.5)
-    figure = style.new_figure(2.0 * PANEL * style.aspect(near) + 1.5, width)
+    figure = style.new_figure(2.0 * PANEL * style.aspect(near) + 1.6, width)
     figure.set_dpi(DPI)
     axes = figure.subplots(2, len(columns), squeeze=False, sharex=True, sharey=True)
     for column, strip in enumerate(columns):
@@ -106,7 +106,7 @@ def frames(columns: list[Strip], size: FloatArray, at: FloatArray) -> Iterator[n
             style.face(panel, strip.s[0, view], style.START)
             style.face(panel, strip.s_star[view], style.GOAL)
             style.frame_pixels(panel, near)
-    style.legend_below(figure, _handles(), 5)
+    style.legend_below(figure, _handles(), 4 if len(columns) > 2 else 2)
     clock = figure.suptitle("time 00.00 s", fontsize=9)
     moving = [
         [_Panel(axes[view, column], strip, view) for view in range(2)] for column, strip in enumerate(columns)
@@ -151,7 +151,8 @@ class _Panel:
         if len(here) > 2:
             self.face.set_xy(here)
         self.face.set_facecolor(HIDDEN_COLOR if self.hidden[now] else SEEN_COLOR)
-        self.word.set_text("FACE HIDDEN" if self.hidden[now] else "")
+        unseen = "MARKERS NOT SEEN" if len(here) < len(self.s[now]) else ""
+        self.word.set_text("FACE HIDDEN" if self.hidden[now] else unseen)
 
 
 def _handles() -> list[Any]:

@@ -64,8 +64,19 @@ def test_as_many_columns_as_runs(columns):
     assert abs(pixels.shape[1] - max(width, 100 * film.LEAST_WIDTH)) <= 1
 
 
-def test_markers_that_were_not_seen_leave_the_rest():
-    lost = strip()
-    lost.s[2:, 0, 1] = np.nan
+def test_markers_that_were_not_seen_are_told_and_leave_the_rest():
+    lost, whole = strip(hidden=()), strip(hidden=())
     lost.s[3, 1] = np.nan
-    assert len(frames([lost], [0.0, 2.0, 3.0, 4.0])) == 4
+    first, last = zip(*(frames([one], [3.0, 4.0]) for one in (lost, whole)), strict=True)
+    upper, lower = np.array_split(np.abs(first[0].astype(int) - first[1]).max(axis=2) > 60, 2)
+    assert lower.sum() > 200  # the word, and the face that is gone, in the image of the right camera alone
+    assert not upper.any()
+    assert count(last[0], film.SEEN_COLOR) > 0.9 * count(last[1], film.SEEN_COLOR)
+
+
+def test_the_legend_is_whole_where_there_is_one_column():
+    (pixels,) = frames([strip()], [0.0])
+    legend = pixels[-60:]
+    assert (legend[:, :3] == 255).all()
+    assert (legend[:, -3:] == 255).all()
+    assert (legend < 128).any()
