@@ -131,6 +131,10 @@ def _work(call: _Call, options: dict[str, Any]) -> None:
                 call.console.say(f"{', '.join(dropped)}: dropped, made from what was replaced")
         if step.law:
             call.laws_done += (step.law,)
+            trace = call.run.traces[step.law]
+            if trace.verdict == "failed":  # nor is what failed driven by the next law
+                call.failed, call.reason = step.name, trace.reason
+                return
     _keep_configuration(call)
 
 

@@ -12,6 +12,7 @@ from projservo_cli.geometry.span import span_of
 from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.step import (
     DISTURBED,
+    FAILED,
     JOINT_LIMIT,
     MARKERS_LOST,
     MAX_STEPS,
@@ -30,7 +31,7 @@ from projservo_cli.loop.step import (
     verdict_at,
 )
 from projservo_cli.plants.plant import Plant
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.task.face import Task
 
 LEFT_TO_THE_LOOP = (-1.0,)
@@ -69,7 +70,8 @@ class LoopPlant(Protocol):
     H : (4, 4) displacement of the face from the reference.
     hidden, in_front : as of ``plants.plant.observe``, when last observed.
     markers : how many are observed, those of the face first.
-    disturbance : why the images no longer agree with the calibration; empty where they do.
+    disturbance : why the run cannot go on, the images no longer agree with the calibration or something
+        failed; empty where it can.
     takes_parts : whether a long step is sent in the parts that the law split it into.
     """
 
@@ -148,10 +150,24 @@ def run(
     Returns
     -------
     verdict, steps, log : as of the compiled loop, to the bit for the built-in laws.
+
+    Raises
+    ------
+    WorkFailed
+        If the plant or the law fails before the first instant is complete.
     """
+    reached = [0]
     try:
         log = new_log(len(plant.joints()), plant.markers, limits.max_steps, len(ERRORS))
-        verdict, steps = _run(law, plant, s_star, period, limits, scale, log)
+        for column in (log.read, log.q, log.s, log.error, log.judged):
+            column[:] = math.nan
+        try:
+            verdict, steps = _run(law, plant, s_star, period, limits, scale, log, reached)
+        except WorkFailed as error:
+            steps = reached[0]
+            if steps == 0:
+                raise
+            verdict, plant.disturbance = FAILED, str(error)
     finally:
         plant.stop()
     return verdict, steps, log
@@ -165,10 +181,12 @@ def _run(
     limits: Limits,
     scale: float,
     log: Log,
+    reached: list[int],
 ) -> tuple[int, int]:
-    """Fill the log and return verdict and steps."""
+    """Fill the log and return verdict and steps; the instant it has come to is in ``reached``."""
     first_distance, first_error, waited = 0.0, math.nan, 0
     for k in range(limits.max_steps + 1):
+        reached[0] = k
         log.read[k] = plant.joints()
         log.q[k], log.H[k] = plant.q, plant.H
         log.s[k] = plant.observe()

@@ -16,7 +16,8 @@ Precedence of the verdicts at one instant, first match wins:
 
 While markers are lost the robot is held where it is for up to ``lost_steps`` periods in a row; the run
 goes on when they are seen again. ``disturbed`` is what the loop of a robot that is not simulated ends
-in, before all others, where the images no longer agree with the calibration.
+in, before all others, where the images no longer agree with the calibration; ``failed`` where a robot or a
+law of somebody else raises, is late or answers nonsense once the run has begun.
 """
 
 import math
@@ -38,7 +39,8 @@ RUNNING = -1
     MAX_STEPS,
     JOINT_LIMIT,
     DISTURBED,
-) = range(10)
+    FAILED,
+) = range(11)
 VERDICTS = (
     "behind camera",
     "left image",
@@ -50,6 +52,7 @@ VERDICTS = (
     "max steps",
     "joint limit",
     "disturbed",
+    "failed",
 )
 PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.

@@ -23,7 +23,7 @@ class AnalyticPlant:
     in_front : whether every marker was in front of both cameras when last observed.
     markers : how many are observed, those of the face first.
     hidden : (2,) 1 where the face was self-occluded when last observed.
-    disturbance : nothing ever disturbs it.
+    disturbance : nothing ever disturbs it; why the law that drove it failed.
     takes_parts : it goes straight to the end of each step; the samples are the same.
     """
 

@@ -27,7 +27,7 @@ class DrivenRobot:
     q : (n,) joint readings when last asked for, rad or m.
     H, hidden : displacement of the face and self-occlusion as the calibration has them there.
     in_front : a camera sees nothing behind it.
-    disturbance : why the images no longer agree with the calibration; empty where they do.
+    disturbance : why the images no longer agree with the calibration, or what failed; else empty.
     """
 
     in_front = True

@@ -151,6 +151,8 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
         return "none yet"
     if stored.key != step.key:
         return "outdated"
+    if step.law and stored.records[""].verdict == "failed":
+        return "failed before"
     if remade:
         return "what it is made from is made anew"
     if step.stage == "report" and stage_module("report").missing(run):

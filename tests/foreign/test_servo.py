@@ -139,6 +139,26 @@ def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, messag
     assert message in answer.err
     assert CALLS.count("stop") == 1
     assert "Traceback" not in answer.err
+    trace = load("run").traces["direct_three"]  # what was known until then
+    assert trace.verdict == "failed"
+    assert message in trace.reason
+    assert len(trace.q) == trace.steps + 1 == len(trace.q_dot) + 1
+    assert trace.steps > 10
+    assert np.isfinite(trace.q[:-1]).all()
+    assert np.isfinite(trace.s[:-1]).all()
+    # What was not measured any more is unknown; a command that fails comes after the images.
+    assert np.isfinite(trace.s[-1]).all() == fault.startswith("command")
+
+
+def test_after_a_failure_no_other_law_drives_the_robot(servo):
+    answer = servo(*faulty("raises", 60), "--law", "exact", "--json")
+    assert answer.code == 1
+    assert [told["law"] for told in answer.json["laws"]] == ["direct_three"]
+    assert answer.json["laws"][0]["verdict"] == "failed"
+    assert answer.json["failed"] == "servo/direct_three"
+    assert CALLS.count("stop") == 1
+    again = servo(*SOUND, "--json")
+    assert again.json["laws"][0]["verdict"] == "converged"
 
 
 def test_ctrl_c_stops_the_robot(servo):

@@ -94,7 +94,7 @@ def test_just_short_of_diverging_goes_on():
 def test_verdicts_have_the_promised_names():
     assert set(VERDICTS) == {
         "converged", "plateau", "diverged", "left image", "behind camera", "joint limit", "singular",
-        "max steps", "markers lost", "disturbed",
+        "max steps", "markers lost", "disturbed", "failed",
     }  # fmt: skip
 
 
