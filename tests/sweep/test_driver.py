@@ -2,14 +2,15 @@
 
 import json
 import signal
+import threading
 
 import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.sweep import engine
+from projservo_cli.sweep import driver, engine
 from projservo_cli.sweep.columns import columns_of
-from projservo_cli.sweep.driver import Folder, read_manifest, status_of
+from projservo_cli.sweep.driver import Folder, read_manifest, shares_settings, status_of
 from projservo_cli.sweepfile import SweepTable
 from tests.sweep.cases import columns, design, make
 from tests.sweep.processes import (
@@ -23,16 +24,6 @@ from tests.sweep.processes import (
 )
 
 pytestmark = pytest.mark.volume
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """Configuration and folder of a sweep that nothing disturbed."""
-    folder = tmp_path_factory.mktemp("whole")
-    config = written(folder)
-    code, _, err = finish(start(config, folder / "out"))
-    assert code == 0, err
-    return config, folder / "out"
 
 
 @pytest.fixture(scope="module")
@@ -81,24 +72,24 @@ def test_interrupted_it_leaves_a_table_of_what_was_done(long, tmp_path):
     assert not differences(tmp_path, reference)
 
 
-def test_the_table_opens_in_xarray_and_pandas(whole):
+def test_the_table_opens_in_xarray_and_pandas(long):
     xarray = pytest.importorskip("xarray", reason="xarray is not installed")
     pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
     pytest.importorskip("pandas", reason="pandas is not installed")
-    _, folder = whole
+    _, folder = long
     ours = columns(folder)
     with xarray.open_dataset(folder / "sweep.h5") as data:
-        assert dict(data.sizes) == {"run": 20}
+        assert dict(data.sizes) == {"run": 300}
         frame = data.to_dataframe()
         assert data["position_error_mm"].attrs["units"] == "mm"
-    assert frame.index.tolist() == list(range(20))
+    assert frame.index.tolist() == list(range(300))
     assert set(frame.columns) == set(ours) - {"run"}
     for name, values in ours.items():
         if name != "run":
             assert frame[name].tolist() == pytest.approx(values.tolist(), nan_ok=True, abs=0)
-    assert frame.groupby("law")["steps"].count().to_dict() == {"direct_two": 10, "stacked": 10}
-    with xarray.open_dataset(folder / "sweep.h5", group="traces/10") as trace:
-        assert trace.sizes["instant"] == ours["steps"][10] + 1
+    assert frame.groupby("law")["steps"].count().to_dict() == {"direct_two": 150, "stacked": 150}
+    with xarray.open_dataset(folder / "sweep.h5", group="traces/150") as trace:
+        assert trace.sizes["instant"] == ours["steps"][150] + 1
         assert trace.attrs["law"] == "stacked"
 
 
@@ -145,6 +136,42 @@ def test_a_damaged_part_is_named(tmp_path):
     part.write_bytes(part.read_bytes()[:1000])
     with pytest.raises(InputError, match=f"{part.name}.*damaged"):
         make(found, tmp_path)
+
+
+def test_threads_give_the_same_and_are_left_in_order(tmp_path):
+    """Runs that differ in their seeds alone are threads; an interrupt waits for those at work."""
+    found = design(runs=30, chunk=5, calibrations=2)
+    assert shares_settings(found)
+    assert make(found, tmp_path / "one").complete
+    reference = columns(tmp_path / "one")
+
+    def interrupt(what, done, total):
+        if what == "runs" and done >= 10:
+            raise KeyboardInterrupt
+
+    two, say = Folder(tmp_path / "two"), [].append
+    with pytest.raises(KeyboardInterrupt):
+        driver.run(found, two, engine.LocalEngine(2), interrupt, say)
+    assert not [thread for thread in threading.enumerate() if "ThreadPool" in thread.name]
+    rows = columns(two.path)["run"]
+    assert 10 <= len(rows) < 60
+    assert make(found, two.path, workers=2).complete
+    for name, values in columns(two.path).items():
+        assert values.tobytes() == reference[name].tobytes(), name
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"random": {"control.gain_t": {"uniform": [1, 3]}}},
+        {"tasks": {"random": 100}, "runs": 100},
+        {"calibrations": 4, "runs": 3},
+        {"grid": {"law": ["exact", "exact_track"]}},
+        {"between_samples": True},
+    ],
+)
+def test_runs_that_share_little_are_not_threads(given):
+    assert not shares_settings(design(**given))
 
 
 def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypatch):
