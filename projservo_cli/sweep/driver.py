@@ -27,8 +27,8 @@ from projservo_cli.sweep.engine import Engine, LocalEngine, completed
 from projservo_cli.sweep.runs import Made, Part, compiled_by, run_part
 from projservo_cli.sweepfile import TABLE, SweepTable, assemble, write_part
 
-PART_S = 1.0  # what making a part should take
-PILOTS, PILOT_RUNS = 5, 8  # parts that are made to see how long a run takes, and their runs
+PART_S = 1.5  # what making a part should take
+PILOTS, PILOT_RUNS = 5, 16  # parts that are made to see how long a run takes, and their runs
 CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
 SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 MOST_RUNS = 50_000  # in a part, whose rows are in memory
@@ -219,10 +219,12 @@ def _make(
         keys = {design.calibration_key(*pair) for pair in pairs}
         return Part(design, first, last, {key: calibrations[key] for key in keys}, tasks)
 
-    engine.suit(status.total, threads=shares_settings(design))
+    threads = shares_settings(design)
+    engine.suit(1 if threads else status.total, threads=False)  # threads would be timed with each other
     chunk = status.chunk or design.sweep.chunk or _measured_chunk(design, engine, part)
     if not status.chunk:
         _begin(design, folder, chunk)
+    engine.suit(status.total, threads=threads)
     left = status.total - status.done
     if status.done:
         say(f"{status.done} of {status.total} runs are stored already")

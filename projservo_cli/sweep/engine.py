@@ -70,8 +70,10 @@ class LocalEngine:
 
     def suit(self, workers: int, *, threads: bool) -> None:
         """Threads take the memory of one process, and share what it has compiled and worked out."""
-        self.close()
-        self.workers, self._threads = min(self.most, workers), threads
+        wanted = min(self.most, workers), threads
+        if wanted != (self.workers, self._threads):
+            self.close()
+            self.workers, self._threads = wanted
 
     def pool(self, *, anew: bool = False) -> Executor:
         """The workers, started when they are first asked for."""
