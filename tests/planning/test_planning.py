@@ -91,6 +91,21 @@ def test_the_shipped_task_needs_coupled_parts():
     assert 0 < np.nanmin(plan.tau_0[plan.tau_0 > 0]) < plan.tau
 
 
+def test_the_shipped_task_that_even_shares_hide_from_both_cameras():
+    """Shares that grow evenly lose sight of the face by true geometry; the planned ones never do."""
+    example = case("apart")
+    q_goal = np.array(example.config.task.goal.joints.values("RRRRRR"))
+    q_start = example.reach.q_start
+    outcome = outcome_of(0, example.config, example.truth, example.truth.model, q_start, q_goal)
+    assert not outcome.linear
+    assert outcome.kept
+    assert outcome.feasible, outcome.reason
+    assert outcome.sight > 0.02
+    linear = example.planned(example.truth.model, samples=101)
+    assert not linear.feasible
+    assert (linear.margin.min(axis=0) < -0.3).all()
+
+
 def _proves_coupling(config, truth, q_start, q_goal):
     H = [truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool) for q in (q_start, q_goal)]
     true = TrueTask(truth.P, truth.image_size, *((truth.M_face @ T.T)[:, :3] for T in H))
