@@ -33,7 +33,8 @@ def test_validate_prints_the_statistics_of_a_table(projservo, stages, statistics
     answer = projservo("validate", *run, "--data", "t.csv", "--json")
     assert answer.json == {"run": str(tmp_path / "out/run.h5"), **statistics, "p95_px": None}
     text = projservo("validate", *run, "--data", "t.csv").out
-    assert "2 marker-view pairs; skipped: 1 unknown marker, 0 behind camera, 3 missing" in text
+    told = " ".join(text.split())
+    assert "2 marker-view pairs; skipped: 1 unknown marker, 0 behind camera, 3 missing" in told
     assert "median 0.25" in text
 
 
