@@ -15,13 +15,14 @@ from projservo_cli.page.template import template
 from projservo_cli.records import FloatArray, InputError
 
 HEIGHT = 640  # px of the scene
-EYE = 1.4  # distance of the eye, in sizes of the scene
+EYE = 1.75  # distance of the eye, in sizes of the scene
+LOWER = 0.15  # that it looks below the middle, where the names of the axes are
 TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
 DOTS = 9  # on the planned path
 # What is wider than high needs more distance where the page is narrow.
 NEARER = """
 const plot = document.getElementById("{plot_id}");
-const far = Math.min(3, Math.max(1, 900 / plot.clientWidth));
+const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
 const {x, y, z} = plot.layout.scene.camera.eye;
 Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
 """
@@ -153,7 +154,8 @@ def _scene(motion: Motion, run: Driven) -> dict[str, Any]:
         for name, reach in _extent(motion, run).items()
     }
     eye = {"x": EYE * np.cos(azimuth), "y": EYE * np.sin(azimuth), "z": 0.5 * EYE}
-    return scene | {"aspectmode": "data", "camera": {"eye": eye}}
+    camera = {"eye": eye, "center": {"x": 0.0, "y": 0.0, "z": -LOWER}}
+    return scene | {"aspectmode": "data", "camera": camera}
 
 
 def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
