@@ -100,7 +100,7 @@ def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
 
 
 def merged(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Merge a function into its only caller before the compiler proper sees it.
+    """Merge a function into its callers, of which it has few, before the compiler proper sees it.
 
     On its own it is compiled only where it is called from Python.
     """

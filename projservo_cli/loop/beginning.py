@@ -8,6 +8,7 @@ import numpy as np
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, State, measure, new_state, reset
 from projservo_cli.geometry.displacement import as_array
+from projservo_cli.geometry.jit import composed
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.mechanisms import OWN, Span
 from projservo_cli.loop.compiled import Log, new_log, run
@@ -76,15 +77,22 @@ def begin(
     -------
     What is wrong, ``FOUND`` for nothing; the parts; False where neither sense of a half turn arrived.
     """
-    if not measure(model, task, s, q_start, state):
-        return NOT_MEASURED, no_parts(), True
-    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
-    if not parts.found:
-        return NOT_UNIQUE, parts, True
-    if rehearse and is_half_turn(parts.theta_p):
+    status, parts = first_parts(model, task, s, q_start, state)
+    if status == FOUND and rehearse and is_half_turn(parts.theta_p):
         parts, arrives = in_better_sense(model, task, q_start, state, stage)
         return FOUND if parts.found else NOT_UNIQUE, parts, arrives
-    return FOUND, parts, True
+    return status, parts, True
+
+
+@composed
+def first_parts(
+    model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
+) -> tuple[int, Parts]:
+    """Measure and partition the task in the sense that the angles have; what is wrong, and the parts."""
+    if not measure(model, task, s, q_start, state):
+        return NOT_MEASURED, no_parts()
+    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    return FOUND if parts.found else NOT_UNIQUE, parts
 
 
 def is_half_turn(theta_p: float) -> bool:

@@ -5,18 +5,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, State, measure, new_state, reset
+from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, State, new_state, reset
 from projservo_cli.geometry.jit import composed, njit
 from projservo_cli.geometry.lens import straight
-from projservo_cli.loop.beginning import Stage, in_better_sense, is_half_turn, new_stage
+from projservo_cli.loop.beginning import Stage, first_parts, in_better_sense, is_half_turn, new_stage
 from projservo_cli.loop.compiled import Log, new_log, run
 from projservo_cli.loop.step import RUNNING, Limits
 from projservo_cli.loop.summary import Ends, Summary, summary
 from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Model, signed
 from projservo_cli.task.body import Body
-from projservo_cli.task.face import FOUND, NOT_MEASURED, NOT_UNIQUE, Task, new_task, put_task
-from projservo_cli.task.partition import partition
+from projservo_cli.task.face import FOUND, NOT_UNIQUE, Task, new_task, put_task
 from projservo_cli.task.target import Bench, new_bench, put_body_task
 
 # A run that could not be begun; other verdicts as of ``step``.
@@ -147,7 +146,7 @@ def opened(
     shown: FloatArray,
     desk: Measuring,
 ) -> tuple[int, float, float]:
-    """Measure and partition a task, as ``begin`` does, and measure it as the law will.
+    """Measure and partition a task, and measure it as the law will.
 
     Parameters
     ----------
@@ -167,12 +166,9 @@ def opened(
     status = put_measured(model, q_start, shown, desk, desk.task)
     if status != FOUND:
         return status, 0.0, 0.0
-    state = desk.state
-    reset(state)
-    if not measure(model, desk.task, desk.start, q_start, state):
-        return NOT_MEASURED, 0.0, 0.0
-    parts = partition(state.work, desk.task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
-    return FOUND if parts.found else NOT_UNIQUE, parts.theta_r, parts.theta_p
+    reset(desk.state)
+    status, parts = first_parts(model, desk.task, desk.start, q_start, desk.state)
+    return status, parts.theta_r, parts.theta_p
 
 
 def trial(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> int:

@@ -82,11 +82,12 @@ def summary_of(outcome: Outcome, plant: Plant, ends: Ends, period: float) -> Sum
     return summary(plant, outcome.log, outcome.steps, outcome.limited, period, ends)
 
 
-def path_between_mm(outcome: Outcome, plant: Plant, ends: Ends, period: float) -> float:
+def path_between_mm(outcome: Outcome, plant: Plant, ends: Ends, period: float, found: Summary) -> float:
     """Largest distance of the centre from its line, between the samples too, mm."""
     log, steps = outcome.log, outcome.steps
     start = log.H[0] @ middle_of(plant)
-    return MM * path_deviation(plant, log, steps, period, start, ends.goal, SUBSAMPLES)
+    between = MM * path_deviation(plant, log, steps, period, start, ends.goal, SUBSAMPLES)
+    return max(between, found.center_deviation_at_samples_mm)
 
 
 def middle_of(plant: Plant) -> FloatArray:
@@ -103,15 +104,14 @@ def known(outcome: Outcome, plant: Plant, truth: Truth, reach: Reach, gains: Gai
     if reach.goal_pose is None:
         return Known(pose, ends.goal_pose, center)
     found = summary_of(outcome, plant, ends, gains.period)
-    at_samples = found.center_deviation_at_samples_mm
     return Known(
         pose,
         reach.goal_pose,
         center,
         found.position_error_mm,
         found.rotation_error_deg,
-        max(path_between_mm(outcome, plant, ends, gains.period), at_samples),
-        at_samples,
+        path_between_mm(outcome, plant, ends, gains.period, found),
+        found.center_deviation_at_samples_mm,
         found.path_length_mm,
     )
 

@@ -17,8 +17,7 @@ from projservo_cli.stages.motion import joints_of
 from projservo_cli.stages.servo import gains_of, limits_of, sense_is_enough
 from projservo_cli.stages.sight import watched_body
 from projservo_cli.stages.traces import ends_of
-from projservo_cli.stages.truth import Ends, plant_of, shown_at, shown_px, truth_of
-from projservo_cli.stages.truth import ends_of as start_and_goal
+from projservo_cli.stages.truth import Reach, plant_of, shown_at, shown_px, start_and_goal, truth_of
 from projservo_cli.task.body import NO_BODY
 
 if TYPE_CHECKING:
@@ -42,7 +41,7 @@ class Prepared(NamedTuple):
 
     config: "Config"
     setting: Setting
-    ends: Ends
+    ends: Reach
     pins: list[int]
     numbers: list[int]
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -219,17 +219,6 @@ class Reach:
     pins_star: FloatArray
 
 
-class Ends(NamedTuple):
-    """Start and goal without noise: joints (n,), pose (4, 4) and pixels (2, m, 2) of face and pins."""
-
-    q_start: FloatArray
-    goal_pose: FloatArray | None
-    s_start: FloatArray
-    s_star: FloatArray
-    pins_start: FloatArray
-    pins_star: FloatArray
-
-
 def reach_of(config: "Config", truth: Truth) -> Reach:
     """Start, goal and their images, with the servo noise of the configuration.
 
@@ -240,7 +229,7 @@ def reach_of(config: "Config", truth: Truth) -> Reach:
     WorkFailed
         If the goal cannot be reached.
     """
-    return shown_at(ends_of(config, truth), config.seed, shown_px(config))
+    return shown_at(start_and_goal(config, truth), config.seed, shown_px(config))
 
 
 def shown_px(config: "Config") -> float:
@@ -248,10 +237,10 @@ def shown_px(config: "Config") -> float:
     return config.noise.servo_px / math.sqrt(config.noise.shown_frames)
 
 
-def shown_at(ends: Ends, seed: int, sigma: float) -> Reach:
+def shown_at(ends: Reach, seed: int, sigma: float) -> Reach:
     """Start and goal as a seed shows them, with noise σ, px."""
     if sigma == 0.0:
-        return Reach(*ends)
+        return ends
     rng = stream_of(seed, TARGET_NOISE)
     s_start = ends.s_start + sigma * rng.standard_normal(ends.s_start.shape)
     pins_noise = stream_of(seed, PIN_TARGET_NOISE).standard_normal((2, *ends.pins_start.shape))
@@ -263,7 +252,7 @@ def shown_at(ends: Ends, seed: int, sigma: float) -> Reach:
     return Reach(ends.q_start, ends.goal_pose, s_start, s_star, pins_start, pins_star)
 
 
-def ends_of(config: "Config", truth: Truth) -> Ends:
+def start_and_goal(config: "Config", truth: Truth) -> Reach:
     """Start and goal of the simulated task without noise.
 
     Raises
@@ -280,7 +269,7 @@ def ends_of(config: "Config", truth: Truth) -> Ends:
 
 
 @lru_cache(maxsize=2048)
-def _ends(task: "Task", types: str, truth: Truth) -> Ends:
+def _ends(task: "Task", types: str, truth: Truth) -> Reach:
     """What the ends of a task look like, for any seed and noise."""
     q_from = np.array(task.start.values(types))
     _require_limits(truth.robot, q_from, "task.start")
@@ -292,10 +281,10 @@ def _ends(task: "Task", types: str, truth: Truth) -> Ends:
     s_start, pins_start = truth.images(q_start, truth.M_face), truth.images(q_start, M_pins)
     if task.goal.images is not None:
         s_star = np.array([task.goal.images.left, task.goal.images.right])
-        return Ends(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
+        return Reach(q_start, None, s_start, s_star, pins_start, np.full(pins_start.shape, math.nan))
     q_goal = goal_joints(task, types, truth, q_from)
     _require_limits(truth.robot, q_goal, "task.goal")
-    return Ends(
+    return Reach(
         q_start,
         truth.robot.pose(q_goal),
         s_start,

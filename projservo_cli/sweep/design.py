@@ -17,7 +17,7 @@ from projservo_cli.config.fields import JointVector
 from projservo_cli.config.models import Goal, Task
 from projservo_cli.config.sweep import BASE, LAW, SweepConfig
 from projservo_cli.modes import names_of
-from projservo_cli.records import FloatArray, InputError
+from projservo_cli.records import FloatArray, InputError, IntArray
 from projservo_cli.stages.calibrate import DEPENDS_ON as CALIBRATION_DEPENDS_ON
 from projservo_cli.stages.chain import NOT_HASHED
 from projservo_cli.sweep.changes import changed, override, overrides
@@ -109,9 +109,18 @@ class Design:
         """
         if not 0 <= run < self.total:
             raise InputError(f"run {run}: the sweep {self.sweep.name} has runs 0 to {self.total - 1}")
-        cell, draw = divmod(run, self.sweep.runs)
+        return Numbers(run, *(int(number[0]) for number in self.placed(np.array([run])).values()))
+
+    def placed(self, runs: IntArray) -> dict[str, IntArray]:
+        """Where runs (k,) stand, by the names of ``Numbers`` after the first."""
+        cell, draw = np.divmod(runs, self.sweep.runs)
         tasks = self.sweep.tasks
-        return Numbers(run, cell, draw, draw % self.sweep.calibrations, draw % tasks.random if tasks else -1)
+        return {
+            "cell": cell,
+            "draw": draw,
+            "calibration": draw % self.sweep.calibrations,
+            "task": draw % tasks.random if tasks else np.full_like(draw, -1),
+        }
 
     def values(self, cell: int) -> dict[str, Any]:
         """Value of each axis in a cell."""

@@ -103,10 +103,9 @@ def run_part(part: Part) -> Made:
 
 def alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
     """Runs in groups that differ in their seeds alone."""
-    cell, draw = np.divmod(runs, design.sweep.runs)
-    tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
-    drawn = draw if design.sweep.random else np.zeros_like(draw)
-    keys = np.stack([cell, draw % design.sweep.calibrations, draw % tasks, drawn])
+    at = design.placed(runs)
+    drawn = at["draw"] if design.sweep.random else np.zeros_like(runs)
+    keys = np.stack([at["cell"], at["calibration"], at["task"], drawn])
     _, group = np.unique(keys, axis=1, return_inverse=True)
     order = np.argsort(group, kind="stable")
     yield from (runs[these] for these in np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
@@ -124,12 +123,10 @@ def _numbered(design: Design, runs: IntArray) -> Columns:
         column.name: np.full(len(runs), missing.get(column.dtype, b""), dtype=column.dtype)
         for column in columns_of(design)
     }
-    cell, draw = np.divmod(runs, design.sweep.runs)
-    table["run"][:], table["cell"][:], table["draw"][:] = runs, cell, draw
-    table["calibration"][:] = draw % design.sweep.calibrations
-    if design.sweep.tasks is not None:
-        table["task"][:] = draw % design.sweep.tasks.random
-    table["seed"][:] = [seed_of(design.sweep.seed, RUNS, number) for number in draw.tolist()]
+    at = design.placed(runs)
+    for name, number in ({"run": runs} | at).items():
+        table[name][:] = number
+    table["seed"][:] = [seed_of(design.sweep.seed, RUNS, number) for number in at["draw"].tolist()]
     return table
 
 
@@ -217,6 +214,5 @@ def measures(config: Config, made: Simulated, *, between_samples: bool) -> dict[
     summary = summary_of(outcome, made.plant, ends, period)
     found = {"verdict": outcome.verdict, "steps": outcome.steps, **summary._asdict()}
     if between_samples:
-        between = path_between_mm(outcome, made.plant, ends, period)
-        found[BETWEEN.name] = max(between, summary.center_deviation_at_samples_mm)
+        found[BETWEEN.name] = path_between_mm(outcome, made.plant, ends, period, summary)
     return found

@@ -8,14 +8,6 @@ from projservo_cli import store
 from projservo_cli.config import load_config
 from projservo_cli.page import write_page
 from projservo_cli.records import InputError
-from tests.store.first_release import first_release
-
-
-@pytest.fixture
-def run(tmp_path):
-    path = tmp_path / "run.h5"
-    path.write_bytes(first_release())
-    return path
 
 
 def test_it_holds_what_it_held(run):

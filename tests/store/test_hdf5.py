@@ -17,13 +17,6 @@ from tests.survival.mutations import EDITS, mutate
 SEAL_SIZE = 83  # bytes of the line behind the data
 
 
-@pytest.fixture
-def run(tmp_path):
-    path = tmp_path / "run.h5"
-    path.write_bytes(first_release())
-    return path
-
-
 def refused(path):
     with pytest.raises(InputError) as caught:
         store.load(path)
