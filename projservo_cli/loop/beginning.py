@@ -95,6 +95,7 @@ def first_parts(
     return FOUND if parts.found else NOT_UNIQUE, parts
 
 
+@composed
 def is_half_turn(theta_p: float) -> bool:
     """Whether the rotation within the plane is so near to half a turn that its sense must be chosen."""
     return math.pi - abs(theta_p) < HALF_TURN_BAND

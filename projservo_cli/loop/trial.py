@@ -4,6 +4,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import literal_unroll
 
 from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, State, new_state, reset
 from projservo_cli.geometry.jit import composed, njit
@@ -13,7 +14,7 @@ from projservo_cli.loop.compiled import Log, new_log, run
 from projservo_cli.loop.step import RUNNING, Limits
 from projservo_cli.loop.summary import Ends, Summary, summary
 from projservo_cli.plants.plant import Plant
-from projservo_cli.records import FloatArray, Model, signed
+from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.body import Body
 from projservo_cli.task.face import FOUND, NOT_UNIQUE, Task, new_task, put_task
 from projservo_cli.task.target import Bench, new_bench, put_body_task
@@ -171,43 +172,97 @@ def opened(
     return status, parts.theta_r, parts.theta_p
 
 
-def trial(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> int:
-    """One run: measure the task, partition it, drive the law to its verdict, and sum up.
+def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> None:
+    """Runs, one after the other: measure the task, partition it, drive the law to its verdict, and sum up.
 
     Parameters
     ----------
-    shown : (2, 2, b, 2) images at the start and at the goal, the face first, px.
-    noise : (k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too short.
+    shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.
+    noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
+        short.
     desk : workspace.
-    numbers : (``NUMBERS``,) on return the numbers of the run.
-
-    Returns
-    -------
-    Its verdict.
+    numbers : (r, ``NUMBERS``) on return the numbers of the runs.
     """
-    model, q_start, at = setting.model, setting.q_start, desk.measuring
-    status, theta_r, theta_p = opened(model, setting.believed, setting.shares_task, q_start, shown, at)
-    if status == FOUND and setting.rehearse and is_half_turn(theta_p):
-        parts, _ = in_better_sense(model, at.task, q_start, at.state, desk.stage)
-        status, theta_r, theta_p = FOUND if parts.found else NOT_UNIQUE, parts.theta_r, parts.theta_p
+    made = 0
+    while made < len(shown):
+        made = without_rehearsal(setting, shown, noise, desk.measuring, desk.log, made, numbers)
+        if made < len(shown):
+            rehearsed(setting, noise[made], desk, numbers[made])
+            made += 1
+
+
+@njit
+def without_rehearsal(
+    setting: Setting,
+    shown: FloatArray,
+    noise: FloatArray,
+    desk: Measuring,
+    log: Log,
+    first: int,
+    numbers: FloatArray,
+) -> int:
+    """Runs from the first on, up to one whose half turn is to be rehearsed; that one is opened.
+
+    A call takes as long as a tenth of a run to hand its arguments over, and all of it with the lock of the
+    interpreter held: hence many runs a call.
+    """
+    runs = len(shown)
+    for made in range(first, runs):
+        status, theta_r, theta_p = opened(
+            setting.model, setting.believed, setting.shares_task, setting.q_start, shown[made], desk
+        )
+        if status == FOUND and setting.rehearse and is_half_turn(theta_p):
+            return made
+        driven(setting, status, theta_r, theta_p, noise[made], desk, log, numbers[made])
+    return runs
+
+
+def rehearsed(setting: Setting, noise: FloatArray, desk: Desk, numbers: FloatArray) -> None:
+    """One run that was opened, its half turn in the better sense."""
+    at = desk.measuring
+    parts, _ = in_better_sense(setting.model, at.task, setting.q_start, at.state, desk.stage)
+    status = FOUND if parts.found else NOT_UNIQUE
+    driven(setting, status, parts.theta_r, parts.theta_p, noise, at, desk.log, numbers)
+
+
+@njit
+def driven(
+    setting: Setting,
+    status: int,
+    theta_r: float,
+    theta_p: float,
+    noise: FloatArray,
+    desk: Measuring,
+    log: Log,
+    numbers: FloatArray,
+) -> None:
+    """Drive the law of a run that was opened, with what is wrong and its angles, rad; its numbers."""
+    for i in range(numbers.shape[0]):
+        numbers[i] = math.nan
+    numbers[VERDICT] = NOT_STARTED
     if status != FOUND:
-        numbers[:] = math.nan
-        numbers[VERDICT] = NOT_STARTED
-        return NOT_STARTED
-    at.own_state.memory.rotation[:] = signed(theta_r, theta_p, at.state.q_hat[1:3])
-    numbers[VERDICT], numbers[STEPS] = verdict, steps = run(
+        return
+    state = desk.own_state
+    for i in range(state.memory.rotation.shape[1]):
+        state.memory.rotation[0, i] = desk.state.q_hat[1, i] if theta_r >= 0.0 else -desk.state.q_hat[1, i]
+        state.memory.rotation[1, i] = desk.state.q_hat[2, i] if theta_p >= 0.0 else -desk.state.q_hat[2, i]
+    verdict, steps = run(
         setting.code,
         setting.believed,
-        at.task if setting.shares_task else at.own_task,
+        desk.task if setting.shares_task else desk.own_task,
         setting.gains,
         setting.limits,
         setting.plant,
         noise,
-        q_start,
-        at.own_state,
-        desk.log,
+        setting.q_start,
+        state,
+        log,
     )
+    numbers[VERDICT] = verdict
+    numbers[STEPS] = steps
     if verdict != RUNNING:
-        limited = float(at.own_state.limited[0])
-        numbers[2:] = summary(setting.plant, desk.log, steps, limited, setting.gains.period, setting.ends)
-    return verdict
+        found = summary(setting.plant, log, steps, state.limited[0], setting.gains.period, setting.ends)
+        column = 2
+        for value in literal_unroll(found):
+            numbers[column] = value
+            column += 1

@@ -1,6 +1,7 @@
 """Many simulated runs of one configuration that differ in their seeds alone, without their traces."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from projservo_cli.control import CODES
 from projservo_cli.geometry.mechanisms import COORDINATES
 from projservo_cli.loop.step import RUNNING
-from projservo_cli.loop.trial import NUMBERS, Setting, new_desk, trial
+from projservo_cli.loop.trial import NUMBERS, VERDICT, Desk, Setting, new_desk, trials
 from projservo_cli.modes import law_and_mode
 from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray
 from projservo_cli.stages.beginning import rehearses
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 # Noise is drawn for so many instants, and for so many times as many where a run is not over then.
 INSTANTS, FURTHER = 192, 4
+# Runs that compiled code makes in one call: their noise is a few hundred kilobytes.
+TOGETHER = 16
 
 
 class Prepared(NamedTuple):
@@ -72,6 +75,8 @@ def prepare(config: "Config", calibration: Calibration, name: str) -> Prepared:
     if watched is not None and law in BODY_LAWS:
         plant = plant._replace(pins=watched.pins)
         numbers += [truth.number[truth.pins[i]] for i in watched.which]
+    if watched is None:
+        ends = replace(ends, pins_start=ends.pins_start[:, :0], pins_star=ends.pins_star[:, :0])
     model, joints = calibration.model(), joints_of(config, calibration.joint_types)
     setting = Setting(
         CODES[law],
@@ -99,19 +104,26 @@ def numbers_of(prepared: Prepared, seeds: Sequence[int]) -> FloatArray:
     WorkFailed
         If the task cannot be begun, whatever the seed.
     """
-    config, m = prepared.config, prepared.ends.s_start.shape[1]
-    desk = new_desk(prepared.setting, m + len(prepared.pins))
+    desk = new_desk(prepared.setting, prepared.ends.s_start.shape[1] + len(prepared.pins))
     found = np.empty((len(seeds), len(NUMBERS)))
-    most = prepared.setting.limits.max_steps + 1
-    for numbers, seed in zip(found, seeds, strict=True):
-        shown = images_of(prepared, seed)
-        instants, verdict = INSTANTS, RUNNING
-        while verdict == RUNNING:
-            noise = noise_of(seed, config.noise.servo_px, min(instants, most), m, len(prepared.numbers) - m)
-            lose_markers(config, noise, prepared.numbers)
-            verdict = trial(prepared.setting, shown, noise, desk, numbers)
-            instants *= FURTHER
+    for first in range(0, len(seeds), TOGETHER):
+        last = first + TOGETHER
+        _make(prepared, seeds[first:last], INSTANTS, desk, found[first:last])
     return found
+
+
+def _make(prepared: Prepared, seeds: Sequence[int], instants: int, desk: Desk, numbers: FloatArray) -> None:
+    """Write the numbers (k, ``NUMBERS``) of runs whose noise is drawn for so many instants at first."""
+    config, m = prepared.config, prepared.ends.s_start.shape[1]
+    drawn = min(instants, prepared.setting.limits.max_steps + 1)
+    shown = np.array([images_of(prepared, seed) for seed in seeds])
+    noise = np.empty((len(seeds), drawn, 2, len(prepared.numbers), 2))
+    for seed, of_run in zip(seeds, noise, strict=True):
+        of_run[:] = noise_of(seed, config.noise.servo_px, drawn, m, len(prepared.numbers) - m)
+        lose_markers(config, of_run, prepared.numbers)
+    trials(prepared.setting, shown, noise, desk, numbers)
+    for i in np.flatnonzero(numbers[:, VERDICT] == RUNNING).tolist():
+        _make(prepared, seeds[i : i + 1], FURTHER * instants, desk, numbers[i : i + 1])
 
 
 def images_of(prepared: Prepared, seed: int) -> FloatArray:

@@ -243,7 +243,9 @@ def shown_at(ends: Reach, seed: int, sigma: float) -> Reach:
         return ends
     rng = stream_of(seed, TARGET_NOISE)
     s_start = ends.s_start + sigma * rng.standard_normal(ends.s_start.shape)
-    pins_noise = stream_of(seed, PIN_TARGET_NOISE).standard_normal((2, *ends.pins_start.shape))
+    pins_noise: FloatArray = np.zeros((2, *ends.pins_start.shape))
+    if pins_noise.size > 0:
+        pins_noise = stream_of(seed, PIN_TARGET_NOISE).standard_normal(pins_noise.shape)
     pins_start = ends.pins_start + sigma * pins_noise[0]
     if ends.goal_pose is None:
         return Reach(ends.q_start, None, s_start, ends.s_star, pins_start, ends.pins_star)
