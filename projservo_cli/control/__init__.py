@@ -8,7 +8,7 @@ from projservo_cli.control.exact import exact
 from projservo_cli.control.following import aim, go_on
 from projservo_cli.control.law import LOST, Gains, State
 from projservo_cli.control.stacked import stacked
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.task.face import Task
@@ -17,7 +17,7 @@ from projservo_cli.task.reference import following
 CODES = {law: code for code, law in enumerate(LAWS)}
 
 
-@njit
+@internal
 def command(
     code: int, model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
 ) -> int:

@@ -3,7 +3,7 @@
 from projservo_cli.control.law import OK, SINGULAR, Gains, State, follow, partitioned, translation_rate
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, inner, mul, unit, vec
 from projservo_cli.geometry.composition import composed_angle, composed_operator
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.mechanisms import Work, rotation_mechanism
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
@@ -46,7 +46,7 @@ def rotation_about_center(
     return True, inner(H, H_s) / size
 
 
-@njit
+@internal
 def single_rotation(
     model: Model, parts: Parts, ratio: float, state: State
 ) -> tuple[bool, float, float, Mat4]:

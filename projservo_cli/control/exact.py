@@ -22,7 +22,7 @@ from projservo_cli.control.law import (
 from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
 from projservo_cli.geometry.inverse import SETTLED, reach
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kinematics import backward, blocked_joint
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
@@ -44,7 +44,7 @@ def desired(parts: Parts, H_s: Mat4, tau: float, theta: float, share: float) -> 
     return mul(translation(parts.H_t, share * tau), rotation(H_s, mul(H_s, H_s), share * theta))
 
 
-@njit
+@internal
 def first_order(parts: Parts, tau: float, theta: float, sense: float, ahead: float, state: State) -> float:
     """First-order joint step τ q̂_t + θ q̂_s of one period into ``state.q_dot``; its largest entry.
 
@@ -62,7 +62,7 @@ def first_order(parts: Parts, tau: float, theta: float, sense: float, ahead: flo
     return most
 
 
-@njit
+@internal
 def continued(
     model: Model,
     task: Task,

@@ -2,7 +2,7 @@
 
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import apply, mat, put_vec, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.geometry.kinematics import image_velocity
 from projservo_cli.geometry.lens import straighten
@@ -12,7 +12,7 @@ from projservo_cli.task.face import Task
 from projservo_cli.task.reference import following
 
 
-@njit
+@internal
 def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
     """Interaction matrix and image error of one view, [RH00] eq. (7), into rows from ``first`` on."""
     work = state.work
@@ -34,7 +34,7 @@ def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, f
         work.rhs[first + 2 * k + 1] = s[view, k, 1] - v
 
 
-@njit
+@internal
 def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
     """Joint motion q̂ (n,) of least squares, and of least norm, of the matrix in the workspace.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
 from projservo_cli.geometry.composition import composed_angle
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import operators_at, row
 from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work, workspace
 from projservo_cli.geometry.span import joint_motion
@@ -235,7 +235,7 @@ def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State)
     return True
 
 
-@njit
+@internal
 def predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
     """Image error between points A and A_star (m, 4), px rms per point and view, [RH00] eq. (1)."""
     total = 0.0
@@ -269,7 +269,7 @@ def aimed(task: Task, state: State) -> Task:
     )
 
 
-@njit
+@internal
 def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> tuple[int, Parts]:
     """Measure and partition the remaining task, or what is left to the place the plan has now.
 
@@ -295,7 +295,7 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
     return OK, parts
 
 
-@njit
+@internal
 def follow(state: State) -> bool:
     """Joint velocity ``q_dot`` of the velocity ``xi_dot``; False where the joints cannot make it."""
     if state.work.span.H_hat.shape[0] == 0:
@@ -303,7 +303,7 @@ def follow(state: State) -> bool:
     return joint_motion(state.work, state.xi_dot, state.q_dot)
 
 
-@njit
+@internal
 def translation_rate(task: Task, gains: Gains, parts: Parts, state: State) -> float:
     """Rate λ_t τ of the translation, its step kept within δ τ_0 of both cameras."""
     wanted = gains.gain_t * parts.tau * gains.period

@@ -5,7 +5,7 @@ enters.
 """
 
 from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, sub, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import Work
@@ -17,7 +17,7 @@ MOST_NEWTON_STEPS = 6
 SETTLED = 1e-8
 
 
-@njit
+@internal
 def reach(
     model: Model,
     H_back: Mat4,

@@ -7,7 +7,7 @@ the compiler turns into vector instructions without changing the order of any su
 
 import math
 
-from projservo_cli.geometry.jit import inline, njit
+from projservo_cli.geometry.jit import inline, internal
 from projservo_cli.records import FloatArray, IntArray
 
 # A kernel is one-dimensional when the next pivot stands above round-off by this factor of the first.
@@ -197,7 +197,7 @@ def normalize(z: FloatArray, n: int) -> float:
     return size
 
 
-@njit
+@internal
 def least_squares(
     B: FloatArray, m: int, n: int, x: FloatArray, pivot: IntArray, z: FloatArray, rhs: FloatArray
 ) -> bool:

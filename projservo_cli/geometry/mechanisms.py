@@ -22,7 +22,7 @@ from projservo_cli.geometry.algebra import (
     sub,
 )
 from projservo_cli.geometry.displacement import as_array
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import kernel_vector
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
 
@@ -123,7 +123,7 @@ def put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
     work.B[i, first + 3] = A[3]
 
 
-@njit
+@internal
 def kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
     """Kernel of the eight rows in ``work.B``, compiled once for that number."""
     return kernel_vector(work.B, 8, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
@@ -192,7 +192,7 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
     return to_radians(work, q_hat)
 
 
-@njit
+@internal
 def moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Operator of a kernel vector, refused where it moves nothing.
 
@@ -210,7 +210,7 @@ def moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     return True, H
 
 
-@njit
+@internal
 def to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
     found, H = moving(work, q_hat)

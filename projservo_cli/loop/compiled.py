@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
 from projservo_cli.geometry.algebra import mat, put_mat
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import internal, njit
 from projservo_cli.geometry.kinematics import beyond_limits, start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
@@ -229,7 +229,7 @@ def run(
     return PLATEAU if on_plateau(log.judged, last, limits.plateau_steps) else MAX_STEPS, last
 
 
-@njit
+@internal
 def begin_row(log: Log, k: int) -> None:
     """Make the row of an instant say that nothing was measured nor commanded."""
     for i in range(log.errors.shape[1]):
@@ -242,7 +242,7 @@ def begin_row(log: Log, k: int) -> None:
     log.parts[k] = 0
 
 
-@njit
+@internal
 def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
     """Move the robot by a joint step, rad or m, overwritten, and whatever befalls it; read its joints."""
     knock(plant.disturbance, k + 1, dq)

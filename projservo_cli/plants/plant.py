@@ -18,7 +18,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.displacement import twist_exponential
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import forward, row
 from projservo_cli.geometry.lens import bend
 from projservo_cli.records import FREE, FloatArray, IntArray, Model
@@ -197,7 +197,7 @@ def rig_distance(plant: Plant, M: FloatArray) -> float:
     return math.sqrt(dot(way, way))
 
 
-@njit
+@internal
 def center_deviation(
     plant: Plant,
     H: Mat4,

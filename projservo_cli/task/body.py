@@ -24,7 +24,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.displacement import twist_exponential
-from projservo_cli.geometry.jit import inline, merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.normal import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
 from projservo_cli.geometry.span import invariant_rotations
 from projservo_cli.records import BoolArray, FloatArray, Model
@@ -212,7 +212,7 @@ def normal_equations(
     return squares, views
 
 
-@njit
+@internal
 def displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
     """Displacement H exp(ξ), with the coordinates ξ in the last column of the solved equations."""
     xi = normal[:, COORDINATES]

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, mat, mul
 from projservo_cli.geometry.displacement import rotation, translation
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.records import FloatArray
 from projservo_cli.task.trajectory import displaced
 
@@ -69,7 +69,7 @@ def between(column: FloatArray, i: int, x: float) -> float:
     return (1.0 - x) * float(column[i]) + x * float(column[i + 1])
 
 
-@njit
+@internal
 def planned(reference: Reference, clock: float) -> Mat4:
     """Displacement from the start that is planned until a time in periods, [RH00] eqs. (17), (18)."""
     i, x = place(reference, clock)

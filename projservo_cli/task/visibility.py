@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, vec
 from projservo_cli.geometry.composition import incidence_angles
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.records import FloatArray
 from projservo_cli.task.face import Task
 
@@ -85,7 +85,7 @@ def violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, float
     return lost, worst
 
 
-@njit
+@internal
 def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, against_previous: bool) -> float:
     """Sense of the rotation onto the target plane, [RH00] section 4.2: θ or θ − 2π, 0 ≤ θ ≤ π.
 

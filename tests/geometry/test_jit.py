@@ -42,7 +42,7 @@ def test_new_files_count(copy):
 
 def test_every_compiled_function_lies_in_a_hashed_package():
     for file in PACKAGE.rglob("*.py"):
-        if re.search("^@(njit|inline)$", file.read_text(encoding="utf-8"), re.MULTILINE):
+        if re.search("^@(njit|internal|inline)$", file.read_text(encoding="utf-8"), re.MULTILINE):
             assert file.relative_to(PACKAGE).parts[0] in COMPILED_PACKAGES
 
 
@@ -69,12 +69,27 @@ print(json.dumps([values, CACHE_FOLDER is not None, sum(margin_coefficients.stat
 """
 
 
-def called(root, **environment):
-    """Values of a kernel, whether there is a cache and whether it served, in a fresh interpreter."""
+INTERNAL = """
+import json
+import numpy as np
+from projservo_cli.geometry.jit import COMPILED
+from projservo_cli.geometry.kernels import least_squares
+
+B, x, rhs = np.zeros((2, 6)), np.zeros(2), np.zeros(6)
+B[:, :3] = [[1.0, 2.0, 3.0], [4.0, 0.0, 6.0]]
+rhs[:3] = [1.0, 2.0, 4.0]
+found = least_squares(B, 3, 2, x, np.zeros(2, dtype=np.int64), np.zeros(2), rhs)
+hits = sum(least_squares.stats.cache_hits.values()) if COMPILED else -1
+print(json.dumps([bool(found), *x.tolist(), hits]))
+"""
+
+
+def called(root, script=CALL, **environment):
+    """What a script says of a kernel and its cache, in a fresh interpreter."""
     kept = {k: v for k, v in os.environ.items() if k not in ("PROJSERVO_CACHE_DIR", "XDG_CACHE_HOME")}
     environment = {**kept, "PYTHONPATH": str(root.parent), "PYTHONDONTWRITEBYTECODE": "1", **environment}
     done = subprocess.run(
-        [sys.executable, "-c", CALL],
+        [sys.executable, "-c", script],
         env=environment,
         cwd=root.parent,
         capture_output=True,
@@ -108,3 +123,13 @@ def test_installed_read_only_with_an_edit_and_without_a_home(copy):
     assert values != first[0]
     assert hits == 0
     assert called(root, HOME=os.devnull) == [values, False, 0]
+
+
+@pytest.mark.volume
+def test_an_internal_function_may_be_called_from_python(tmp_path):
+    cache = str(tmp_path)
+    *interpreted, hits = called(PACKAGE, INTERNAL, XDG_CACHE_HOME=cache, NUMBA_DISABLE_JIT="1")
+    assert interpreted[0]
+    assert hits == -1
+    for hits in 0, 1:
+        assert called(PACKAGE, INTERNAL, XDG_CACHE_HOME=cache) == [*interpreted, hits]
