@@ -159,10 +159,11 @@ def _compilation(call: _Call) -> AbstractContextManager[None]:
         call.console.say("compiling kernels (in every run: no cache folder can be written)")
     elif not any(CACHE_FOLDER.rglob("*.nbi")):
         call.console.say("compiling kernels, once")
-        if any(step.stage == "plan" and step.why for step in call.steps):
+        made = {step.stage for step in call.steps if step.why}
+        if beside := [part for part, stage in (("path", "plan"), ("loop", "servo")) if stage in made]:
             from projservo_cli.stages.compilation import compiling_beside
 
-            return compiling_beside()
+            return compiling_beside(*beside)
     return nullcontext()
 
 
