@@ -8,6 +8,7 @@ import importlib.util
 import itertools
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,19 +17,20 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.control import CODES
 from projservo_cli.control.bound import bind, bound_command
-from projservo_cli.control.law import ERRORS, new_state
+from projservo_cli.control.law import ERRORS, Gains, State, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
-from projservo_cli.loop.compiled import new_log
+from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.repeated import many_steps
 from projservo_cli.loop.step import Limits
-from projservo_cli.loop.threads import Job, run_all
+from projservo_cli.loop.trial import NUMBERS, Desk, Setting, new_desk, trials
 from projservo_cli.plants.plant import Plant
-from projservo_cli.records import LAWS, FloatArray
+from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.stages.servo import gains_of, limits_of
+from projservo_cli.stages.traces import ends_of
 from projservo_cli.stages.truth import plant_of, reach_of, truth_of
-from projservo_cli.task.body import body_of
+from projservo_cli.task.body import NO_BODY, body_of
 from projservo_cli.task.face import Task, task_from_images
 from projservo_cli.task.target import task_from_body
 
@@ -42,6 +44,21 @@ NOISE_PX = 0.5
 ROUNDS = 200
 RUNS = 64
 BODY = "exact, body"
+
+
+class Job(NamedTuple):
+    """The arguments of one run; ``state`` and ``log`` are its own, the rest may be shared."""
+
+    code: int
+    model: Model
+    task: Task
+    gains: Gains
+    limits: Limits
+    plant: Plant
+    noise: FloatArray
+    q_start: FloatArray
+    state: State
+    log: Log
 
 
 class Times(NamedTuple):
@@ -71,6 +88,8 @@ class Case:
             image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
         self.plant = plant_of(config, truth, reach.q_start)
+        self.shown = np.array([reach.s_start, reach.s_star])
+        self.ends = ends_of(self.plant, truth, reach.goal_pose)
         self.task = task_from_images(self.model, reach.s_start, reach.s_star, truth.center)
         pins = np.ascontiguousarray(truth.M[list(truth.pins)])
         self.body_plant = self.plant._replace(pins=pins)
@@ -121,6 +140,27 @@ class Case:
         """A run of 150 steps, traced."""
         return self.job("direct_three", self.task, self.plant, self.bounds._replace(max_steps=STEPS))
 
+    def batches(self, count: int) -> list["Batch"]:
+        """Runs of 150 steps as a sweep makes them, each with noise of its own, in so many equal shares."""
+        plant, bounds = self.plant, self.bounds._replace(max_steps=STEPS)
+        code, limits = CODES["direct_three"], (plant.lower, plant.upper)
+        setting = Setting(
+            code, self.model, self.model, NO_BODY, True, False, self.gains, bounds, plant, *limits,
+            self.q_start, self.ends,
+        )  # fmt: skip
+        m = self.shown.shape[2]
+        noise = NOISE_PX * np.random.default_rng(1).standard_normal((RUNS, STEPS + 1, 2, m, 2))
+        return [
+            Batch(
+                setting,
+                np.tile(self.shown, (len(share), 1, 1, 1, 1)),
+                share,
+                new_desk(setting, m),
+                np.empty((len(share), len(NUMBERS))),
+            )
+            for share in np.split(noise, count)
+        ]
+
     def matrices(self) -> FloatArray:
         """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
         _, Q = self.points
@@ -131,6 +171,16 @@ class Case:
             A = self.task.A_star
             found[k] = np.concatenate([(work.H_hat @ A[0]).T, (work.H_hat @ A[1]).T])
         return found
+
+
+class Batch(NamedTuple):
+    """The arguments of many runs; ``desk`` and ``numbers`` are their own."""
+
+    setting: Setting
+    shown: FloatArray
+    noise: FloatArray
+    desk: Desk
+    numbers: FloatArray
 
 
 def seconds(function: Callable[[], object]) -> float:
@@ -186,18 +236,18 @@ def _times(values: FloatArray, svd: FloatArray) -> Times:
 
 def threads(case: Case, count: int = 2) -> tuple[float, bool]:
     """How many times faster many runs are in two threads than in one, and whether their bits agree."""
-    serial = [case.whole_run() for _ in range(RUNS)]
-    parallel = [case.whole_run() for _ in range(RUNS)]
-    rounds = [
-        (seconds(lambda: run_all(serial, 1)), seconds(lambda: run_all(parallel, count))) for _ in range(15)
-    ]
-    alone, together = np.min(rounds, axis=0)
-    same = all(
-        left.tobytes() == right.tobytes()
-        for one, other in zip(serial, parallel, strict=True)
-        for left, right in zip(one.log, other.log, strict=True)
-    )
-    return float(alone / together), same
+    (serial,) = case.batches(1)
+    shares = case.batches(count)
+    with ThreadPoolExecutor(count) as pool:
+
+        def together() -> None:
+            for future in [pool.submit(trials, *share) for share in shares]:
+                future.result()
+
+        rounds = [(seconds(lambda: trials(*serial)), seconds(together)) for _ in range(15)]
+    alone, beside = np.min(rounds, axis=0)
+    same = serial.numbers.tobytes() == np.concatenate([share.numbers for share in shares]).tobytes()
+    return float(alone / beside), same
 
 
 def toolbox_step(case: Case) -> Callable[[], object] | None:

@@ -12,8 +12,8 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import load_config
+from projservo_cli.loop import trial
 from projservo_cli.loop.compiled import run
-from projservo_cli.loop.threads import run_all
 from projservo_cli.records import LAWS
 from projservo_cli.stages import bench
 from tests.conftest import ROOT
@@ -54,17 +54,16 @@ def test_a_whole_run(benchmark, case):
     assert least < 0.01
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_runs_in_threads_are_those_made_one_by_one(case, threads):
-    jobs, alone = [case.whole_run() for _ in range(6)], case.whole_run()
-    # Every other job has noise of its own, so that one in the place of another would be seen.
-    jobs = [job._replace(noise=job.noise * (1 + i % 2)) for i, job in enumerate(jobs)]
-    verdict = run(*alone)
-    found = run_all(jobs, threads)
-    assert found[::2] == [verdict] * 3
-    for i, job in enumerate(jobs):
-        assert (job.log.q.tobytes() == alone.log.q.tobytes()) == (i % 2 == 0)
-    assert jobs[1].log.q.tobytes() == jobs[3].log.q.tobytes() == jobs[5].log.q.tobytes()
+def test_runs_in_threads_are_those_made_one_by_one(case):
+    (serial,) = case.batches(1)
+    trial.trials(*serial)
+    assert len(np.unique(serial.numbers[:, trial.NUMBERS.index("image_error_px")])) == bench.RUNS
+    one = case.batches(bench.RUNS)[3]
+    trial.trials(*one)
+    assert one.numbers.tobytes() == serial.numbers[3].tobytes()
+    assert one.numbers[0, trial.STEPS] == bench.STEPS
+    _, same = bench.threads(case)
+    assert same
 
 
 def test_the_table_holds_every_law_and_ratios_to_the_svd(case):
