@@ -160,10 +160,11 @@ def _compilation(call: _Call) -> AbstractContextManager[None]:
     elif not any(CACHE_FOLDER.rglob("*.nbi")):
         call.console.say("compiling kernels, once")
         made = {step.stage for step in call.steps if step.why}
-        if beside := [part for part, stage in (("path", "plan"), ("loop", "servo")) if stage in made]:
+        # A plan needs the loop too, where it rehearses a half turn.
+        if {"plan", "servo"} & made:
             from projservo_cli.stages.compilation import compiling_beside
 
-            return compiling_beside(*beside)
+            return compiling_beside(*(["path"] if "plan" in made else []), "loop")
     return nullcontext()
 
 

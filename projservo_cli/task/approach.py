@@ -7,7 +7,7 @@ can do, though the robot itself can do it: the calibration is off by more than i
 import math
 
 from projservo_cli.geometry.algebra import Mat4, apply, mul, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.geometry.kinematics import operators_at, row
 from projservo_cli.geometry.mechanisms import Work
@@ -23,7 +23,7 @@ OUT_OF_REACH, SOON = 10.0, 3
 DAMPING = 1e-3
 
 
-@njit
+@internal
 def image_miss(reaching: Reaching, H: Mat4, goal: Mat4, rhs: FloatArray) -> tuple[float, float]:
     """What the face displaced by H lacks of where ``goal`` takes it, in the images; differences in ``rhs``.
 
@@ -45,7 +45,7 @@ def image_miss(reaching: Reaching, H: Mat4, goal: Mat4, rhs: FloatArray) -> tupl
     return math.sqrt(most), total
 
 
-@njit
+@internal
 def approach(
     reaching: Reaching, H_back: Mat4, goal: Mat4, q: FloatArray, work: Work, M: FloatArray, newton: FloatArray
 ) -> float:
@@ -93,7 +93,7 @@ def approach(
     return left
 
 
-@njit
+@internal
 def damp(work: Work, n: int, rows: int, damping: float) -> None:
     """Append rows that hold back each joint, by a share of the longest column of the image Jacobian."""
     longest = 0.0

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, apply, axpy, dot, mat, put_vec, vec
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import internal, njit
 from projservo_cli.geometry.kernels import orthogonalize
 from projservo_cli.geometry.kinematics import image_velocity, row
 from projservo_cli.geometry.lens import bend
@@ -172,7 +172,7 @@ def limit_margin(q: FloatArray, demands: Demands) -> float:
     return max(WORST, least)
 
 
-@njit
+@internal
 def image_jacobian(reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray) -> None:
     """Image Jacobian of the displaced face in the workspace, a column a joint, [RH00] eq. (7).
 
@@ -192,7 +192,7 @@ def image_jacobian(reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray) -
                 jacobian.B[i, 4 * k + 2 * view + 1] = dv
 
 
-@njit
+@internal
 def reciprocal_condition(
     reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray, norms: FloatArray
 ) -> float:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from projservo_cli.geometry.inverse import SETTLED, reach
-from projservo_cli.geometry.jit import allocating, njit
+from projservo_cli.geometry.jit import allocating, internal, njit
 from projservo_cli.geometry.kinematics import backward, operators_at
 from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray, IntArray
@@ -35,7 +35,7 @@ DETOUR = 1.01
 ROUND_OFF = 1e-9
 
 
-@njit
+@internal
 def continued(
     reaching: Reaching,
     first: FloatArray,
@@ -151,7 +151,7 @@ def interpolate(field: FloatArray, mu: FloatArray, x: FloatArray) -> None:
         x[l] = (1.0 - w) * low + w * ((1.0 - u) * near + u * far)
 
 
-@njit
+@internal
 def piece(
     reaching: Reaching,
     field: FloatArray,

@@ -7,7 +7,7 @@ node keeps different ones that lead to it.
 
 from projservo_cli.geometry.algebra import Mat4
 from projservo_cli.geometry.inverse import reach
-from projservo_cli.geometry.jit import njit
+from projservo_cli.geometry.jit import internal, njit
 from projservo_cli.geometry.kinematics import backward, operators_at
 from projservo_cli.geometry.mechanisms import COORDINATES, Work
 from projservo_cli.records import FloatArray, IntArray
@@ -104,7 +104,7 @@ def orientation(H_hat: FloatArray, start: FloatArray, G: FloatArray) -> float:
     return product
 
 
-@njit
+@internal
 def arrive(
     reaching: Reaching,
     H_back: Mat4,
@@ -127,7 +127,7 @@ def arrive(
     return near(q, before, stride)
 
 
-@njit
+@internal
 def carried(
     reaching: Reaching,
     H_back: Mat4,
