@@ -10,18 +10,28 @@ from projservo_cli.stages import compilation
 SAME_TYPES = """
 from pathlib import Path
 
+import numba
+from numba.core.types import unliteral
+
 from projservo_cli.config import load_config
+from projservo_cli.geometry.jit import _OPTIONS
+from projservo_cli.loop import beginning, compiled
 from projservo_cli.stages import calibrate, compilation, plan, servo
 from projservo_cli.task.path import follow
 
+def anew(function):
+    return numba.njit(**{**_OPTIONS, "cache": False})(function.py_func)
+
 for compile_part in compilation.PARTS.values():
     compile_part()
-compiled = [follow, *(value for value in vars(compilation).values() if hasattr(value, "overloads"))]
+parts = [follow, *(value for value in vars(compilation).values() if hasattr(value, "overloads"))]
+# The loop is not taken from the cache, where it would need its parts no more.
+compiled.command = anew(compiled.command)
+beginning.run = servo.run_loop = anew(compiled.run)
 config = load_config(Path("configs/paper.yaml"))
 calibration = calibrate.run(config)[1]
-planned = plan.run(config, calibration)
-servo.run(config, calibration, planned, "exact")
-print(len(compiled), *(len(function.overloads) for function in compiled))
+servo.run(config, calibration, plan.run(config, calibration), "exact")
+print(*(len({tuple(map(unliteral, types)) for types in part.overloads}) for part in parts))
 """
 
 
@@ -38,9 +48,9 @@ def test_a_real_task_needs_no_other_types(request):
         text=True,
         check=True,
     )
-    functions, *overloads = map(int, answer.stdout.split())
-    assert functions > 8
-    assert overloads == [1] * functions
+    made = answer.stdout.split()
+    assert len(made) > 8
+    assert set(made) == {"1"}
 
 
 @pytest.mark.parametrize(("processors", "processes"), [(2, 1), (3, 2)])
