@@ -72,10 +72,10 @@ def test_everything_comes_back(run):
 
 @dataclass(frozen=True, eq=False)
 class Odd:
-    counts: records.IntArray = array("thing", about="counts")  # noqa: RUF009
-    yes: records.BoolArray = array("thing", "thing_", about="flags")  # noqa: RUF009
-    absent: records.FloatArray | None = array("nothing", about="not there")  # noqa: RUF009
-    there: records.FloatArray | None = array("there", "side", units="px", about="named as a dimension")  # noqa: RUF009
+    counts: records.IntArray = array("thing", about="counts")  # noqa: RUF009 (a field)
+    yes: records.BoolArray = array("thing", "thing_", about="flags")  # noqa: RUF009 (a field)
+    absent: records.FloatArray | None = array("nothing", about="not there")  # noqa: RUF009 (a field)
+    there: records.FloatArray | None = array("there", "side", units="px", about="named as a dimension")  # noqa: RUF009 (a field)
     number: float | None = scalar()
     missing: str | None = scalar()
     flag: bool = scalar()
