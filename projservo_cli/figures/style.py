@@ -4,9 +4,9 @@ matplotlib is imported where it is used and always draws without a display; the 
 same bytes in SVG, PDF and PNG.
 """
 
-from collections.abc import Iterator
+import io
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -131,9 +131,16 @@ def _equal_scales(axes: "Axes") -> None:
     axes.set_ylim(v - half[1], v + half[1])
 
 
-def save(figure: "Figure", path: Path, kind: str) -> None:
-    """Write an arranged figure as ``svg``, ``pdf`` or ``png``."""
-    figure.savefig(path, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
+def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
+    """An arranged figure as files, by format: ``svg``, ``pdf`` or ``png``."""
+    from projservo_cli.figures.recorded import Recorded
+
+    recorded, made = Recorded(figure, PNG_DPI), {}
+    for kind in formats:
+        file = io.BytesIO()
+        recorded.savefig(file, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
+        made[kind] = file.getvalue()
+    return made
 
 
 def pixels(figure: "Figure") -> npt.NDArray[np.uint8]:

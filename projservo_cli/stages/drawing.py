@@ -155,9 +155,9 @@ def draw(drawing: Drawing) -> None:
     figure = style.new_figure(spec.height)
     spec.draw(drawing.data, figure)
     style.arrange(figure)
-    for kind in drawing.formats:
+    for kind, content in style.contents(figure, drawing.formats).items():
         with replacing(drawing.folder / f"{spec.name}.{kind}") as path:
-            style.save(figure, path, kind)
+            path.write_bytes(content)
 
 
 def lacking(spec: FigureSpec, material: Fit) -> str:

@@ -68,11 +68,12 @@ def _drawn(picture: Picture, folder: Path, formats: Sequence[str]) -> Iterator[P
         figure = style.new_figure(picture.height, 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH)
         picture.draw(picture.data, figure)
         style.arrange(figure)
-        for kind in formats:
-            path = folder / f"{picture.name}.{kind}"
-            with replacing(path) as temporary:
-                style.save(figure, temporary, kind)
-            yield path
+        made = style.contents(figure, formats)
+    for kind, content in made.items():
+        path = folder / f"{picture.name}.{kind}"
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+        yield path
     path = folder / f"{picture.name}.csv"
     with replacing(path) as temporary:
         temporary.write_text(to_csv(picture.data), encoding="utf-8")
