@@ -133,7 +133,7 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
         If the readings have another number of joints or are not finite.
     """
     J = prediction_derivative(calibration.model(), calibration.M, q)
-    variance = np.einsum("...a,ab,...b->...", J, calibration.covariance, J, optimize=True)
+    variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
     result: FloatArray = np.maximum(variance, 0.0)
     return result
 

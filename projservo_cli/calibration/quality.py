@@ -144,7 +144,7 @@ def require_off_line(M: FloatArray, factor: FloatArray) -> None:
     U, extent, Vt = np.linalg.svd(M, full_matrices=False)
     m = len(M)
     across = np.eye(m) - U[:, :2] @ U[:, :2].T
-    noise = np.einsum("ij,jkr,ck->icr", across, factor.reshape(m, 4, -1), Vt[2:], optimize=True)
+    noise = across @ (Vt[2:] @ factor.reshape(m, 4, -1)).reshape(m, -1)
     if extent[2] < OFF_LINE * float(np.linalg.norm(noise)):
         raise WorkFailed(ON_A_LINE)
 

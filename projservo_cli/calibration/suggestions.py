@@ -92,7 +92,8 @@ def suggest(
     _, T = _seen(calibration, targets, TARGETS, factor, rng)
     q, C = _seen(calibration, candidates, CANDIDATES, factor, rng)
     coordinates = np.count_nonzero(T.any(axis=2))
-    gram = np.einsum("kra,krb->ab", T, T, optimize=True)
+    rows = T.reshape(-1, T.shape[2])
+    gram = rows.T @ rows
     C /= sigma
     left = np.ones(len(q), dtype=np.bool_)
     found: list[Suggestion] = []

@@ -81,7 +81,7 @@ def border_distance(material: Material, mu: FloatArray) -> FloatArray:
     turns = np.linspace(0.0, 1.0, TURNS)
     within = np.array([exp_rotation(plan.H_hat[2], share * plan.theta_p) for share in turns])
     onto = np.array([exp_rotation(plan.H_hat[1], share * plan.theta_r) for share in mu])
-    M = np.einsum("rij,pjk,mk->rpmi", onto, within, plan.A, optimize=True)
+    M = np.einsum("rij,pmj->rpmi", onto, plan.A @ np.swapaxes(within, 1, 2))
     depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))
     result = np.empty((2, len(mu), len(mu)))
     for i, share in enumerate(mu):

@@ -128,7 +128,7 @@ def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
 
 def _accepted(truth: Truth, poses: FloatArray, front: float, rejected: dict[str, int]) -> IntArray:
     """Indices of the poses that show the face to both cameras; the others are counted by reason."""
-    m = np.einsum("vij,kjl,ml->kvmi", truth.P, poses, truth.M_face, optimize=True)
+    m = np.einsum("vij,kmj->kvmi", truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
     before = (m[..., 2] > 0.0).all(axis=(1, 2))
     turned = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
