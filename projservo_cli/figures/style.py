@@ -4,7 +4,9 @@ matplotlib is imported where it is used and always draws without a display; the 
 same bytes in SVG, PDF and PNG.
 """
 
+import hashlib
 import io
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
@@ -139,8 +141,18 @@ def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
     for kind in formats:
         file = io.BytesIO()
         recorded.savefig(file, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
-        made[kind] = file.getvalue()
+        made[kind] = clips_by_content(file.getvalue()) if kind == "svg" else file.getvalue()
     return made
+
+
+def clips_by_content(svg: bytes) -> bytes:
+    """The same picture with outlines that clip named by what they are.
+
+    matplotlib names those that are no rectangles by where they are in memory.
+    """
+    outlines = re.findall(rb'<clipPath id="(\w+)">(.*?)</clipPath>', svg, re.DOTALL)
+    names = {name: b"p" + hashlib.sha256(outline).hexdigest()[:10].encode() for name, outline in outlines}
+    return re.sub(rb"p[0-9a-f]{10}", lambda found: names.get(found[0], found[0]), svg)
 
 
 def pixels(figure: "Figure") -> npt.NDArray[np.uint8]:

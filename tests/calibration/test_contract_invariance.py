@@ -1,6 +1,9 @@
 """What must not change a calibration: order and numbers of rows, pixel units, zeros and senses of joints."""
 
 import dataclasses
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ import pytest
 from projservo_cli.calibration import calibrate, predict
 from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.conftest import ROOT
 
 SIGMA = 0.5
 # The search ends when a step moves the images by 1e-7 of the residual; it converges faster than
@@ -128,3 +132,29 @@ def test_seed_of_the_search(case):
         again = calibrate(observation, robot.joint_types, source="recorded", seed=seed)
         np.testing.assert_array_equal(other.P, again.P)
         np.testing.assert_array_equal(other.covariance, again.covariance)
+
+
+@pytest.mark.parametrize("seed", ["2", "3"])
+def test_last_digits_do_not_depend_on_the_hash_seed(seed):
+    """Names in sets come in the order of their hashes, by which a library might order its sums."""
+    code = (
+        "import numpy as np\n"
+        "from projservo_cli.calibration import calibrate, prediction_variance\n"
+        "from tests.calibration.simulated_robot import random_robot, trials\n"
+        "rng = np.random.default_rng(3)\n"
+        "robot = random_robot('RRP', rng, markers=6)\n"
+        "observation = robot.observe(trials(robot, 6), 0.5, rng)\n"
+        "found = prediction_variance(calibrate(observation, 'RRP'), observation.q)\n"
+        "print(found.sum(axis=(1, 2, 3)).tobytes().hex())\n"
+    )
+    outputs = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONHASHSEED": value},
+            cwd=ROOT,
+            capture_output=True,
+            check=True,
+        ).stdout
+        for value in ("0", seed)
+    ]
+    assert outputs[0] == outputs[1]

@@ -120,6 +120,17 @@ def test_same_input_gives_the_same_bytes():
     assert first == second
 
 
+def test_outlines_that_clip_have_the_same_names_wherever_they_are_in_memory(figures):
+    svg = contents(figures["fig02_visibility"], ["svg"])["svg"]
+    names = re.findall(rb'<clipPath id="(\w+)"', svg)
+    assert len(names) > 1
+    elsewhere = svg
+    for i, name in enumerate(names):
+        elsewhere = elsewhere.replace(name, b"p%010x" % i)
+    assert elsewhere != svg
+    assert style.clips_by_content(elsewhere) == svg
+
+
 def saved(figure, kind):
     file = io.BytesIO()
     with style.styled():
