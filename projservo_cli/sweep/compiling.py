@@ -7,9 +7,10 @@ from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.sweep.design import Design, TaskSet, name_of_run
 from projservo_cli.sweep.engine import LocalEngine, completed
 from projservo_cli.sweep.preparation import Wanted, calibrate_one
-from projservo_cli.sweep.runs import Part, run_part
+from projservo_cli.sweep.runs import Part, compiled_by, run_part
 
-LOOP = "compiled.run-*.nbi"  # the index of the closed loop's machine code
+# Indices of the machine code of the closed loop, by whether many runs are made in one call.
+LOOPS = ("compiled.run-*.nbi", "trial.without_rehearsal-*.nbi")
 
 
 class First(NamedTuple):
@@ -26,7 +27,8 @@ def compile_once(
 
     That process ends here: the compiler keeps hundreds of megabytes.
     """
-    if engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(LOOP)):
+    loop = LOOPS[compiled_by(design, design.cell(0))]
+    if engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
         return
     say("compiling kernels, once, before the processes start")
     for _ in completed(engine, first_runs, [First(design, tasks)]):

@@ -32,10 +32,10 @@ def cache(tmp_path, monkeypatch):
     return tmp_path
 
 
-def filled(cache):
-    """Put the machine code of the loop where the compiler does."""
-    (cache / "loop_0123").mkdir()
-    (cache / "loop_0123" / "compiled.run-108.py311.nbi").touch()
+def filled(cache, name):
+    """Put machine code of the loop where the compiler does."""
+    (cache / "loop_0123").mkdir(exist_ok=True)
+    (cache / "loop_0123" / f"{name}-108.py311.nbi").touch()
 
 
 def test_only_an_empty_cache_that_several_processes_share_is_filled_first(cache, monkeypatch):
@@ -46,11 +46,16 @@ def test_only_an_empty_cache_that_several_processes_share_is_filled_first(cache,
     engine = Counted()
     compile_once(design(), {}, engine, told.append)
     assert len(made) == len(told) == engine.asked == engine.ended == 1
-    filled(cache)
+    filled(cache, "compiled.run")  # by a run of its own
+    compile_once(design(grid={"law": ["exact"]}, set={"control.mode": "track"}), {}, engine, told.append)
+    assert len(made) == len(told) == 1
+    compile_once(design(), {}, engine, told.append)
+    assert len(made) == len(told) == 2
+    filled(cache, "trial.without_rehearsal")
     compile_once(design(), {}, engine, told.append)
     monkeypatch.setattr(compiling, "CACHE_FOLDER", None)
     compile_once(design(), {}, engine, told.append)
-    assert len(made) == len(told) == 1
+    assert len(made) == len(told) == 2
 
 
 @pytest.mark.volume
