@@ -96,7 +96,7 @@ def main():
     rng = np.random.default_rng(20260101)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        config = written(folder, runs=12 * kills)
+        config = written(folder, runs=60 * kills)
         assert finish(start(config, folder / "whole"))[0] == 0
         process = start(config, folder / "killed", "-j", workers)
         wait_for_parts(process, folder / "killed", 1)
