@@ -3,11 +3,14 @@
 Only click is imported here; a command imports what it needs when it runs.
 """
 
+import _thread
 import difflib
 import importlib
 import io
 import os
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from typing import Any, NoReturn
@@ -29,7 +32,26 @@ class _Projservo(click.Command):
     def main(self, args: Sequence[str] | None = None, *_: Any, **__: Any) -> NoReturn:
         """Run the command line, or answer a shell that completes it, and leave with the exit code."""
         self._main_shell_completion({}, "projservo")
+        sys.unraisablehook = _interrupt_anew
         sys.exit(run(sys.argv[1:] if args is None else args))
+
+
+def _interrupt_anew(lost: "sys.UnraisableHookArgs") -> None:
+    """Interrupt a moment later where Ctrl-C came amid what cannot raise, such as the end of an object."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    timer = threading.Timer(0.01, _interrupt)
+    timer.daemon = True
+    timer.start()
+
+
+def _interrupt() -> None:
+    """Interrupt the main thread, from another one, and wherever there are signals also what it waits for."""
+    if os.name == "posix":
+        os.kill(os.getpid(), signal.SIGINT)
+    else:
+        _thread.interrupt_main()
 
 
 def _complete(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:

@@ -25,12 +25,14 @@ from tests.sweep.processes import (
 
 pytestmark = pytest.mark.volume
 
+RUNS = 300  # a law: some seconds of work, on a busy machine long after its first parts are seen
+
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory):
-    """Configuration and folder of a sweep of 300 runs, which takes long enough to be ended in its midst."""
+    """Configuration and folder of a sweep of two laws, which takes long enough to be ended in its midst."""
     folder = tmp_path_factory.mktemp("long")
-    config = written(folder, 150)
+    config = written(folder, RUNS)
     code, _, err = finish(start(config, folder / "out"))
     assert code == 0, err
     return config, folder / "out"
@@ -48,7 +50,7 @@ def test_killed_and_run_again_equals_the_uninterrupted_one(long, tmp_path):
     assert not (tmp_path / "sweep.h5").exists()
     code, _, err = finish(start(config, tmp_path, "-j", "2"))
     assert code == 0
-    assert f"{2 * len(left)} of 300 runs are stored already" in err
+    assert f"{2 * len(left)} of {2 * RUNS} runs are stored already" in err
     assert not differences(tmp_path, reference)
     assert not parts(tmp_path)
 
@@ -63,12 +65,18 @@ def test_interrupted_it_leaves_a_table_of_what_was_done(long, tmp_path):
     assert "Traceback" not in err
     table, full = SweepTable(tmp_path / "sweep.h5"), SweepTable(reference / "sweep.h5")
     rows = table.column("run")
-    assert 4 <= len(rows) < 300
+    assert 4 <= len(rows) < 2 * RUNS
     for name in table.names:
         assert table.column(name).tobytes() == full.column(name)[rows].tobytes()
     code, out, _ = finish(start(config, tmp_path, "--json"))
     told = json.loads(out)
-    assert (code, told["complete"], told["runs"], told["done"], told["cells"]) == (0, True, 300, 300, 2)
+    assert (code, told["complete"], told["runs"], told["done"], told["cells"]) == (
+        0,
+        True,
+        2 * RUNS,
+        2 * RUNS,
+        2,
+    )
     assert not differences(tmp_path, reference)
 
 
@@ -79,17 +87,17 @@ def test_the_table_opens_in_xarray_and_pandas(long):
     _, folder = long
     ours = columns(folder)
     with xarray.open_dataset(folder / "sweep.h5") as data:
-        assert dict(data.sizes) == {"run": 300}
+        assert dict(data.sizes) == {"run": 2 * RUNS}
         frame = data.to_dataframe()
         assert data["position_error_mm"].attrs["units"] == "mm"
-    assert frame.index.tolist() == list(range(300))
+    assert frame.index.tolist() == list(range(2 * RUNS))
     assert set(frame.columns) == set(ours) - {"run"}
     for name, values in ours.items():
         if name != "run":
             assert frame[name].tolist() == pytest.approx(values.tolist(), nan_ok=True, abs=0)
-    assert frame.groupby("law")["steps"].count().to_dict() == {"direct_two": 150, "stacked": 150}
-    with xarray.open_dataset(folder / "sweep.h5", group="traces/150") as trace:
-        assert trace.sizes["instant"] == ours["steps"][150] + 1
+    assert frame.groupby("law")["steps"].count().to_dict() == {"direct_two": RUNS, "stacked": RUNS}
+    with xarray.open_dataset(folder / "sweep.h5", group=f"traces/{RUNS}") as trace:
+        assert trace.sizes["instant"] == ours["steps"][RUNS] + 1
         assert trace.attrs["law"] == "stacked"
 
 
