@@ -11,8 +11,8 @@ from projservo_cli.geometry.lens import bent
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.compiled import new_log, run
 from projservo_cli.loop.step import VERDICTS, Limits
-from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Model
+from projservo_cli.robots.simulated import Plant
 from projservo_cli.task.body import body_of
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane, task_from_images
 from projservo_cli.task.target import task_from_body

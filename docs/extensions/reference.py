@@ -17,7 +17,7 @@ from projservo_cli import records
 from projservo_cli.cli.commands import COMMANDS, allowed
 from projservo_cli.cli.options import OPTIONS
 from projservo_cli.equations import REGISTER
-from projservo_cli.sweep.columns import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERS, Column
+from projservo_cli.sweep.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED, Column
 
 # Where a run file holds which record.
 GROUPS = {
@@ -118,7 +118,7 @@ def sweep_columns() -> Iterator[str]:
         ("column", "value", "unit", "what it is"),
         (
             (f"`{column.name}`", kinds[column.dtype[0]], unit_of(column), text(column.about))
-            for column in (*NUMBERS, *MEASURED, BETWEEN)
+            for column in (*NUMBERED, *MEASURED, BETWEEN)
         ),
     )
     yield from ("", f"`{BETWEEN.name}` is there with `between_samples`. Verdicts are:", "")

@@ -3,8 +3,8 @@
 import numpy as np
 
 from projservo_cli.calibration.frame import ProjectiveScene, isotropic
-from projservo_cli.calibration.projective import reconstruct
 from projservo_cli.calibration.readings import Readings, joint_trials, reference_pose
+from projservo_cli.calibration.reconstruction import reconstruct
 from projservo_cli.geometry.displacement import log_rotation, log_translation, normalize_displacement
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 

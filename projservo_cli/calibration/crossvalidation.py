@@ -6,11 +6,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration import adjustment
-from projservo_cli.calibration.excitation import UNDETERMINED_NOISE, require_motion
 from projservo_cli.calibration.fit import Solution, least_squares
 from projservo_cli.calibration.frame import spread_factor
 from projservo_cli.calibration.optimization import prepare
-from projservo_cli.calibration.quality import WARN_RATIO
+from projservo_cli.calibration.quality import UNDETERMINED_NOISE, WARN_RATIO, require_motion
 from projservo_cli.calibration.readings import Readings, of_poses, restrict
 from projservo_cli.records import BoolArray, CrossValidation, FloatArray, InputError, IntArray, WorkFailed
 

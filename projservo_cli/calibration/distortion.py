@@ -7,11 +7,11 @@ from scipy.linalg import cho_factor, cho_solve
 
 from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import LENS
-from projservo_cli.calibration.chance import chi2_beyond, f_beyond
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.epipolar import estimate as epipolar_geometry
 from projservo_cli.calibration.fit import RAYLEIGH, Solution, cauchy, distances, hopeless_px, least_squares
 from projservo_cli.calibration.optimization import LEAST_DAMPING, minimize, prepare, scaled_normal
+from projservo_cli.calibration.quality import chi2_beyond, f_beyond
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.calibration.reconstruction import Frame
 from projservo_cli.geometry.lens import FIRST, straight_views, within

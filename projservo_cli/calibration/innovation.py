@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from projservo_cli.calibration.chance import chi2_beyond
 from projservo_cli.calibration.prediction import predict, prediction_derivative
+from projservo_cli.calibration.quality import chi2_beyond
 from projservo_cli.records import BoolArray, Calibration, FloatArray
 
 VIEWS = ("left", "right")

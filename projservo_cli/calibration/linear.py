@@ -4,8 +4,8 @@ import numpy as np
 
 from projservo_cli.calibration.adjustment import Scene
 from projservo_cli.calibration.closed_form import trials_of
-from projservo_cli.calibration.projective import Reconstruction, reconstruct
 from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.reconstruction import Reconstruction, reconstruct
 from projservo_cli.calibration.rotations import cross
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 

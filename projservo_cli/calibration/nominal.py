@@ -9,6 +9,7 @@ from projservo_cli.calibration.adjustment import Scene, predict_pixels
 from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.fit import (
     RAYLEIGH,
+    SAME_LEVEL,
     Solution,
     far_px,
     hopeless_px,
@@ -19,7 +20,6 @@ from projservo_cli.calibration.fit import (
 from projservo_cli.calibration.optimization import prepare
 from projservo_cli.calibration.quality import Expected
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.calibration.refined import SAME_LEVEL
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, IntArray, Model, WorkFailed
 

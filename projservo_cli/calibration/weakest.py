@@ -5,9 +5,9 @@ from scipy.linalg import rq
 
 from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import Scene
-from projservo_cli.calibration.excitation import REACH_M, REACH_RAD
 from projservo_cli.calibration.optimization import Problem
 from projservo_cli.calibration.prediction import prediction_derivative
+from projservo_cli.calibration.quality import REACH_M, REACH_RAD
 from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, Model
 
 # Rows of the rotation of a camera in words.

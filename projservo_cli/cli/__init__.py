@@ -134,9 +134,11 @@ def _dispatch(arguments: list[str]) -> int:
     unused = [OPTIONS[name].opts[-1] for name in OPTIONS if name in given - allowed(names)]
     if unused:
         raise click.UsageError(f"{', '.join(unused)}: not used by {' '.join(names)}")
-    module = "swept" if names == ["report"] and rest else "staged" if COMMANDS[names[0]].stage else names[0]
+    of_sweep = names == ["report"] and bool(rest)
+    module = "sweep" if of_sweep else "stages" if COMMANDS[names[0]].stage else names[0]
     command = importlib.import_module(f"projservo_cli.cli.{module}")
-    code: int = command.run(names, rest, context.params)
+    run_command = command.run_report if of_sweep else command.run
+    code: int = run_command(names, rest, context.params)
     return code
 
 

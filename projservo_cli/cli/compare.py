@@ -16,7 +16,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     del names
     if len(rest) < 2:
         raise click.UsageError("compare needs two runs or more: projservo compare RUN RUN")
-    from projservo_cli.page import write_comparison
+    from projservo_cli.report.page import write_comparison
     from projservo_cli.store import load
 
     path = Path(options["output"] or DEFAULT)

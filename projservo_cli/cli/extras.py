@@ -26,7 +26,7 @@ def require(config: Config, options: Mapping[str, Any]) -> None:
         If plotly is not installed, the robot is not known in metres, or there is no task.
     """
     if wanted_of(options):
-        from projservo_cli.stages import extras
+        from projservo_cli.stages import report as extras
 
         extras.require(config, wanted_of(options))
 
@@ -35,8 +35,8 @@ def made_extras(
     config: Config, run: Run, laws: Sequence[str], wanted: Sequence[str], console: Console
 ) -> dict[str, Path]:
     """Write what is wanted, and the page anew, which links to it; the paths by name."""
-    from projservo_cli.page import write_page
-    from projservo_cli.stages import extras
+    from projservo_cli.report.page import write_page
+    from projservo_cli.stages import report as extras
     from projservo_cli.stages.chain import reported
 
     chosen = {name: result for name, result in run.results.items() if not laws or _is_of(name, laws)}

@@ -6,10 +6,9 @@ from typing import Any
 
 import click
 
-from projservo_cli import plugins
 from projservo_cli.cli.output import Console
-from projservo_cli.modes import law_and_mode
-from projservo_cli.records import LAWS, InputError
+from projservo_cli.records import LAWS, InputError, law_and_mode
+from projservo_cli.robots import plugins
 
 
 def law_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -33,7 +32,7 @@ def require_asked(options: dict[str, Any], config: Any, steps: Sequence[Any]) ->
         Where it is refused, or a class cannot be found.
     """
     from projservo_cli.control import CODES
-    from projservo_cli.plants.foreign import METHODS
+    from projservo_cli.robots.yours import METHODS
 
     servo = [step for step in steps if step.stage == "servo" and step.why]
     laws = [law_and_mode(step.law)[0] for step in servo]

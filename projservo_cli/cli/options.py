@@ -149,8 +149,9 @@ OPTIONS: dict[str, click.Option] = {
         ),
         click.Option(
             ["--to"],
-            type=click.Choice(["csv", "mat", "npz"]),
-            help="On export: the kind of file.",
+            type=click.Choice(["csv"]),
+            default="csv",
+            help="On export: the kind of file, of which there is one.",
         ),
         click.Option(["--force"], is_flag=True, help="Make the named stages even where they are up to date."),
         click.Option(["-n", "--dry-run"], is_flag=True, help="Say what would be done, do nothing."),

@@ -19,7 +19,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     require_terminal(options)
     from projservo_cli.cli.configuration import SHIPPED, given_overrides, shipped
     from projservo_cli.config import load_config
-    from projservo_cli.lock import working_in
+    from projservo_cli.files import working_in
     from projservo_cli.stages.record import prepare, record
     from projservo_cli.tables import read_joints
 

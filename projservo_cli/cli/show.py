@@ -16,7 +16,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     del names
     if rest and options["output"] is not None:
         raise click.UsageError("show takes one run, as an argument or with -o")
-    from projservo_cli.cli.objects import stage_object, summary
+    from projservo_cli.cli.words import stage_object, summary
     from projservo_cli.config import load_config
     from projservo_cli.store import SERVO, load
 

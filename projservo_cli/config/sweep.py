@@ -7,10 +7,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
-from projservo_cli.config.fields import Count, Number, Positive, Section, Whole
-from projservo_cli.config.loading import Override, apply_overrides, problem_lines, read_text
-from projservo_cli.config.messages import translated
+from projservo_cli.config.loading import Override, apply_overrides, problem_lines, read_text, translated
 from projservo_cli.config.models import folder_name
+from projservo_cli.config.robot import Count, Number, Positive, Section, Whole
 from projservo_cli.config.yaml_source import Document, Problem
 from projservo_cli.records import InputError
 

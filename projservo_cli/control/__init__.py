@@ -12,7 +12,7 @@ from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.task.face import Task
-from projservo_cli.task.reference import following
+from projservo_cli.task.trajectory import following
 
 CODES = {law: code for code, law in enumerate(LAWS)}
 

@@ -2,7 +2,7 @@
 
 from projservo_cli.control.law import OK, SINGULAR, Gains, State, follow, partitioned, translation_rate
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, inner, mul, unit, vec
-from projservo_cli.geometry.composition import composed_angle, composed_operator
+from projservo_cli.geometry.displacement import composed_angle, composed_operator
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.mechanisms import Work, rotation_mechanism
 from projservo_cli.records import FloatArray, Model

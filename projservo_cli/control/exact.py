@@ -21,13 +21,13 @@ from projservo_cli.control.law import (
 )
 from projservo_cli.geometry.algebra import Mat4, mul
 from projservo_cli.geometry.displacement import rotation, translation
-from projservo_cli.geometry.inverse import SETTLED, reach
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kinematics import backward, blocked_joint
+from projservo_cli.geometry.mechanisms import SETTLED, reach
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
-from projservo_cli.task.reference import following, planned_step
+from projservo_cli.task.trajectory import following, planned_step
 
 # A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
 # by about 0.1 mm from the path of a robot of a metre's size.

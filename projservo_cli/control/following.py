@@ -4,7 +4,7 @@ from projservo_cli.control.law import OK, Gains, State
 from projservo_cli.geometry.algebra import apply, put_vec, vec
 from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray
-from projservo_cli.task.reference import Reference, between, place, planned
+from projservo_cli.task.trajectory import Reference, between, place, planned
 
 
 @merged

@@ -6,10 +6,10 @@ from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.kernels import least_squares
 from projservo_cli.geometry.kinematics import image_velocity
 from projservo_cli.geometry.lens import straighten
-from projservo_cli.geometry.span import joint_motion
+from projservo_cli.geometry.mechanisms import joint_motion
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
-from projservo_cli.task.reference import following
+from projservo_cli.task.trajectory import following
 
 
 @internal

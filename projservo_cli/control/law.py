@@ -12,17 +12,16 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
-from projservo_cli.geometry.composition import composed_angle
+from projservo_cli.geometry.displacement import composed_angle
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import operators_at, row
-from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work, workspace
-from projservo_cli.geometry.span import joint_motion
+from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work, joint_motion, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, carry, fit_body, new_normal
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
-from projservo_cli.task.reference import following
+from projservo_cli.task.trajectory import following
 from projservo_cli.task.visibility import limited_translation
 
 # Whether to fit only the views that the goal showed, and in how many steps; written as values of a loop,

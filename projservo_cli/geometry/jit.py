@@ -21,13 +21,18 @@ from numba.extending import register_jitable
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
-COMPILED_PACKAGES = ("records", "geometry", "task", "control", "loop", "plants")
+COMPILED_PARTS = ("records.py", "geometry", "task", "control", "loop", "robots")
+
+
+def _sources(part: Path) -> list[Path]:
+    """Files of a package, or the one that is a module."""
+    return [part] if part.is_file() else sorted(part.glob("*.py"))
 
 
 def source_hash(root: Path) -> str:
     """Hash of the sources that machine code depends on, and of the compiler's version."""
     digest = hashlib.sha256(f"{sys.version}|{numba.__version__}|{np.__version__}".encode())
-    for file in (file for package in COMPILED_PACKAGES for file in sorted((root / package).glob("*.py"))):
+    for file in (file for part in COMPILED_PARTS for file in _sources(root / part)):
         digest.update(file.relative_to(root).as_posix().encode())
         digest.update(file.read_bytes())
     return digest.hexdigest()[:16]

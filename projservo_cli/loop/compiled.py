@@ -28,15 +28,8 @@ from projservo_cli.loop.step import (
     tolerance,
     verdict_at,
 )
-from projservo_cli.plants.plant import (
-    Plant,
-    knock,
-    observe,
-    pose_after,
-    read_joints,
-    rig_distance,
-)
 from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.robots.simulated import Plant, knock, observe, pose_after, read_joints, rig_distance
 from projservo_cli.task.face import Task
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.control.bound import bind, bound_command
 from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, new_state
 from projservo_cli.geometry.kinematics import beyond_limits
-from projservo_cli.geometry.span import span_of
+from projservo_cli.geometry.mechanisms import span_of
 from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.step import (
     DISTURBED,
@@ -30,8 +30,8 @@ from projservo_cli.loop.step import (
     tolerance,
     verdict_at,
 )
-from projservo_cli.plants.plant import Plant
 from projservo_cli.records import FloatArray, Model, WorkFailed
+from projservo_cli.robots.simulated import Plant
 from projservo_cli.task.face import Task
 
 LEFT_TO_THE_LOOP = (-1.0,)

@@ -24,8 +24,8 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.geometry.jit import merged
-from projservo_cli.plants.plant import inside
 from projservo_cli.records import FloatArray
+from projservo_cli.robots.simulated import inside
 
 RUNNING = -1
 (

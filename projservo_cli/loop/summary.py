@@ -6,8 +6,8 @@ from typing import NamedTuple
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, mul, put_vec, sub, vec
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.loop.compiled import Log
-from projservo_cli.plants.plant import Plant, center_deviation, line_distance
 from projservo_cli.records import FloatArray
+from projservo_cli.robots.simulated import Plant, center_deviation, line_distance
 from projservo_cli.task.face import center_of
 
 MM = 1e3

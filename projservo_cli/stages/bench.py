@@ -25,11 +25,11 @@ from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.repeated import many_steps
 from projservo_cli.loop.step import Limits
 from projservo_cli.loop.trial import NUMBERS, Desk, Setting, new_desk, trials
-from projservo_cli.plants.plant import Plant
 from projservo_cli.records import LAWS, FloatArray, Model
+from projservo_cli.robots.simulated import Plant
+from projservo_cli.stages.scenario import plant_of, reach_of, truth_of
 from projservo_cli.stages.servo import gains_of, limits_of
 from projservo_cli.stages.traces import ends_of
-from projservo_cli.stages.truth import plant_of, reach_of, truth_of
 from projservo_cli.task.body import NO_BODY, body_of
 from projservo_cli.task.face import Task, task_from_images
 from projservo_cli.task.target import task_from_body

@@ -7,16 +7,10 @@ import numpy as np
 
 from projservo_cli.calibration import calibrate, cross_validate
 from projservo_cli.calibration.fit import Solution
-from projservo_cli.records import (
-    Calibration,
-    CrossValidation,
-    FloatArray,
-    InputError,
-    Observation,
-)
+from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.motion import joints_of, reference_of
-from projservo_cli.stages.truth import Truth, calibration_generator, calibration_seed, truth_of
+from projservo_cli.stages.scenario import Truth, calibration_generator, calibration_seed, truth_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -94,7 +88,7 @@ def run(
     WorkFailed
         If the data do not support a calibration.
     """
-    from projservo_cli.nominal import read_nominal
+    from projservo_cli.config.nominal import read_nominal
 
     settings = config.calibration
     init = read_nominal(settings.init) if settings.init is not None else None

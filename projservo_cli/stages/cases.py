@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.plants.robot import rotation_about_axis
 from projservo_cli.records import Calibration, Trace, WorkFailed
+from projservo_cli.robots.truth import rotation_about_axis
 from projservo_cli.stages import Progress, plan, servo, silent
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from typing import Any
 
 from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
-from projservo_cli.modes import names_of
-from projservo_cli.records import InputError
+from projservo_cli.records import InputError, names_of
 from projservo_cli.stages import Progress
 from projservo_cli.store import SERVO, Result, Run, save
 

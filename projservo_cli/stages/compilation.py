@@ -18,11 +18,11 @@ from projservo_cli.control.image_based import pseudo_inverse, put_view
 from projservo_cli.control.law import measure
 from projservo_cli.geometry.jit import compile_for
 from projservo_cli.geometry.mechanisms import NO_OPERATOR
-from projservo_cli.loop.beginning import new_stage
 from projservo_cli.loop.compiled import advance
 from projservo_cli.loop.summary import Ends, path_deviation, summary
-from projservo_cli.plants.plant import observe
+from projservo_cli.loop.trial import new_stage
 from projservo_cli.records import NO_LENS, Model
+from projservo_cli.robots.simulated import observe
 from projservo_cli.task.along import along
 from projservo_cli.task.face import MIDPOINT, Task
 from projservo_cli.task.margins import CONSTRAINTS, Reaching, within

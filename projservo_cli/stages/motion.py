@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from projservo_cli import plugins
-from projservo_cli.plants.foreign import METHODS, ForeignRobot, Robot
 from projservo_cli.records import FloatArray, InputError, WorkFailed
+from projservo_cli.robots import plugins
+from projservo_cli.robots.yours import METHODS, ForeignRobot, Robot
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
-    from projservo_cli.config.fields import JointVector
+    from projservo_cli.config.robot import JointVector
 
 ARRIVED = 1e-3  # rad or m: a robot this near to where it was sent is there
 SETTLE = 10  # further commands for what rounding or a controller left at the end of a motion
@@ -87,7 +87,7 @@ def foreign_robot(config: "Config", joints: Joints, markers: int) -> ForeignRobo
     return ForeignRobot(robot, f"plant {target}", len(joints.types), markers, config.plant.timeout_s)
 
 
-def drive(robot: Robot, target: FloatArray, limit: FloatArray, period: float, what: str = "record") -> int:
+def drive_to(robot: Robot, target: FloatArray, limit: FloatArray, period: float, what: str = "record") -> int:
     """Move along a straight line in joint space, each command within the limit; the number of commands.
 
     Parameters

@@ -5,12 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.modes import REPLAN, law_and_mode
-from projservo_cli.records import BODY_LAWS, Calibration, Plan, Trace
+from projservo_cli.records import BODY_LAWS, REPLAN, Calibration, Plan, Trace, law_and_mode
+from projservo_cli.stages.scenario import SERVO_NOISE, generator, sight_of
 from projservo_cli.stages.servo import drive
-from projservo_cli.stages.sight import sight_of
 from projservo_cli.stages.studies import Bench
-from projservo_cli.stages.truth import SERVO_NOISE, generator
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli.config import digest
-from projservo_cli.plants.foreign import Robot, at_rest_after
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
+from projservo_cli.robots.yours import Robot, at_rest_after
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.calibrate import images_at, trial_motions
-from projservo_cli.stages.motion import drive, foreign_robot, joints_of, near
-from projservo_cli.stages.truth import Truth, calibration_generator, truth_of
+from projservo_cli.stages.motion import drive_to, foreign_robot, joints_of, near
+from projservo_cli.stages.scenario import Truth, calibration_generator, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 if TYPE_CHECKING:
@@ -187,7 +187,9 @@ def record(
     try:
         with at_rest_after(driven):
             for pose in recording.pending:
-                recording.commands += drive(driven, recording.targets[pose], limit, config.control.period_s)
+                recording.commands += drive_to(
+                    driven, recording.targets[pose], limit, config.control.period_s
+                )
                 recording.q[pose], recording.images[pose] = driven.joints(), driven.observe()
                 unsaved = True
                 progress("record", len(recording.q), total)

@@ -8,23 +8,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli.control.law import Gains
-from projservo_cli.figures.material import DIRECT, Studies
-from projservo_cli.geometry.composition import compose_rotations
 from projservo_cli.geometry.displacement import (
     as_array,
     as_mat,
+    compose_rotations,
     exp_rotation,
     exp_translation,
     twist_exponential,
 )
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.loop.step import Limits
-from projservo_cli.plants.plant import Plant
 from projservo_cli.records import PRISMATIC, FloatArray, Model, Plan, Trace
+from projservo_cli.report.material import DIRECT, Studies
+from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.scenario import Reach, Truth, plant_of, reach_of, truth_of
 from projservo_cli.stages.servo import drive, gains_of, limits_of
-from projservo_cli.stages.truth import Reach, Truth, plant_of, reach_of, truth_of
 from projservo_cli.task.margins import within
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from projservo_cli.calibration.suggestions import Region, Suggestion, suggest
 from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, FloatArray, Observation
 from projservo_cli.stages.calibrate import image_size_of
-from projservo_cli.stages.truth import SUGGESTIONS, generator, robot_of
+from projservo_cli.stages.scenario import SUGGESTIONS, generator, robot_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config

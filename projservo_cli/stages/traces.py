@@ -7,14 +7,13 @@ import numpy as np
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.displacement import as_mat
-from projservo_cli.geometry.normal import COORDINATES
+from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.compiled import Log
 from projservo_cli.loop.step import Limits, tolerance
 from projservo_cli.loop.summary import MM, Ends, Summary, angle_between, effort, path_deviation, summary
-from projservo_cli.modes import REPLAN
-from projservo_cli.plants.plant import Plant
-from projservo_cli.records import FloatArray, Trace
-from projservo_cli.stages.truth import Reach, Truth
+from projservo_cli.records import REPLAN, FloatArray, Trace
+from projservo_cli.robots.simulated import Plant
+from projservo_cli.stages.scenario import Reach, Truth
 from projservo_cli.task.face import center_of
 
 # Points of a joint step at which the deviation between samples is measured.

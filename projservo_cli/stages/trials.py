@@ -10,15 +10,23 @@ from projservo_cli.control import CODES
 from projservo_cli.geometry.mechanisms import COORDINATES
 from projservo_cli.loop.step import RUNNING
 from projservo_cli.loop.trial import NUMBERS, VERDICT, Desk, Setting, new_desk, trials
-from projservo_cli.modes import law_and_mode
-from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray
-from projservo_cli.stages.beginning import rehearses
-from projservo_cli.stages.disturbed import disturbance_of, lose_markers, noise_of
+from projservo_cli.records import BODY_LAWS, METRIC_LAWS, Calibration, FloatArray, law_and_mode
 from projservo_cli.stages.motion import joints_of
+from projservo_cli.stages.plan import rehearses
+from projservo_cli.stages.scenario import (
+    Reach,
+    disturbance_of,
+    lose_markers,
+    noise_of,
+    plant_of,
+    shown_at,
+    shown_px,
+    start_and_goal,
+    truth_of,
+    watched_body,
+)
 from projservo_cli.stages.servo import gains_of, limits_of, sense_is_enough
-from projservo_cli.stages.sight import watched_body
 from projservo_cli.stages.traces import ends_of
-from projservo_cli.stages.truth import Reach, plant_of, shown_at, shown_px, start_and_goal, truth_of
 from projservo_cli.task.body import NO_BODY
 
 if TYPE_CHECKING:

@@ -6,10 +6,9 @@ from pathlib import Path
 from projservo_cli.config import Config
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.stages.chain import steps_for
-from projservo_cli.store import Result, Run, load
+from projservo_cli.store import TABLE, Result, Run, load
 from projservo_cli.sweep.driver import Folder, stored_design
 from projservo_cli.sweep.preparation import REFUSED, calibration_path, read_tasks
-from projservo_cli.sweepfile import TABLE
 
 
 def folder_of(target: Path | str) -> Folder:

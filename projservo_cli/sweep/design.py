@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
@@ -12,16 +12,82 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.config import Config, digest, load_config, to_yaml
-from projservo_cli.config.fields import JointVector
+from projservo_cli.config import Config, Override, digest, load_config, to_yaml
 from projservo_cli.config.models import Goal, Task
-from projservo_cli.config.sweep import BASE, LAW, SweepConfig
-from projservo_cli.modes import names_of
-from projservo_cli.records import FloatArray, InputError, IntArray
+from projservo_cli.config.robot import JointVector
+from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
+from projservo_cli.records import FloatArray, InputError, IntArray, law_and_mode, names_of
 from projservo_cli.stages.calibrate import DEPENDS_ON as CALIBRATION_DEPENDS_ON
 from projservo_cli.stages.chain import NOT_HASHED
-from projservo_cli.sweep.changes import changed, override, overrides
-from projservo_cli.sweep.draws import CALIBRATION_VALUES, CALIBRATIONS, RUNS, VALUES, sample, seed_of
+
+
+def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
+    """A configuration with other values.
+
+    Raises
+    ------
+    InputError
+        If a value is not one that its key takes.
+    """
+    resolved = config.model_dump(mode="json")
+    try:
+        for key, value in values.items():
+            _put(resolved, key.split("."), value)
+        return Config.model_validate(resolved)
+    except (ValueError, KeyError, IndexError, TypeError):
+        given = [override(what, key, value) for key, value in values.items()]
+        load_config(config.name, given, text=to_yaml(config))  # says what is wrong in the user's words
+        raise
+
+
+def _put(values: Any, path: Sequence[str], value: Any) -> None:
+    for step in path[:-1]:
+        values = values[int(step)] if isinstance(values, list) else values[step]
+    if isinstance(values, list):
+        values[int(path[-1])] = value
+    else:
+        values[path[-1]] = value
+
+
+def override(what: str, key: str, value: Any) -> Override:
+    """A value as an override, which messages call by what it is of."""
+    path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(key.split(".")))
+    return Override(f"{what}: {key}={json.dumps(value)}", path, value)
+
+
+def overrides(what: str, key: str, value: Any) -> list[Override]:
+    """A value as overrides; that of a law sets its mode too where its name tells one."""
+    if key != LAW:
+        return [override(what, key, value)]
+    flag = f"{what}: {key}={json.dumps(value)}"
+    law, mode = law_and_mode(value)
+    found = [Override(flag, ("control", "laws"), [law])]
+    return found if law == value else [*found, Override(flag, ("control", "mode"), [mode])]
+
+
+# Streams of the sweep's seed.
+RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES = range(5)
+
+
+def seed_of(seed: int, stream: int, number: int) -> int:
+    """Seed of one of many draws."""
+    return int(np.random.SeedSequence(seed, spawn_key=(stream, number)).generate_state(1, np.uint64)[0] >> 1)
+
+
+def sample(distribution: Distribution, rng: np.random.Generator) -> Any:
+    """One value; always as many random numbers, whatever the distribution."""
+    uniform, normal = rng.random(), rng.standard_normal()
+    if distribution.uniform is not None:
+        least, most = distribution.uniform
+        return least + (most - least) * uniform
+    if distribution.log_uniform is not None:
+        least, most = distribution.log_uniform
+        return math.exp(math.log(least) + (math.log(most) - math.log(least)) * uniform)
+    if distribution.normal is not None:
+        mean, deviation = distribution.normal
+        return mean + deviation * normal
+    assert distribution.choice is not None
+    return distribution.choice[int(uniform * len(distribution.choice))]
 
 
 @dataclass(frozen=True)

@@ -19,13 +19,12 @@ from projservo_cli import provenance
 from projservo_cli.files import replacing
 from projservo_cli.records import InputError
 from projservo_cli.stages import Progress
+from projservo_cli.store import TABLE, SweepTable, assemble, write_part
 from projservo_cli.sweep import preparation
-from projservo_cli.sweep.columns import columns_of
 from projservo_cli.sweep.compiling import compile_once
 from projservo_cli.sweep.design import Design, from_recipe
 from projservo_cli.sweep.engine import Engine, LocalEngine, completed
-from projservo_cli.sweep.runs import Made, Part, compiled_by, run_part
-from projservo_cli.sweepfile import TABLE, SweepTable, assemble, write_part
+from projservo_cli.sweep.runs import Made, Part, columns_of, compiled_by, run_part
 
 PART_S = 1.5  # what making a part should take
 PILOTS, PILOT_RUNS = 5, 16  # parts that are made to see how long a run takes, and their runs

@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.columns import to_csv
 from projservo_cli.config.sweep import LAW
-from projservo_cli.figures import style
-from projservo_cli.figures.material import Data
-from projservo_cli.figures.sweeps import draw_basin, draw_final_errors, draw_success
 from projservo_cli.files import replacing
+from projservo_cli.report import style
+from projservo_cli.report.figures.sweeps import draw_basin, draw_final_errors, draw_success
+from projservo_cli.report.material import Data
 from projservo_cli.stages import Progress
+from projservo_cli.store import SweepTable
 from projservo_cli.sweep.driver import Folder, assembled, stored_design
 from projservo_cli.sweep.statistics import Rows, statistics, success_by
-from projservo_cli.sweepfile import SweepTable
+from projservo_cli.tables import to_csv
 
 STATISTICS = "statistics.json"
 OFFSET = "task.start_offset."

@@ -1,8 +1,9 @@
 """A part of a sweep: runs with consecutive numbers, each to one row of the table."""
 
+import json
 import math
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -11,25 +12,92 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
+from projservo_cli.config.sweep import Distribution
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.loop.trial import NUMBERS, VERDICT
 from projservo_cli.records import Calibration, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.sense import Sense, rotation_sense
+from projservo_cli.stages.plan import Sense, rotation_sense
 from projservo_cli.stages.servo import Simulated, record, scene_of, sense_is_enough, simulate
 from projservo_cli.stages.traces import ends_of, path_between_mm, summary_of
 from projservo_cli.stages.trials import is_compiled, numbers_of, prepare
-from projservo_cli.sweep.columns import (
-    BETWEEN,
-    MEASURED,
-    NONE,
-    NOT_CALIBRATED,
-    NOT_STARTED,
-    columns_of,
-    shown,
+from projservo_cli.sweep.design import RUNS, Design, TaskSet, name_of_run, seed_of
+
+NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
+ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
+NONE = -1  # in columns of counts, where a run did not begin
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the table: its name, NumPy type, unit and what it holds."""
+
+    name: str
+    dtype: str
+    units: str
+    about: str
+
+
+def text(name: str, values: Sequence[str], about: str) -> Column:
+    """A column of texts, as wide as the longest of the possible ones."""
+    return Column(name, f"S{max(len(value.encode()) for value in values)}", "1", about)
+
+
+NUMBERED = (
+    Column("run", "i8", "1", "number of the run"),
+    Column("cell", "i8", "1", "number of its cell of the grid"),
+    Column("draw", "i8", "1", "number of the run in its cell; runs of one number share task and noise"),
+    Column("calibration", "i8", "1", "number of the calibration in the cell"),
+    Column("task", "i8", "1", "number of the random task, -1 for that of the base"),
+    Column("seed", "i8", "1", "seed of the run"),
 )
-from projservo_cli.sweep.design import Design, TaskSet, name_of_run
-from projservo_cli.sweep.draws import RUNS, seed_of
+MEASURED = (
+    text("verdict", ALL_VERDICTS, "how the run ended"),
+    Column("usable", "i1", "1", "whether its calibration is usable"),
+    Column("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
+    Column("rotation_deg", "f8", "deg", "true rotation from start to goal"),
+    Column("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
+    Column("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
+    Column("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
+    Column("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
+    Column("self_occluded_steps_left", "i8", "1", "instants at which the left camera is behind the face"),
+    Column("self_occluded_steps_right", "i8", "1", "instants at which the right camera is behind the face"),
+    Column("first_outside_image", "i8", "1", "first instant with a marker outside an image, -1 for never"),
+    Column("first_beyond_limit", "i8", "1", "first instant beyond a joint limit, -1 for never"),
+    Column("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
+    Column("visibility_limited_steps", "i8", "1", "commands whose translation was kept within delta·tau_0"),
+    Column("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
+    Column("center_deviation_at_samples_mm", "f8", "mm", "largest distance of the centre from the line"),
+    Column("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
+)
+BETWEEN = Column("center_deviation_mm", "f8", "mm", "largest distance of the centre, between samples too")
+
+
+def columns_of(design: Design) -> tuple[Column, ...]:
+    """All columns of the table of a sweep: numbers, inputs, what was measured."""
+    about = "value of the grid"
+    axes = [_input(axis.name, axis.values, about) for axis in design.axes]
+    drawn = [_drawn(key, distribution) for key, distribution in design.sweep.random.items()]
+    between = (BETWEEN,) if design.sweep.between_samples else ()
+    return (*NUMBERED, *axes, *drawn, *MEASURED, *between)
+
+
+def _drawn(key: str, distribution: Distribution) -> Column:
+    if distribution.choice is not None:
+        return _input(key, distribution.choice, "value drawn for the run")
+    return Column(key, "f8", "1", "value drawn for the run")
+
+
+def _input(name: str, values: Sequence[Any], about: str) -> Column:
+    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
+        return Column(name, "f8", "1", about)
+    return text(name, [shown(value) for value in values], about)
+
+
+def shown(value: Any) -> str:
+    """A value as text, texts as they are."""
+    return value if isinstance(value, str) else json.dumps(value)
+
 
 Columns = dict[str, npt.NDArray[Any]]
 # What the table says of a verdict of the kernel.

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from projservo_cli.config.sweep import LAW
 from projservo_cli.records import BoolArray, FloatArray
-from projservo_cli.sweepfile import SweepTable
+from projservo_cli.store import SweepTable
 
 Z_95 = 1.959963984540054
 SUCCESS = "converged"

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.mechanisms import Work, workspace
-from projservo_cli.geometry.span import span_of
+from projservo_cli.geometry.mechanisms import Work, span_of, workspace
 from projservo_cli.records import FloatArray
+from projservo_cli.task.lattice import slowness
 from projservo_cli.task.margins import (
     CONDITIONING,
     IMAGE,
@@ -18,7 +18,6 @@ from projservo_cli.task.margins import (
     limit_margin,
 )
 from projservo_cli.task.path import follow, view_path
-from projservo_cli.task.strides import slowness
 
 # Points of a path at which its joints and margins are looked at.
 CHECKS = 151

@@ -12,7 +12,7 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, put_points
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
-from projservo_cli.task.reference import NO_REFERENCE, Reference
+from projservo_cli.task.trajectory import NO_REFERENCE, Reference
 
 MIDPOINT = -1
 # Offsets that leave less than this share of the longest beside it lie on one line.

@@ -21,8 +21,7 @@ from projservo_cli.geometry.algebra import (
     unit,
     vec,
 )
-from projservo_cli.geometry.composition import incidence_angles
-from projservo_cli.geometry.displacement import rotation
+from projservo_cli.geometry.displacement import incidence_angles, rotation
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,

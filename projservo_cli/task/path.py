@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from projservo_cli.geometry.inverse import SETTLED, reach
 from projservo_cli.geometry.jit import allocating, internal, njit
 from projservo_cli.geometry.kinematics import backward, operators_at
-from projservo_cli.geometry.mechanisms import Work
+from projservo_cli.geometry.mechanisms import SETTLED, Work, reach
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.task.approach import approach
+from projservo_cli.task.lattice import near, put, stride
 from projservo_cli.task.margins import (
     CONDITIONING,
     JOINTS,
@@ -20,7 +20,6 @@ from projservo_cli.task.margins import (
     view_share,
     visibility_margin,
 )
-from projservo_cli.task.strides import near, put, stride
 from projservo_cli.task.trajectory import displaced
 
 # A joint that moves more than this between neighbours on a path, rad or m, asks for points between.

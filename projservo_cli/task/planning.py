@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.algebra import apply, mat, sub, vec
-from projservo_cli.geometry.composition import wrap
+from projservo_cli.geometry.displacement import wrap
 from projservo_cli.geometry.mechanisms import Work
 from projservo_cli.records import FloatArray
 from projservo_cli.task.along import EQUALLY, Path, best_of, planning_workspace, timed
@@ -21,6 +21,7 @@ from projservo_cli.task.lattice import (
     COARSE,
     NODES,
     shortest,
+    slowness,
     solve_joints,
     view_shares,
     widest,
@@ -39,7 +40,6 @@ from projservo_cli.task.margins import (
 )
 from projservo_cli.task.path import straightened, view_path
 from projservo_cli.task.search import WAYS, carry, traced
-from projservo_cli.task.strides import slowness
 from projservo_cli.task.visibility import margin_coefficients
 
 # A margin of conditioning that no path is bounded by.

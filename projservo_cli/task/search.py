@@ -6,12 +6,11 @@ node keeps different ones that lead to it.
 """
 
 from projservo_cli.geometry.algebra import Mat4
-from projservo_cli.geometry.inverse import reach
 from projservo_cli.geometry.jit import internal, njit
 from projservo_cli.geometry.kinematics import backward, operators_at
-from projservo_cli.geometry.mechanisms import COORDINATES, Work
+from projservo_cli.geometry.mechanisms import COORDINATES, Work, reach
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.task.lattice import ROUGH
+from projservo_cli.task.lattice import ROUGH, near, put
 from projservo_cli.task.margins import (
     CONDITIONING,
     JOINTS,
@@ -20,7 +19,6 @@ from projservo_cli.task.margins import (
     limit_margin,
     reciprocal_condition,
 )
-from projservo_cli.task.strides import near, put
 from projservo_cli.task.trajectory import displaced
 
 # A joint that moves more than this between neighbours of the fine lattice, rad or m, has changed its branch;

@@ -10,8 +10,7 @@ from projservo_cli.geometry.displacement import translation
 from projservo_cli.geometry.jit import composed
 from projservo_cli.geometry.kinematics import forward, operators_at
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.geometry.mechanisms import OWN, Span, Work, workspace
-from projservo_cli.geometry.span import span_of
+from projservo_cli.geometry.mechanisms import OWN, Span, Work, span_of, workspace
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.body import Body, carry, fit_body, new_normal
 from projservo_cli.task.face import (
@@ -30,8 +29,8 @@ from projservo_cli.task.partition import Memory, clear, partition
 from projservo_cli.task.trajectory import turned
 
 # A fit ends where a step moves the images by less than this, px rms a coordinate.
-SETTLED_PX = 1e-6
-MOST_STEPS = 30
+SETTLED_SIGHT_PX = 1e-6
+MOST_SIGHT_STEPS = 30
 SETTLED, TOO_FEW, UNSETTLED = range(3)  # how it ended
 
 
@@ -160,12 +159,12 @@ def settled(P: FloatArray, body: Body, s: FloatArray, H: Mat4, normal: FloatArra
     view; the displacement.
     """
     views = 0
-    for _ in range(MOST_STEPS):
-        fit = fit_body(P, body, s, H, False, SETTLED_PX, 1, normal)
+    for _ in range(MOST_SIGHT_STEPS):
+        fit = fit_body(P, body, s, H, False, SETTLED_SIGHT_PX, 1, normal)
         views = fit.views
         if not fit.found:
             return TOO_FEW, views, H
         H = fit.H
-        if fit.before - fit.after <= SETTLED_PX * SETTLED_PX * (2 * views):
+        if fit.before - fit.after <= SETTLED_SIGHT_PX * SETTLED_SIGHT_PX * (2 * views):
             return SETTLED, views, H
     return UNSETTLED, views, H

@@ -12,8 +12,7 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Config, load_config
 from projservo_cli.records import Calibration, FloatArray, Plan, Trace
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.disturbed import servo_noise
-from projservo_cli.stages.truth import plant_of, reach_of, truth_of
+from projservo_cli.stages.scenario import plant_of, reach_of, servo_noise, truth_of
 from projservo_cli.task.margins import within
 
 CONFIGS = Path(__file__).parents[2] / "configs"

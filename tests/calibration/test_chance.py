@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from projservo_cli.calibration.chance import chi2_beyond, chi2_quantile, f_beyond
+from projservo_cli.calibration.quality import chi2_beyond, chi2_quantile, f_beyond
 
 # Both evaluate inverse incomplete functions that are good to a few units in the last place.
 TOLERANCE = 1e-9

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.calibration import epipolar
-from projservo_cli.calibration.projective import canonical_pair, reconstruct
+from projservo_cli.calibration.reconstruction import canonical_pair, reconstruct
 from projservo_cli.geometry.stereo import fundamental_matrix
 from projservo_cli.records import WorkFailed
 from tests.calibration.simulated_robot import rig

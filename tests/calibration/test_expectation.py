@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.calibration.expectation import quantile
+from projservo_cli.calibration.prediction import quantile
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import random_robot, trials
 

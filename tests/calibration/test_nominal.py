@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.nominal import read_nominal
+from projservo_cli.config.nominal import read_nominal
 from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 

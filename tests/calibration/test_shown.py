@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate
+from projservo_cli.calibration.quality import image_path, spread
 from projservo_cli.calibration.readings import gather
-from projservo_cli.calibration.shown import image_path, spread
 from projservo_cli.records import WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 

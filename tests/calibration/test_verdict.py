@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.calibration import calibrate
 from projservo_cli.calibration.adjustment import Scene
-from projservo_cli.calibration.excitation import WEAK_NOISE, describe_joint
+from projservo_cli.calibration.quality import WEAK_NOISE, describe_joint
 from projservo_cli.calibration.weakest import _left_camera
 from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import random_robot, trials

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from projservo_cli import cli, files
-from projservo_cli.modes import law_and_mode
-from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
+from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed, law_and_mode
 from projservo_cli.stages import chain
 from projservo_cli.tables import read_table
 from tests.fake_records import fake

@@ -1,8 +1,8 @@
 """The options --view and --animation of a report."""
 
-from projservo_cli import page
 from projservo_cli.records import InputError
-from projservo_cli.stages import extras
+from projservo_cli.report import page
+from projservo_cli.stages import report as extras
 
 
 def test_a_view_and_an_animation_are_made_beside_a_report_that_is_up_to_date(projservo, stages, monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from projservo_cli.config import Config, digest, load_config
-from projservo_cli.config.fields import Section
+from projservo_cli.config.robot import Section
 from projservo_cli.config.schema import STARTER, json_schema, schema_text, sweep_schema
 from projservo_cli.config.sweep import SweepConfig, load_sweep
 from tests.conftest import SHIPPED, SWEEPS

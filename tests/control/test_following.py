@@ -8,13 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
-from projservo_cli.modes import MODES_OF, TRACK
-from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.following import followed, instants
-from projservo_cli.stages.pace import from_rest
-from projservo_cli.task.reference import NO_REFERENCE, following, place, planned_step
-from projservo_cli.task.reference import planned as planned_at
-from projservo_cli.task.trajectory import trajectory_displacement
+from projservo_cli.records import MODES_OF, TRACK, InputError, WorkFailed
+from projservo_cli.stages.plan import from_rest
+from projservo_cli.stages.servo import followed, instants
+from projservo_cli.task.trajectory import (
+    NO_REFERENCE,
+    following,
+    place,
+    planned_step,
+    trajectory_displacement,
+)
+from projservo_cli.task.trajectory import planned as planned_at
 from tests.control.following import SPEED, Followed, planned, tracked
 from tests.samples import frame
 from tests.scene import GAINS, Run, limits, scene, with_pins

@@ -12,7 +12,7 @@ from projservo_cli.config import Config
 from projservo_cli.config.schema import json_schema
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.equations import REGISTER
-from projservo_cli.sweep.columns import BETWEEN, MEASURED, NUMBERS
+from projservo_cli.sweep.runs import BETWEEN, MEASURED, NUMBERED
 from tests.documentation.blocks import DOCS, ROOT, imported
 
 pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
@@ -45,7 +45,7 @@ def test_every_key_has_a_row(schema, lines):
 
 
 def test_every_column_of_a_sweep_has_a_row():
-    columns = {column.name: column for column in (*NUMBERS, *MEASURED, BETWEEN)}
+    columns = {column.name: column for column in (*NUMBERED, *MEASURED, BETWEEN)}
     rows = {row[0].strip("`"): row for row in cells(reference.sweep_columns()) if row[0].startswith("`")}
     assert rows.keys() == columns.keys()
     assert rows["path_length_mm"] == [

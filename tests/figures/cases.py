@@ -7,13 +7,13 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import prediction_derivative
 from projservo_cli.config import load_config
-from projservo_cli.figures.material import Material
-from projservo_cli.modes import following_mode, name_of
-from projservo_cli.records import LAWS, METRIC_LAWS, Calibration
-from projservo_cli.stages import calibrate, plan, servo, studies, truth
-from projservo_cli.stages.disturbed import servo_noise
+from projservo_cli.records import LAWS, METRIC_LAWS, Calibration, following_mode, name_of
+from projservo_cli.report.material import Material
+from projservo_cli.stages import calibrate, plan, servo, studies
+from projservo_cli.stages import scenario as truth
 from projservo_cli.stages.noisy import noisy_runs
-from projservo_cli.stages.pace import Pace
+from projservo_cli.stages.plan import Pace
+from projservo_cli.stages.scenario import servo_noise
 from projservo_cli.task.margins import within
 from tests.conftest import ROOT
 from tests.fake_records import fake

@@ -6,9 +6,10 @@ from matplotlib.container import BarContainer
 
 from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.config import load_config
-from projservo_cli.figures import FIGURES, calibration, style
-from projservo_cli.figures.material import Fit
 from projservo_cli.records import CrossValidation, Observation
+from projservo_cli.report import style
+from projservo_cli.report.figures import FIGURES, calibration
+from projservo_cli.report.material import Fit
 from projservo_cli.stages import calibrate, chain
 from projservo_cli.store import Result, Run
 from tests.fake_records import fake

@@ -3,7 +3,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.figures import (
+from projservo_cli.geometry.kinematics import project
+from projservo_cli.records import PRISMATIC, REVOLUTE
+from projservo_cli.report import style
+from projservo_cli.report.figures import (
     drift,
     errors,
     images,
@@ -12,12 +15,9 @@ from projservo_cli.figures import (
     path,
     planned,
     scene,
-    style,
     visibility,
 )
-from projservo_cli.geometry.kinematics import project
-from projservo_cli.plants.robot import camera_center, look_at_camera
-from projservo_cli.records import PRISMATIC, REVOLUTE
+from projservo_cli.robots.truth import camera_center, look_at_camera
 from projservo_cli.task.trajectory import trajectory_displacement
 from tests.figures.cases import GAINS, case
 from tests.samples import prismatic, revolute

@@ -4,7 +4,8 @@ import re
 import numpy as np
 import pytest
 
-from projservo_cli.figures import FIGURES, style
+from projservo_cli.report import style
+from projservo_cli.report.figures import FIGURES
 from tests.figures.cases import case
 
 PLACE = rb'transform="translate[(]([-\d.]+ [-\d.]+)[)]'  # of texts in SVG

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from projservo_cli.figures import film, style
+from projservo_cli.report import animation as film
+from projservo_cli.report import style
 from tests.figures.cases import case
 
 SIZE = np.array([1280.0, 1024.0])

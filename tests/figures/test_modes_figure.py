@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.figures import FIGURES, modes
-from projservo_cli.figures.material import title
-from projservo_cli.stages.drawing import lacking
+from projservo_cli.report.figures import FIGURES, modes
+from projservo_cli.report.material import title
+from projservo_cli.stages.report import lacking
 from tests.figures.cases import DRAWS, case
 
 COMPARED = ["stacked", "exact", "exact_track", "stacked_image_track"]

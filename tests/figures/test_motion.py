@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.figures import motion
-from projservo_cli.stages.truth import truth_of
+from projservo_cli.report import view as motion
+from projservo_cli.stages.scenario import truth_of
 from tests.figures.cases import SHORT, case
 
 

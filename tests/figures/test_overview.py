@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from projservo_cli.figures import FIGURES, overview, style
+from projservo_cli.report import style
+from projservo_cli.report.figures import FIGURES, overview
 from tests.figures.cases import case
 
 SPEC = next(spec for spec in FIGURES if spec.name == "fig00_overview")

@@ -8,9 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from projservo_cli.plants import foreign
-from projservo_cli.plants.foreign import ForeignRobot, at_rest_after
 from projservo_cli.records import WorkFailed
+from projservo_cli.robots import yours as foreign
+from projservo_cli.robots.yours import ForeignRobot, at_rest_after
 
 
 class Scripted:

@@ -13,8 +13,7 @@ import pytest
 from projservo_cli import files
 from projservo_cli.config import load_config
 from projservo_cli.records import Calibration
-from projservo_cli.stages.driven import adapted, innovation_of, untested
-from projservo_cli.stages.servo import gains_of, limits_of
+from projservo_cli.stages.servo import adapted, gains_of, innovation_of, limits_of, untested
 from projservo_cli.store import load
 from tests.fake_records import fake
 from tests.foreign import robots

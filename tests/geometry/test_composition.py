@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm, logm
 
-from projservo_cli.geometry.composition import (
+from projservo_cli.geometry.displacement import (
     angles_onto_plane,
     compose_rotations,
     composed_angle,

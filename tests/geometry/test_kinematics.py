@@ -5,12 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.kinematics import (
-    forward_kinematics,
-    image_jacobian,
-    joint_operators,
-    project,
-)
+from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators, project
 from projservo_cli.records import PRISMATIC, REVOLUTE, Model
 from tests.samples import arm, face, frame, hat, in_frame, operators, pixels, poe
 

@@ -4,10 +4,15 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.displacement import as_mat
-from projservo_cli.geometry.inverse import reach
 from projservo_cli.geometry.kinematics import backward, forward_kinematics, joint_operators
-from projservo_cli.geometry.mechanisms import workspace
-from projservo_cli.geometry.span import in_span, invariant_rotations, joint_motion, span_of
+from projservo_cli.geometry.mechanisms import (
+    in_span,
+    invariant_rotations,
+    joint_motion,
+    reach,
+    span_of,
+    workspace,
+)
 from projservo_cli.records import PRISMATIC, WorkFailed
 from tests.samples import arm, face, frame, in_frame
 

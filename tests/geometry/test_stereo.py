@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from projservo_cli.geometry.stereo import (
-    fundamental_matrix,
-    optical_centers,
-    triangulate,
-    triangulate_points,
-)
+from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, triangulate, triangulate_points
 from projservo_cli.records import WorkFailed
 from tests.samples import frame, hat, pixels, rig
 

@@ -7,8 +7,8 @@ from projservo_cli.control import CODES
 from projservo_cli.geometry.lens import bent
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.python import run as run_python
-from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.records import LAWS, METRIC_LAWS, NO_LENS
+from projservo_cli.robots.simulated import AnalyticPlant
 from tests.samples import frame
 from tests.scene import GAINS, STEP, Run, limits, with_pins
 from tests.scene import scene as scene_of

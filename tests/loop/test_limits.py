@@ -7,7 +7,7 @@ from projservo_cli.control import CODES
 from projservo_cli.geometry.kinematics import blocked_joint
 from projservo_cli.loop.python import BuiltInLaw, run
 from projservo_cli.loop.step import VERDICTS, shorten, stands_still
-from projservo_cli.plants.analytic import AnalyticPlant
+from projservo_cli.robots.simulated import AnalyticPlant
 from tests.loop.test_python_loop import same_logs
 from tests.scene import GAINS, STEP, Run, limits, scene
 

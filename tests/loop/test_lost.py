@@ -7,7 +7,7 @@ from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, OK
 from projservo_cli.loop.python import BuiltInLaw, run, time_for
 from projservo_cli.loop.step import VERDICTS
-from projservo_cli.plants.analytic import AnalyticPlant
+from projservo_cli.robots.simulated import AnalyticPlant
 from tests.loop.test_python_loop import Towards, in_python, same_logs
 from tests.scene import GAINS, Run, limits, scene
 

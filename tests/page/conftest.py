@@ -7,8 +7,9 @@ from html.parser import HTMLParser
 import pytest
 
 from projservo_cli.config import to_yaml
-from projservo_cli.figures import FIGURES
-from projservo_cli.stages import drawing, report
+from projservo_cli.report.figures import FIGURES
+from projservo_cli.stages import report
+from projservo_cli.stages import report as drawing
 from projservo_cli.store import Result, Run
 from tests.figures.cases import SHORT, case, config_of
 

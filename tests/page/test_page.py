@@ -7,14 +7,13 @@ import re
 import numpy as np
 import pytest
 
-from projservo_cli.columns import to_csv
-from projservo_cli.figures import FIGURES
-from projservo_cli.page import PAGE_FILE, write_comparison, write_page
-from projservo_cli.page.vector import inline
-from projservo_cli.page.words import calibration_words, number, short
 from projservo_cli.records import CrossValidation, Report
+from projservo_cli.report.content import calibration_words, inline, number, short
+from projservo_cli.report.figures import FIGURES
+from projservo_cli.report.page import PAGE_FILE, write_comparison, write_page
 from projservo_cli.stages import report
 from projservo_cli.store import Result
+from projservo_cli.tables import to_csv
 from tests.fake_records import fake
 from tests.figures.cases import case
 from tests.page.conftest import SOME, claims_of, numbers, read, stored, words

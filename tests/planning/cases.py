@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from projservo_cli.stages.constrained import demands_of
-from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.plan import demands_of, plan_task
 from projservo_cli.task.margins import Reaching
 from tests.stages.cases import case
 

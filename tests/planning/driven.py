@@ -18,8 +18,8 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.random_tasks import STRATA, random_tasks
-from projservo_cli.stages.truth import truth_of
+from projservo_cli.stages.scenario import truth_of
+from projservo_cli.sweep.preparation import STRATA, random_tasks
 from tests.conftest import ROOT
 from tests.planning.arm import arm_of, feasible
 from tests.planning.oracle import TrueTask

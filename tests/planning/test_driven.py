@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.stages.truth import truth_of
+from projservo_cli.stages.scenario import truth_of
 from tests.planning.arm import arm_of, feasible, flood, pivot_ratio, pose, solve
 from tests.planning.driven import configured, driven, feasible_tasks, true_task, words
 from tests.samples import poe

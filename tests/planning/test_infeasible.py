@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.stages.constrained import demands_of
-from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.truth import truth_of
+from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.scenario import truth_of
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.volume

@@ -6,16 +6,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.task.along import along
-from projservo_cli.task.lattice import shortest, view_shares, widest
-from projservo_cli.task.margins import (
-    Demands,
-    image_distance,
-    limit_margin,
-    view_share,
-    visibility_margin,
-)
+from projservo_cli.task.lattice import shortest, stride, view_shares, widest
+from projservo_cli.task.margins import Demands, image_distance, limit_margin, view_share, visibility_margin
 from projservo_cli.task.path import interpolate
-from projservo_cli.task.strides import stride
 from tests.planning.cases import reaching_of
 from tests.samples import frame, in_frame, pixels, poe
 from tests.stages.cases import case

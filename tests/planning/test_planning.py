@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError
-from projservo_cli.stages.constrained import demands_of
-from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.random_tasks import STRATA, random_tasks
+from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.sweep.preparation import STRATA, random_tasks
 from projservo_cli.task.planning import turning_sense
 from tests.planning.cases import constrained, reaching_of
 from tests.planning.oracle import TrueTask

@@ -3,15 +3,12 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.mechanisms import workspace
-from projservo_cli.geometry.span import span_of
-from projservo_cli.stages.constrained import demands_of
-from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.truth import truth_of
-from projservo_cli.task.lattice import view_shares, widest
+from projservo_cli.geometry.mechanisms import span_of, workspace
+from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.scenario import truth_of
+from projservo_cli.task.lattice import near, view_shares, widest
 from projservo_cli.task.margins import limit_margin
 from projservo_cli.task.search import MOST_STRIDE, WAYS, best_way, carry, orientation, traced
-from projservo_cli.task.strides import near
 from projservo_cli.task.trajectory import displaced
 from tests.planning.arm import arm_of, feasible
 from tests.planning.cases import reaching_of

@@ -15,8 +15,8 @@ from projservo_cli.control.law import ERRORS, Gains, new_state
 from projservo_cli.geometry.displacement import IDENTITY, as_array
 from projservo_cli.loop.compiled import new_log, run
 from projservo_cli.loop.step import VERDICTS, Limits
-from projservo_cli.plants.free_flying import free_flying_plant, rig_twists
-from projservo_cli.plants.plant import pose_after
+from projservo_cli.robots.simulated import pose_after
+from projservo_cli.robots.truth import free_flying_plant, rig_twists
 from projservo_cli.task.face import task_from_images
 from tests.samples import displacement, pixels
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.displacement import as_mat
-from projservo_cli.plants.analytic import AnalyticPlant
-from projservo_cli.plants.plant import observe, rig_distance
+from projservo_cli.robots.simulated import AnalyticPlant, observe, rig_distance
 from tests.samples import displacement, poe
 from tests.scene import STEP, scene
 

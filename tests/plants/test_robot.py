@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.plants.robot import (
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.robots.truth import (
     camera_center,
     dh_robot,
     inverse_kinematics,
@@ -16,7 +17,6 @@ from projservo_cli.plants.robot import (
     rotation_about_axis,
     twist,
 )
-from projservo_cli.records import InputError, WorkFailed
 from tests.samples import displacement, hat, pixels
 
 # θ, d, a, α of six joints, the third prismatic; lengths in m.

@@ -11,7 +11,7 @@ from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.stages import record as stage
 from projservo_cli.stages.calibrate import simulate
-from projservo_cli.stages.truth import truth_of
+from projservo_cli.stages.scenario import truth_of
 from projservo_cli.store import load
 from projservo_cli.tables import read_joints, read_table
 

@@ -5,10 +5,9 @@ from functools import cache
 import numpy as np
 
 from projservo_cli.config import load_config
-from projservo_cli.stages.constrained import demands_of
-from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.scenario import plant_of, reach_of, truth_of
 from projservo_cli.stages.servo import drive, gains_of, limits_of
-from projservo_cli.stages.truth import plant_of, reach_of, truth_of
 from tests.conftest import ROOT
 
 

@@ -7,10 +7,10 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.geometry.kinematics import joint_operators, project
-from projservo_cli.plants.robot import rotation_about_axis
 from projservo_cli.records import WorkFailed
+from projservo_cli.robots.truth import rotation_about_axis
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.truth import reach_of, truth_of
+from projservo_cli.stages.scenario import reach_of, truth_of
 from tests.conftest import ROOT
 
 LAWS = ("exact", "direct_two", "direct_three", "stacked")

@@ -7,9 +7,9 @@ from projservo_cli.config import load_config
 from projservo_cli.control import CODES
 from projservo_cli.loop.python import BuiltInLaw, run
 from projservo_cli.loop.step import VERDICTS
-from projservo_cli.plants.analytic import AnalyticPlant
 from projservo_cli.records import InputError
-from projservo_cli.stages.disturbed import disturbance_of, lose_markers
+from projservo_cli.robots.simulated import AnalyticPlant
+from projservo_cli.stages.scenario import disturbance_of, lose_markers
 from tests.conftest import ROOT
 from tests.loop.test_python_loop import same_logs
 from tests.scene import GAINS, Run, limits, scene, with_pins

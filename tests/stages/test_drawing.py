@@ -2,9 +2,9 @@
 
 import pytest
 
-from projservo_cli.figures import FIGURES
 from projservo_cli.records import InputError
-from projservo_cli.stages import drawing
+from projservo_cli.report.figures import FIGURES
+from projservo_cli.stages import report as drawing
 from tests.figures.cases import case
 
 FORMATS = ("svg", "pdf", "png")

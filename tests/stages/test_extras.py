@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from projservo_cli.figures import film
-from projservo_cli.page import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, write_page
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages import extras, report
+from projservo_cli.report import animation as film
+from projservo_cli.report.page import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, write_page
+from projservo_cli.stages import report
+from projservo_cli.stages import report as extras
 from projservo_cli.store import Result
 from tests.figures.cases import case, config_of
 from tests.page.conftest import MADE, read, stored

@@ -5,14 +5,12 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import to_yaml
-from projservo_cli.figures import FIGURES
-from projservo_cli.figures.material import DIRECT
 from projservo_cli.records import InputError, Report, WorkFailed
-from projservo_cli.stages import drawing, report, studies
-from projservo_cli.stages.claims import claims_of
-from projservo_cli.stages.claims.claim import listed
-from projservo_cli.stages.claims.control import decay_ranges
-from projservo_cli.stages.claims.drift import composition_claim
+from projservo_cli.report.claims import claims_of, composition_claim, decay_ranges, listed
+from projservo_cli.report.figures import FIGURES
+from projservo_cli.report.material import DIRECT
+from projservo_cli.stages import report, studies
+from projservo_cli.stages import report as drawing
 from projservo_cli.store import Result, Run, load, save
 from tests.figures.cases import GAINS, PERIODS_S, SHORT, case, config_of
 

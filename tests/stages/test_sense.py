@@ -5,8 +5,8 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.stages import calibrate, plan
-from projservo_cli.stages.reach import reach_for, sight_for
-from projservo_cli.stages.sense import rotation_sense
+from projservo_cli.stages.plan import rotation_sense
+from projservo_cli.stages.scenario import reach_for, sight_for
 from tests.conftest import ROOT
 
 CASES = [

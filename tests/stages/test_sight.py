@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.sight import sight_of
+from projservo_cli.stages.scenario import plant_of, reach_of, sight_of, truth_of
 from projservo_cli.stages.traces import rotation_between
-from projservo_cli.stages.truth import plant_of, reach_of, truth_of
 from tests.stages.cases import Case, case
 
 STEPS, TAIL, GAIN = 200, 150, 0.1

@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.truth import (
+from projservo_cli.stages.scenario import (
     calibration_generator,
     camera_of,
     generator,

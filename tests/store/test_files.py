@@ -8,13 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from projservo_cli.export import write_csv, write_mat, write_npz
 
 from projservo_cli import files
-from projservo_cli.export import write_csv, write_mat, write_npz
-from projservo_cli.files import clear_leftovers, inside, replacing, require_inside
-from projservo_cli.lock import LOCK, working_in
-from projservo_cli.page import write_comparison
+from projservo_cli.files import LOCK, clear_leftovers, inside, replacing, require_inside, working_in
 from projservo_cli.records import InputError
+from projservo_cli.report.page import write_comparison
 from projservo_cli.store import load, save
 from projservo_cli.tables import write_table
 from tests.conftest import ROOT
@@ -83,7 +82,7 @@ def test_links_that_lead_out_are_refused(tmp_path):
 HOLD = """
 import sys
 from pathlib import Path
-from projservo_cli.lock import working_in
+from projservo_cli.files import working_in
 with working_in(Path(sys.argv[1])):
     print("in", flush=True)
     sys.stdin.read()

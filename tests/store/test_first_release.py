@@ -6,8 +6,8 @@ import pytest
 
 from projservo_cli import store
 from projservo_cli.config import load_config
-from projservo_cli.page import write_page
 from projservo_cli.records import InputError
+from projservo_cli.report.page import write_page
 
 
 def test_it_holds_what_it_held(run):

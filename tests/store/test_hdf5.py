@@ -9,7 +9,8 @@ import h5py
 import numpy as np
 import pytest
 
-from projservo_cli import hdf5, quarantine, store
+from projservo_cli import quarantine, store
+from projservo_cli import store as hdf5
 from projservo_cli.records import InputError
 from tests.store.first_release import first_release
 from tests.survival.mutations import EDITS, mutate

@@ -16,7 +16,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from projservo_cli import hdf5
+from projservo_cli import store as hdf5
 from projservo_cli.store import load
 from tests.store.first_release import first_release
 from tests.survival.calls import Ending, call, prepare

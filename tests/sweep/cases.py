@@ -1,10 +1,10 @@
 """Small sweeps of a robot with few trial motions, quick enough to be made many times."""
 
 from projservo_cli.config.sweep import SweepConfig
+from projservo_cli.store import SweepTable
 from projservo_cli.sweep.design import read_design
 from projservo_cli.sweep.driver import Folder, run
 from projservo_cli.sweep.engine import LocalEngine
-from projservo_cli.sweepfile import SweepTable
 from tests.conftest import ROOT
 
 QUICK = {"stop.max_steps": 60, "noise.servo_px": 0.3, "calibration.frames_per_joint": 6}

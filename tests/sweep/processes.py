@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.sweepfile import SweepTable
+from projservo_cli.store import SweepTable
 from tests.conftest import ROOT
 
 SWEEP = """\

@@ -8,20 +8,12 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.store import SweepTable
 from projservo_cli.sweep import driver, engine
-from projservo_cli.sweep.columns import columns_of
 from projservo_cli.sweep.driver import Folder, read_manifest, shares_settings, status_of
-from projservo_cli.sweepfile import SweepTable
+from projservo_cli.sweep.runs import columns_of
 from tests.sweep.cases import columns, design, make
-from tests.sweep.processes import (
-    differences,
-    finish,
-    kill_group,
-    parts,
-    start,
-    wait_for_parts,
-    written,
-)
+from tests.sweep.processes import differences, finish, kill_group, parts, start, wait_for_parts, written
 
 pytestmark = pytest.mark.volume
 

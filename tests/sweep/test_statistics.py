@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError
-from projservo_cli.sweep.columns import MEASURED, NUMBERS, Column
+from projservo_cli.store import SweepTable, assemble, write_part
 from projservo_cli.sweep.driver import Folder
 from projservo_cli.sweep.report import pictures_of, report
+from projservo_cli.sweep.runs import MEASURED, NUMBERED, Column
 from projservo_cli.sweep.statistics import Rows, chance, compared, of_runs, paired, success_by, wilson
-from projservo_cli.sweepfile import SweepTable, assemble, write_part
 from tests.sweep.cases import design, make
 
 AXES = [["noise.servo_px", [0, 1]], ["law", ["direct_two", "stacked"]]]
@@ -25,7 +25,7 @@ def table(folder, draws=40, seed=3):
     law = np.where(cell % 2 == 0, b"direct_two", b"stacked")
     noise, angle = (cell // 2).astype(float), np.tile(rng.uniform(0, 180, draws), 4)
     good = rng.random(count) < np.where(law == b"direct_two", 0.95, 0.6)
-    values = {column.name: np.zeros(count, dtype=column.dtype) for column in (*NUMBERS, *MEASURED)}
+    values = {column.name: np.zeros(count, dtype=column.dtype) for column in (*NUMBERED, *MEASURED)}
     values |= {
         "run": np.arange(count),
         "cell": cell,
@@ -40,7 +40,7 @@ def table(folder, draws=40, seed=3):
         "law": law,
     }
     own = (Column("noise.servo_px", "f8", "1", ""), Column("law", "S10", "1", ""))
-    headings = [(c.name, c.dtype, c.units, c.about) for c in (*NUMBERS, *own, *MEASURED)]
+    headings = [(c.name, c.dtype, c.units, c.about) for c in (*NUMBERED, *own, *MEASURED)]
     write_part(folder / "part.h5", values, {})
     attributes = {"axes": AXES, "columns": [h[0] for h in headings], "random": [], "total": count}
     assemble(folder / "sweep.h5", [folder / "part.h5"], headings, attributes)

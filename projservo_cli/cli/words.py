@@ -1,0 +1,297 @@
+"""What each stage reports: the JSON objects, and the same in words."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+from projservo_cli.cli.options import wrapped
+from projservo_cli.config import Config
+from projservo_cli.records import Calibration, WorkFailed, name_of
+from projservo_cli.store import Run
+
+FILE = "suggestions.csv"
+
+
+def require_covariance(config: Config) -> None:
+    """Refuse before any work what has no covariance to judge poses by."""
+    if config.calibration.method != "refined":
+        raise click.UsageError(
+            f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
+            "use --set calibration.method=refined"
+        )
+
+
+def suggested(config: Config, run: Run, count: int) -> dict[str, Any]:
+    """Further poses for the calibration of a run, as JSON values; the list of them is written beside it.
+
+    Parameters
+    ----------
+    config, run : what is calibrated.
+    count : poses to suggest.
+    """
+    from projservo_cli.stages import suggest
+
+    calibration = run.calibration
+    try:
+        found = suggest.run(config, run.observation, calibration, count)
+    except WorkFailed as error:
+        return {"suggestions": [], "suggestions_reason": str(error)}
+    path = run.path.parent / FILE
+    prismatic = [letter == "P" for letter in calibration.joint_types]
+    unit = config.data.joint_unit if config.data is not None else None
+    suggest.write(found, path, prismatic, unit)
+    rows = [
+        {
+            "q": one.q,
+            "from_pose": one.from_pose,
+            "delta": one.delta,
+            "variance_before": one.variance_before,
+            "variance_after": one.variance_after,
+        }
+        for one in found
+    ]
+    return {
+        "suggestions": rows,
+        "suggestions_file": path.resolve(),
+        "suggestions_unit": unit or "rad",
+        "suggestions_limited": config.robot is not None,
+    }
+
+
+def suggested_words(value: dict[str, Any]) -> list[str]:
+    """The suggestions of a calibration's object as a table, deltas in deg and mm."""
+    rows = value.get("suggestions")
+    if not rows:
+        return []
+    types = [joint["type"] for joint in value["joints"]]
+    names = "".join(f"{f'q{i} ' + ('deg' if t == 'R' else 'mm'):>9}" for i, t in enumerate(types, 1))
+    lines = [
+        f"  poses to add, as the way from a recorded one; predicted error {_error(rows[0], 'before')} px now",
+        f"  {'from pose':>9}{names}{'then px':>9}",
+    ]
+    for row in rows:
+        way = (math.degrees(d) if t == "R" else 1e3 * d for d, t in zip(row["delta"], types, strict=True))
+        lines.append(
+            f"  {row['from_pose']:>9}" + "".join(f"{d:>+9.1f}" for d in way) + f"{_error(row, 'after'):>9}"
+        )
+    lines.append(f"  joints of these poses: {value['suggestions_file']} ({value['suggestions_unit']}, m)")
+    if not value["suggestions_limited"]:
+        lines.append("  joint limits are not known here: leave out what your robot cannot reach")
+    return lines
+
+
+def _error(row: dict[str, Any], when: str) -> str:
+    """Predicted error of a coordinate, px."""
+    return f"{math.sqrt(row[f'variance_{when}']):.3g}"
+
+
+NEAREST = ("visibility", "border_px", "joints", "condition")  # smallest along the planned motion
+LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
+NOTES = {  # on runs, and their reasons
+    "unplanned": "driven without a plan",
+    "untested": "images were not tested against the calibration",
+}
+COUNTS = ("merged_poses", "merged_markers")
+NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
+
+
+def stage_object(stage: str, run: Run, config: Config, laws: Sequence[str]) -> dict[str, Any]:
+    """The JSON object of a stage that was made or is up to date."""
+    path = {"run": run.path.resolve()}
+    if stage == "calibrate":
+        return path | _calibration(run, config)
+    if stage == "plan":
+        return path | _plan(run)
+    if stage == "servo":
+        return path | {"laws": [_scalars(run.traces[law]) for law in laws]}
+    from projservo_cli.report.page import PAGE_FILE
+
+    page = run.path.parent / PAGE_FILE
+    report = run.results["report"].records[""]
+    return path | {"page": page.resolve() if page.is_file() else None} | _scalars(report)
+
+
+def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
+    """The JSON object of a stage that could not be made, or lacks what it needs."""
+    result: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
+    if stage == "calibrate":
+        lists: dict[str, list[Any]] = {name: [] for name in ("advice", "joints", *LISTS)}
+        return (
+            result
+            | {"usable": False, "lens": None}
+            | dict.fromkeys(NUMBERS)
+            | dict.fromkeys(COUNTS, 0)
+            | lists
+        )
+    if stage == "plan":
+        return result | {"feasible": False}
+    if stage == "servo":
+        return result | {"laws": [_scalars(run.traces[law]) for law in laws]}
+    return result
+
+
+def _scalars(record: Any) -> dict[str, Any]:
+    """All fields of a record but its arrays."""
+    fields = [field.name for field in dataclasses.fields(record) if "dims" not in field.metadata]
+    return {name: getattr(record, name) for name in fields}
+
+
+def _calibration(run: Run, config: Config) -> dict[str, Any]:
+    from projservo_cli.calibration import findings  # heavy; only this object needs it
+
+    calibration = run.calibration
+    given = config.robot.joints if config.robot is not None else ()
+    joints = [
+        {
+            "name": (given[i].name if i < len(given) else None) or f"q{i + 1}",
+            "type": letter,
+            "excitation": float(calibration.excitation[i]),
+            "weak": bool(calibration.weak[i]),
+        }
+        for i, letter in enumerate(calibration.joint_types)
+    ]
+    held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
+    return (
+        _scalars(calibration)
+        | {"joints": joints, "lens": _lens(calibration)}
+        | findings(calibration)
+        | held_out
+    )
+
+
+def _lens(calibration: Calibration) -> dict[str, Any] | None:
+    """Radial distortion of both views, None where it was not estimated."""
+    if calibration.lens is None:
+        return None
+    return {
+        view: {"center_px": terms[:2], "radius_px": terms[2], "k1": terms[3], "k2": terms[4]}
+        for view, terms in zip(("left", "right"), calibration.lens.tolist(), strict=True)
+    }
+
+
+def _plan(run: Run) -> dict[str, Any]:
+    plan = run.plan
+    angles = {f"{name}_deg": math.degrees(getattr(plan, name)) for name in ("theta_r", "theta_p", "theta_s")}
+    radians = ("theta_r", "theta_p", "theta_s")
+    rest = {name: value for name, value in _scalars(plan).items() if name not in radians}
+    nearest = {
+        name: {"least": value, "mu": mu}
+        for name, value, mu in zip(NEAREST, plan.least, plan.least_mu, strict=True)
+    }
+    found = {
+        "tau_0": plan.tau_0,
+        "smallest_margin": plan.margin.min(axis=0),
+        "margins": nearest,
+        "most_miss_px": plan.miss.max(),
+    }
+    return rest | angles | found
+
+
+def summary(stage: str, value: dict[str, Any]) -> str:
+    """A stage's object in words, at most 80 columns wide."""
+    if "failed" in value:  # the reason is told with the exit code
+        return f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
+    words = {
+        "calibrate": _calibrate_words,
+        "plan": _plan_words,
+        "servo": _servo_words,
+        "report": _report_words,
+    }
+    return "\n".join(words[stage](value))
+
+
+def _calibrate_words(value: dict[str, Any]) -> list[str]:
+    weak = [joint["name"] for joint in value["joints"] if joint["weak"]]
+    found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in LISTS if value[name]]
+    return [
+        wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}"),
+        f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "
+        f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s",
+        *(_lens_words(value["lens"]) if value["lens"] else []),
+        wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
+        *([wrapped(f"worst determined: {worst}", "  ")] if (worst := value["worst_determined"]) else []),
+        *_predicted_words(value["predicted_rms_px"], value["predicted_p99_px"]),
+        *_held_out_words(value.get("cross_validation")),
+        *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),
+        *suggested_words(value),
+    ]
+
+
+def _predicted_words(rms: float | None, bound: float | None) -> list[str]:
+    """Expected error of images, where the method has a covariance."""
+    if rms is None or bound is None:
+        return []
+    text = f"predicted error within the ranges of the joints: {_number(rms)} px rms, 99 % below"
+    return [wrapped(f"{text} {_number(bound)} px", "  ")]
+
+
+def _held_out_words(value: dict[str, Any] | None) -> list[str]:
+    if value is None:
+        return []
+    numbers = ("rms_px", "median_px", "p95_px", "predicted_rms_px")
+    rms, median, p95, predicted = (_number(value[name]) for name in numbers)
+    text = f"held out, {value['folds']} parts of {value['unit']}: rms {rms} px (predicted {predicted})"
+    return [
+        wrapped(f"{text}, median {median}, p95 {p95}", "  "),
+        wrapped(value["reason"], "  "),
+    ]
+
+
+def _lens_words(lens: dict[str, Any]) -> list[str]:
+    """Distortion at the radius of each view, half the image size."""
+    return [
+        f"  lens {view}: k1 {terms['k1']:.3g}, k2 {terms['k2']:.3g} at {terms['radius_px']:.4g} px from "
+        f"({terms['center_px'][0]:.4g}, {terms['center_px'][1]:.4g})"
+        for view, terms in lens.items()
+    ]
+
+
+def _plan_words(value: dict[str, Any]) -> list[str]:
+    feasible = "feasible" if value["feasible"] else "NOT feasible"
+    return [
+        wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}"),
+        "  rotation {theta_s_deg:.2f} deg = {theta_r_deg:.2f} deg onto the plane, "
+        "{theta_p_deg:.2f} deg within it".format_map(value),
+        "  least: " + ", ".join(f"{name} {_number(value['margins'][name]['least'])}" for name in NEAREST),
+        *([f"  duration {value['duration']:.3g} s"] if value["duration"] else []),
+    ]
+
+
+def _servo_words(value: dict[str, Any]) -> list[str]:
+    head = f"  {'law':<20}{'verdict':<13}{'steps':>6}{'mm':>9}{'deg':>9}{'occluded':>11}{'drift mm':>10}"
+    rows = [
+        f"  {name_of(trace['law'], trace['mode']):<20}{trace['verdict']:<13}{trace['steps']:>6}"
+        f"{_number(trace['position_error_mm']):>9}"
+        f"{_number(trace['rotation_error_deg']):>9}"
+        f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}"
+        f"{_number(trace['center_deviation_mm']):>10}"
+        for trace in value["laws"]
+    ]
+    notes = [
+        wrapped(f"{said}: {reason}", "  ")
+        for name, said in NOTES.items()
+        for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name])
+    ]
+    return ["servo: true errors at the end, self-occluded steps left/right", head, *rows, *notes]
+
+
+def _report_words(value: dict[str, Any]) -> list[str]:
+    words = {True: "holds", False: "does not hold", None: "not measured"}
+    holding = sum(row["holds"] is True for row in value["claims"])
+    claims = [f"{words[row['holds']]}: {row['claim']}: {row['measured']}" for row in value["claims"]]
+    reasons: dict[str, list[str]] = {}
+    for row in value["left_out"]:
+        reasons.setdefault(row["reason"], []).append(row["what"])
+    left_out = [f"left out: {', '.join(what)}: {reason}" for reason, what in reasons.items()]
+    return [
+        f"report: {len(value['figures'])} files of figures; {holding} of {len(claims)} claims hold",
+        *(wrapped(text, "  ") for text in (*claims, *left_out)),
+        *(f"{name}: {value[name]}" for name in ("page", "view", "animation") if value.get(name)),
+    ]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}"

@@ -1,1 +1,0 @@
-"""What is being controlled: simulated robots and rigs that know the truth."""

@@ -1,0 +1,579 @@
+"""What the page shows of a run: plain values, in the order in which they are shown."""
+
+import base64
+import json
+import math
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from projservo_cli.calibration.quality import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
+from projservo_cli.config import Config, load_config
+from projservo_cli.files import inside
+from projservo_cli.records import Calibration, CrossValidation, Plan, Report, Trace, name_of
+from projservo_cli.report.figures import FIGURES, FigureSpec
+from projservo_cli.report.figures.drift import drift_rows
+from projservo_cli.report.material import VIEWS, title
+from projservo_cli.report.style import FORMATS
+from projservo_cli.store import Run
+
+MINUS = "\N{MINUS SIGN}"
+NONE = "\N{EN DASH}"
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def short(value: float | None, digits: int = 3) -> str:
+    """A number with few digits, powers of ten set as such; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    if value == 0 or isinstance(value, (int, np.integer)):
+        return f"{value:.0f}".replace("-", MINUS)
+    power = math.floor(math.log10(abs(value)))
+    if digits <= power + 1 <= 6:
+        return f"{value:.0f}".replace("-", MINUS)
+    text = f"{value:.{digits}g}"
+    mantissa, sign, exponent = text.partition("e")
+    if sign:
+        text = f"{mantissa} × 10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+    return text.replace("-", MINUS)
+
+
+def number(value: Any, digits: int = 3) -> Markup:
+    """A number for the eye that carries all of its digits for programs."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    if plain is None or not math.isfinite(plain):
+        return Markup(NONE)
+    return Markup('<data value="{}">{}</data>').format(repr(plain), short(plain, digits))
+
+
+def calibration_words(calibration: Calibration, *, estimated: bool) -> list[str]:
+    """Whether a calibration is good, why, and which joint is known worst, a sentence each.
+
+    Parameters
+    ----------
+    calibration : the calibration.
+    estimated : whether the noise was estimated from the same images, so that χ² alone decides nothing.
+    """
+    found = [f"{'Usable' if calibration.usable else 'Not usable'}: {calibration.reason}."]
+    if math.isfinite(calibration.chi2_per_dof) and calibration.dof > 0:
+        low, high = chi2_band(calibration.dof)
+        found.append(
+            f"χ² per degree of freedom is {short(calibration.chi2_per_dof)} at "
+            f"{short(calibration.sigma_px)} px of noise per coordinate, with {calibration.dof} degrees of "
+            f"freedom; where model and noise are true it stays within {short(low)} and {short(high)}."
+            + (" The noise is itself an estimate from these images." if estimated else "")
+        )
+    found.append(_worst_joint(calibration))
+    if calibration.worst_determined:
+        found.append(f"Worst determined of all is {calibration.worst_determined}.")
+    if calibration.predicted_rms_px is not None and calibration.predicted_p99_px is not None:
+        found.append(
+            f"Within the ranges of the joints images are expected to err by "
+            f"{short(calibration.predicted_rms_px)} px rms, and in 99 of 100 calibrations by less than "
+            f"{short(calibration.predicted_p99_px)} px."
+        )
+    left_out = (
+        (len(calibration.outlier), "reading", "left out as an outlier", "left out as outliers"),
+        (len(calibration.suspect), "joint reading", "contradicts the images", "contradict the images"),
+        (len(calibration.swapped), "marker", "was renumbered", "were renumbered"),
+    )
+    for count, what, one, many in left_out:
+        if count:
+            found.append(f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}.")
+    return found
+
+
+def _worst_joint(calibration: Calibration) -> str:
+    noise = calibration.prediction_noise
+    if not np.isfinite(noise).any():
+        return f"The method {calibration.method} states no uncertainty, so no joint can be called the worst."
+    worst = int(np.nanargmax(noise))
+    reach = f"{REACH_M:g} m" if calibration.joint_types[worst] == "P" else f"{REACH_RAD:g} rad"
+    weak = "weak" if noise[worst] > WEAK_NOISE else "well determined"
+    return (
+        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {short(float(noise[worst]))} "
+        f"times the pixel noise to predicted images; a joint is weak above {WEAK_NOISE:g}, so this one is "
+        f"{weak}."
+    )
+
+
+def held_out_words(value: CrossValidation) -> str:
+    """How well poses were predicted that the fit had not seen, in a sentence or two."""
+    text = (
+        f"Held out, in {value.folds} parts of {value.unit}: rms {short(value.rms_px)} px where noise and "
+        f"covariance predict {short(value.predicted_rms_px)} px, median {short(value.median_px)} px, 95th "
+        f"percentile {short(value.p95_px)} px. {value.reason[:1].upper()}{value.reason[1:]}."
+    )
+    return text.replace("..", ".")
+
+
+def law_words(trace: Trace) -> str:
+    """Verdict of a law, its reason, and where it ended, in one sentence."""
+    seconds = short(trace.steps * trace.period)
+    steps = f"{trace.steps} step{'s' * (trace.steps != 1)}"
+    text = f"{title(name_of(trace.law, trace.mode))}: {trace.verdict} after {steps} ({seconds} s)"
+    if trace.reason:
+        text += (
+            f", because the {trace.reason}" if trace.reason.startswith("image error") else f": {trace.reason}"
+        )
+    if trace.position_error_mm is not None and trace.rotation_error_deg is not None:
+        text += (
+            f"; the face is then {short(trace.position_error_mm)} mm and {short(trace.rotation_error_deg)}° "
+            "from its goal"
+        )
+    return f"{text}."
+
+
+_SVG = "{http://www.w3.org/2000/svg}"
+_HREF = "{http://www.w3.org/1999/xlink}href"
+_SHAPES = ("path", "use", "rect", "circle", "ellipse", "line", "polyline", "polygon", "image")
+_ELEMENTS = frozenset((*_SHAPES, "svg", "g", "defs", "clipPath", "pattern"))
+_PLACES = ("x", "y", "width", "height", "cx", "cy", "r", "rx", "ry", "x1", "x2", "y1", "y2", "points", "d")
+_PAINTS = ("style", "fill", "stroke", "opacity", "clip-path", "transform", "patternUnits")
+_ATTRIBUTES = frozenset((*_PLACES, *_PAINTS, "id", "href", "preserveAspectRatio"))
+_PICTURE = "data:image/png;base64,"
+_REFERENCE = re.compile(r"url\(#([\w.:-]+)\)")
+
+
+def inline(svg: bytes, prefix: str, alt: str) -> Markup | None:
+    """An SVG image to stand within HTML; None where the file is not one.
+
+    Only shapes and what paints them are kept, so that the file of a stranger can neither run a
+    script nor fetch anything; references lead to names that start with ``prefix``.
+
+    Parameters
+    ----------
+    svg : content of the file.
+    prefix : unlike those of all other images of the page.
+    alt : what the image shows, for those who do not see it.
+    """
+    try:
+        root = ET.fromstring(svg)
+    except ET.ParseError:
+        return None
+    if root.tag != f"{_SVG}svg" or "viewBox" not in root.attrib:
+        return None
+    view = " ".join(root.attrib["viewBox"].split())
+    used = _references(root)
+    _clean(root, prefix, used)
+    root.attrib.clear()
+    root.attrib.update({"viewBox": view, "role": "img", "aria-label": alt})
+    return Markup(ET.tostring(root, encoding="unicode"))
+
+
+def _references(root: ET.Element) -> set[str]:
+    """Names that something in the image refers to."""
+    found: set[str] = set()
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            if name in (_HREF, "href") and value.startswith("#"):
+                found.add(value[1:])
+            elif "url(" in value:
+                found.update(_REFERENCE.findall(value))
+    return found
+
+
+def _clean(element: ET.Element, prefix: str, used: set[str]) -> None:
+    element.tag = element.tag.removeprefix(_SVG)
+    element.text = element.tail = None
+    kept = {}
+    for name, value in element.attrib.items():
+        name = "href" if name == _HREF else name
+        text = _attribute(name, value, prefix, used)
+        if text is not None:
+            kept[name] = text
+    element.attrib.clear()
+    element.attrib.update(kept)
+    for child in list(element):
+        tag: Any = child.tag  # of a comment it is a function
+        if isinstance(tag, str) and tag.startswith(_SVG) and tag.removeprefix(_SVG) in _ELEMENTS:
+            _clean(child, prefix, used)
+        else:
+            element.remove(child)
+
+
+def _attribute(name: str, value: str, prefix: str, used: set[str]) -> str | None:
+    """The value of an attribute as the page has it; None where it is to go."""
+    if name not in _ATTRIBUTES:
+        return None
+    value = " ".join(value.split())
+    if name == "id":
+        return prefix + value if value in used else None
+    if name == "href":
+        return f"#{prefix}{value[1:]}" if value.startswith("#") else _picture_vector(value)
+    changed = _REFERENCE.sub(rf"url(#{prefix}\1)", value)
+    foreign = _REFERENCE.sub("", value).lower()
+    return None if any(sign in foreign for sign in ("url", "@", "\\", "expression")) else changed
+
+
+def _picture_vector(value: str) -> str | None:
+    return value.replace(" ", "") if value.startswith(_PICTURE) else None
+
+
+SECTIONS = ("calibration", "plan", "control")
+_MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One figure.
+
+    Attributes
+    ----------
+    anchor : its name within the page.
+    number : as in the names of its files.
+    caption, paper : what it shows, and which figure and section of the paper it follows.
+    drawing : the figure itself; None where there is no file that a page can show.
+    links : (label, path) of its files and of the numbers behind it.
+    """
+
+    anchor: str
+    number: str
+    caption: str
+    paper: str
+    drawing: Markup | None
+    links: tuple[tuple[str, str], ...]
+
+
+def pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -> dict[str, list[Picture]]:
+    """Figures by section, in their order.
+
+    Parameters
+    ----------
+    directory : of the run.
+    files : those the report wrote, relative to it.
+    folder : of the run as seen from the page, empty or ending in a slash.
+    prefix : of all names within the page.
+    """
+    found: dict[str, list[Picture]] = {section: [] for section in SECTIONS}
+    for spec in FIGURES:
+        kinds = [kind for kind in FORMATS if _file(spec, kind) in files]
+        if kinds:
+            found[_section(spec)].append(_picture(spec, directory, kinds, folder, prefix))
+    return found
+
+
+def _file(spec: FigureSpec, kind: str) -> str:
+    return f"figures/{spec.name}.{kind}"
+
+
+def _section(spec: FigureSpec) -> str:
+    if not spec.task:
+        return "calibration"
+    return "control" if spec.laws or spec.studies or spec.modes else "plan"
+
+
+def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> Picture:
+    drawing = None
+    for kind in ("svg", "png"):
+        content = _content(directory, _file(spec, kind)) if kind in kinds and drawing is None else None
+        if content is not None:
+            drawing = _drawn(content, kind, f"{prefix}{spec.name}-", spec.alt or spec.title)
+    links = [(kind.upper(), folder + _file(spec, kind)) for kind in kinds]
+    if (directory / _file(spec, "csv")).is_file():
+        links.insert(0, ("numbers (CSV)", folder + _file(spec, "csv")))
+    digits = "".join(c for c in spec.name.partition("_")[0] if c.isdigit())
+    return Picture(
+        f"{prefix}{spec.name}", str(int(digits or 0)), spec.title, spec.paper, drawing, tuple(links)
+    )
+
+
+def _content(directory: Path, name: str) -> bytes | None:
+    """Content of a figure; None where it is none, or one that a link takes from elsewhere."""
+    path = directory / name
+    try:
+        return path.read_bytes() if inside(path, directory) and path.stat().st_size <= _MOST_BYTES else None
+    except OSError:
+        return None
+
+
+def _drawn(content: bytes, kind: str, prefix: str, alt: str) -> Markup | None:
+    if kind == "svg":
+        return inline(content, prefix, alt)
+    data = base64.b64encode(content).decode()
+    return Markup('<img src="data:image/png;base64,{}" alt="{}">').format(data, alt)
+
+
+VIEW_FILE, ANIMATION_FILE = "view.html", "animation.gif"
+# What may lie beside the page, and what the page calls it.
+_EXTRAS = {VIEW_FILE: "3D view with a time slider", ANIMATION_FILE: "animation of both camera images (GIF)"}
+# What made a run: key in the provenance, and what the page calls it.
+_MADE = {
+    "date": "date",
+    "argv": "command",
+    "projservo": "projservo",
+    "git_commit": "commit",
+    "host": "host",
+    "system": "system",
+    "cpu": "processor",
+}
+_VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
+
+
+@dataclass(frozen=True)
+class View:
+    """One run as the page shows it; what it lacks is empty or None.
+
+    Attributes
+    ----------
+    name : of its configuration.
+    folder : of the run, relative to the page.
+    config : settings, and ``configuration`` the same as YAML with all defaults.
+    made : (property, value) of what the run was made with.
+    calibration, plan, laws : of each stage.
+    claims, drift, left_out : of the report; what was left out for each reason.
+    pictures : the figures by section.
+    extras : (label, path) of what lies beside the page.
+    """
+
+    name: str
+    folder: str
+    config: Config
+    configuration: str
+    made: list[tuple[str, str]]
+    calibration: dict[str, Any] | None = None
+    plan: dict[str, Any] | None = None
+    laws: list[dict[str, Any]] = field(default_factory=list)
+    claims: tuple[dict[str, Any], ...] = ()
+    drift: dict[str, Any] | None = None
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+    reported: bool = False
+    pictures: dict[str, list[Picture]] = field(default_factory=lambda: {name: [] for name in SECTIONS})
+    extras: tuple[tuple[str, str], ...] = ()
+
+
+def view_of(run: Run, *, folder: str = "", prefix: str = "") -> View:
+    """What the page shows of a run.
+
+    Parameters
+    ----------
+    run : the run; its figures are read from its folder.
+    folder : of the run as seen from the page, empty or ending in a slash.
+    prefix : of all names within the page, where it shows several runs.
+
+    Raises
+    ------
+    InputError
+        If the stored configuration cannot be read.
+    """
+    config = load_config(run.path, text=run.configuration)
+    report: Report | None = run.results["report"].records[""] if "report" in run.results else None
+    shown = View(
+        config.name,
+        folder,
+        config,
+        run.configuration,
+        list(_made(run, config)),
+        calibration=_calibration(run, config) if "calibrate" in run.results else None,
+        plan=_plan(run.plan) if "plan" in run.results else None,
+        laws=[_law(trace, config) for trace in run.traces.values()],
+        extras=tuple(
+            (label, folder + name) for name, label in _EXTRAS.items() if (run.path.parent / name).is_file()
+        ),
+    )
+    if report is None:
+        return shown
+    return replace(
+        shown,
+        claims=report.claims,
+        drift=_drift(report),
+        left_out=_by_reason(report.left_out),
+        reported=True,
+        pictures=pictures(run.path.parent, report.figures, folder, prefix),
+    )
+
+
+def _by_reason(left_out: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
+    """What was left out, gathered for each reason."""
+    gathered: dict[str, list[str]] = {}
+    for entry in left_out:
+        gathered.setdefault(entry["reason"], []).append(entry["what"])
+    return gathered
+
+
+def _made(run: Run, config: Config) -> Iterator[tuple[str, str]]:
+    """What was run, from what and with what; a value that stages differ in stands with its stages."""
+    yield "configuration", f"{config.name}, {'recorded' if config.recorded else 'simulated'}"
+    yield "seed", str(config.seed)
+    inputs = {key: text for result in run.results.values() for key, text in result.inputs.items()}
+    for key, text in inputs.items():
+        yield key.replace("_", " "), text
+    stages = {name: result.provenance for name, result in run.results.items()}
+    for key, label in _MADE.items():
+        yield from _values(label, {name: _told(key, made) for name, made in stages.items()})
+    versions = {
+        name: ", ".join(f"{package} {made[package]}" for package in _VERSIONS if made.get(package))
+        for name, made in stages.items()
+    }
+    yield from _values("versions", versions)
+
+
+def _told(key: str, made: Any) -> str:
+    value = made.get(key)
+    if value is None:
+        return ""
+    if key == "argv":
+        return " ".join(["projservo", *value[1:]])
+    if key == "date":
+        moment = datetime.fromisoformat(value)
+        return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC" if moment.tzinfo else str(value)
+    if key == "git_commit":
+        return f"{value}{', with changes' if made.get('git_dirty') else ''}"
+    return str(value)
+
+
+def _values(label: str, told: dict[str, str]) -> Iterator[tuple[str, str]]:
+    by_value: dict[str, list[str]] = {}
+    for name, value in told.items():
+        if value:
+            by_value.setdefault(value, []).append(name.split("/")[0])
+    for value, names in by_value.items():
+        yield label, value if len(by_value) == 1 else f"{value} ({', '.join(dict.fromkeys(names))})"
+
+
+def _calibration(run: Run, config: Config) -> dict[str, Any]:
+    calibration, held_out = run.calibration, run.cross_validation
+    words = calibration_words(calibration, estimated=config.data is not None and config.data.noise_px is None)
+    given = config.robot.joints if config.robot is not None else ()
+    joints = []
+    for i, letter in enumerate(calibration.joint_types):
+        span = float(calibration.excitation[i])
+        joints.append(
+            {
+                "name": (given[i].name if i < len(given) else None) or f"q{i + 1}",
+                "type": "prismatic" if letter == "P" else "revolute",
+                "excitation": 1e3 * span if letter == "P" else math.degrees(span),
+                "unit": " mm" if letter == "P" else "°",
+                "noise": float(calibration.prediction_noise[i]),
+                "defect": float(calibration.operator_defect[i]),
+                "weak": bool(calibration.weak[i]),
+            }
+        )
+    return {
+        "usable": calibration.usable,
+        "words": words if held_out is None else [*words, held_out_words(held_out)],
+        "advice": calibration.advice,
+        "numbers": [
+            ("method", calibration.method, ""),
+            ("source", calibration.source, ""),
+            ("residual, rms per marker and view", calibration.rms_px, "px"),
+            ("noise per coordinate, as taken", calibration.sigma_px, "px"),
+            ("noise per coordinate, from the residuals", calibration.sigma_fitted_px, "px"),
+            ("χ² per degree of freedom", calibration.chi2_per_dof, ""),
+            ("degrees of freedom", calibration.dof, ""),
+            ("poses", calibration.merged_poses, ""),
+            ("markers", calibration.merged_markers, ""),
+            *_lens(calibration),
+            ("time", calibration.seconds, "s"),
+        ],
+        "joints": joints,
+    }
+
+
+def _lens(calibration: Calibration) -> Iterator[tuple[str, float, str]]:
+    """Coefficients of radial distortion, where they were estimated."""
+    for name, lens in zip(VIEWS, [] if calibration.lens is None else calibration.lens, strict=False):
+        for k in (1, 2):
+            yield f"lens of the {name} camera, k{k}", float(lens[2 + k]), ""
+
+
+def _plan(plan: Plan) -> dict[str, Any]:
+    views = []
+    for v, name in enumerate(VIEWS):
+        least = int(np.argmin(plan.margin[:, v]))
+        views.append(
+            {
+                "name": name,
+                "margin": float(plan.margin[least, v]),
+                "sigma": float(plan.sigma[least]),
+                "tau_0": float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None,
+                "theta_0": [math.degrees(angle) for angle in plan.theta_0[v]],
+            }
+        )
+    senses = [
+        {"theta": math.degrees(angle), "margins": [float(value) for value in margins]}
+        for angle, margins in zip(plan.sense, plan.sense_margin, strict=True)
+    ]
+    return {
+        "feasible": plan.feasible,
+        "profile": plan.profile.replace("_", " "),
+        "reason": plan.reason,
+        "theta_r": math.degrees(plan.theta_r),
+        "theta_p": math.degrees(plan.theta_p),
+        "theta_s": math.degrees(plan.theta_s),
+        "views": views,
+        "senses": senses,
+    }
+
+
+def _law(trace: Trace, config: Config) -> dict[str, Any]:
+    return {
+        "title": title(name_of(trace.law, trace.mode)),
+        "words": law_words(trace),
+        "trace": trace,
+        "converged": trace.verdict == "converged",
+        "must": trace.law in config.control.must_converge,
+    }
+
+
+def _drift(report: Report) -> dict[str, Any] | None:
+    """The drift table: a row for law, operators and limit, a column for each gain."""
+    if not report.drift_mm.size:
+        return None
+    rows: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in drift_rows(report):
+        rows.setdefault((row["law"], row["operators"], row["limit_deg_per_step"]), []).append(row)
+    return {
+        "gains": [float(gain) for gain in report.gain_per_step],
+        "rows": [
+            {"law": title(law), "operators": operators, "limit": limit, "cells": cells}
+            for (law, operators, limit), cells in rows.items()
+        ],
+    }
+
+
+def differences(views: list[View]) -> list[tuple[str, list[str]]]:
+    """Settings in which runs differ: the key, and what each run has; empty where it lacks the key."""
+    flat = [dict(_leaves("", view.config.model_dump(mode="json", exclude_none=True))) for view in views]
+    keys = dict.fromkeys(key for settings in flat for key in settings)
+    rows = [(key, [settings.get(key, "") for settings in flat]) for key in keys]
+    return [(key, values) for key, values in rows if len(set(values)) > 1]
+
+
+def _leaves(path: str, value: Any) -> Iterator[tuple[str, str]]:
+    """Every value by its key, with positions for lists of mappings; other lists stay whole."""
+    if isinstance(value, list) and any(isinstance(inner, dict) for inner in value):
+        value = {str(position): inner for position, inner in enumerate(value)}
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _leaves(f"{path}.{key}" if path else key, inner)
+    else:
+        yield path, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def picture_rows(views: list[View]) -> dict[str, list[list[Picture | None]]]:
+    """Figures by section, a row for each, an entry for each run; None where a run lacks it."""
+    rows: dict[str, list[list[Picture | None]]] = {}
+    for section in SECTIONS:
+        numbered = [{picture.number: picture for picture in view.pictures[section]} for view in views]
+        names = sorted({number for own in numbered for number in own}, key=int)
+        rows[section] = [[own.get(number) for own in numbered] for number in names]
+    return rows
+
+
+def claim_rows(views: list[View]) -> list[dict[str, Any]]:
+    """Claims of all runs: what is claimed, where, when it holds, and what each run measured."""
+    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for v, view in enumerate(views):
+        for claim in view.claims:
+            key = (claim["claim"], claim["source"], claim["criterion"])
+            row = rows.setdefault(key, {**claim, "runs": [None] * len(views)})
+            row["runs"][v] = claim
+    return list(rows.values())

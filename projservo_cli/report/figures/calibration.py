@@ -1,0 +1,300 @@
+"""Diagnostics of a calibration: what the fit leaves of the images, and what the data determine."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.calibration import predict, prediction_variance
+from projservo_cli.calibration.quality import chi2_quantile
+from projservo_cli.records import BoolArray, Calibration, CrossValidation, FloatArray, Observation
+from projservo_cli.report import style
+from projservo_cli.report.material import VIEWS, Data, Fit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+RIGHT, BOTH = 1, 2
+# Length of an arrow of the rms residual, as a share of the extent of what was seen.
+ARROW = 0.04
+# Shares of χ² between which the residuals of a pose are expected.
+BAND = (0.025, 0.975)
+BINS = 40
+RESIDUAL: style.Look = {"color": style.BLUE}
+WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
+LEFT_OUT: style.Look = {
+    "color": style.VERMILION,
+    "marker": "x",
+    "linestyle": "none",
+    "markersize": 4,
+    "markeredgewidth": 0.9,
+}
+MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
+
+
+def data(fit: Fit) -> Data:
+    """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
+    calibration, observation = fit.calibration, fit.observation
+    predicted = predict(calibration, observation.q)
+    seen, renamed = by_marker(calibration, observation)
+    read: BoolArray = np.asarray(np.isfinite(seen).all(axis=-1))
+    lost = renamed | ~np.isfinite(predicted).all(axis=-1)
+    out: BoolArray = np.logical_or(left_out(calibration, observation), lost)
+    used: BoolArray = np.logical_and(read, ~out)
+    residual = seen - predicted
+    result: Data = {
+        "sigma_px": np.array(calibration.sigma_px),
+        "chi2_per_dof": np.array(calibration.chi2_per_dof),
+        "excitation": calibration.excitation,
+        "prismatic": np.array([letter == "P" for letter in calibration.joint_types]),
+        "weak": calibration.weak,
+        "information": information(calibration.covariance),
+        "parameters": np.array(len(calibration.covariance)),
+        "residual": residual[used].ravel(),
+        "held_out": np.array(fit.held_out is not None),
+        **(
+            by_pose(used, residual, prediction_variance(calibration, observation.q))
+            if fit.held_out is None
+            else by_pose_held_out(fit.held_out)
+        ),
+    }
+    unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
+    for v, view in enumerate(VIEWS):
+        others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
+        result[f"seen_{view}"] = seen[:, v][used[:, v]]
+        result[f"residual_{view}"] = residual[:, v][used[:, v]]
+        result[f"left_out_{view}"] = np.concatenate([seen[:, v][(read & out)[:, v]], others])
+    extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
+    result["factor"] = np.array(magnification(result["residual"], extent))
+    return result
+
+
+def by_marker(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
+    """Pixels (K, 2, m, 2) of the calibrated markers, and which of them were read under another number."""
+    column = {int(number): j for j, number in enumerate(observation.marker)}
+    seen = observation.images[:, :, [column[int(number)] for number in calibration.marker]]
+    renamed = np.zeros(seen.shape[:3], dtype=np.bool_)
+    for pose, number, _ in calibration.swapped:
+        rows = observation.pose == pose
+        renamed |= rows[:, None, None] & (calibration.marker == number)
+    return seen, renamed
+
+
+def left_out(calibration: Calibration, observation: Observation) -> BoolArray:
+    """Readings (K, 2, m) that the fit did not use: outliers, and poses whose joints are in doubt."""
+    out = np.zeros((len(observation.pose), 2, len(calibration.marker)), dtype=np.bool_)
+    for pose, number, view in calibration.outlier:
+        views = np.array([view != RIGHT, view in (RIGHT, BOTH)])
+        rows = observation.pose == pose
+        out |= rows[:, None, None] & views[:, None] & (calibration.marker == number)
+    out[np.isin(observation.pose, calibration.suspect[:, 0])] = True
+    return out
+
+
+def by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
+    """Predicted and actual error of each pose with a reading, rms per coordinate.
+
+    Parameters
+    ----------
+    used : (K, 2, m) readings that count.
+    residual : (K, 2, m, 2) px.
+    variance : (K, 2, m, 2) variance of the prediction, px².
+
+    Returns
+    -------
+    ``pose_predicted_px``, ``pose_residual_px`` (L,) and ``pose_coordinates`` (L,), their number.
+    """
+    poses = used.any(axis=(1, 2))
+    count = 2 * used.sum(axis=(1, 2))[poses]
+
+    def mean(squares: FloatArray) -> FloatArray:
+        total = np.where(used[..., None], squares, 0.0).sum(axis=(1, 2, 3))[poses]
+        return np.asarray(total / count)
+
+    return {
+        "pose_predicted_px": np.sqrt(mean(variance)),
+        "pose_residual_px": np.sqrt(mean(residual**2)),
+        "pose_coordinates": count,
+    }
+
+
+def by_pose_held_out(held_out: CrossValidation) -> Data:
+    """Predicted and actual error of each pose from fits that have not seen it, as of ``by_pose``.
+
+    The predicted one has the noise of the held-out reading in it.
+    """
+    predicted = np.asarray(np.isfinite(held_out.residual).all(axis=-1))
+    return by_pose(predicted, held_out.residual, held_out.predicted**2)
+
+
+def information(covariance: FloatArray) -> FloatArray:
+    """Eigenvalues of the information matrix, falling: the covariance's that are not zero, inverted.
+
+    Zero are the gauge directions, and those across the constraint that all operators are conjugate
+    to rigid motions by one matrix. Empty for a method without covariance.
+
+    Parameters
+    ----------
+    covariance : (d, d) of P, H_hat_0 and M.
+    """
+    if not np.isfinite(covariance).all():
+        return np.zeros(0)
+    spread = np.linalg.eigvalsh(covariance)
+    floor = len(spread) * np.finfo(np.float64).eps * spread[-1]
+    return np.asarray(1.0 / spread[spread > floor])
+
+
+def expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
+    """Rms residual (L,) that a fit leaves where its own prediction errs by so much, px per coordinate.
+
+    A least-squares residual is noise less the error of the fitted prediction, which it follows:
+    variance σ² − p²; D. A. Belsley, E. Kuh, R. E. Welsch, "Regression Diagnostics", 1980, section 2.1.
+
+    Parameters
+    ----------
+    predicted : (L,) predicted error p, px per coordinate.
+    sigma : noise σ, px per coordinate.
+    """
+    return np.asarray(np.sqrt(np.maximum(sigma**2 - predicted**2, 0.0)))
+
+
+def magnification(residual: FloatArray, extent: float) -> float:
+    """Factor 1, 2 or 5 times a power of ten that makes the rms residual visible in an image.
+
+    Parameters
+    ----------
+    residual : (N,) px per coordinate.
+    extent : width or height of what was seen, px.
+    """
+    rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
+    if rms == 0.0:
+        return 1.0
+    wanted = ARROW * extent / rms
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted * (1.0 + 1e-12)))
+
+
+def draw(data: Data, figure: "Figure") -> None:
+    """Residuals over both images; their histogram and error of each pose; excitation and information."""
+    from matplotlib.patches import Patch
+
+    panels = figure.subplots(3, 2, height_ratios=(1.15, 1.0, 0.9))
+    for axes, view in zip(panels[0], VIEWS, strict=True):
+        _arrows(axes, data, view)
+    _histogram(panels[1, 0], data)
+    _poses(panels[1, 1], data)
+    _excitation(panels[2, 0], data)
+    _spectrum(panels[2, 1], data)
+    handles: list[Any] = [
+        style.line_handle(f"residual, {data['factor']:,g} times", **RESIDUAL),
+        style.line_handle("reading left out", **LEFT_OUT),
+        style.line_handle("noise model", **MODEL),
+        style.line_handle("residual of a pose", color=style.BLUE, marker="o", linestyle="none"),
+        style.line_handle("95 % of poses in the model", color=style.PALE, linewidth=6),
+        Patch(label="weak joint", **WEAK),
+    ]
+    style.legend_below(figure, handles, 3)
+
+
+def _arrows(axes: "Axes", data: Data, view: str) -> None:
+    seen, residual, out = data[f"seen_{view}"], data[f"residual_{view}"], data[f"left_out_{view}"]
+    tips = seen + float(data["factor"]) * residual
+    axes.quiver(
+        *seen.T,
+        *(tips - seen).T,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        width=0.0022,
+        headwidth=4.0,
+        headlength=5.0,
+        headaxislength=4.0,
+        **RESIDUAL,
+    )
+    axes.plot(*out.T, **LEFT_OUT)
+    style.image_axes(axes, f"{view}: {len(seen)} readings, {len(out)} left out")
+    style.frame_pixels(axes, np.concatenate([seen, tips, out]))
+
+
+def _histogram(axes: "Axes", data: Data) -> None:
+    """Density of the residuals beside the normal one of the noise model."""
+    residual, sigma = data["residual"], float(data["sigma_px"])
+    widest = max(4.0 * sigma, float(np.abs(residual).max(initial=0.0)))
+    axes.hist(
+        residual,
+        bins=np.linspace(-widest, widest, BINS + 1).tolist(),
+        density=bool(residual.size),
+        color=style.SKY,
+        linewidth=0,
+    )
+    x = np.linspace(-widest, widest, 401)
+    axes.plot(x, np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)), **MODEL)
+    axes.set_title(f"noise model {sigma:.3g} px, χ²/dof {float(data['chi2_per_dof']):.3g}")
+    axes.set_xlabel("residual (px)")
+    axes.set_ylabel("density (1/px)")
+
+
+def _poses(axes: "Axes", data: Data) -> None:
+    """Residual of each pose over its predicted error, beside what the noise model leads one to expect."""
+    predicted, residual = data["pose_predicted_px"], data["pose_residual_px"]
+    sigma = float(data["sigma_px"])
+    held_out = bool(data["held_out"])
+    axes.set_title("each pose, held out" if held_out else "each pose, in the fit (not held out)")
+    axes.set_xlabel("predicted error with noise (px)" if held_out else "predicted error (px)")
+    axes.set_ylabel("rms residual (px)")
+    if not np.isfinite(predicted).all():
+        return _without_covariance(axes)
+    most = 1.06 * float(predicted.max(initial=0.0))
+    x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
+    expected = x if held_out else expected_residual(x, sigma)
+    coordinates = float(np.median(data["pose_coordinates"])) if predicted.size else 1.0
+    low, high = np.sqrt(chi2_quantile(BAND, coordinates) / coordinates)
+    axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)
+    axes.plot(x, expected, **MODEL)
+    axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
+    return None
+
+
+def _excitation(axes: "Axes", data: Data) -> None:
+    """Range of each joint, revolute in deg on the left, prismatic in m on the right."""
+    prismatic, weak = data["prismatic"], data["weak"]
+    mixed = bool(prismatic.any() and not prismatic.all())
+    other = axes.twinx() if mixed else axes
+    if mixed:
+        other.grid(visible=False)
+    for chosen, kind, scale, unit, color in (
+        (~prismatic, axes, np.degrees(1.0), "deg", style.BLUE),
+        (prismatic, other, 1.0, "m", style.SKY),
+    ):
+        for i in np.flatnonzero(chosen):
+            look = WEAK if weak[i] else {"color": color}
+            kind.bar(i, scale * data["excitation"][i], width=0.6, **look)
+        if chosen.any():
+            kind.set_ylabel(f"range ({unit})")
+    units = [" (m)" if mixed and slides else "" for slides in prismatic]
+    axes.set_xticks(range(len(units)), [f"$q_{{{i + 1}}}${unit}" for i, unit in enumerate(units)])
+    axes.set_xlim(-0.6, len(prismatic) - 0.4)
+    axes.grid(visible=False, axis="x")
+    axes.set_title(f"excitation, {int(weak.sum())} of {len(weak)} joints weak")
+
+
+def _spectrum(axes: "Axes", data: Data) -> None:
+    """Information along each direction that the images determine, falling; the last is the worst."""
+    values = data["information"]
+    axes.set_title(f"information, {len(values)} of {int(data['parameters'])} directions free")
+    axes.set_xlabel("direction (best to worst)")
+    axes.set_ylabel("eigenvalue (1)")
+    if not values.size:
+        return _without_covariance(axes)
+    axes.plot(np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8)
+    style.log_scale(axes)
+    return None
+
+
+def _without_covariance(axes: "Axes") -> None:
+    """Say why a panel is empty."""
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.text(0.5, 0.5, "the method has no covariance", ha="center", va="center", transform=axes.transAxes)

@@ -1,0 +1,182 @@
+"""Figs. 9 and 10 of [RH00]: the control errors of directTWO and directTHREE."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.records import FloatArray, Trace
+from projservo_cli.report import style
+from projservo_cli.report.material import Data, Material
+from projservo_cli.report.measures import center_distance, curve_difference
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# What is drawn of an error on a logarithmic scale: five decades below its start.
+DECADES = 1e-5
+
+
+def percent(values: FloatArray) -> FloatArray:
+    """Values normalised to 100 at their start; NaN throughout where they start at 0."""
+    return np.asarray(100.0 * values / values[0]) if values[0] != 0 else np.full_like(values, np.nan)
+
+
+def data_two(material: Material) -> Data:
+    """Errors of directTWO with calibrated operators, without and with the limit."""
+    studies = material.studies
+    assert studies is not None
+    result: Data = {"step_limit_deg": np.array(studies.step_limit_deg)}
+    for name, limited in (("free", False), ("limited", True)):
+        trace = studies.own["direct_two", "calibrated", limited]
+        result |= {
+            f"t_s_{name}": _time(trace),
+            f"tau_{name}": percent(trace.tau),
+            f"tau_affine_{name}": percent(trace.tau_affine),
+            f"theta_s_deg_{name}": np.degrees(trace.theta_s),
+        }
+    return result
+
+
+def _time(trace: Trace) -> FloatArray:
+    return np.asarray(trace.period * np.arange(len(trace.tau)))
+
+
+def draw_two(data: Data, figure: "Figure") -> None:
+    """Above τ, below θ_s; left as in the paper, right on a logarithmic scale."""
+    axes = figure.subplots(2, 2, sharex=True)
+    looks: dict[str, style.Look] = {
+        "free": {"color": style.BLACK, "linestyle": "-"},
+        "limited": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
+    }
+    for name, look in looks.items():
+        t = data[f"t_s_{name}"]
+        for column in range(2):
+            axes[0, column].plot(t, data[f"tau_affine_{name}"], **look)
+            axes[0, column].plot(t, data[f"tau_{name}"], **(look | {"linewidth": 0.8, "alpha": 0.55}))
+            axes[1, column].plot(t, data[f"theta_s_deg_{name}"], **look)
+    _log(axes[0, 1], 100.0)
+    _log(axes[1, 1], float(data["theta_s_deg_free"][0]))
+    for column, title in enumerate(("linear scale", "logarithmic scale")):
+        axes[0, column].set_title(f"directTWO, {title}")
+        axes[0, column].set_ylabel(r"$\tau$ (% of its start)")
+        axes[1, column].set_ylabel(r"$\theta_s$ (deg)")
+        axes[1, column].set_xlabel("time (s)")
+    faint: style.Look = {"linewidth": 0.8, "alpha": 0.55}
+    handles = [
+        style.line_handle("no limit", **looks["free"]),
+        style.line_handle(f"{data['step_limit_deg']:g}° per step", **looks["limited"]),
+        style.line_handle(r"thin: $\tau$ of the unit-norm kernel (8)", color=style.BLACK, **faint),
+    ]
+    style.legend_below(figure, handles, 3)
+
+
+def _log(axes: "Axes", start: float) -> None:
+    style.log_scale(axes)
+    axes.set_ylim(max(start, 1e-3) * DECADES, max(start, 1e-3) * 3.0)
+
+
+def data_three(material: Material) -> Data:
+    """Errors of directTHREE with the projective and the metric model, and the true distance.
+
+    τ is normalised to 100. In the unit-norm kernel of (8) its scale changes with the joints; scaled
+    through a_inf it is the true distance of the centre.
+    """
+    studies = material.studies
+    assert studies is not None
+    calibrated = studies.own["direct_three", "calibrated", False]
+    metric = studies.own["direct_three", "true", False]
+    twin = studies.own["direct_three", "twin", False]
+    result: Data = {
+        "t_s": _time(calibrated),
+        "t_s_metric": _time(metric),
+        "tau": percent(calibrated.tau),
+        "tau_affine": percent(calibrated.tau_affine),
+        "distance": percent(center_distance(material, calibrated)),
+        "tau_metric": percent(metric.tau),
+        "distance_metric": percent(center_distance(material, metric)),
+    }
+    for name in ("theta_r", "theta_p"):
+        curves = {trace: getattr(trace, name) for trace in (calibrated, metric, twin)}
+        result[f"{name}_deg"] = np.degrees(curves[calibrated])
+        result[f"{name}_deg_metric"] = np.degrees(curves[metric])
+        for kind, trace in (("calibrated", calibrated), ("true", twin)):
+            difference, _ = curve_difference(curves[trace], curves[metric])
+            result[f"{name}_difference_deg_{kind}"] = np.degrees(difference)
+    return result
+
+
+def draw_three(data: Data, figure: "Figure") -> None:
+    """Above τ and what separates it from the truth, below the angles and their differences."""
+    axes = figure.subplots(2, 2, sharex=True)
+    t, t_metric = data["t_s"], data["t_s_metric"]
+    t_common = max(t, t_metric, key=len)
+    translation: list[tuple[str, FloatArray, FloatArray, dict[str, Any]]] = [
+        (r"true distance", t, data["distance"], {"color": style.SKY, "linewidth": 3.2}),
+        (r"$\tau$, scale fixed through $a_\infty$", t, data["tau_affine"], {"color": style.BLACK}),
+        (
+            r"$\tau$, unit-norm kernel (8), projective",
+            t,
+            data["tau"],
+            {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
+        ),
+        (
+            r"$\tau$, unit-norm kernel (8), Euclidean",
+            t_metric,
+            data["tau_metric"],
+            {"color": style.BLACK, "linestyle": (0, (1, 1.2))},
+        ),
+    ]
+    for _, time, values, look in translation:
+        axes[0, 0].plot(time, values, **look)
+    for label, name, look in (
+        (r"scale fixed through $a_\infty$", "tau_affine", translation[1][3]),
+        ("unit-norm kernel (8)", "tau", translation[2][3]),
+    ):
+        del label
+        axes[0, 1].plot(t, np.abs(data[name] - data["distance"]), **look)
+    angles = (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s"))
+    for name, color, marker in angles:
+        axes[1, 0].plot(t, data[f"{name}_deg"], color=color)
+        every = max(1, len(t_metric) // 25)
+        axes[1, 0].plot(
+            t_metric, data[f"{name}_deg_metric"], marker, color=color, fillstyle="none", markevery=every
+        )
+        for kind, line in (("calibrated", "-"), ("true", (0, (1, 1.2)))):
+            difference = data[f"{name}_difference_deg_{kind}"]
+            axes[1, 1].plot(t_common[: len(difference)], difference, color=color, linestyle=line)
+    _floor(axes[0, 1], 1e-4)
+    _floor(axes[1, 1], 1e-15)
+    _label_three(axes)
+    handles = [style.line_handle(label, **look) for label, _, _, look in translation]
+    handles += [
+        style.line_handle(r"$\theta_r$, projective model", color=style.BLACK),
+        style.line_handle(r"$\theta_p$, projective model", color=style.VERMILION),
+        style.line_handle(
+            r"$\theta_r$, $\theta_p$, Euclidean",
+            color=style.BLACK,
+            marker="o",
+            linestyle="none",
+            fillstyle="none",
+        ),
+        style.line_handle("dotted difference: true operators", color=style.BLACK, linestyle=(0, (1, 1.2))),
+    ]
+    style.legend_below(figure, handles, 2)
+
+
+def _floor(axes: "Axes", least: float) -> None:
+    style.log_scale(axes)
+    axes.set_ylim(bottom=least)
+
+
+def _label_three(axes: Any) -> None:
+    axes[0, 0].set_title("directTHREE: translation error")
+    axes[0, 0].set_ylabel(r"$\tau$ (% of its start)")
+    axes[0, 1].set_title("its difference from the true distance")
+    axes[0, 1].set_ylabel("difference (% of the start)")
+    axes[1, 0].set_title("rotation errors")
+    axes[1, 0].set_ylabel("angle (deg)")
+    axes[1, 1].set_title("projective less Euclidean model")
+    axes[1, 1].set_ylabel("difference (deg)")
+    for panel in axes[1]:
+        panel.set_xlabel("time (s)")

@@ -1,0 +1,183 @@
+"""Beside the figures of [RH00]: where the face is seen over the shares μ_t, μ_r, and the planned path."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.geometry.displacement import exp_rotation
+from projservo_cli.geometry.lens import through
+from projservo_cli.records import FloatArray
+from projservo_cli.report import style
+from projservo_cli.report.material import VIEWS, Data, Material
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NODES = 81
+TURNS = 41  # shares μ_p tried at each μ_t, μ_r
+TICKS = 11  # points at equal steps of σ on the path
+WIDE = 4.0  # margins beyond are drawn in powers of ten
+LABEL = 0.05  # room that the number on a contour needs, in shares
+
+SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider shows beneath
+    r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
+    r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
+    r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
+}
+REGIONS: dict[str, style.Look] = {  # hatched, so that they differ in grey too
+    "margin": {"facecolor": style.GREY, "hatch": ""},
+    "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
+}
+MARGINS: dict[str, style.Look] = {
+    "visibility": {"color": style.BLUE, "linestyle": "-"},
+    "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
+    "joints": {"color": style.GREEN, "linestyle": (0, (4, 1, 1, 1))},
+    "conditioning (start = 1)": {"color": style.PURPLE, "linestyle": (0, (1, 1))},
+}
+
+
+def data(material: Material) -> Data:
+    """Margins of both cameras over the unit square, the border distance at the best μ_p, and the path."""
+    plan = material.plan
+    mu = np.linspace(0.0, 1.0, NODES)
+    O = plan.optical_center
+    moved = O[:, None] - mu[:, None] * plan.tau * (O @ plan.H_hat[0].T)[:, None]
+    planes = np.array([exp_rotation(plan.H_hat[1], -share * plan.theta_r).T @ plan.a for share in mu])
+    margin = np.einsum("vtc,rc->vtr", moved, planes) / (O @ plan.a)[:, None, None]
+    half = 0.5 * float(material.plant.image_size.min())
+    return {
+        "share": mu,
+        "margin": margin,
+        "border_px": border_distance(material, mu),
+        "sigma": plan.sigma,
+        "mu": plan.mu,
+        "along": np.stack(
+            [
+                plan.margin.min(axis=1),
+                plan.border_distance.min(axis=1) / half,
+                plan.joint_margin,
+                plan.condition / plan.condition[0],
+            ],
+            axis=1,
+        ),
+        "given_up": plan.given_up,
+        "profile": np.array(plan.profile.replace("_", " ")),
+    }
+
+
+def border_distance(material: Material, mu: FloatArray) -> FloatArray:
+    """Least distance of a marker from the border of each image, px, where μ_p is best for both.
+
+    Parameters
+    ----------
+    mu : (k,) shares of t and of r.
+
+    Returns
+    -------
+    (2, k, k) distances over μ_t and μ_r, negative outside.
+    """
+    plan, P, lens = material.plan, material.calibrated.P, material.calibrated.lens
+    turns = np.linspace(0.0, 1.0, TURNS)
+    within = np.array([exp_rotation(plan.H_hat[2], share * plan.theta_p) for share in turns])
+    onto = np.array([exp_rotation(plan.H_hat[1], share * plan.theta_r) for share in mu])
+    M = np.einsum("rij,pmj->rpmi", onto, plan.A @ np.swapaxes(within, 1, 2))
+    depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))
+    result = np.empty((2, len(mu), len(mu)))
+    for i, share in enumerate(mu):
+        there = M + share * plan.tau * (M @ plan.H_hat[0].T)
+        m = np.einsum("vij,rpmj->vrpmi", P, there)
+        uv = through(lens[:, None, None, None], m[..., :2] / m[..., 2:])
+        least = np.minimum(uv + 0.5, material.plant.image_size - 0.5 - uv).min(axis=(-1, -2))
+        front = (m[..., 2] * depth[:, None, None] > 0.0).all(axis=-1)
+        least = np.where(front & np.isfinite(least), least, -np.inf)
+        best = least.min(axis=0).argmax(axis=1)
+        result[:, i] = least[:, np.arange(len(mu)), best]
+    return result
+
+
+def draw(data: Data, figure: "Figure") -> None:
+    """Above the map of each camera with the path, below the shares and the margins along it."""
+    axes = figure.subplots(2, 2, height_ratios=[1.5, 1.0])
+    for view, name in enumerate(VIEWS):
+        _map(axes[0, view], data, view)
+        axes[0, view].set_title(f"{name} camera, {data['profile']} profile")
+    handles = [
+        _region("hidden from this camera", "margin"),
+        _region(r"outside this image at every $\mu_p$", "border_px"),
+        style.line_handle(r"path, at tenths of $\sigma$", color=style.VERMILION, marker="o"),
+    ]
+    handles += _lines(axes[1, 0], data["sigma"], data["mu"], SHARES)
+    axes[1, 0].set_ylabel(r"share $\mu$ (1)")
+    handles += _lines(axes[1, 1], data["sigma"], data["along"], MARGINS)
+    if data["given_up"].any():
+        handles.append(_mark_given_up(axes[1, 1], data))
+    axes[1, 1].axhline(0.0, color=style.BLACK, linewidth=0.6)
+    if np.nanmax(data["along"]) > WIDE:  # conditioning may grow a hundredfold
+        axes[1, 1].set_yscale("symlog", linthresh=1.0)
+        axes[1, 1].yaxis.set_major_formatter("{x:g}")
+    axes[1, 1].set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
+    axes[1, 1].set_ylabel("margin (1)")
+    style.legend_below(figure, handles, 4)
+
+
+def _region(label: str, name: str) -> Any:
+    from matplotlib.patches import Patch
+
+    return Patch(label=label, alpha=0.6, edgecolor=style.BLACK, linewidth=0.0, **REGIONS[name])
+
+
+def _mark_given_up(axes: "Axes", data: Data) -> Any:
+    """Mark where conditioning is below its bound or the joints stay behind; returns the legend's entry."""
+    axes.plot(data["sigma"], np.where(data["given_up"], 0.0, np.nan), "x", color=style.PURPLE)
+    return style.line_handle("constraint given up", color=style.PURPLE, marker="x", linestyle="none")
+
+
+def _map(axes: "Axes", data: Data, view: int) -> None:
+    share = data["share"]
+    for name, look in REGIONS.items():
+        finite = np.maximum(data[name][view], -1e6)
+        if finite.min() < 0.0:
+            color, hatch = look["facecolor"], look["hatch"]
+            axes.contourf(
+                share, share, finite.T, levels=[-1e9, 0.0], colors=[color], hatches=[hatch], alpha=0.6
+            )
+        if finite.min() < 0.0 < finite.max():
+            axes.contour(share, share, finite.T, levels=[0.0], colors=[style.BLACK], linewidths=0.6)
+    seen = axes.contour(
+        share, share, data["margin"][view].T, levels=[0.25, 0.5, 0.75, 1.0, 1.5, 2.0],
+        colors=[style.BLACK], linewidths=0.4, linestyles="dotted",
+    )  # fmt: skip
+    lines = np.concatenate([data["mu"][:, :2], np.repeat(share[:, None], 2, axis=1)])
+    axes.clabel(seen, fmt="%g", fontsize=6.5, manual=_clear(seen.allsegs, lines))
+    t, r = data["mu"][:, 0], data["mu"][:, 1]
+    axes.plot([0.0, 1.0], [0.0, 1.0], color=style.BLACK, linewidth=0.5)
+    axes.plot(t, r, color=style.VERMILION, linewidth=1.6)
+    tenths = np.linspace(0.0, 1.0, TICKS)
+    sigma = data["sigma"]
+    axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), "o", color=style.VERMILION)
+    axes.set_xlim(-0.02, 1.02)
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_xlabel(r"translation $\mu_t$ (1)")
+    axes.set_ylabel(r"turn onto the plane $\mu_r$ (1)")
+
+
+def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
+    """A place (2,) on each piece of each contour, away from the points (k, 2), the border and one another."""
+    places: list[FloatArray] = []
+    for piece in (piece for pieces in contours for piece in pieces if len(piece) > 1):
+        taken = np.concatenate([lines, np.reshape(places, (-1, 2))])
+        room = np.linalg.norm(piece[:, None] - taken, axis=2).min(axis=1)
+        room = np.minimum(room, np.minimum(piece, 1.0 - piece).min(axis=1))
+        if room.max() > LABEL:
+            places.append(piece[room.argmax()])
+    return places
+
+
+def _lines(axes: "Axes", sigma: FloatArray, columns: FloatArray, looks: dict[str, style.Look]) -> list[Any]:
+    """Draw columns (s, k) over σ; returns the entries of the legend."""
+    axes.set_xlabel(r"path parameter $\sigma$ (1)")
+    return [
+        axes.plot(sigma, column, label=name, **look)[0]
+        for column, (name, look) in zip(columns.T, looks.items(), strict=True)
+    ]

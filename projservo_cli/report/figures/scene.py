@@ -1,0 +1,160 @@
+"""Fig. 3 of [RH00]: robot, stereo rig and face at the start and at the goal."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.records import PRISMATIC, FloatArray
+from projservo_cli.report import style
+from projservo_cli.report.material import Data, Material
+from projservo_cli.robots.truth import camera_center
+from projservo_cli.task.face import center_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Length of the drawn viewing pyramids, as a share of the distance to the face.
+PYRAMID = 0.16
+
+
+def data(material: Material) -> Data:
+    """Joints, faces and cameras in metres; the robot at the start as a polyline through its axes."""
+    plant, robot, plan = material.plant, material.robot, material.plan
+    start = forward_kinematics(plant.model, plan.q_start)
+    face = plant.M[plant.order]
+    result = {
+        "robot": skeleton(
+            joint_operators(plant.model, plan.q_start), robot.joint_types, (start @ robot.base_tool)[:3, 3]
+        ),
+        "face_start": (face @ start.T)[:, :3],
+        "cameras": np.stack([camera_center(P) for P in plant.model.P]),
+    }
+    distance = np.linalg.norm(result["face_start"].mean(axis=0) - result["cameras"].mean(axis=0))
+    result["pyramids"] = np.stack(
+        [pyramid(P, plant.image_size, PYRAMID * float(distance)) for P in plant.model.P]
+    )
+    goal = _goal(material)
+    if goal is not None:
+        result["face_goal"] = (face @ goal.T)[:, :3]
+        centers = [np.array(center_of(plant.M @ H.T, plant.center))[:3] for H in (start, goal)]
+        result["line"] = np.stack(centers)
+    return result
+
+
+def _goal(material: Material) -> FloatArray | None:
+    """True displacement of the face at the goal, where a run knows it."""
+    for trace in material.traces.values():
+        if np.isfinite(trace.goal_pose).all():
+            return trace.goal_pose @ np.linalg.inv(material.robot.base_tool)
+    return None
+
+
+def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArray:
+    """Points (k, 3) of a polyline from the base over all revolute axes to the tool, m.
+
+    From each point the perpendicular is dropped onto the next axis; a prismatic joint has a
+    direction but no place.
+
+    Parameters
+    ----------
+    H_hat : (n, 4, 4) metric operators at the current joints.
+    joint_types : (n,) ``REVOLUTE`` or ``PRISMATIC``.
+    tool : (3,) place of the tool, m.
+    """
+    points = [np.zeros(3)]
+    for operator, kind in zip(H_hat, joint_types, strict=True):
+        if kind == PRISMATIC:
+            continue
+        w = np.array([operator[2, 1], operator[0, 2], operator[1, 0]])
+        on_axis = np.cross(w, operator[:3, 3]) / (w @ w)
+        points.append(on_axis + w * (w @ (points[-1] - on_axis)) / (w @ w))
+    return np.array([*points, tool])
+
+
+def pyramid(P: FloatArray, image_size: FloatArray, depth: float) -> FloatArray:
+    """Centre and four image corners (5, 3) of a metric camera (3, 4), m, at a depth in front of it."""
+    center = camera_center(P)
+    width, height = image_size - 0.5
+    corners = np.array([[-0.5, -0.5, 1], [width, -0.5, 1], [width, height, 1], [-0.5, height, 1]])
+    scale = np.linalg.norm(P[2, :3])
+    sign = np.sign(np.linalg.det(P[:, :3]))
+    rays = np.linalg.solve(P[:, :3], corners.T).T * scale * sign
+    return np.concatenate([center[None], center + depth * rays])
+
+
+def draw(data: Data, figure: "Figure") -> None:
+    """One view in perspective with equal scales."""
+    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
+    axes.patch.set_visible(False)
+    axes.computed_zorder = False
+    axes.plot(*data["robot"].T, "o-", color=style.BLACK, linewidth=2.0, markersize=4)
+    for i, color in enumerate((style.BLUE, style.ORANGE)):
+        apex, corners = data["pyramids"][i, 0], style.closed(data["pyramids"][i, 1:])
+        axes.plot(*corners.T, color=color, linewidth=1.0)
+        for corner in corners[:-1]:
+            axes.plot(*np.stack([apex, corner]).T, color=color, linewidth=1.0)
+    axes.plot(*style.closed(data["face_start"]).T, color=style.BLACK, linewidth=1.4)
+    handles = [
+        style.line_handle("robot at the start", color=style.BLACK, linewidth=2.0, marker="o", markersize=4),
+        style.line_handle("face at the start", color=style.BLACK, linewidth=1.4),
+        style.line_handle("left camera", color=style.BLUE, linewidth=1.0),
+        style.line_handle("right camera", color=style.ORANGE, linewidth=1.0),
+    ]
+    shown = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
+    if "face_goal" in data:
+        goal = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
+        axes.plot(*style.closed(data["face_goal"]).T, **goal)
+        line = {"color": style.GREY, "linestyle": (0, (1, 1))}
+        axes.plot(*data["line"].T, **line)
+        handles.insert(2, style.line_handle("face at the goal", **goal))
+        handles.insert(3, style.line_handle("straight line of the centre", **line))
+        shown.append(data["face_goal"])
+    extent = _frame(axes, np.concatenate(shown), data["cameras"].mean(axis=0))
+    figure.set_layout_engine()
+    figure.legend(handles=handles, loc="lower center", ncols=3)
+    _fit(axes, figure, extent)
+
+
+def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
+    """Equal scales on all axes, seen from the side of the rig; returns the extent (3, 2) shown, m."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    pad = 0.05 * (high - low).max()
+    extent = np.stack([low - pad, high + pad], axis=1)
+    for name, (a, b) in zip("xyz", extent, strict=True):
+        getattr(axes, f"set_{name}lim")(a, b)
+        getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
+        getattr(axes, f"{name}axis").set_major_locator(_locator(0.25 if b - a < 0.75 else 0.5))
+    axes.tick_params(pad=0)
+    towards = rig - points.mean(axis=0)
+    axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
+    return extent
+
+
+def _fit(axes: Any, figure: "Figure", extent: FloatArray) -> None:
+    """Show the scene as large as its labels and the room above the legend allow."""
+    corners = np.array([*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)])
+    size = np.ptp(extent, axis=1)
+    side = np.array([1.0, figure.get_figwidth() / figure.get_figheight()])  # a square
+    zoom, middle = 1.0, np.array([0.5, 0.5])
+    for _ in range(2):
+        axes.set_position((*(middle - 0.5 * side), *side))
+        axes.set_box_aspect(size, zoom=zoom)
+        figure.draw_without_rendering()
+        m = axes.get_proj() @ corners
+        shown = axes.transData.transform((m[:2] / m[3]).T)
+        labels = [axis.get_tightbbox().get_points() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+        taken = np.concatenate([shown, *labels])
+        low = np.array([0.0, figure.legends[0].get_window_extent().y1])
+        room = figure.bbox.get_points()[1] - low
+        zoom *= 0.95 * float((room / np.ptp(taken, axis=0)).min())
+        off = low + 0.5 * room - 0.5 * (taken.min(axis=0) + taken.max(axis=0))
+        middle += off / figure.bbox.size
+    axes.set_box_aspect(size, zoom=zoom)
+    axes.set_position((*(middle - 0.5 * side), *side))
+
+
+def _locator(step: float) -> Any:
+    from matplotlib.ticker import MultipleLocator
+
+    return MultipleLocator(step)

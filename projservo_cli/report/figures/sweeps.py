@@ -1,0 +1,89 @@
+"""Figures of a sweep: success over a value, over start offsets, and how far from the goal runs end."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.report import style
+from projservo_cli.report.material import Data
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def draw_success(data: Data, figure: "Figure") -> None:
+    """Success of each law with its interval, over ``x``.
+
+    ``data`` has the label of the axis as ``label``, and for each law ``<law>.x``, ``.rate``, ``.low``
+    and ``.high``.
+    """
+    axes = figure.add_subplot()
+    laws = _laws(data, ".rate")
+    handles = []
+    span = max(float(np.ptp(data[f"{law}.x"])) for law in laws) or 1.0
+    for i, law in enumerate(laws):
+        x, rate = data[f"{law}.x"], data[f"{law}.rate"]
+        beside = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
+        look = style.curve(i, marker=True)
+        reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
+        axes.errorbar(x + beside, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **look)
+        handles.append(style.line_handle(law, **look))
+    axes.set_ylim(-3, 103)
+    axes.set_xlabel(str(data["label"]))
+    axes.set_ylabel("converged (%), bars: 95 %")
+    style.legend_below(figure, handles, min(3, len(handles)))
+
+
+def draw_basin(data: Data, figure: "Figure") -> None:
+    """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
+
+    ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
+    """
+    laws = _laws(data, ".share")
+    columns = min(3, len(laws))
+    panels = figure.subplots(
+        math.ceil(len(laws) / columns), columns, sharex=True, sharey=True, squeeze=False
+    ).ravel()
+    x, y = _edges(data["x"]), _edges(data["y"])
+    mesh: Any = None
+    for axes, law in zip(panels, laws, strict=False):
+        mesh = axes.pcolormesh(x, y, 100.0 * data[f"{law}.share"], vmin=0, vmax=100)
+        axes.grid(visible=False)
+        axes.set_facecolor(style.PALE)  # where no run can begin
+        axes.set_title(law)
+        axes.set_xticks(data["x"][:: max(1, len(data["x"]) // 5)])
+        axes.set_yticks(data["y"][:: max(1, len(data["y"]) // 5)])
+    for axes in panels[len(laws) :]:
+        axes.set_visible(False)
+    figure.supxlabel(str(data["label_x"]), fontsize=8)
+    figure.supylabel(str(data["label_y"]), fontsize=8)
+    figure.colorbar(mesh, ax=panels.tolist(), label="converged (%)")
+
+
+def draw_final_errors(data: Data, figure: "Figure") -> None:
+    """Share of the runs of each law that end within a distance of the goal.
+
+    ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
+    """
+    axes = figure.add_subplot()
+    handles = []
+    for i, law in enumerate(_laws(data, ".error")):
+        look = style.curve(i)
+        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **look)
+        handles.append(style.line_handle(law, **look))
+    axes.set_xscale("log")
+    axes.set_ylim(-3, 103)
+    axes.set_xlabel("distance of the centre from the goal at the end (mm)")
+    axes.set_ylabel("runs within it (%)")
+    style.legend_below(figure, handles, min(3, len(handles)))
+
+
+def _laws(data: Data, ending: str) -> list[str]:
+    return [name.removesuffix(ending) for name in data if name.endswith(ending)]
+
+
+def _edges(x: Any) -> Any:
+    """Edges of the cells around sorted places."""
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])

@@ -1,0 +1,242 @@
+"""One look for all figures: print size, fonts, colours that survive grey print, and saving.
+
+matplotlib is imported where it is used and always draws without a display; the same data give the
+same bytes in SVG, PDF and PNG.
+"""
+
+import hashlib
+import io
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from projservo_cli.records import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+FORMATS = ("svg", "pdf", "png")
+WIDTH = 6.9  # inches across both columns of a page
+PNG_DPI = 200
+Look = dict[str, Any]
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+IMAGE = "image"  # label of axes that show pixels
+
+# M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
+BLACK, ORANGE, BLUE, SKY, VERMILION, GREEN, PURPLE = (
+    "#000000",
+    "#E69F00",
+    "#0072B2",
+    "#56B4E9",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+)
+GREY = "#999999"
+PALE = "#DDDDDD"
+# Colour, line style and marker change together, so that a curve is known without its colour.
+CURVES: tuple[tuple[str, Any, str], ...] = (
+    (BLACK, "-", "o"),
+    (VERMILION, (0, (5, 1.5)), "s"),
+    (BLUE, (0, (1, 1)), "^"),
+    (ORANGE, (0, (5, 1.5, 1, 1.5)), "D"),
+    (GREEN, (0, (3, 3)), "v"),
+    (PURPLE, (0, (3, 1, 1, 1, 1, 1)), "P"),
+)
+
+# How the face at the start and at the goal look in every figure.
+START: Look = {"color": BLACK, "linewidth": 1.4}
+GOAL: Look = {"color": BLUE, "linestyle": (0, (5, 1.5))}
+
+RC: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.8,
+    "legend.columnspacing": 1.6,
+    "axes.linewidth": 0.6,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.4,
+    "grid.color": "#E3E3E3",
+    "lines.linewidth": 1.2,
+    "lines.markersize": 3.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "axes.unicode_minus": True,
+    "svg.hashsalt": "projservo",
+    "svg.fonttype": "path",
+    "pdf.fonttype": 3,
+    "image.cmap": "cividis",
+    "savefig.facecolor": "white",
+}
+METADATA: dict[str, dict[str, Any]] = {
+    "svg": {"Date": None, "Creator": "projservo"},
+    "pdf": {"CreationDate": None, "ModDate": None, "Creator": "projservo", "Producer": "matplotlib"},
+    "png": {"Software": "projservo"},
+}
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw and save in the style of the figures."""
+    import matplotlib
+
+    with matplotlib.rc_context(RC):
+        yield
+
+
+def new_figure(height: float, width: float = WIDTH) -> "Figure":
+    """Empty figure of a size in inches whose parts arrange themselves."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def arrange(figure: "Figure") -> None:
+    """Arrange the parts of a figure once, so that every format shows the same."""
+    engine = figure.get_layout_engine()
+    if engine is None:
+        return
+    engine.execute(figure)
+    images = [axes for axes in figure.axes if axes.get_label() == IMAGE]
+    for axes in images:
+        _equal_scales(axes)
+    if images:  # other limits may have brought other tick labels, and with them another arrangement
+        engine.execute(figure)
+        for axes in images:
+            _equal_scales(axes)
+    figure.set_layout_engine()  # with an engine, even one that does nothing, saving draws twice
+
+
+def _equal_scales(axes: "Axes") -> None:
+    """Widen what axes show until a pixel is as wide as it is high in the panel as it is."""
+    box = axes.get_window_extent()
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    scale = max(abs(right - left) / box.width, abs(top - bottom) / box.height)
+    half = 0.5 * scale * np.array([box.width, box.height]) * np.sign([right - left, top - bottom])
+    u, v = 0.5 * (left + right), 0.5 * (bottom + top)
+    axes.set_xlim(u - half[0], u + half[0])
+    axes.set_ylim(v - half[1], v + half[1])
+
+
+def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
+    """An arranged figure as files, by format: ``svg``, ``pdf`` or ``png``."""
+    from projservo_cli.report.figures.recorded import Recorded
+
+    recorded, made = Recorded(figure, PNG_DPI), {}
+    for kind in formats:
+        file = io.BytesIO()
+        recorded.savefig(file, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
+        made[kind] = clips_by_content(file.getvalue()) if kind == "svg" else file.getvalue()
+    return made
+
+
+def clips_by_content(svg: bytes) -> bytes:
+    """The same picture with outlines that clip named by what they are.
+
+    matplotlib names those that are no rectangles by where they are in memory.
+    """
+    outlines = re.findall(rb'<clipPath id="(\w+)">(.*?)</clipPath>', svg, re.DOTALL)
+    names = {name: b"p" + hashlib.sha256(outline).hexdigest()[:10].encode() for name, outline in outlines}
+    return re.sub(rb"p[0-9a-f]{10}", lambda found: names.get(found[0], found[0]), svg)
+
+
+def pixels(figure: "Figure") -> npt.NDArray[np.uint8]:
+    """Pixels (height, width, 3) of a figure as it is now."""
+    canvas: Any = figure.canvas
+    canvas.draw()
+    return np.array(canvas.buffer_rgba(), dtype=np.uint8)[:, :, :3]
+
+
+def legend_below(figure: "Figure", handles: Any, columns: int) -> None:
+    """Put one legend for the whole figure below all axes, where it covers no data."""
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
+
+
+def line_handle(label: str, **look: Any) -> Any:
+    """Entry of a legend that stands for a line or a marker."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], label=label, **look)
+
+
+def curve(index: int, *, marker: bool = False) -> Look:
+    """Look of the curve of a number: colour, line style and, if asked for, marker."""
+    color, style, symbol = CURVES[index % len(CURVES)]
+    look = {"color": color, "linestyle": style}
+    return look | {"marker": symbol} if marker else look
+
+
+def image_axes(axes: "Axes", title: str) -> None:
+    """Axes in pixels of an image with equal scales; the view widens to fill its panel."""
+    axes.set_title(title)
+    axes.set_xlabel("u (px)")
+    axes.set_ylabel("v (px)")
+    axes.set_label(IMAGE)
+
+
+def frame_pixels(axes: "Axes", pixels: FloatArray, margin: float = 0.06) -> None:
+    """Show all pixels (…, 2) with a margin; v points down."""
+    points = pixels.reshape(-1, 2)
+    points = points[np.isfinite(points).all(axis=1)]
+    low, high = points.min(axis=0), points.max(axis=0)
+    pad = margin * max(float((high - low).max()), 1.0)
+    axes.set_xlim(low[0] - pad, high[0] + pad)
+    axes.set_ylim(high[1] + pad, low[1] - pad)
+
+
+def aspect(pixels: FloatArray, least: float = 0.3, most: float = 1.1) -> float:
+    """Height over width of what a panel shows of pixels (…, 2), within bounds fit for print."""
+    points = pixels.reshape(-1, 2)
+    size = np.ptp(points[np.isfinite(points).all(axis=1)], axis=0)
+    return float(np.clip(size[1] / max(size[0], 1.0), least, most))
+
+
+def log_scale(axes: "Axes") -> None:
+    """Logarithmic vertical scale with plain powers of ten as labels, about five of them."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_yscale("log", nonpositive="clip")
+    axis = axes.yaxis
+    axis.set_major_locator(LogLocator(numticks=5))
+    axis.set_major_formatter(FuncFormatter(_power))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _power(value: float, position: int | None = None) -> str:
+    del position
+    exponent = round(float(np.log10(value))) if value > 0 else 0
+    return "10" + str(exponent).translate(SUPERSCRIPTS)
+
+
+def signed(value: float, decimals: int = 1) -> str:
+    """Number with a typographic minus."""
+    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
+
+
+def closed(polygon: FloatArray) -> FloatArray:
+    """Corners (k, 2) with the first one repeated at the end."""
+    return np.concatenate([polygon, polygon[:1]])
+
+
+def face(axes: "Axes", corners: FloatArray, look: Look, *, fill: bool = False) -> None:
+    """Draw a face from its corners (k, 2) in cyclic order; a dot marks the first."""
+    loop = closed(corners)
+    if fill:
+        axes.fill(loop[:, 0], loop[:, 1], color=PALE, alpha=0.35, linewidth=0)
+    axes.plot(loop[:, 0], loop[:, 1], **look)
+    axes.plot(corners[:1, 0], corners[:1, 1], "o", color=look["color"], markersize=3)

@@ -1,0 +1,294 @@
+"""The true robot and rig as the compiled loop sees them."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, combine, dot, mat, mul, put_vec, vec
+from projservo_cli.geometry.displacement import as_array, as_mat, twist_exponential
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kinematics import forward, row, start_pose
+from projservo_cli.geometry.lens import bend
+from projservo_cli.records import FREE, FloatArray, IntArray, Model
+from projservo_cli.task.face import center_of, face_plane
+
+NO_PINS = np.zeros((0, 4))
+NEVER = 2**62
+
+
+class Disturbance(NamedTuple):
+    """What befalls a simulated robot beside noise; instants count from 0, the start.
+
+    Attributes
+    ----------
+    delay : periods by which images are late; the first ones show the start.
+    bump_at : instant by which the joints have been knocked; −1 for never.
+    bump : (n,) by how much, rad or m.
+    bump_read : whether the readings follow the bump, or a joint slipped on its encoder.
+    frozen : joint whose reading stands still, −1 for none.
+    frozen_at, frozen_until : instant of the reading that stays, and the first that is true again.
+    """
+
+    delay: int
+    bump_at: int
+    bump: FloatArray
+    bump_read: bool
+    frozen: int
+    frozen_at: int
+    frozen_until: int
+
+
+# For any number of joints a configuration may have.
+UNDISTURBED = Disturbance(0, -1, np.zeros(64), True, -1, 0, NEVER)
+
+
+class Plant(NamedTuple):
+    """True robot, rig and face in the metric frame.
+
+    Attributes
+    ----------
+    model : metric model; ``FREE`` joint types make the rig fly.
+    M : (m, 4) points of the face at the reference, m.
+    order : (m,) markers around the face.
+    center : index of the centre marker, or ``MIDPOINT``.
+    O : (2, 4) optical centres.
+    visible : (2,) sign of a·O on the visible side of the face.
+    image_size : (2,) width and height, px; infinite where an image has no border.
+    lower, upper : (n,) joint limits, rad or m.
+    opaque : whether the face hides its markers from a camera behind it.
+    pins : (p, 4) further markers of the body at the reference, m; a camera sees those within its image.
+    disturbance : what befalls the robot.
+    """
+
+    model: Model
+    M: FloatArray
+    order: IntArray
+    center: int
+    O: FloatArray
+    visible: FloatArray
+    image_size: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    opaque: bool
+    pins: FloatArray = NO_PINS
+    disturbance: Disturbance = UNDISTURBED
+
+
+@njit
+def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: FloatArray) -> Mat4:
+    """Displacement of the face after the joint step dq, rad or m; the joints are written to q_next.
+
+    A serial robot is moved by its joints; a free-flying rig by one exponential of its twist.
+    """
+    n = q.shape[0]
+    for i in range(n):
+        q_next[i] = q[i] + dq[i]
+    if plant.model.joint_types[0] != FREE:
+        return forward(plant.model, q_next)
+    X = combine(float(dq[0]), mat(plant.model.H_hat_0[0]), 0.0, mat(plant.model.H_hat_0[0]))
+    for i in range(1, n):
+        X = combine(1.0, X, float(dq[i]), mat(plant.model.H_hat_0[i]))
+    return mul(twist_exponential(X), H)
+
+
+@merged
+def knock(disturbance: Disturbance, instant: int, dq: FloatArray) -> None:
+    """Add to a joint step, rad or m, what knocks the joints until the instant it ends at."""
+    if instant == disturbance.bump_at:
+        for i in range(dq.shape[0]):
+            dq[i] += disturbance.bump[i]
+
+
+@merged
+def read_joints(
+    disturbance: Disturbance, instant: int, q: FloatArray, before: FloatArray, reading: FloatArray
+) -> None:
+    """Readings (n,) of the joints q (n,), rad or m; ``before`` are those of the instant before."""
+    for i in range(q.shape[0]):
+        reading[i] = q[i]
+    if not disturbance.bump_read and 0 <= disturbance.bump_at <= instant:
+        for i in range(q.shape[0]):
+            reading[i] -= disturbance.bump[i]
+    if disturbance.frozen >= 0 and disturbance.frozen_at < instant < disturbance.frozen_until:
+        reading[disturbance.frozen] = before[disturbance.frozen]
+
+
+@njit
+def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatArray) -> bool:
+    """True pixels of the face after the displacement H.
+
+    Parameters
+    ----------
+    M : (m, 4) on return the points of the face.
+    s : (2, m + p, 2) on return the pixels of face and pins, NaN where unseen.
+    hidden : (2,) on return 1 where the face is self-occluded in a view.
+
+    Returns
+    -------
+    False where a marker is not in front of a camera.
+    """
+    m = M.shape[0]
+    for k in range(m):
+        put_vec(M[k], apply(H, vec(plant.M[k])))
+    a = face_plane(M, plant.order, center_of(M, plant.center))
+    in_front = True
+    for view in range(2):
+        seen = plant.visible[view] * dot(a, vec(plant.O[view])) > 0.0
+        hidden[view] = 0.0 if seen else 1.0
+        camera, lens = plant.model.P[view], plant.model.lens[view]
+        for k in range(m):
+            A = vec(M[k])
+            if not put_pixel(camera, lens, A, s[view, k]):
+                in_front = False
+            elif plant.opaque and not seen:
+                put_unseen(s[view, k])
+        for k in range(plant.pins.shape[0]):
+            pixel = s[view, m + k]
+            A = apply(H, vec(plant.pins[k]))
+            if put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
+                put_unseen(pixel)
+    return in_front
+
+
+@merged
+def put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
+    """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
+    depth = row(camera, 2, A)
+    if not depth > 0.0:
+        put_unseen(pixel)
+        return False
+    pixel[0], pixel[1] = bend(lens, row(camera, 0, A) / depth, row(camera, 1, A) / depth)
+    return True
+
+
+@merged
+def put_unseen(pixel: FloatArray) -> None:
+    """Write what stands for an unseen marker, NaN."""
+    pixel[0] = math.nan
+    pixel[1] = math.nan
+
+
+@merged
+def inside(pixel: FloatArray, image_size: FloatArray) -> bool:
+    """Whether a pixel lies within an image; pixel centres reach from −½ to size − ½."""
+    for j in range(2):
+        if not -0.5 <= pixel[j] <= image_size[j] - 0.5:
+            return False
+    return True
+
+
+@merged
+def rig_distance(plant: Plant, M: FloatArray) -> float:
+    """Distance of the centre of the face M (m, 4) from the middle of the optical centres, m."""
+    middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
+    way = axpy(-0.5, middle, center_of(M, plant.center))
+    return math.sqrt(dot(way, way))
+
+
+@internal
+def center_deviation(
+    plant: Plant,
+    H: Mat4,
+    q: FloatArray,
+    dq: FloatArray,
+    start: Vec4,
+    goal: Vec4,
+    samples: int,
+    M: FloatArray,
+    scratch: FloatArray,
+) -> float:
+    """Largest distance of the centre from the line start–goal during one joint step, m.
+
+    The joints move linearly; the step is sampled at ``samples`` equal parts, its end included.
+    ``M`` (m, 4) and ``scratch`` (≥2, n) are overwritten.
+    """
+    part = scratch[0]
+    reached = scratch[1]
+    most = 0.0
+    for j in range(1, samples + 1):
+        for i in range(dq.shape[0]):
+            part[i] = dq[i] * (j / samples)
+        H_part = pose_after(plant, H, q, part, reached)
+        for k in range(M.shape[0]):
+            put_vec(M[k], apply(H_part, vec(plant.M[k])))
+        most = max(most, line_distance(center_of(M, plant.center), start, goal))
+    return most
+
+
+@merged
+def line_distance(A: Vec4, start: Vec4, goal: Vec4) -> float:
+    """Distance of a metric point from the line through start and goal; from start where they agree."""
+    way = axpy(-1.0, start, goal)
+    off = axpy(-1.0, start, A)
+    length = dot(way, way)
+    if length > 0.0:
+        off = axpy(-dot(off, way) / length, way, off)
+    return math.sqrt(dot(off, off))
+
+
+class AnalyticPlant:
+    """Simulated robot and rig, with given pixel noise.
+
+    Parameters
+    ----------
+    plant : the truth, and what befalls it.
+    q_start : (n,) first joints, rad or m.
+    noise : (k, 2, markers, 2) added to the pixels of each observation in turn, px.
+
+    Attributes
+    ----------
+    q, H : (n,) true joints, rad or m, and (4, 4) displacement of the face.
+    in_front : whether every marker was in front of both cameras when last observed.
+    markers : how many are observed, those of the face first.
+    hidden : (2,) 1 where the face was self-occluded when last observed.
+    disturbance : nothing ever disturbs it; why the law that drove it failed.
+    takes_parts : it goes straight to the end of each step; the samples are the same.
+    """
+
+    disturbance = ""
+    takes_parts = False
+
+    def __init__(self, plant: Plant, q_start: FloatArray, noise: FloatArray) -> None:
+        self.plant = plant
+        self.noise = noise
+        self.q = np.array(q_start, dtype=np.float64)
+        self.H = as_array(start_pose(plant.model, self.q))
+        self.reading = self.q.copy()
+        self.shown: list[FloatArray] = []
+        self.observations = 0
+        self.M = np.zeros_like(plant.M)
+        self.hidden = np.zeros(2)
+        self.in_front = True
+        self.markers = len(plant.M) + len(plant.pins)
+
+    def joints(self) -> FloatArray:
+        """Joint readings (n,), rad or m."""
+        return self.reading.copy()
+
+    def observe(self) -> FloatArray:
+        """Noisy pixels (2, markers, 2), NaN where unseen; of some periods ago where images are late."""
+        s = np.zeros((2, self.markers, 2))
+        self.in_front = observe(self.plant, as_mat(self.H), self.M, s, self.hidden)
+        self.shown.append(self.H)
+        if self.plant.disturbance.delay > 0:
+            late = as_mat(self.shown[max(0, self.observations - self.plant.disturbance.delay)])
+            observe(self.plant, late, np.zeros_like(self.M), s, np.zeros(2))
+        s += self.noise[self.observations]
+        self.observations += 1
+        return s
+
+    def distance(self) -> float:
+        """Distance of the face from the middle of the optical centres when last observed, m."""
+        return rig_distance(self.plant, self.M)
+
+    def command(self, step: FloatArray, period: float) -> None:
+        """Move by the joint step (n,), rad or m; the simulated robot always arrives."""
+        step, q_next, before = step.copy(), np.zeros_like(self.q), self.reading.copy()
+        knock(self.plant.disturbance, self.observations, step)
+        self.H = as_array(pose_after(self.plant, as_mat(self.H), self.q, step, q_next))
+        self.q = q_next
+        read_joints(self.plant.disturbance, self.observations, self.q, before, self.reading)
+
+    def stop(self) -> None:
+        """Nothing moves between commands."""
