@@ -335,7 +335,9 @@ class Trace:
         units="mm", about="length of the path of the centre, from sample to sample"
     )
     effort: float = scalar(units="rad²/s or m²/s", about="integral of the squared joint velocities")
-    plateau_steps: int = scalar(about="longest stretch in which the image error falls < 1 % in 20 steps")
+    plateau_steps: int = scalar(
+        about="longest stretch in which stop_error falls < 1 % in each stop.plateau_steps"
+    )
     speed_limited_steps: int = scalar(about="commands scaled to the joint-speed limit")
     visibility_limited_steps: int = scalar(about="commands whose translation was kept within delta·tau_0")
     first_outside_image: int = scalar(about="first instant with a marker outside an image, -1 for never")

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -62,8 +61,8 @@ def _done(call: _Call, options: dict[str, Any]) -> int:
     from projservo_cli.cli.words import suggested
 
     try:
-        with _compilation(call):
-            _work(call, options)
+        _say_compilation(call)
+        _work(call, options)
         if options["suggest"] is not None and not _lacking(call, "calibrate"):
             call.suggested = suggested(call.config, call.run, options["suggest"])
         if (wanted := wanted_of(options)) and not _lacking(call, "report"):
@@ -148,23 +147,16 @@ def _keep_configuration(call: _Call) -> None:
         save(call.run)
 
 
-def _compilation(call: _Call) -> AbstractContextManager[None]:
-    """The first run on a machine is slower by the time of compilation; say so, and use both processors."""
+def _say_compilation(call: _Call) -> None:
+    """The first run on a machine is slower by the time of compilation; say so."""
     if not any(step.why for step in call.steps) or os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        return nullcontext()
+        return
     from projservo_cli.geometry.jit import CACHE_FOLDER
 
     if CACHE_FOLDER is None:
         call.console.say("compiling kernels (in every run: no cache folder can be written)")
     elif not any(CACHE_FOLDER.rglob("*.nbi")):
         call.console.say("compiling kernels, once")
-        made = {step.stage for step in call.steps if step.why}
-        # A plan needs the loop too, where it rehearses a half turn.
-        if {"plan", "servo"} & made:
-            from projservo_cli.stages.compilation import compiling_beside
-
-            return compiling_beside(*(["path"] if "plan" in made else []), "loop")
-    return nullcontext()
 
 
 def _tell(call: _Call, *, as_json: bool) -> int:

@@ -646,7 +646,7 @@ class ReportSettings(Section):
     """What the report writes."""
 
     formats: tuple[Literal["svg", "pdf", "png"], ...] = Field(
-        ("svg", "pdf", "png"), min_length=1, description="files of each figure"
+        ("svg",), min_length=1, description="files of each figure; the page shows SVG, else PNG"
     )
 
 

@@ -23,6 +23,8 @@ law of somebody else raises, is late or answers nonsense once the run has begun.
 import math
 from typing import NamedTuple
 
+import numpy as np
+
 from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import inside
@@ -213,6 +215,22 @@ def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
     if k < window:
         return False
     return bool(errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window])
+
+
+def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
+    """First and last instant of the longest stretch in which ``on_plateau`` holds from its window on.
+
+    Parameters
+    ----------
+    errors : (k,) errors that a run is judged by, px.
+    window : of the plateau test, steps.
+    """
+    flat = errors[window:] > (1.0 - PLATEAU_FALL) * errors[:-window]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
+    if not len(edges):
+        return None
+    first, end = edges.reshape(-1, 2)[np.argmax(edges[1::2] - edges[::2])]
+    return int(first), int(end) - 1 + window
 
 
 @merged

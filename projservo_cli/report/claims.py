@@ -8,12 +8,30 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.geometry.kinematics import joint_operators
+from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
-from projservo_cli.report import measures
-from projservo_cli.report.figures.drift import table
-from projservo_cli.report.figures.errors import percent
-from projservo_cli.report.figures.images import PLATEAU_WINDOW
-from projservo_cli.report.material import DIRECT, TITLES, Material, Studies
+from projservo_cli.report.figures.drift import drift_tables
+from projservo_cli.report.material import (
+    DIRECT,
+    LEAST_ANGLE,
+    LEAST_DISTANCE,
+    TITLES,
+    Material,
+    Studies,
+    along_line,
+    center_distance,
+    center_image,
+    coordinate_rise,
+    curve_difference,
+    decay_factors,
+    fitted_rate,
+    off_exponential,
+    path_gap,
+    percent,
+    second_order_drift,
+    settled_at,
+    true_rotation,
+)
 
 
 @dataclass(frozen=True)
@@ -79,7 +97,7 @@ def control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     )
     yield from _scale(material, calibrated)
     trace = studies.own[DIRECT[1], "calibrated", False]
-    start, task = math.degrees(trace.theta_s[0]), math.degrees(measures.true_rotation(trace))
+    start, task = math.degrees(trace.theta_s[0]), math.degrees(true_rotation(trace))
     yield Claim(
         "θ_s starts at the overall rotation of the task, 180° in the paper",
         "section 6, Fig. 9",
@@ -96,12 +114,10 @@ def decay_ranges(material: Material, trace: Trace) -> dict[str, tuple[float, flo
 
     Counted are the steps 20 after the last speed-limited one, down to 0.1 mm and 0.05°.
     """
-    first = measures.settled_at(trace)
+    first = settled_at(trace)
     ratios = {
-        "distance": measures.decay_factors(
-            measures.center_distance(material, trace), first, measures.LEAST_DISTANCE
-        ),
-        "theta_s": measures.decay_factors(trace.theta_s, first, float(measures.LEAST_ANGLE)),
+        "distance": decay_factors(center_distance(material, trace), first, LEAST_DISTANCE),
+        "theta_s": decay_factors(trace.theta_s, first, float(LEAST_ANGLE)),
     }
     return {name: (float(r.min()), float(r.max()), len(r)) for name, r in ratios.items() if len(r)}
 
@@ -110,12 +126,10 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[Cla
     trace = studies.own[law, "calibrated", True]
     if not np.isfinite(trace.goal_pose).all():
         return
-    first = measures.settled_at(trace)
+    first = settled_at(trace)
     rates = [
-        measures.fitted_rate(
-            measures.center_distance(material, trace), first, measures.LEAST_DISTANCE, trace.period
-        ),
-        measures.fitted_rate(trace.theta_s, first, float(measures.LEAST_ANGLE), trace.period),
+        fitted_rate(center_distance(material, trace), first, LEAST_DISTANCE, trace.period),
+        fitted_rate(trace.theta_s, first, float(LEAST_ANGLE), trace.period),
     ]
     ranges = decay_ranges(material, trace)
     gains = _gains(studies, law)
@@ -152,7 +166,7 @@ def _gains(studies: Studies, law: str) -> tuple[float, float]:
 def _model_difference(trace: Trace, metric: Trace) -> float:
     """Largest difference of θ_r and θ_p between two runs, deg."""
     return max(
-        math.degrees(measures.curve_difference(getattr(trace, name), getattr(metric, name))[0].max())
+        math.degrees(curve_difference(getattr(trace, name), getattr(metric, name))[0].max())
         for name in ("theta_r", "theta_p")
     )
 
@@ -160,7 +174,7 @@ def _model_difference(trace: Trace, metric: Trace) -> float:
 def _scale(material: Material, trace: Trace) -> Iterator[Claim]:
     if not np.isfinite(trace.goal_pose).all() or trace.tau[0] == 0:
         return
-    distance = percent(measures.center_distance(material, trace))
+    distance = percent(center_distance(material, trace))
     off = float(np.abs(percent(trace.tau) - distance).max())
     affine = float(np.abs(percent(trace.tau_affine) - distance).max())
     yield Claim(
@@ -175,7 +189,7 @@ def _scale(material: Material, trace: Trace) -> Iterator[Claim]:
 
 def _image_error(trace: Trace, factor: float) -> Iterator[Claim]:
     e = trace.s - trace.s_star
-    rise, off = measures.coordinate_rise(e), measures.off_exponential(e, factor)
+    rise, off = coordinate_rise(e), off_exponential(e, factor)
     yield Claim(
         "The image error does not decay exponentially",
         "section 6, Fig. 11",
@@ -201,7 +215,7 @@ SAMPLING = 1e-3
 
 def drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     """Claims of sections 5.2, 6 and 7 about drift; none where the goal pose is unknown."""
-    drift = table(studies)
+    drift = drift_tables(studies)[0]
     if not np.isfinite(drift).all():
         return
     gains = ", ".join(f"{gain:g}" for gain in studies.gains)
@@ -262,8 +276,8 @@ def _joints(material: Material, trace: Trace) -> Claim:
     line = line / max(float(np.linalg.norm(line)), np.finfo(float).tiny)
     H_hat = joint_operators(material.plant.model, trace.q[0])
     joint_step = trace.q[1] - trace.q[0]
-    parts = measures.second_order_drift(H_hat, joint_step, np.append(trace.center[0], 1.0), line)
-    first = 1e3 * measures.along_line(trace.center[1:2], trace.center[0], trace.center[0] + line)[1][0]
+    parts = second_order_drift(H_hat, joint_step, np.append(trace.center[0], 1.0), line)
+    first = 1e3 * along_line(trace.center[1:2], trace.center[0], trace.center[0] + line)[1][0]
     ranking = np.argsort(-np.abs(parts))
     shares = ", ".join(f"q{i + 1} {1e3 * parts[i]:+.2f}" for i in ranking)
     fastest = ", ".join(f"q{i + 1}" for i in np.argsort(-np.abs(joint_step))[:2])
@@ -317,7 +331,7 @@ def classical(material: Material) -> Iterator[Claim]:
             "verdict other than converged",
             trace.verdict != "converged",
         )
-        way = measures.center_distance(material, trace) if np.isfinite(trace.goal_pose).all() else None
+        way = center_distance(material, trace) if np.isfinite(trace.goal_pose).all() else None
         grown = (
             ""
             if way is None
@@ -332,10 +346,10 @@ def classical(material: Material) -> Iterator[Claim]:
         )
     for law in ("stacked", "euclidean_points"):
         if law in material.traces:
-            yield from _escape(law, material.traces[law])
+            yield from _escape(law, material.traces[law], material.plateau_steps)
 
 
-def _escape(law: str, trace: Trace) -> Iterator[Claim]:
+def _escape(law: str, trace: Trace, window: int) -> Iterator[Claim]:
     left, right = trace.self_occluded_steps_left, trace.self_occluded_steps_right
     yield Claim(
         f"{TITLES[law]}: runs through self-occlusion, then converges",
@@ -344,16 +358,16 @@ def _escape(law: str, trace: Trace) -> Iterator[Claim]:
         "steps in both cameras, verdict converged",
         left > 0 and right > 0 and trace.verdict == "converged",
     )
-    stretch = measures.plateau_stretch(trace.image_error, PLATEAU_WINDOW)
+    stretch = plateau_stretch(trace.stop_error, window)
     measured = "none"
     if stretch is not None:
-        level = float(trace.image_error[stretch[0]])
+        level = float(trace.stop_error[stretch[0]])
         measured = f"{stretch[1] - stretch[0]} steps from step {stretch[0]} at {level:.0f} px"
     yield Claim(
         f"{TITLES[law]}: stands still in a local minimum before it converges",
         "section 6, Fig. 4",
         f"{measured}; {trace.verdict}",
-        f"image error falls < 1 % in {PLATEAU_WINDOW} steps, verdict converged",
+        f"image error falls < 1 % in {window} steps, verdict converged",
         stretch is not None and trace.verdict == "converged",
     )
 
@@ -388,7 +402,7 @@ def direct(material: Material) -> Iterator[Claim]:
             total == 0,
         )
     if len(traces) == len(DIRECT):
-        gap = float(measures.path_gap(*(trace.s for trace in traces.values())).max())
+        gap = float(path_gap(*(trace.s for trace in traces.values())).max())
         diagonal = float(np.linalg.norm(material.plant.image_size))
         yield Claim(
             "The image paths of directTHREE and directTWO differ very little",
@@ -402,7 +416,7 @@ def direct(material: Material) -> Iterator[Claim]:
 
 
 def _level(material: Material, trace: Trace) -> Claim:
-    image = measures.center_image(material, trace)
+    image = center_image(material, trace)
     travel, variation = np.ptp(image, axis=0).T
     return Claim(
         "The centre moves horizontally in the images: its ordinate stays constant",

@@ -18,9 +18,9 @@ from projservo_cli.calibration.quality import REACH_M, REACH_RAD, WEAK_NOISE, ch
 from projservo_cli.config import Config, load_config
 from projservo_cli.files import inside
 from projservo_cli.records import Calibration, CrossValidation, Plan, Report, Trace, name_of
-from projservo_cli.report.figures import FIGURES, FigureSpec
+from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.drift import drift_rows
-from projservo_cli.report.material import VIEWS, title
+from projservo_cli.report.material import VIEWS, FigureSpec, title
 from projservo_cli.report.style import FORMATS
 from projservo_cli.report.values import ANIMATION_FILE, VIEW_FILE
 from projservo_cli.store import Run

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.records import FloatArray
+from projservo_cli.report.material import Data, FigureSpec
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -133,14 +134,20 @@ def _equal_scales(axes: "Axes") -> None:
     axes.set_ylim(v - half[1], v + half[1])
 
 
+def drawn(spec: FigureSpec, data: Data, formats: Sequence[str]) -> dict[str, bytes]:
+    """A figure of some data as files, by format: ``svg``, ``pdf`` or ``png``."""
+    figure = new_figure(spec.height)
+    spec.draw(data, figure)
+    arrange(figure)
+    return contents(figure, formats)
+
+
 def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
     """An arranged figure as files, by format: ``svg``, ``pdf`` or ``png``."""
-    from projservo_cli.report.figures.recorded import Recorded
-
-    recorded, made = Recorded(figure, PNG_DPI), {}
+    made = {}
     for kind in formats:
         file = io.BytesIO()
-        recorded.savefig(file, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
+        figure.savefig(file, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
         made[kind] = clips_by_content(file.getvalue()) if kind == "svg" else file.getvalue()
     return made
 

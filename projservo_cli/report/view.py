@@ -1,7 +1,6 @@
 """The 3D view of a run: one page of HTML with a time slider, drawn by plotly, that needs no network."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,55 +11,65 @@ from projservo_cli.files import replacing
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
-from projservo_cli.report.figures.scene import PYRAMID, pyramid, skeleton
+from projservo_cli.report.figures.scene import pyramids, skeleton
 from projservo_cli.report.material import VIEWS, title
 from projservo_cli.report.page import template
+from projservo_cli.report.values import PAGE_FILE
 from projservo_cli.robots.simulated import Plant
-from projservo_cli.robots.truth import Robot, camera_center
+from projservo_cli.robots.truth import Robot
 from projservo_cli.task.face import center_of
 
 MOST_INSTANTS = 60
+DOTS = 9  # on the planned path
+DIGITS = 4  # of coordinates in m: a tenth of a millimetre
+HEIGHT = 640  # px of the scene
+EYE = 1.75  # distance of the eye, in sizes of the scene
+LOWER = 0.15  # that it looks below the middle, where the names of the axes are
+PAD = 0.03  # around all that is shown, as a share of it
+FRAME_MS = 80
+TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
+# What is wider than high needs more distance where the page is narrow.
+NEARER = """
+const plot = document.getElementById("{plot_id}");
+const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
+const {x, y, z} = plot.layout.scene.camera.eye;
+Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
+"""
+CAMERAS = (style.BLUE, style.ORANGE)
+SEEN, HIDDEN = style.SKY, style.VERMILION
+KEY = (
+    ("robot, face at the start", style.BLACK),
+    ("face", SEEN),
+    ("face, hidden from a camera", HIDDEN),
+    ("markers", style.GREY),
+    ("left camera", CAMERAS[0]),
+    ("right camera", CAMERAS[1]),
+    ("goal, planned path of the centre", style.PURPLE),
+    ("driven path of the centre", style.GREEN),
+)
+AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
+PLAYING = AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
 
 
 class Driven(NamedTuple):
-    """One run of a law at the instants that are shown.
-
-    Attributes
-    ----------
-    verdict : how it ended.
-    seconds : (k,) time of the instants.
-    robot : (k, j, 3) the robot as a polyline from its base to the tool, m.
-    face : (k, m, 3) corners of the face in cyclic order, m.
-    markers : (k, p, 3) all markers of the body, m.
-    hidden : (k, 2) whether the face is hidden from each camera.
-    path : (t, 3) centre of the face at every instant of the run, m.
-    """
+    """One run at the k instants shown, in m: polylines of the robot, faces in cyclic order, all markers."""
 
     verdict: str
-    seconds: FloatArray
-    robot: FloatArray
-    face: FloatArray
-    markers: FloatArray
-    hidden: BoolArray
-    path: FloatArray
+    seconds: FloatArray  # (k,)
+    robot: FloatArray  # (k, j, 3)
+    face: FloatArray  # (k, m, 3)
+    markers: FloatArray  # (k, p, 3)
+    hidden: BoolArray  # (k, 2) whether the face is hidden from each camera
+    path: FloatArray  # (t, 3) centre of the face at every instant of the run
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """What stands still in the view, and the runs.
+class Motion(NamedTuple):
+    """What stands still in the view, in m, and the runs by name."""
 
-    Attributes
-    ----------
-    cameras : (2, 5, 3) optical centre and image corners of both viewing pyramids, m.
-    start, goal : (m, 3) corners of the face, m; the goal is None where only its images are known.
-    planned : (s, 3) centre of the face along the joints of the plan, m; none where joints cannot follow it.
-    runs : the runs by name.
-    """
-
-    cameras: FloatArray
-    start: FloatArray
-    goal: FloatArray | None
-    planned: FloatArray
+    cameras: FloatArray  # (2, 5, 3) optical centre and image corners of both viewing pyramids
+    start: FloatArray  # (m, 3) corners of the face
+    goal: FloatArray | None  # the same, None where only images of the goal are known
+    planned: FloatArray  # (s, 3) centre of the face along the joints of the plan, as far as they follow it
     runs: Mapping[str, Driven]
 
 
@@ -78,23 +87,18 @@ def motion(
     """
     face = plant.M[plant.order]
     start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
-    distance = np.linalg.norm(start.mean(axis=0) - np.mean([camera_center(P) for P in plant.model.P], axis=0))
     goals = [trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all()]
-    goal = goals[0] @ np.linalg.inv(robot.base_tool) if goals else None
-    return Motion(
-        np.stack([pyramid(P, plant.image_size, PYRAMID * float(distance)) for P in plant.model.P]),
-        start,
-        None if goal is None else (face @ goal.T)[:, :3],
-        _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)]),
-        {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()},
-    )
+    goal = (face @ np.linalg.solve(robot.base_tool.T, goals[0].T))[:, :3] if goals else None
+    planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
+    runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
+    return Motion(pyramids(plant, start), start, goal, planned, runs)
 
 
 def instants(q: FloatArray) -> IntArray:
-    """At most ``MOST_INSTANTS`` instants of the joints q (t, n), all of a shorter run.
+    """At most ``MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
 
-    First and last are among them. They are spread evenly half over the time and half over the way of the
-    joints, so that neither the beginning of a long run nor its end is passed over.
+    They are spread evenly half over the time and half over the way of the joints, so that neither the
+    beginning of a long run nor its end is passed over.
     """
     if len(q) <= MOST_INSTANTS:
         return np.arange(len(q))
@@ -107,58 +111,22 @@ def instants(q: FloatArray) -> IntArray:
 
 def _driven(robot: Robot, plant: Plant, markers: FloatArray, trace: Trace) -> Driven:
     shown = instants(trace.q)
-    H = [forward_kinematics(plant.model, q) for q in trace.q[shown]]
-    polylines = [
-        skeleton(joint_operators(plant.model, q), robot.joint_types, (displacement @ robot.base_tool)[:3, 3])
-        for q, displacement in zip(trace.q[shown], H, strict=True)
-    ]
-    face = plant.M[plant.order]
-    return Driven(
-        f"{trace.verdict}, {trace.steps} steps",
-        trace.period * shown.astype(np.float64),
-        np.stack(polylines),
-        np.stack([(face @ displacement.T)[:, :3] for displacement in H]),
-        np.stack([(markers @ displacement.T)[:, :3] for displacement in H]),
-        trace.self_occluded[shown],
-        _centers(plant, trace.q),
-    )
+    places, face, every = [], [], []
+    for q in trace.q[shown]:
+        H = forward_kinematics(plant.model, q)
+        tool = (H @ robot.base_tool)[:3, 3]
+        places.append(skeleton(joint_operators(plant.model, q), robot.joint_types, tool))
+        face.append((plant.M[plant.order] @ H.T)[:, :3])
+        every.append((markers @ H.T)[:, :3])
+    verdict, seconds = f"{trace.verdict}, {trace.steps} steps", trace.period * shown.astype(np.float64)
+    moved = np.stack(places), np.stack(face), np.stack(every)
+    return Driven(verdict, seconds, *moved, trace.self_occluded[shown], _centers(plant, trace.q))
 
 
 def _centers(plant: Plant, q: FloatArray) -> FloatArray:
     """Centre of the face (k, 3) at joints (k, n), m."""
     found = [center_of(plant.M @ forward_kinematics(plant.model, joints).T, plant.center)[:3] for joints in q]
     return np.reshape(np.array(found, dtype=np.float64), (-1, 3))
-
-
-HEIGHT = 640  # px of the scene
-EYE = 1.75  # distance of the eye, in sizes of the scene
-LOWER = 0.15  # that it looks below the middle, where the names of the axes are
-TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
-DOTS = 9  # on the planned path
-# What is wider than high needs more distance where the page is narrow.
-NEARER = """
-const plot = document.getElementById("{plot_id}");
-const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
-const {x, y, z} = plot.layout.scene.camera.eye;
-Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
-"""
-PAD = 0.03  # around all that is shown, as a share of it
-DIGITS = 4  # of coordinates in m: a tenth of a millimetre
-FRAME_MS = 80
-CAMERA_COLORS = (style.BLUE, style.ORANGE)
-SEEN, HIDDEN = style.SKY, style.VERMILION
-KEY = (
-    ("robot, face at the start", style.BLACK),
-    ("face", SEEN),
-    ("face, hidden from a camera", HIDDEN),
-    ("markers", style.GREY),
-    ("left camera", CAMERA_COLORS[0]),
-    ("right camera", CAMERA_COLORS[1]),
-    ("goal, planned path of the centre", style.PURPLE),
-    ("driven path of the centre", style.GREEN),
-)
-AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
-PLAYING = AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
 
 
 def plotly() -> Any:
@@ -176,23 +144,15 @@ def plotly() -> Any:
     return plotly.graph_objects
 
 
-def write_view(motion: Motion, path: Path, name: str, known: str, page: str) -> None:
-    """Write the view of a run.
-
-    Parameters
-    ----------
-    motion : what it shows.
-    path : file to write.
-    name : of the run.
-    known : where the picture comes from, a sentence.
-    page : the report of the run, as seen from the file.
+def write_view(path: Path, motion: Motion, *, name: str, known: str) -> None:
+    """Write the view of a run of a name beside its report; ``known`` says where the picture comes from.
 
     Raises
     ------
     InputError
         If plotly is not installed or the file cannot be written.
     """
-    scene = figure(motion).to_html(
+    scene = _figure(motion).to_html(
         full_html=False,
         include_plotlyjs=True,
         auto_play=False,
@@ -200,64 +160,47 @@ def write_view(motion: Motion, path: Path, name: str, known: str, page: str) -> 
         div_id="scene",
         post_script=NEARER,
     )
-    text = template("view.html").render(name=name, known=known, page=page, scene=Markup(scene), key=KEY)
+    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=KEY)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
-def figure(motion: Motion) -> Any:
+def _figure(motion: Motion) -> Any:
     """The view as a figure of plotly: what stands still, then four traces a run, and a frame an instant."""
     go = plotly()
     still = [*_still(go, motion)]
-    traces, frames, choices = [*still], [], []
-    for name, run in motion.runs.items():
-        first = len(traces)
+    traces, frames, buttons, chosen = [*still], [], [], []
+    for number, (name, run) in enumerate(motion.runs.items()):
         moving = [_moving(go, run, k) for k in range(len(run.seconds))]
-        own_traces = [*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)]
-        for trace in own_traces:
-            trace.visible = first == len(still)  # a list of all runs chooses another
-        traces += own_traces
         own = [f"{name}/{k}" for k in range(len(moving))]
-        frames += [
-            go.Frame(name=frame, data=data, traces=[first, first + 1, first + 2])
-            for frame, data in zip(own, moving, strict=True)
-        ]
-        choices.append((name, run, own))
-    return go.Figure(traces, _layout(motion, len(still), choices), frames)
-
-
-def _layout(motion: Motion, still: int, choices: list[tuple[str, Driven, list[str]]]) -> dict[str, Any]:
-    """Scene, slider and buttons; the first run is shown.
-
-    Parameters
-    ----------
-    motion : what the view shows.
-    still : number of traces that stand still, the first ones; four a run follow.
-    choices : name, run and names of the frames of each run.
-    """
-    each = 4
-    buttons = []
-    for number, (name, run, own) in enumerate(choices):
-        shown = [True] * still + [k // each == number for k in range(each * len(choices))]
+        place = [len(traces) + k for k in range(3)]
+        frames += [go.Frame(name=n, data=data, traces=place) for n, data in zip(own, moving, strict=True)]
+        for trace in (*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)):
+            trace.visible = number == 0  # a list of all runs chooses another
+            traces.append(trace)
+        shown = [True] * len(still) + [k // 4 == number for k in range(4 * len(motion.runs))]
         changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": _play(own)}
         changed |= {f"scene.{axis}.range": reach for axis, reach in _extent(motion, run).items()}
         buttons.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
-    _, first, own = choices[0]
-    place = {"x": 0.0, "xanchor": "left"}
-    above = place | {"y": 1.0, "yanchor": "bottom", "pad": {"b": 8}}
-    below = place | {"y": 0.0, "yanchor": "top", "pad": {"t": 8}}
-    playing = {"type": "buttons", "direction": "left", "showactive": False, "buttons": _play(own)}
-    return {
+        chosen.append(changed)
+    left = {"x": 0.0, "xanchor": "left"}
+    playing = {"type": "buttons", "direction": "left", "showactive": False}
+    playing["buttons"] = chosen[0]["updatemenus[1].buttons"]
+    layout = {
         "height": HEIGHT,
         "margin": {"l": 10, "r": 10, "t": 60, "b": 10},
         "showlegend": False,  # the page has a key that leaves the scene its room
         "font": {"family": "system-ui, DejaVu Sans, sans-serif", "size": 13, "color": style.BLACK},
         "paper_bgcolor": "#ffffff",
         "uirevision": "kept",  # the view stays as it was turned
-        "scene": _scene(motion, first),
-        "sliders": [_slider(first, own)],
-        "updatemenus": [above | {"buttons": buttons}, below | playing],
+        "scene": _scene(motion, next(iter(motion.runs.values()))),
+        "sliders": chosen[0]["sliders"],
+        "updatemenus": [
+            left | {"y": 1.0, "yanchor": "bottom", "pad": {"b": 8}, "buttons": buttons},
+            left | {"y": 0.0, "yanchor": "top", "pad": {"t": 8}} | playing,
+        ],
     }
+    return go.Figure(traces, layout, frames)
 
 
 def _scene(motion: Motion, run: Driven) -> dict[str, Any]:
@@ -265,13 +208,13 @@ def _scene(motion: Motion, run: Driven) -> dict[str, Any]:
     axis: dict[str, Any] = {"backgroundcolor": "#ffffff", "gridcolor": style.PALE, "showbackground": False}
     towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
     azimuth = float(np.arctan2(towards[1], towards[0])) - np.radians(58.0)
-    scene: dict[str, Any] = {
+    axes = {
         name: axis | {"title": {"text": f"{name[0]} (m)"}, "range": reach}
         for name, reach in _extent(motion, run).items()
     }
     eye = {"x": EYE * np.cos(azimuth), "y": EYE * np.sin(azimuth), "z": 0.5 * EYE}
     camera = {"eye": eye, "center": {"x": 0.0, "y": 0.0, "z": -LOWER}}
-    return scene | {"aspectmode": "data", "camera": camera}
+    return {**axes, "aspectmode": "data", "camera": camera}
 
 
 def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
@@ -282,17 +225,17 @@ def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
     low, high = shown.min(axis=0), shown.max(axis=0)
     pad = PAD * float((high - low).max())
     ranges = np.round(np.stack([low - pad, high + pad], axis=1), DIGITS)
-    return {f"{name}axis": [float(low), float(high)] for name, (low, high) in zip("xyz", ranges, strict=True)}
+    return {f"{name}axis": reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
 
 
 def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
     """A step for each instant; what it is labelled with stands above the slider."""
-    labels = [_label(seconds, hidden) for seconds, hidden in zip(run.seconds, run.hidden, strict=True)]
-    labels[-1] += f", {run.verdict}"
-    steps = [
-        {"label": label, "method": "animate", "args": [[frame], AT_ONCE], "value": frame}
-        for frame, label in zip(own, labels, strict=True)
-    ]
+    steps = []
+    for frame, seconds, hidden in zip(own, run.seconds, run.hidden, strict=True):
+        views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
+        label = f"{seconds:.2f} s" + (f", hidden from {views}" if views else "")
+        label += f", {run.verdict}" if frame == own[-1] else ""
+        steps.append({"label": label, "method": "animate", "args": [[frame], AT_ONCE], "value": frame})
     return {
         "steps": steps,
         "active": 0,
@@ -304,11 +247,6 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
     }
 
 
-def _label(seconds: float, hidden: Any) -> str:
-    from_views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
-    return f"{seconds:.2f} s" + (f", hidden from {from_views}" if from_views else "")
-
-
 def _play(own: list[str]) -> list[dict[str, Any]]:
     return [
         {"label": "▶ play", "method": "animate", "args": [own, PLAYING]},
@@ -317,8 +255,8 @@ def _play(own: list[str]) -> list[dict[str, Any]]:
 
 
 def _still(go: Any, motion: Motion) -> Iterator[Any]:
-    for frustum, name, color in zip(motion.cameras, VIEWS, CAMERA_COLORS, strict=True):
-        apex, corners = frustum[:1], style.closed(frustum[1:])
+    for pyramid, name, color in zip(motion.cameras, VIEWS, CAMERAS, strict=True):
+        apex, corners = pyramid[:1], style.closed(pyramid[1:])
         edges = np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
         yield _line(go, edges, f"{name} camera", color, width=3)
     yield _line(go, style.closed(motion.start), "face at the start", style.BLACK, width=3)
@@ -331,29 +269,25 @@ def _still(go: Any, motion: Motion) -> Iterator[Any]:
 
 def _moving(go: Any, run: Driven, k: int) -> tuple[Any, Any, Any]:
     """Robot, face and markers at one of the instants."""
-    behind = bool(run.hidden[k].any())
     robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
     robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})
-    count = run.face.shape[1]
-    fan = np.arange(1, count - 1)
+    fan = np.arange(1, run.face.shape[1] - 1)
     face = go.Mesh3d(
         **_places(run.face[k]),
-        i=np.zeros(count - 2, dtype=int).tolist(),
+        i=(0 * fan).tolist(),
         j=fan.tolist(),
         k=(fan + 1).tolist(),
-        color=HIDDEN if behind else SEEN,
+        color=HIDDEN if run.hidden[k].any() else SEEN,
         flatshading=True,
         name="face",
         hoverinfo="name",
     )
-    markers = _points(go, run.markers[k], "markers", style.GREY)
-    return robot, face, markers
+    return robot, face, _points(go, run.markers[k], "markers", style.GREY)
 
 
 def _line(go: Any, points: FloatArray, name: str, color: str, **look: Any) -> Any:
-    return go.Scatter3d(
-        **_places(points), mode="lines", line={"color": color} | look, name=name, hoverinfo="name"
-    )
+    line = {"color": color} | look
+    return go.Scatter3d(**_places(points), mode="lines", line=line, name=name, hoverinfo="name")
 
 
 def _points(go: Any, points: FloatArray, name: str, color: str) -> Any:

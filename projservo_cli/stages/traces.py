@@ -9,7 +9,7 @@ from projservo_cli.control.law import TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.compiled import Log
-from projservo_cli.loop.step import Limits, tolerance
+from projservo_cli.loop.step import Limits, plateau_stretch, tolerance
 from projservo_cli.loop.summary import MM, Ends, Summary, angle_between, effort, path_deviation, summary
 from projservo_cli.records import REPLAN, FloatArray, Trace
 from projservo_cli.robots.simulated import Plant
@@ -133,6 +133,7 @@ def record_of(
     hidden = log.hidden[:rows] > 0.5
     outside, beyond, joint = (int(x) for x in log.events[:3])
     # A law that follows a plan measures what is left to where the plan is, not to the goal.
+    stretch = plateau_stretch(log.judged[:rows], limits.plateau_steps)
     remaining = left(log, steps) if mode == REPLAN else (None, None)
     return Trace(
         law=law,
@@ -153,7 +154,7 @@ def record_of(
         center_deviation_at_samples_mm=truth.at_samples_mm,
         path_length_mm=truth.path_mm,
         effort=effort(log, steps, gains.period),
-        plateau_steps=longest_plateau(log.error[:rows], limits.plateau_steps),
+        plateau_steps=0 if stretch is None else stretch[1] - stretch[0],
         speed_limited_steps=int((log.factor[:steps] < 1.0).sum()),
         visibility_limited_steps=int(outcome.limited),
         first_outside_image=outside,
@@ -208,16 +209,6 @@ def rms(squares: FloatArray, count: FloatArray) -> FloatArray:
 def rotation_between(pose: FloatArray, goal: FloatArray) -> float:
     """Angle between the rotations of two poses (4, 4), deg."""
     return math.degrees(angle_between(as_mat(pose), as_mat(goal)))
-
-
-def longest_plateau(image_error: FloatArray, window: int) -> int:
-    """Longest stretch, in steps, in which the image error falls by less than 1 % in ``window`` steps."""
-    flat = image_error[window:] > 0.99 * image_error[:-window]
-    longest = current = 0
-    for value in flat:
-        current = current + 1 if value else 0
-        longest = max(longest, current)
-    return longest + window - 1 if longest else 0
 
 
 def reason_of(verdict: str, log: Log, steps: int, limits: Limits, joint: int, remaining: Remaining) -> str:

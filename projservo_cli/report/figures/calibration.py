@@ -8,7 +8,7 @@ from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.calibration.quality import chi2_quantile
 from projservo_cli.records import BoolArray, Calibration, CrossValidation, FloatArray, Observation
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Fit
+from projservo_cli.report.material import VIEWS, Data, Fit, registered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +32,7 @@ LEFT_OUT: style.Look = {
 MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
 
 
-def data(fit: Fit) -> Data:
+def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
@@ -174,7 +174,18 @@ def magnification(residual: FloatArray, extent: float) -> float:
     return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted * (1.0 + 1e-12)))
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig13_calibration",
+    "What the calibration leaves of the images, and what the data determine",
+    "beside the paper's",
+    7.8,
+    _data,
+    task=False,
+    alt="Residuals as arrows in both images; their histogram beside the noise model; rms residual "
+    "of each pose over its predicted error; range of each joint; eigenvalues of the information "
+    "matrix.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """Residuals over both images; their histogram and error of each pose; excitation and information."""
     from matplotlib.patches import Patch
 

@@ -1,15 +1,25 @@
-"""Fig. 8 of [RH00]: how far the centre drifts from its straight line, for several gains."""
+"""How far the centre drifts from its straight line: for several gains, Fig. 8 of [RH00], and by mode."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.records import FloatArray, Report
+from projservo_cli.records import BoolArray, FloatArray, Report
 from projservo_cli.report import style
-from projservo_cli.report.material import DIRECT, TITLES, Data, Material, Studies
-from projservo_cli.report.measures import along_line, center_path
+from projservo_cli.report.material import (
+    DIRECT,
+    TITLES,
+    Data,
+    Material,
+    Studies,
+    along_line,
+    center_path,
+    registered,
+    title,
+)
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Share of the largest deviation of the best run below which nothing is drawn.
@@ -17,37 +27,35 @@ LEAST_SHARE = 0.05
 PATH_POINTS = 400
 # Runs with a longer joint step, rad or m, wind the arm up: their path is drawn at the instants only.
 WHIRL = np.pi
+# Modes whose largest distances differ by more than this are shown on a logarithmic scale, down to a share
+# of the least of them.
+WIDE, LEAST_OF_MODES = 10.0, 0.02
 
 
-def table(studies: Studies, *, at_samples: bool = False) -> FloatArray:
-    """Largest deviation of the centre, mm, by law, operators (true, calibrated), limit (no, yes), gain.
+def drift_tables(studies: Studies | None) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Largest deviation of the centre, mm, all along and at the samples alone, and what converged.
 
-    NaN where the goal pose is unknown.
+    Each by law, operators (true, calibrated), limit (no, yes) and gain; NaN where the goal pose is unknown.
     """
-    result = np.full((len(DIRECT), 2, 2, len(studies.gains)), np.nan)
-    for (law, operators, limited, gain), trace in studies.sweep.items():
-        value = trace.center_deviation_at_samples_mm if at_samples else trace.center_deviation_mm
-        where = DIRECT.index(law), int(operators == "calibrated"), int(limited), studies.gains.index(gain)
-        result[where] = np.nan if value is None else value
-    return result
+    gains, sweep = (studies.gains, studies.sweep) if studies is not None else ((), {})
+    shape = (len(DIRECT), 2, 2, len(gains))
+    drift, at_samples, converged = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.bool_)
+    for (law, operators, limited, gain), trace in sweep.items():
+        where = DIRECT.index(law), int(operators == "calibrated"), int(limited), gains.index(gain)
+        converged[where] = trace.verdict == "converged"
+        if trace.center_deviation_mm is not None and trace.center_deviation_at_samples_mm is not None:
+            drift[where] = trace.center_deviation_mm
+            at_samples[where] = trace.center_deviation_at_samples_mm
+    return drift, at_samples, converged
 
 
-def converged(studies: Studies) -> np.ndarray[Any, np.dtype[np.bool_]]:
-    """Which runs of the table converged, in its shape."""
-    result = np.zeros((len(DIRECT), 2, 2, len(studies.gains)), dtype=np.bool_)
-    for (law, operators, limited, gain), trace in studies.sweep.items():
-        where = DIRECT.index(law), int(operators == "calibrated"), int(limited), studies.gains.index(gain)
-        result[where] = trace.verdict == "converged"
-    return result
-
-
-def data(material: Material) -> Data:
+def _data(material: Material) -> Data:
     """Paths of the centre with calibrated operators, and the largest deviations of all runs."""
     studies = material.studies
     assert studies is not None
     result: Data = {
         "gain": np.array(studies.gains),
-        "drift_mm": table(studies),
+        "drift_mm": drift_tables(studies)[0],
         "step_limit_deg": np.array(studies.step_limit_deg),
     }
     for law in DIRECT:
@@ -63,7 +71,19 @@ def data(material: Material) -> Data:
     return result
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig08_drift",
+    "Drift of the centre from its straight line",
+    "Fig. 8, section 6",
+    5.2,
+    _data,
+    studies=True,
+    goal=True,
+    alt="For directTHREE and directTWO: distance of the centre from its straight line along the way "
+    "for several gains, and the largest distance over the gain, with true and calibrated "
+    "operators, with and without a limit.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """One row a law: left the paths, right the largest deviation over the gain."""
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
@@ -146,3 +166,46 @@ def drift_rows(report: Report) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _data_modes(material: Material) -> Data:
+    """Way along the line of the centre and distance from it at every instant, mm."""
+    names = material.compared()
+    result: Data = {"names": np.array(names)}
+    for name in names:
+        trace = material.traces[name]
+        way, off = along_line(trace.center, trace.center[0], material.goal_center(trace))
+        result[f"path_mm_{name}"] = 1e3 * np.stack([way, off], axis=1)
+    return result
+
+
+@registered(
+    "fig15_modes_path",
+    "Path of the centre: planning anew in each step, and following the plan",
+    "beside the paper's, after section 4",
+    3.0,
+    _data_modes,
+    modes=True,
+    goal=True,
+    alt="Distance of the centre from its straight line over the way along it, one curve a law and mode.",
+)
+def _draw_modes(data: Data, figure: "Figure") -> None:
+    """Distance of the centre from its line over the way along it, one curve a run."""
+    axes, names = figure.subplots(), [str(name) for name in data["names"]]
+    for i, name in enumerate(names):
+        way, off = data[f"path_mm_{name}"].T
+        axes.plot(way, off, **style.curve(i))
+    axes.set_title("path of the centre")
+    axes.set_xlabel("way along the straight line (mm)")
+    axes.set_ylabel("distance from it (mm)")
+    _log_where_wide(axes, [data[f"path_mm_{name}"][:, 1] for name in names])
+    handles = [style.line_handle(title(name), **style.curve(i)) for i, name in enumerate(names)]
+    style.legend_below(figure, handles, 2)
+
+
+def _log_where_wide(axes: "Axes", values: list[Any]) -> None:
+    """Logarithmic scale where the runs differ much at their largest."""
+    most = [float(np.max(value)) for value in values]
+    if min(most) > 0.0 and max(most) > WIDE * min(most):
+        style.log_scale(axes)
+        axes.set_ylim(bottom=LEAST_OF_MODES * min(most))

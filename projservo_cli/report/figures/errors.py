@@ -6,8 +6,14 @@ import numpy as np
 
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.material import Data, Material
-from projservo_cli.report.measures import center_distance, curve_difference
+from projservo_cli.report.material import (
+    Data,
+    Material,
+    center_distance,
+    curve_difference,
+    percent,
+    registered,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,12 +23,7 @@ if TYPE_CHECKING:
 DECADES = 1e-5
 
 
-def percent(values: FloatArray) -> FloatArray:
-    """Values normalised to 100 at their start; NaN throughout where they start at 0."""
-    return np.asarray(100.0 * values / values[0]) if values[0] != 0 else np.full_like(values, np.nan)
-
-
-def data_two(material: Material) -> Data:
+def _data_two(material: Material) -> Data:
     """Errors of directTWO with calibrated operators, without and with the limit."""
     studies = material.studies
     assert studies is not None
@@ -42,7 +43,17 @@ def _time(trace: Trace) -> FloatArray:
     return np.asarray(trace.period * np.arange(len(trace.tau)))
 
 
-def draw_two(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig09_errors_two",
+    "Control errors of directTWO, without and with the limit",
+    "Fig. 9, section 6",
+    4.2,
+    _data_two,
+    studies=True,
+    alt="Translation and rotation error of directTWO over time, on a linear and on a logarithmic "
+    "scale, without a limit and with one.",
+)
+def _draw_two(data: Data, figure: "Figure") -> None:
     """Above τ, below θ_s; left as in the paper, right on a logarithmic scale."""
     axes = figure.subplots(2, 2, sharex=True)
     looks: dict[str, style.Look] = {
@@ -76,7 +87,7 @@ def _log(axes: "Axes", start: float) -> None:
     axes.set_ylim(max(start, 1e-3) * DECADES, max(start, 1e-3) * 3.0)
 
 
-def data_three(material: Material) -> Data:
+def _data_three(material: Material) -> Data:
     """Errors of directTHREE with the projective and the metric model, and the true distance.
 
     τ is normalised to 100. In the unit-norm kernel of (8) its scale changes with the joints; scaled
@@ -106,7 +117,18 @@ def data_three(material: Material) -> Data:
     return result
 
 
-def draw_three(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig10_errors_three",
+    "Control errors of directTHREE, projective beside Euclidean model",
+    "Fig. 10, section 6",
+    4.8,
+    _data_three,
+    studies=True,
+    goal=True,
+    alt="Translation and rotation errors of directTHREE over time with the projective and the "
+    "Euclidean model, and the differences between both.",
+)
+def _draw_three(data: Data, figure: "Figure") -> None:
     """Above τ and what separates it from the truth, below the angles and their differences."""
     axes = figure.subplots(2, 2, sharex=True)
     t, t_metric = data["t_s"], data["t_s_metric"]

@@ -4,10 +4,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.material import CLASSICAL, DIRECT, TITLES, VIEWS, Data, Material
-from projservo_cli.report.measures import center_image, plateau_stretch
+from projservo_cli.report.material import (
+    CLASSICAL,
+    DIRECT,
+    TITLES,
+    VIEWS,
+    Data,
+    Material,
+    center_image,
+    registered,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -16,11 +25,10 @@ if TYPE_CHECKING:
 # How far outside an image, as a share of its size, a path is still drawn.
 OUTSIDE = 0.15
 BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
-PLATEAU_WINDOW = 20
 PANEL_WIDTH = 2.9  # inches, of one of two panels beside one another
 
 
-def data_classical(material: Material) -> Data:
+def _data_classical(material: Material) -> Data:
     """Image paths of the classical laws that were run, with their hidden and standing stretches."""
     result: Data = {"image_size": material.plant.image_size}
     for law in CLASSICAL:
@@ -32,7 +40,7 @@ def data_classical(material: Material) -> Data:
 
 
 def _paths(material: Material, trace: Trace) -> Data:
-    stretch = plateau_stretch(trace.image_error, PLATEAU_WINDOW)
+    stretch = plateau_stretch(trace.stop_error, material.plateau_steps)
     return {
         "s": trace.s[:, :, material.plant.order],
         "s_star": trace.s_star[:, material.plant.order],
@@ -41,7 +49,19 @@ def _paths(material: Material, trace: Trace) -> Data:
     }
 
 
-def draw_classical(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig04_classical",
+    "Image trajectories of the classical laws",
+    "Fig. 4, section 6",
+    8.0,
+    _data_classical,
+    laws=CLASSICAL,
+    any_law=True,
+    alt="A row for each classical law, a panel for each camera: the paths of the markers from start "
+    "to goal, with the stretches in which the face is hidden and in which the image error "
+    "stands still.",
+)
+def _draw_classical(data: Data, figure: "Figure") -> None:
     """One row a law, one column a camera."""
     laws = [law for law in CLASSICAL if f"s_{law}" in data]
     shown = [
@@ -108,7 +128,7 @@ def _classical_handles() -> list[object]:
     ]
 
 
-def data_direct(material: Material) -> Data:
+def _data_direct(material: Material) -> Data:
     """Image paths of both direct laws."""
     order = material.plant.order
     first = material.traces[DIRECT[0]]
@@ -116,7 +136,16 @@ def data_direct(material: Material) -> Data:
     return result | {"s_star": first.s_star[:, order]}
 
 
-def draw_direct(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig07_three_two",
+    "directTHREE over directTWO in the images",
+    "Fig. 7, section 6",
+    3.4,
+    _data_direct,
+    laws=DIRECT,
+    alt="Paths of the markers in both camera images under directTHREE and directTWO.",
+)
+def _draw_direct(data: Data, figure: "Figure") -> None:
     """Both laws over one another, one panel a camera."""
     every = np.concatenate([data[f"s_{law}"].reshape(-1, 2) for law in DIRECT])
     figure.set_figheight(PANEL_WIDTH * style.aspect(every) + 1.05)
@@ -141,7 +170,7 @@ def draw_direct(data: Data, figure: "Figure") -> None:
     style.legend_below(figure, handles, 4)
 
 
-def data_errors(material: Material) -> Data:
+def _data_errors(material: Material) -> Data:
     """Image errors of the markers and of the centre under directTHREE, over time."""
     trace = material.traces[DIRECT[0]]
     center = center_image(material, trace)
@@ -156,7 +185,17 @@ def data_errors(material: Material) -> Data:
     }
 
 
-def draw_errors(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig11_image_errors",
+    "Image errors of the markers and of the centre",
+    "Fig. 11, section 6",
+    3.2,
+    _data_errors,
+    laws=DIRECT[:1],
+    goal=True,
+    alt="For each camera: the errors of u and v of every marker and of the centre over time.",
+)
+def _draw_errors(data: Data, figure: "Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick."""
     axes = figure.subplots(1, 2, sharey=True)
     t = data["t_s"]

@@ -6,13 +6,13 @@ import numpy as np
 
 from projservo_cli.records import PRISMATIC
 from projservo_cli.report import style
-from projservo_cli.report.material import Data, Material
+from projservo_cli.report.material import Data, Material, registered
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def data(material: Material) -> Data:
+def _data(material: Material) -> Data:
     """Joints and their steps under directTHREE with calibrated operators, in deg and in mm."""
     studies = material.studies
     assert studies is not None
@@ -29,7 +29,16 @@ def data(material: Material) -> Data:
     return result
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig12_joints",
+    "Joint trajectories without and with the limit",
+    "Fig. 12, section 6",
+    4.8,
+    _data,
+    studies=True,
+    alt="The joints and their steps over time under directTHREE, without a limit and with one.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """Left without, right with the limit; joints above, their steps below, per kind of joint."""
     prismatic = data["prismatic"]
     kinds = [

@@ -6,9 +6,7 @@ import numpy as np
 
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.figures.errors import percent
-from projservo_cli.report.material import TITLES, VIEWS, Data, Material
-from projservo_cli.report.measures import center_image
+from projservo_cli.report.material import TITLES, VIEWS, Data, Material, center_image, percent, registered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +30,7 @@ ERRORS = (
 )
 
 
-def data(material: Material) -> Data:
+def _data(material: Material) -> Data:
     """Paths and image errors of the direct and the stacked law, control errors of the direct one."""
     order = material.plant.order
     direct = material.traces[LAWS[0]]
@@ -57,7 +55,18 @@ def data(material: Material) -> Data:
     return result
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig00_overview",
+    "One run at a look: the classical and the direct law in both images, and their errors",
+    "beside the paper's",
+    5.0,
+    _data,
+    laws=LAWS,
+    alt="Left: paths of the markers in both camera images, from the face at the start to the goal, "
+    "for directTHREE and the stacked law, with the stretches in which the face is hidden. "
+    "Right: control errors of directTHREE and image errors of both laws over time.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """Left the images of both cameras, right the errors."""
     aspect = style.aspect(
         np.concatenate([_shown(data, view) for view in range(2)]), LEAST_ASPECT, MOST_ASPECT

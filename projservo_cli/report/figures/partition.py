@@ -8,7 +8,7 @@ from projservo_cli.geometry.displacement import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import Data, Material
+from projservo_cli.report.material import Data, Material, registered
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 ARC_POINTS = 61
 
 
-def data(material: Material) -> Data:
+def _data(material: Material) -> Data:
     """Images in the left camera of the face, its targets and the paths of the three parts.
 
     A_t is the goal less the translation, A_r the goal less both translation and rotation onto the
@@ -68,7 +68,16 @@ PATH: style.Look = {"color": style.GREY, "linewidth": 0.7}
 AXIS: style.Look = {"color": style.BLACK, "linewidth": 0.8, "linestyle": (0, (8, 3, 1, 3))}
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig01_partition",
+    "The task as a translation, a rotation onto the target plane and one within it",
+    "Fig. 1, section 4.1",
+    3.0,
+    _data,
+    alt="Three panels in the left image: the face moved along a straight line, turned onto the "
+    "target plane, and turned within it.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """Three panels, one a part."""
     axes = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
     _translation(axes[0], data)

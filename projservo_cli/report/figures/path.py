@@ -8,7 +8,7 @@ from projservo_cli.geometry.displacement import exp_rotation
 from projservo_cli.geometry.lens import through
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Material
+from projservo_cli.report.material import VIEWS, Data, Material, registered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,7 @@ MARGINS: dict[str, style.Look] = {
 }
 
 
-def data(material: Material) -> Data:
+def _data(material: Material) -> Data:
     """Margins of both cameras over the unit square, the border distance at the best μ_p, and the path."""
     plan = material.plan
     mu = np.linspace(0.0, 1.0, NODES)
@@ -96,7 +96,14 @@ def border_distance(material: Material, mu: FloatArray) -> FloatArray:
     return result
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig14_path",
+    "Where each camera sees the face, and the planned path among it",
+    "beside the paper's, after section 4.3",
+    6.0,
+    _data,
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """Above the map of each camera with the path, below the shares and the margins along it."""
     axes = figure.subplots(2, 2, height_ratios=[1.5, 1.0])
     for view, name in enumerate(VIEWS):

@@ -8,7 +8,7 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Material
+from projservo_cli.report.material import VIEWS, Data, Material, registered
 from projservo_cli.robots.truth import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
@@ -21,13 +21,13 @@ STEEP = 0.35
 FACES = 9
 
 
-def data_linear(material: Material) -> Data:
+def _data_linear(material: Material) -> Data:
     """The plan of the run, by default with linear shares."""
     plan = material.plan
     return _rendered(material, plan.mu, plan.s, plan.margin, plan.profile)
 
 
-def data_steep(material: Material) -> Data:
+def _data_steep(material: Material) -> Data:
     """The same task with linear shares of the rotations and a steep one of the translation."""
     plan = material.plan
     mu = np.stack([np.minimum(plan.sigma / STEEP, 1.0), plan.sigma, plan.sigma], axis=1)
@@ -86,7 +86,26 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     return result
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig05_planned",
+    "The planned motion from between the cameras",
+    "Fig. 5, section 6",
+    3.6,
+    _data_linear,
+    alt="The face at several moments of the planned motion, seen from between the cameras; beside "
+    "it the shares of translation and rotations that are done and the visibility margin of both "
+    "cameras.",
+)
+@registered(
+    "fig06_planned_steep",
+    "The planned motion with a steep translation",
+    "Fig. 6, section 6",
+    3.6,
+    _data_steep,
+    alt="As the figure before, with a translation that is driven first: the face at several "
+    "moments, the shares of the motions and the visibility margins.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
     from matplotlib import colormaps
 

@@ -7,7 +7,8 @@ import numpy as np
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import Data, Material
+from projservo_cli.report.material import Data, Material, registered
+from projservo_cli.robots.simulated import Plant
 from projservo_cli.robots.truth import camera_center
 from projservo_cli.task.face import center_of
 
@@ -15,10 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Length of the drawn viewing pyramids, as a share of the distance to the face.
-PYRAMID = 0.16
+_PYRAMID = 0.16
 
 
-def data(material: Material) -> Data:
+def _data(material: Material) -> Data:
     """Joints, faces and cameras in metres; the robot at the start as a polyline through its axes."""
     plant, robot, plan = material.plant, material.robot, material.plan
     start = forward_kinematics(plant.model, plan.q_start)
@@ -30,10 +31,7 @@ def data(material: Material) -> Data:
         "face_start": (face @ start.T)[:, :3],
         "cameras": np.stack([camera_center(P) for P in plant.model.P]),
     }
-    distance = np.linalg.norm(result["face_start"].mean(axis=0) - result["cameras"].mean(axis=0))
-    result["pyramids"] = np.stack(
-        [pyramid(P, plant.image_size, PYRAMID * float(distance)) for P in plant.model.P]
-    )
+    result["pyramids"] = pyramids(plant, result["face_start"])
     goal = _goal(material)
     if goal is not None:
         result["face_goal"] = (face @ goal.T)[:, :3]
@@ -72,6 +70,13 @@ def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArra
     return np.array([*points, tool])
 
 
+def pyramids(plant: Plant, face: FloatArray) -> FloatArray:
+    """Viewing pyramids (2, 5, 3) of both cameras, m; their length goes by the distance of a face (m, 3)."""
+    centers = np.stack([camera_center(P) for P in plant.model.P])
+    depth = _PYRAMID * float(np.linalg.norm(face.mean(axis=0) - centers.mean(axis=0)))
+    return np.stack([pyramid(P, plant.image_size, depth) for P in plant.model.P])
+
+
 def pyramid(P: FloatArray, image_size: FloatArray, depth: float) -> FloatArray:
     """Centre and four image corners (5, 3) of a metric camera (3, 4), m, at a depth in front of it."""
     center = camera_center(P)
@@ -83,7 +88,16 @@ def pyramid(P: FloatArray, image_size: FloatArray, depth: float) -> FloatArray:
     return np.concatenate([center[None], center + depth * rays])
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig03_scene",
+    "Robot, stereo rig, and the face at the start and at the goal",
+    "Fig. 3, section 6",
+    4.4,
+    _data,
+    alt="The robot's arm at the start in three dimensions, both cameras, the face at the start and "
+    "at the goal, and the straight line of its centre between them.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """One view in perspective with equal scales."""
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)

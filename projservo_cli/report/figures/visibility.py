@@ -8,7 +8,7 @@ from projservo_cli.geometry.displacement import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Material
+from projservo_cli.report.material import VIEWS, Data, Material, registered
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 ARC_POINTS = 181
 
 
-def data(material: Material) -> Data:
+def _data(material: Material) -> Data:
     """Margins a·O of both cameras over τ and θ_r, their zeros, and the images along both senses.
 
     Margins are relative to the start, so 1 is the face as first seen and 0 a face seen edge-on.
@@ -61,7 +61,16 @@ SENSES: tuple[style.Look, ...] = (
 )
 
 
-def draw(data: Data, figure: "Figure") -> None:
+@registered(
+    "fig02_visibility",
+    "Where the face changes visibility, and both senses of the rotation onto the plane",
+    "Fig. 2, section 4.2",
+    7.4,
+    _data,
+    alt="For each camera: the face turned onto the target plane in both senses, and its visibility "
+    "margin over the angle and over the translation, with the values at which it is zero.",
+)
+def _draw(data: Data, figure: "Figure") -> None:
     """Per camera: the images along both senses of θ_r, and the margin over θ_r and over τ."""
     axes = figure.subplots(3, 2, height_ratios=[1.9, 1.0, 0.9])
     for view, name in enumerate(VIEWS):
