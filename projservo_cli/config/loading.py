@@ -2,21 +2,16 @@
 
 import difflib
 import json
-import math
 import pathlib
-import re
-import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
-from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError, create_model
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from projservo_cli.config.models import Config, problems, written_out
+from projservo_cli.config.models import Config
 from projservo_cli.config.robot import Section
 from projservo_cli.config.yaml_source import MAX_BYTES, MAX_DEPTH, Document, Path, Problem, shortened
 from projservo_cli.records import InputError
@@ -45,101 +40,11 @@ _PHRASES = {
     "value_error": "{error}",
 }
 
-
-MOST = 200  # problems that are looked at; who has more has taken another file
-
-
-def nearest(word: object, valid: Sequence[str]) -> str:
-    """The end of a message: the nearest valid word, or all of them."""
-    close = difflib.get_close_matches(str(word)[:80], valid, n=1, cutoff=0.5)
-    return f"did you mean {close[0]}?" if close else f"valid: {', '.join(valid)}"
-
-
-def translated(model: type[BaseModel], errors: Sequence[ErrorDetails], values: Any) -> Iterator[Problem]:
-    """One problem for each wrong value, whatever number of alternatives pydantic tried on it."""
-    seen: dict[Path, Problem] = {}
-    for error in errors[:MOST]:
-        path = _plain(error["loc"], values)
-        if path in seen and error["type"] != "literal_error":  # of alternatives, the named ones say most
-            continue
-        seen[path] = Problem(path, _phrase(model, error, path))
-    for path, problem in seen.items():
-        inner = any(len(other) > len(path) and other[: len(path)] == path for other in seen)
-        if not inner:  # a list counts only its valid entries, so it also calls itself too short
-            yield problem
-
-
-def _plain(location: Path, values: Any) -> Path:
-    """The path without the names of alternatives that pydantic puts in it."""
-    path: list[str | int] = []
-    for step in location:
-        holds = (isinstance(values, Mapping) and step in values) or (
-            isinstance(values, list) and isinstance(step, int) and step < len(values)
-        )
-        if holds:
-            values = values[step]
-        elif not isinstance(values, (Mapping, list)):
-            continue
-        else:
-            values = None
-        path.append(step)
-    return tuple(path)
-
-
-def _phrase(model: type[BaseModel], error: ErrorDetails, path: Path) -> str:
-    kind, context = error["type"], error.get("ctx", {})
-    if kind == "extra_forbidden":
-        return f"unknown key; {nearest(path[-1], valid_keys(model, path[:-1]))}"
-    if kind == "string_pattern_mismatch":
-        return f"{_shown(error['input'])} must be letters R and P, one a joint"
-    if kind == "literal_error":
-        valid = [option.strip("'") for option in context["expected"].replace(" or ", ", ").split(", ")]
-        return f"{_shown(error['input'])} is not one of them; {nearest(error['input'], valid)}"
-    phrase = _PHRASES.get(kind, error["msg"]).format(**context)
-    return phrase if kind == "missing" else f"{phrase}{_given(error['input'])}"
-
-
-def _given(value: Any) -> str:
-    """What stands there instead, for short values."""
-    return f", not {_shown(value)}" if isinstance(value, (str, int, float)) or value is None else ""
-
-
-def _shown(value: Any) -> str:
-    """A value as it would stand in YAML, shortened."""
-    return shortened(json.dumps(value) if value is None or isinstance(value, bool) else repr(value), 40)
-
-
-def valid_keys(model: type[BaseModel], path: Path) -> list[str]:
-    """Keys that the mapping at ``path`` may have; none where there is no mapping of known keys."""
-    current: Any = model
-    for step in path:
-        current = _inside(current, step)
-    return sorted(current.model_fields) if current is not None else []
-
-
-def _inside(current: Any, step: str | int) -> Any:
-    """The model found under one step of a path, through optional values and lists."""
-    if current is None or (isinstance(step, str) and step not in current.model_fields):
-        return None
-    if isinstance(step, int):
-        return current
-    return _model(current.model_fields[step].annotation)
-
-
-def _model(annotation: Any) -> Any:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    if typing.get_origin(annotation) in (tuple, typing.Union, types.UnionType):
-        return next((found for found in map(_model, typing.get_args(annotation)) if found), None)
-    return None
-
-
 # Values that name files, relative to the configuration.
-FILES = (("data", "table"), ("calibration", "init"))
-
-
+_FILES = (("data", "table"), ("calibration", "init"))
 _DIGITS = 9  # of a position in a list
-MOST_LINES = 50  # that are told of what is wrong
+_MOST = 200  # problems that are looked at; who has more has taken another file
+_Model = TypeVar("_Model", bound=Section)
 
 
 @dataclass(frozen=True)
@@ -201,23 +106,19 @@ def load_config(
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
     document = Document("" if path is None else read_text(path) if text is None else text, str(path or ""))
-    found = list(document.problems)
-    values = document.values
-    if values is None:
-        values = {}
-    if not isinstance(values, dict):
+    if document.values is None:
+        document.values = {}
+    if not isinstance(document.values, dict):
         raise InputError(f"{document.place(())}: expected keys and values such as name: paper")
-    if path is not None and not values and not found:
-        found.append(Problem((), "the configuration is empty; start from one of the shipped ones"))
+    if path is not None and not document.values and not document.problems:
+        what = "the configuration is empty; start from one of the shipped ones"
+        document.problems.append(Problem((), what))
+    _spell_out(document.values)
     for change in changes:
-        written_out(values)
-        found += apply_overrides(values, [change], document)
-    written_out(values)
-    if not any(problem.path == () for problem in found):
-        found += _defects(_defaults(values, path))
-    if found:
-        raise InputError("\n".join(problem_lines(document, found)))
-    return Config.model_validate(values)
+        document.override(change.path, change.value, change.flag)
+        _spell_out(document.values)
+    _fill_in(document.values, path)
+    return validated(Config, document)
 
 
 def read_text(path: pathlib.Path | str) -> str:
@@ -235,101 +136,91 @@ def read_text(path: pathlib.Path | str) -> str:
         raise InputError(f"{path}: not UTF-8 text; expected a YAML configuration") from error
 
 
-def apply_overrides(values: dict[str, Any], changes: Sequence[Override], document: Document) -> list[Problem]:
-    """Set values in place, in order; what could not be set."""
-    problems = [_apply(values, change, document) for change in changes]
-    return [problem for problem in problems if problem]
+def validated(model: type[_Model], document: Document) -> _Model:
+    """The configuration that a document holds; an InputError with all that is wrong with it."""
+    found = document.problems
+    try:
+        if all(problem.path for problem in found):  # of a text that is none, nothing more can be said
+            config = model.model_validate(document.values)
+    except ValidationError as error:
+        found = [*found, *_translated(model, error.errors(include_url=False))]
+    if found:
+        raise document.refused(found)
+    return config
 
 
-def _apply(values: dict[str, Any], change: Override, document: Document) -> Problem | None:
-    """Set one value in place, making the mappings on the way to it."""
-    holder: Any = values
-    for i, step in enumerate(change.path):
-        last = i == len(change.path) - 1
-        here = change.path[: i + 1]
-        if isinstance(holder, list):
-            if not isinstance(step, int) or step >= len(holder):
-                return Problem(here, f"expected a list position from 0 to {len(holder) - 1}", change.flag)
-        elif isinstance(holder, dict):
-            step = str(step)
-        else:
-            return Problem(here, "there is a plain value where a section is expected", change.flag)
-        if last:
-            holder[step] = change.value
-            document.overridden(here, change.flag)
-        elif isinstance(holder, dict) and holder.get(step) is None:
-            holder[step] = {}
-            document.overridden(here, change.flag)
-        holder = holder[step]
-    return None
+def _spell_out(values: dict[str, Any]) -> None:
+    """Replace ``plant: module:Class`` and ``law: module:Class`` by the keys they stand for."""
+    if isinstance(values.get("plant"), str):
+        values["plant"] = {"use": values["plant"]}
+    control = values.setdefault("control", {}) if isinstance(values.get("law"), str) else None
+    if isinstance(control, dict) and "laws" not in control:
+        control["laws"] = [values.pop("law")]
 
 
-def _defaults(values: dict[str, Any], path: pathlib.Path | str | None) -> dict[str, Any]:
+def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
     """Fill the name from the file and make the paths of files absolute."""
     base = pathlib.Path(path).parent if path is not None else pathlib.Path()
-    for section, key in FILES:
+    for section, key in _FILES:
         part = values.get(section)
         if isinstance(part, dict) and isinstance(part.get(key), str) and part[key]:
             part[key] = str((base / part[key]).resolve())
     data = values.get("data")
     table = data.get("table") if isinstance(data, dict) else None
-    if isinstance(table, str) and table:
-        values.setdefault("name", pathlib.Path(table).stem)
-    if path is not None:
-        values.setdefault("name", pathlib.Path(path).stem)
-    return values
+    for file in (table, path):
+        if isinstance(file, (str, pathlib.Path)) and str(file):
+            values.setdefault("name", pathlib.Path(file).stem)
 
 
-def _defects(values: dict[str, Any]) -> Iterable[Problem]:
-    """Check each section by itself, then what must hold between the well-formed ones."""
-    found: list[Problem] = []
-    good = SimpleNamespace()
-    broken = set()
-    for name in Config.model_fields:
-        section = _alone(name)
-        part = {name: values[name]} if name in values else {}
-        try:
-            setattr(good, name, getattr(section.model_validate(part), name))
-        except ValidationError as error:
-            broken.add(name)
-            found += translated(Config, error.errors(include_url=False), part)
-    unknown = [key for key in values if key not in Config.model_fields]
-    found += [Problem((key,), _unknown(key, values)) for key in unknown[:MOST]]
-    return found + [Problem(path, what) for path, what in problems(good, frozenset(broken))]
+def _translated(model: type[Section], errors: Sequence[ErrorDetails]) -> Iterator[Problem]:
+    """What pydantic found, in words."""
+    places = [error["loc"] for error in errors]
+    for error, place in list(zip(errors, places, strict=True))[:_MOST]:
+        inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
+        if not (inside and error["type"] == "too_short"):  # a list counts only its valid entries
+            yield Problem(place, _phrase(model, error))
 
 
-def _unknown(key: str, values: dict[str, Any]) -> str:
-    if key == "law":  # else it would have been written out
-        text = isinstance(values[key], str)
-        return "control.laws is set as well; keep one" if text else "must be the name of one law"
-    return f"unknown key; {nearest(key, sorted(Config.model_fields))}"
+def _phrase(model: type[Section], error: ErrorDetails) -> str:
+    kind, path, given = error["type"], error["loc"], error["input"]
+    context = error.get("ctx", {})
+    if kind == "extra_forbidden":
+        if path == ("law",):  # else it would have been spelt out
+            both = isinstance(given, str)
+            return "control.laws is set as well; keep one" if both else "must be the name of one law"
+        return f"unknown key; {_nearest(path[-1], _keys_at(model, path[:-1]))}"
+    if kind == "string_pattern_mismatch":
+        return f"{_shown(given)} must be letters R and P, one a joint"
+    if kind == "literal_error":
+        valid = [option.strip("'") for option in context["expected"].replace(" or ", ", ").split(", ")]
+        return f"{_shown(given)} is not one of them; {_nearest(given, valid)}"
+    phrase = _PHRASES.get(kind, error["msg"]).format(**context)
+    plain = isinstance(given, (str, int, float)) or given is None
+    return f"{phrase}, not {_shown(given)}" if plain and kind != "missing" else phrase
 
 
-@cache
-def _alone(name: str) -> type[Section]:
-    """A model of one section by itself."""
-    field = Config.model_fields[name]
-    definition: dict[str, Any] = {name: (field.annotation, field)}
-    return create_model("Part", __base__=Section, **definition)
+def _shown(value: Any) -> str:
+    """A value as it would stand in YAML, shortened."""
+    return shortened(json.dumps(value) if value is None or isinstance(value, bool) else repr(value), 40)
 
 
-def problem_lines(document: Document, found: Sequence[Problem]) -> list[str]:
-    """One line a problem, flags last, otherwise in the order of the file; of very many the first."""
-    placed = [(problem.source or document.place(problem.path), problem) for problem in found]
-    placed.sort(key=lambda item: _position(item[0]))
-    lines = [
-        ": ".join(part for part in (place, _dotted(problem.path), shortened(problem.what, 1000)) if part)
-        for place, problem in placed
-    ]
-    different = list(dict.fromkeys(lines))
-    left = len(different) - MOST_LINES
-    return [*different[:MOST_LINES], f"{document.name}: and {left} more"] if left > 0 else different
+def _nearest(word: object, valid: Sequence[str]) -> str:
+    """The end of a message: the nearest valid word, or all of them."""
+    close = difflib.get_close_matches(str(word)[:80], valid, n=1, cutoff=0.5)
+    return f"did you mean {close[0]}?" if close else f"valid: {', '.join(valid)}"
 
 
-def _dotted(path: Path) -> str:
-    return shortened(".".join(map(str, path)), 200)
+def _keys_at(model: type[BaseModel], path: Path) -> list[str]:
+    """Keys that the mapping at ``path`` may have."""
+    for step in path:
+        if step in model.model_fields:  # else a position in a list, or any key of a mapping
+            model = next(_models(model.model_fields[str(step)].annotation), model)
+    return sorted(model.model_fields)
 
 
-def _position(place: str) -> tuple[float, float]:
-    numbers = re.search(r":(\d+):(\d+)$", place)
-    return (float(numbers[1]), float(numbers[2])) if numbers else (math.inf, math.inf)
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The model of a value, through optional values, lists and mappings."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in typing.get_args(annotation):
+        yield from _models(part)

@@ -1,17 +1,21 @@
 """The configuration as a whole; every key has its unit in its name."""
 
+import inspect
 import json
 import math
-from collections.abc import Callable, Iterator
-from typing import Annotated, Any, Literal
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
+    ModelWrapValidatorHandler,
     Strict,
     StringConstraints,
+    ValidationError,
     WithJsonSchema,
     model_validator,
 )
@@ -19,9 +23,9 @@ from pydantic_core import PydanticCustomError
 
 from projservo_cli.config.robot import (
     Count,
+    Finding,
     JointVector,
     Markers,
-    Modes,
     NotNegative,
     Number,
     Positive,
@@ -31,8 +35,10 @@ from projservo_cli.config.robot import (
     Vector2,
     Vector3,
     Whole,
+    together,
+    unknown_markers,
 )
-from projservo_cli.records import LAWS, REPLAN
+from projservo_cli.records import LAWS, MODES, REPLAN
 from projservo_cli.robots import plugins
 
 
@@ -55,6 +61,11 @@ class Bump(Section):
     by_m: Number | None = Field(None, description="how far, a prismatic joint")
     read: Annotated[bool, Strict()] = Field(True, description="whether its reading follows")
 
+    def contradictions(self) -> Iterator[Finding]:
+        """An angle and a distance, or neither."""
+        if (self.by_deg is None) == (self.by_m is None):
+            yield (), "give exactly one of by_deg and by_m"
+
 
 class FrozenJoint(Section):
     """A joint whose reading stands still while it moves."""
@@ -73,307 +84,6 @@ class Disturbance(Section):
     delay_periods: Annotated[int, Strict(), Field(ge=0, le=1000)] = Field(
         0, description="by how many periods images are late"
     )
-
-
-Path = tuple[str | int, ...]
-Finding = tuple[Path, str]
-Check = Callable[[Any], Iterator[Finding]]
-
-_CHECKS: list[tuple[tuple[str, ...], Check]] = []
-TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
-
-
-def _needs(*sections: str) -> Callable[[Check], Check]:
-    def register(check: Check) -> Check:
-        _CHECKS.append((sections, check))
-        return check
-
-    return register
-
-
-def problems(config: Any, broken: frozenset[str] = frozenset()) -> list[Finding]:
-    """Everything inconsistent in ``config``, leaving out checks that read a ``broken`` section."""
-    return [
-        finding for sections, check in _CHECKS if broken.isdisjoint(sections) for finding in check(config)
-    ]
-
-
-@_needs("robot")
-def _robot(config: Any) -> Iterator[Finding]:
-    robot = config.robot
-    if robot is None:
-        return
-    if (robot.dh is None) == (robot.screws is None):
-        yield ("robot",), "give exactly one of dh and screws"
-        return
-    kind = "dh" if robot.dh is not None else "screws"
-    for i, joint in enumerate(robot.joints):
-        yield from _limits(("robot", kind, "joints", i), joint)
-    if robot.dh is not None:
-        yield from _rigid(("robot", "dh", "tool"), robot.dh.tool)
-        return
-    yield from _rigid(("robot", "screws", "base_tool"), robot.screws.base_tool)
-    for i, joint in enumerate(robot.screws.joints):
-        yield from _screw(("robot", "screws", "joints", i), joint)
-
-
-def _limits(path: Path, joint: Any) -> Iterator[Finding]:
-    given = [name for name in ("limits_deg", "limits_rad", "limits_m") if getattr(joint, name) is not None]
-    if len(given) > 1:
-        yield (*path, given[1]), f"{given[0]} is set as well; keep one"
-    for name in given:
-        if (name == "limits_m") != (joint.type == "P"):
-            units = "limits_m" if joint.type == "P" else "limits_deg or limits_rad"
-            yield (*path, name), f"a joint of type {joint.type} takes {units}"
-        low, high = getattr(joint, name)
-        if not low < high:
-            yield (*path, name), f"the lower limit {low:g} must be below the upper limit {high:g}"
-
-
-def _rigid(path: Path, matrix: Any) -> Iterator[Finding]:
-    rows = [row[:3] for row in matrix[:3]]
-    products = [[sum(a * b for a, b in zip(u, v, strict=True)) for u in rows] for v in rows]
-    apart = max(abs(products[i][j] - (i == j)) for i in range(3) for j in range(3))
-    if tuple(matrix[3]) != (0, 0, 0, 1):
-        yield path, "the last row must be [0, 0, 0, 1]"
-    elif apart > TOLERANCE or _determinant(rows) < 0:
-        yield path, "the upper left 3×3 block must be a rotation, written with seven digits or more"
-
-
-def _determinant(rows: Any) -> float:
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
-
-
-def _screw(path: Path, joint: Any) -> Iterator[Finding]:
-    axis = "w" if joint.type == "R" else "v"
-    length = math.hypot(*getattr(joint, axis))
-    if abs(length - 1) > TOLERANCE:
-        yield (*path, axis), f"must be of unit length for a joint of type {joint.type}, it is {length:g}"
-    if joint.type == "P" and math.hypot(*joint.w) > TOLERANCE:
-        yield (*path, "w"), "must be zero for a joint of type P"
-    if joint.type == "R" and abs(sum(a * b for a, b in zip(joint.w, joint.v, strict=True))) > TOLERANCE:
-        yield (*path, "v"), "must be orthogonal to w: a revolute joint has no pitch"
-
-
-@_needs("rig")
-def _rig(config: Any) -> Iterator[Finding]:
-    if config.rig is None:
-        return
-    if 0 in config.rig.image_size_px:
-        yield ("rig", "image_size_px"), "width and height must be greater than 0"
-    for side in ("left", "right"):
-        yield from _camera(("rig", side), getattr(config.rig, side))
-
-
-def _camera(path: Path, camera: Any) -> Iterator[Finding]:
-    wanted = ("focal_px", "principal_point_px", "position_m", "target_m")
-    given = [name for name in wanted if getattr(camera, name) is not None]
-    if camera.matrix is not None:
-        if given:
-            yield (*path, given[0]), "matrix is set as well; keep one description of the camera"
-        scale = max(abs(value) for row in camera.matrix for value in row)
-        if scale == 0 or abs(_determinant([row[:3] for row in camera.matrix])) < 1e-12 * scale**3:
-            yield (*path, "matrix"), "its left 3×3 block is singular: no finite pinhole camera"
-        return
-    if len(given) < len(wanted):
-        missing = ", ".join(name for name in wanted if name not in given)
-        yield (
-            path,
-            f"give matrix, or all of {', '.join(wanted)}" + (f" (missing: {missing})" if given else ""),
-        )
-        return
-    sight = [b - a for a, b in zip(camera.position_m, camera.target_m, strict=True)]
-    length, up = math.hypot(*sight), math.hypot(*camera.up)
-    if length == 0:
-        yield (*path, "target_m"), "is the position of the camera; it must look somewhere"
-    elif up == 0 or abs(sum(a * b for a, b in zip(sight, camera.up, strict=True))) > (1 - 1e-9) * length * up:
-        yield (*path, "up"), "must not be zero or along the line of sight"
-
-
-@_needs("markers")
-def _markers(config: Any) -> Iterator[Finding]:
-    markers = config.markers
-    if markers is None:
-        return
-    known = markers.known
-    if known is not None:
-        if markers.positions_m is not None and len(known) != len(markers.positions_m):
-            yield ("markers", "numbers"), f"{len(known)} numbers for {len(markers.positions_m)} positions_m"
-        if len(set(known)) < len(known):
-            yield ("markers", "numbers"), "a number stands here twice"
-        for i, number in enumerate(markers.face or ()):
-            if number not in known:
-                yield ("markers", "face", i), f"there is no marker {number}; markers: {_listed(known)}"
-    if markers.face is not None and markers.center not in ("midpoint", *markers.face):
-        yield (
-            ("markers", "center"),
-            f"marker {markers.center} is not on the face; face: {_listed(markers.face)}",
-        )
-    if markers.face is not None and len(set(markers.face)) < len(markers.face):
-        yield ("markers", "face"), "a marker stands here twice"
-
-
-def _listed(numbers: Any) -> str:
-    shown = ", ".join(map(str, numbers[:20]))
-    return shown + (" …" if len(numbers) > 20 else "")
-
-
-@_needs("robot", "rig", "markers", "task", "calibration", "data")
-def _enough(config: Any) -> Iterator[Finding]:
-    if config.data is not None:
-        return
-    reason = "is missing; a simulated run needs it (a recorded one sets data.table)"
-    if config.robot is None:
-        yield ("robot",), reason
-    if config.rig is None:
-        yield ("rig",), reason
-    if config.markers is None or config.markers.positions_m is None:
-        yield ("markers", "positions_m"), reason
-    if config.task is None and config.calibration.reference is None:
-        yield ("task",), "is missing; a simulated run needs it, or calibration.reference"
-
-
-@_needs("calibration")
-def _only_refined(config: Any) -> Iterator[Finding]:
-    settings = config.calibration
-    for key in ("cross_validate", "init"):
-        if getattr(settings, key) is not None and settings.method != "refined":
-            yield ("calibration", key), f"belongs to the method refined, not to {settings.method}"
-
-
-@_needs("robot", "data")
-def _same_joints(config: Any) -> Iterator[Finding]:
-    if config.data is None or config.data.joints is None or config.robot is None:
-        return
-    types = config.robot.joint_types
-    if types and types != config.data.joints:
-        yield ("data", "joints"), f"{config.data.joints} are not the joints of the robot, {types}"
-
-
-@_needs("robot", "data", "calibration", "task")
-def _joint_vectors(config: Any) -> Iterator[Finding]:
-    types = config.data.joints if config.data and config.data.joints else None
-    if types is None and config.robot is not None:
-        types = config.robot.joint_types
-    vectors: list[tuple[Path, Any, bool]] = [
-        (("calibration", "reference"), config.calibration.reference, True),
-    ]
-    if config.robot is not None and config.robot.screws is not None:
-        vectors.append((("robot", "screws", "reference"), config.robot.screws.reference, False))
-    if config.task is not None:
-        vectors.append((("task", "start"), config.task.start, True))
-        vectors.append((("task", "start_offset"), config.task.start_offset, False))
-        vectors.append((("task", "goal", "joints"), config.task.goal.joints, False))
-    for path, vector, limited in vectors:
-        if vector is None or not types:
-            continue
-        if len(vector.joints) != len(types):
-            yield (*path, "joints"), f"{len(vector.joints)} values for {len(types)} joints ({types})"
-        elif limited and config.robot is not None and config.robot.joint_types == types:
-            yield from _within(path, vector.values(types), config.robot)
-
-
-def _within(path: Path, values: tuple[float, ...], robot: Any) -> Iterator[Finding]:
-    for i, (value, joint) in enumerate(zip(values, robot.joints, strict=True)):
-        low, high = joint.limits
-        if low <= value <= high or any(_limits((), joint)):  # limits that are wrong themselves limit nothing
-            continue
-        turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
-        yield (
-            (*path, "joints", i),
-            f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}, "
-            f"{turn(low):.6g} to {turn(high):.6g} {unit}",
-        )
-
-
-@_needs("task")
-def _goal(config: Any) -> Iterator[Finding]:
-    if config.task is None:
-        return
-    goal = config.task.goal
-    kinds = [name for name in ("joints", "turn_deg", "images") if getattr(goal, name) is not None]
-    if len(kinds) != 1:
-        given = f", not {' and '.join(kinds)}" if kinds else ""
-        yield ("task", "goal"), f"give exactly one of joints, turn_deg and images{given}"
-    if goal.perturbation is not None and goal.turn_deg is None:
-        yield ("task", "goal", "perturbation"), "belongs to a goal given by turn_deg"
-
-
-@_needs("task", "markers")
-def _goal_images(config: Any) -> Iterator[Finding]:
-    if config.task is None or config.task.goal.images is None:
-        return
-    path = ("task", "goal", "images")
-    if config.markers is None or config.markers.face is None:
-        yield path, "needs markers.face, whose markers these pixels are"
-        return
-    for side in ("left", "right"):
-        pixels = getattr(config.task.goal.images, side)
-        if len(pixels) != len(config.markers.face):
-            yield (
-                (*path, side),
-                f"{len(pixels)} pixels for the {len(config.markers.face)} markers of the face",
-            )
-
-
-@_needs("disturbance", "plant", "robot", "markers")
-def _disturbance(config: Any) -> Iterator[Finding]:
-    given = config.disturbance
-    wanted = [name for name in ("lost_markers", "bump", "frozen_joint") if getattr(given, name) is not None]
-    if config.plant.use is not None and (wanted or given.delay_periods):
-        yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
-    types = config.robot.joint_types if config.robot is not None else None
-    for name in ("bump", "frozen_joint"):
-        if name in wanted and types and getattr(given, name).joint > len(types):
-            yield ("disturbance", name, "joint"), f"the robot has {len(types)} joints, counted from 1"
-    if given.bump is not None:
-        yield from _bump(given.bump, types)
-    known = config.markers.known if config.markers is not None else None
-    lost = given.lost_markers.markers if given.lost_markers is not None else None
-    for i, number in enumerate(lost or ()):
-        if known is not None and number not in known:
-            yield (
-                ("disturbance", "lost_markers", "markers", i),
-                f"there is no marker {number}; markers: {_listed(known)}",
-            )
-
-
-def _bump(bump: Any, types: str | None) -> Iterator[Finding]:
-    if (bump.by_deg is None) == (bump.by_m is None):
-        yield ("disturbance", "bump"), "give exactly one of by_deg and by_m"
-    elif types and bump.joint <= len(types):
-        fitting = "by_deg" if types[bump.joint - 1] == "R" else "by_m"
-        if getattr(bump, fitting) is None:
-            yield (
-                ("disturbance", "bump"),
-                f"joint {bump.joint} is of type {types[bump.joint - 1]}: give {fitting}",
-            )
-
-
-@_needs("control", "trajectory")
-def _plan_to_follow(config: Any) -> Iterator[Finding]:
-    control = config.control
-    limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
-    if any(mode != REPLAN for mode in control.mode) and {*limits, config.trajectory.duration_s} == {None}:
-        yield (
-            ("control", "mode"),
-            "follows the plan in time, and nothing gives it one: set trajectory.duration_s, or a limit with "
-            "control.joint_speed_limit_deg_s",
-        )
-
-
-@_needs("control")
-def _gains(config: Any) -> Iterator[Finding]:
-    control = config.control
-    for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain"):
-        product = getattr(control, name) * control.period_s
-        if product >= 1:
-            yield (
-                ("control", name),
-                f"gain · period_s is {product:.3g}; it must stay below 1 for the loop to be stable "
-                f"(below {1 / control.period_s:.3g} 1/s at this period)",
-            )
 
 
 def _law(name: str) -> str:
@@ -420,17 +130,17 @@ class Options(BaseModel):
         return dict(self.model_extra or {})
 
 
-def written_out(values: dict[str, Any]) -> None:
-    """Replace ``plant: module:Class`` and ``law: module:Class`` by the keys they stand for."""
-    if isinstance(values.get("plant"), str):
-        values["plant"] = {"use": values["plant"]}
-    control = values.setdefault("control", {}) if isinstance(values.get("law"), str) else None
-    if isinstance(control, dict) and "laws" not in control:
-        control["laws"] = [values.pop("law")]
+def _list(value: Any) -> Any:
+    return [value] if isinstance(value, str) else value
 
 
-Profile = Literal[
-    "linear", "exponential", "rotation_first", "translation_first", "planar_first", "constrained"
+_MODE = {"enum": list(MODES)}
+# One mode may stand for a list of it.
+_Modes = Annotated[
+    tuple[Literal["replan", "track", "image_track"], ...],
+    BeforeValidator(_list),
+    Field(min_length=1),
+    WithJsonSchema({"anyOf": [_MODE, {"type": "array", "items": _MODE, "minItems": 1}]}),
 ]
 
 
@@ -470,6 +180,12 @@ class CalibrationSettings(Section):
     lens: Annotated[bool, Strict()] = Field(
         False, description="whether to estimate two coefficients of radial distortion a camera"
     )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """What another method takes."""
+        for key in ("cross_validate", "init"):
+            if getattr(self, key) is not None and self.method != "refined":
+                yield (key,), f"belongs to the method refined, not to {self.method}"
 
 
 class Data(Section):
@@ -516,6 +232,15 @@ class Goal(Section):
     )
     images: GoalImages | None = Field(None, description="pixels of the face, recorded at the goal")
 
+    def contradictions(self) -> Iterator[Finding]:
+        """No goal, or several."""
+        kinds = [name for name in ("joints", "turn_deg", "images") if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            given = f", not {' and '.join(kinds)}" if kinds else ""
+            yield (), f"give exactly one of joints, turn_deg and images{given}"
+        if self.perturbation is not None and self.turn_deg is None:
+            yield ("perturbation",), "belongs to a goal given by turn_deg"
+
 
 class Task(Section):
     """A reaching task from ``start`` to ``goal``.
@@ -533,7 +258,9 @@ class Task(Section):
 class Trajectory(Section):
     """How the planned motion is spread over σ in [0, 1], and what the profile ``constrained`` keeps to."""
 
-    profile: Profile = Field("linear", description="which part is driven when")
+    profile: Literal[
+        "linear", "exponential", "rotation_first", "translation_first", "planar_first", "constrained"
+    ] = Field("linear", description="which part is driven when")
     delta: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = Field(
         0.9, description="share of the translation at which visibility changes that is kept to"
     )
@@ -568,7 +295,7 @@ class Control(Section):
         min_length=1,
         description="laws to run, each from the start; module:Class for a law of yours",
     )
-    mode: Modes = Field(
+    mode: _Modes = Field(
         ("replan",),
         description="whether each step plans anew or the plan is followed; with a list, each law in those "
         "of the modes that it has",
@@ -596,6 +323,17 @@ class Control(Section):
         description="what direct laws measure with: the face's points or all visible markers; "
         "null for body where the calibration is usable",
     )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Gains that overshoot."""
+        for name in ("gain_t", "gain_r", "gain_p", "gain_s", "gain"):
+            product = getattr(self, name) * self.period_s
+            if product >= 1:
+                yield (
+                    (name,),
+                    f"gain · period_s is {product:.3g}; it must stay below 1 for the loop to be stable "
+                    f"(below {1 / self.period_s:.3g} 1/s at this period)",
+                )
 
 
 class PlantSettings(Section):
@@ -657,6 +395,139 @@ def folder_name(name: str) -> str:
     return name
 
 
+def _joint_types(robot: Robot | None, data: Data | None) -> str:
+    """One letter a joint, R or P; empty where only the table tells how many there are."""
+    if data is not None and data.joints is not None:
+        return data.joints
+    return robot.joint_types if robot is not None else ""
+
+
+def _same_joints(robot: Robot | None, data: Data | None) -> Iterator[Finding]:
+    given = _joint_types(robot, data)
+    if robot is not None and given != robot.joint_types:
+        yield ("data", "joints"), f"{given} are not the joints of the robot, {robot.joint_types}"
+
+
+def _reference(robot: Robot | None, data: Data | None, calibration: CalibrationSettings) -> Iterator[Finding]:
+    yield from _readings(calibration.reference, robot, data, "calibration", "reference")
+    yield from _within(calibration.reference, robot, "calibration", "reference")
+
+
+def _ends(robot: Robot | None, data: Data | None, task: Task | None) -> Iterator[Finding]:
+    if task is not None:
+        yield from _readings(task.start, robot, data, "task", "start")
+        yield from _within(task.start, robot, "task", "start")
+        yield from _readings(task.start_offset, robot, data, "task", "start_offset")
+        yield from _readings(task.goal.joints, robot, data, "task", "goal", "joints")
+
+
+def _readings(
+    vector: JointVector | None, robot: Robot | None, data: Data | None, *path: str
+) -> Iterator[Finding]:
+    types = _joint_types(robot, data)
+    if vector is not None and types:
+        yield from vector.miscounted(types, *path)
+
+
+def _within(vector: JointVector | None, robot: Robot | None, *path: str) -> Iterator[Finding]:
+    """Readings beyond the limits of the robot."""
+    if vector is None or robot is None or len(vector.joints) != len(robot.joints):
+        return
+    for i, (value, joint) in enumerate(zip(vector.values(robot.joint_types), robot.joints, strict=True)):
+        low, high = joint.limits
+        if not low <= value <= high:
+            turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
+            yield (
+                (*path, "joints", i),
+                f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}, "
+                f"{turn(low):.6g} to {turn(high):.6g} {unit}",
+            )
+
+
+def _goal_images(task: Task | None, markers: Markers | None) -> Iterator[Finding]:
+    if task is None or task.goal.images is None:
+        return
+    path = ("task", "goal", "images")
+    if markers is None or markers.face is None:
+        yield path, "needs markers.face, whose markers these pixels are"
+        return
+    for side, pixels in task.goal.images:
+        if len(pixels) != len(markers.face):
+            what = f"{len(pixels)} pixels for the {len(markers.face)} markers of the face"
+            yield (*path, side), what
+
+
+def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Finding]:
+    if plant.use is not None and disturbance != Disturbance():
+        yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
+
+
+def _disturbed_joints(disturbance: Disturbance, robot: Robot | None) -> Iterator[Finding]:
+    if robot is None:
+        return
+    types, bump = robot.joint_types, disturbance.bump
+    for name, event in (("bump", bump), ("frozen_joint", disturbance.frozen_joint)):
+        if event is not None and event.joint > len(types):
+            yield ("disturbance", name, "joint"), f"the robot has {len(types)} joints, counted from 1"
+    if bump is not None and bump.joint <= len(types):
+        letter = types[bump.joint - 1]
+        fitting = "by_deg" if letter == "R" else "by_m"
+        if getattr(bump, fitting) is None:
+            yield ("disturbance", "bump"), f"joint {bump.joint} is of type {letter}: give {fitting}"
+
+
+def _lost_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Finding]:
+    lost = disturbance.lost_markers
+    if lost is not None and lost.markers is not None and markers is not None and markers.known is not None:
+        yield from unknown_markers(lost.markers, markers.known, "disturbance", "lost_markers", "markers")
+
+
+def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Finding]:
+    limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
+    if any(mode != REPLAN for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
+        yield (
+            ("control", "mode"),
+            "follows the plan in time, and nothing gives it one: set trajectory.duration_s, or a limit with "
+            "control.joint_speed_limit_deg_s",
+        )
+
+
+# Each takes the sections that its parameters name.
+_RULES: tuple[Callable[..., Iterator[Finding]], ...] = (
+    _same_joints,
+    _reference,
+    _ends,
+    _goal_images,
+    _simulated_alone,
+    _disturbed_joints,
+    _lost_markers,
+    _plan_to_follow,
+)
+
+
+def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
+    """What a simulated run needs."""
+    reason = "is missing; a simulated run needs it"
+    for key in ("robot", "rig"):
+        if sections.get(key, "broken") is None:
+            yield (key,), f"{reason} (a recorded one sets data.table)"
+    if "markers" in sections and getattr(sections["markers"], "positions_m", None) is None:
+        yield ("markers", "positions_m"), f"{reason} (a recorded one sets data.table)"
+    calibration = sections.get("calibration")
+    if sections.get("task", "broken") is None and calibration and calibration.reference is None:
+        yield ("task",), f"{reason}, or calibration.reference"
+
+
+def _between(sections: Mapping[str, Any]) -> Iterator[Finding]:
+    """What does not fit together between these sections, of which broken ones are left out."""
+    if "data" in sections and sections["data"] is None:
+        yield from _missing(sections)
+    for rule in _RULES:
+        wanted = inspect.signature(rule).parameters
+        if wanted.keys() <= sections.keys():
+            yield from rule(**{name: sections[name] for name in wanted})
+
+
 class Config(Section):
     """Everything a run depends on.
 
@@ -682,12 +553,23 @@ class Config(Section):
     stop: Stop = Stop()
     report: ReportSettings = ReportSettings()
 
-    @model_validator(mode="after")
-    def _consistent(self) -> "Config":
-        found = [f"{'.'.join(map(str, path))}: {what}" for path, what in problems(self)]
-        if found:
-            raise ValueError("; ".join(found))
-        return self
+    @model_validator(mode="wrap")
+    @classmethod
+    def _all_at_once(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Tell what is wrong in the sections together with what is wrong between the sound ones."""
+        try:
+            config = handler(values)
+        except ValidationError as error:
+            wrong = error.errors(include_url=False)
+            broken = {part["loc"][0] for part in wrong if part["loc"]}
+            if not broken:
+                raise
+            rest = {key: value for key, value in values.items() if key not in broken}
+            sound = {key: value for key, value in handler({"name": "-", **rest}) if key not in broken}
+            raise together(cls, _between(sound), wrong) from None
+        if found := list(_between(dict(config))):
+            raise together(cls, found)
+        return config
 
     @property
     def recorded(self) -> bool:
@@ -697,6 +579,4 @@ class Config(Section):
     @property
     def joint_types(self) -> str | None:
         """One letter a joint, R or P; None where only the table tells how many there are."""
-        if self.data is not None and self.data.joints is not None:
-            return self.data.joints
-        return self.robot.joint_types if self.robot is not None else None
+        return _joint_types(self.robot, self.data) or None

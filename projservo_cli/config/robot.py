@@ -1,11 +1,22 @@
 """The robot, its rig and its markers, in metric terms: what a simulation takes as true."""
 
 import math
-from typing import Annotated, Any, Literal
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, WithJsonSchema
-
-from projservo_cli.records import MODES
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    Strict,
+    ValidationError,
+    WithJsonSchema,
+    model_validator,
+)
+from pydantic_core import ErrorDetails, InitErrorDetails
 
 Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
@@ -17,24 +28,11 @@ Vector3 = tuple[Number, Number, Number]
 Vector4 = tuple[Number, Number, Number, Number]
 Matrix34 = tuple[Vector4, Vector4, Vector4]
 Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
-JointType = Literal["R", "P"]
+# The path from a section to a value in it, and what is wrong with that value.
+Finding = tuple[tuple[str | int, ...], str]
+TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
 
-
-def _listed(value: Any) -> Any:
-    return [value] if isinstance(value, str) else value
-
-
-Mode = Literal["replan", "track", "image_track"]
-_MODE = {"enum": list(MODES)}
-# One mode may stand for a list of it.
-Modes = Annotated[
-    tuple[Mode, ...],
-    BeforeValidator(_listed),
-    Field(min_length=1),
-    WithJsonSchema({"anyOf": [_MODE, {"type": "array", "items": _MODE, "minItems": 1}]}),
-]
-
-IDENTITY: Matrix44 = (
+_IDENTITY: Matrix44 = (
     (1.0, 0.0, 0.0, 0.0),
     (0.0, 1.0, 0.0, 0.0),
     (0.0, 0.0, 1.0, 0.0),
@@ -43,9 +41,34 @@ IDENTITY: Matrix44 = (
 
 
 class Section(BaseModel):
-    """A mapping of the configuration: immutable, no unknown keys."""
+    """A mapping of the configuration: immutable, no unknown keys, its values fitting together."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False)
+
+    def contradictions(self) -> Iterable[Finding]:
+        """What does not fit together in this section."""
+        return ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if found := list(self.contradictions()):
+            raise together(type(self), found)
+        return self
+
+
+def together(
+    section: type[Section], found: Iterable[Finding], also: Iterable[ErrorDetails] = ()
+) -> ValidationError:
+    """One error for all that is wrong in a section, each at the path of its value."""
+    errors = [
+        InitErrorDetails(type="value_error", loc=path, input=section, ctx={"error": what})
+        for path, what in found
+    ]
+    more = [
+        InitErrorDetails(type=error["type"], loc=error["loc"], input=error["input"], ctx=error.get("ctx", {}))
+        for error in also
+    ]
+    return ValidationError.from_exception_data(section.__name__, [*errors, *more])
 
 
 class JointVector(Section):
@@ -66,11 +89,17 @@ class JointVector(Section):
         turn = math.radians if self.unit == "deg" else float
         return tuple(turn(value) if letter == "R" else float(value) for value, letter in pairs)
 
+    def miscounted(self, joint_types: str, *path: str) -> Iterator[Finding]:
+        """Readings too many or too few for the joints of a robot, this vector being at a path."""
+        if len(self.joints) != len(joint_types):
+            what = f"{len(self.joints)} values for {len(joint_types)} joints ({joint_types})"
+            yield (*path, "joints"), what
+
 
 class Joint(Section):
     """What joints have in common: a type, perhaps a name, perhaps limits."""
 
-    type: JointType = Field(description="R revolute, P prismatic")
+    type: Literal["R", "P"] = Field(description="R revolute, P prismatic")
     name: str | None = Field(None, description="for messages and figures")
     limits_deg: Vector2 | None = Field(None, description="lowest and highest reading of a revolute joint")
     limits_rad: Vector2 | None = Field(None, description="the same in rad")
@@ -82,6 +111,19 @@ class Joint(Section):
         if self.limits_deg is not None:
             return math.radians(self.limits_deg[0]), math.radians(self.limits_deg[1])
         return self.limits_rad or self.limits_m or (-math.inf, math.inf)
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Limits in two units, of the other type of joint, or upside down."""
+        given = [name for name in ("limits_deg", "limits_rad", "limits_m") if getattr(self, name) is not None]
+        if len(given) > 1:
+            yield (given[1],), f"{given[0]} is set as well; keep one"
+        for name in given:
+            if (name == "limits_m") != (self.type == "P"):
+                units = "limits_m" if self.type == "P" else "limits_deg or limits_rad"
+                yield (name,), f"a joint of type {self.type} takes {units}"
+            low, high = getattr(self, name)
+            if not low < high:
+                yield (name,), f"the lower limit {low:g} must be below the upper limit {high:g}"
 
 
 class DHJoint(Joint):
@@ -99,21 +141,53 @@ class ScrewJoint(Joint):
     w: Vector3 = Field(description="unit axis of a revolute joint, zero for a prismatic one")
     v: Vector3 = Field(description="-w × a point of the axis, m; unit direction of a prismatic joint")
 
+    def contradictions(self) -> Iterator[Finding]:
+        """Wrong limits, an axis that is not of unit length, or a joint that turns and slides."""
+        yield from super().contradictions()
+        axis = "w" if self.type == "R" else "v"
+        length = math.hypot(*getattr(self, axis))
+        if abs(length - 1) > TOLERANCE:
+            yield (axis,), f"must be of unit length for a joint of type {self.type}, it is {length:g}"
+        if self.type == "P" and math.hypot(*self.w) > TOLERANCE:
+            yield ("w",), "must be zero for a joint of type P"
+        if self.type == "R" and abs(_dot(self.w, self.v)) > TOLERANCE:
+            yield ("v",), "must be orthogonal to w: a revolute joint has no pitch"
+
+
+def _dot(u: Sequence[float], v: Sequence[float]) -> float:
+    return sum(a * b for a, b in zip(u, v, strict=True))
+
+
+def _rigid(T: Matrix44) -> Matrix44:
+    if T[3] != (0, 0, 0, 1):
+        raise ValueError("the last row must be [0, 0, 0, 1]")
+    R = np.array(T)[:3, :3]
+    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > TOLERANCE or np.linalg.det(R) < 0:
+        raise ValueError("the upper left 3×3 block must be a rotation, written with seven digits or more")
+    return T
+
+
+_Pose = Annotated[Matrix44, AfterValidator(_rigid)]
+
 
 class DH(Section):
     """A Denavit-Hartenberg table, standard or modified (Craig)."""
 
     convention: Literal["standard", "modified"] = Field("standard", description="of the table")
     joints: tuple[DHJoint, ...] = Field(min_length=1, max_length=64, description="rows, base to tool")
-    tool: Matrix44 = Field(IDENTITY, description="pose of the tool in the last joint's frame, m")
+    tool: _Pose = Field(_IDENTITY, description="pose of the tool in the last joint's frame, m")
 
 
 class Screws(Section):
     """Joint screws at a reference: T(q) = Π exp(screw_i (q_i − reference_i)) · base_tool."""
 
     reference: JointVector = Field(description="joint readings at which the screws hold")
-    base_tool: Matrix44 = Field(description="pose of the tool in the base frame there, m")
+    base_tool: _Pose = Field(description="pose of the tool in the base frame there, m")
     joints: tuple[ScrewJoint, ...] = Field(min_length=1, max_length=64, description="screws, base to tool")
+
+    def contradictions(self) -> Iterable[Finding]:
+        """A reading too many or too few."""
+        return self.reference.miscounted("".join(joint.type for joint in self.joints), "reference")
 
 
 class Robot(Section):
@@ -139,6 +213,11 @@ class Robot(Section):
         """Lowest and highest reading of each joint, rad or m; infinite where none is set."""
         return tuple(joint.limits for joint in self.joints)
 
+    def contradictions(self) -> Iterator[Finding]:
+        """No kinematics, or two."""
+        if (self.dh is None) == (self.screws is None):
+            yield (), "give exactly one of dh and screws"
+
 
 class Camera(Section):
     """A pinhole camera: a 3×4 matrix from the base frame to pixels, or a look-at description."""
@@ -150,6 +229,33 @@ class Camera(Section):
     target_m: Vector3 | None = Field(None, description="point that the camera looks at")
     up: Vector3 = Field((0.0, 0.0, 1.0), description="direction that is up in the image")
 
+    def contradictions(self) -> Iterator[Finding]:
+        """Two descriptions, half a one, or one that is no camera."""
+        wanted = ("focal_px", "principal_point_px", "position_m", "target_m")
+        given = [name for name in wanted if getattr(self, name) is not None]
+        missing = [name for name in wanted if name not in given]
+        if self.matrix is not None:
+            if given:
+                yield (given[0],), "matrix is set as well; keep one description of the camera"
+            P = np.array(self.matrix)
+            if not P.any() or abs(np.linalg.det(P[:, :3] / abs(P).max())) < 1e-12:
+                yield ("matrix",), "its left 3×3 block is singular: no finite pinhole camera"
+        elif missing:
+            told = f" (missing: {', '.join(missing)})" if given else ""
+            yield (), f"give matrix, or all of {', '.join(wanted)}{told}"
+        else:
+            yield from _blind(self.position_m, self.target_m, self.up)
+
+
+def _blind(position: Any, target: Any, up: Vector3) -> Iterator[Finding]:
+    """A camera that looks nowhere, or along what is up in its image."""
+    sight = [b - a for a, b in zip(position, target, strict=True)]
+    length, height = math.hypot(*sight), math.hypot(*up)
+    if length == 0:
+        yield ("target_m",), "is the position of the camera; it must look somewhere"
+    elif height == 0 or abs(_dot(sight, up)) > (1 - 1e-9) * length * height:
+        yield ("up",), "must not be zero or along the line of sight"
+
 
 class Rig(Section):
     """Two cameras that look at the robot and do not move."""
@@ -157,6 +263,24 @@ class Rig(Section):
     image_size_px: tuple[Whole, Whole] = Field(description="width and height")
     left: Camera = Field(description="the left camera")
     right: Camera = Field(description="the right camera")
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Images without pixels."""
+        if 0 in self.image_size_px:
+            yield ("image_size_px",), "width and height must be greater than 0"
+
+
+def _center(value: Any) -> Any:
+    if value == "midpoint" or (type(value) is int and 0 <= value < 2**63):
+        return value
+    raise ValueError("must be midpoint or the number of a marker of the face")
+
+
+_Center = Annotated[
+    Literal["midpoint"] | int,
+    PlainValidator(_center),
+    WithJsonSchema({"anyOf": [{"const": "midpoint", "type": "string"}, {"type": "integer", "minimum": 0}]}),
+]
 
 
 class Markers(Section):
@@ -171,7 +295,7 @@ class Markers(Section):
     face: tuple[Whole, ...] | None = Field(
         None, min_length=3, description="numbers of those in a plane that must stay visible"
     )
-    center: Literal["midpoint"] | Whole = Field("midpoint", description="of the face: midpoint, or a number")
+    center: _Center = Field("midpoint", description="of the face: midpoint, or a number")
 
     @property
     def known(self) -> tuple[int, ...] | None:
@@ -179,3 +303,29 @@ class Markers(Section):
         if self.numbers is None and self.positions_m is not None:
             return tuple(range(len(self.positions_m)))
         return self.numbers
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Numbers that are missing, strange or given twice."""
+        known, face = self.known, self.face or ()
+        if known is not None:
+            if self.positions_m is not None and len(known) != len(self.positions_m):
+                yield ("numbers",), f"{len(known)} numbers for {len(self.positions_m)} positions_m"
+            if len(set(known)) < len(known):
+                yield ("numbers",), "a number stands here twice"
+            yield from unknown_markers(face, known, "face")
+        if face and self.center not in ("midpoint", *face):
+            yield ("center",), f"marker {self.center} is not on the face; face: {_listed(face)}"
+        if len(set(face)) < len(face):
+            yield ("face",), "a marker stands here twice"
+
+
+def unknown_markers(numbers: Sequence[int], known: Sequence[int], *path: str) -> Iterator[Finding]:
+    """Numbers at a path that no marker has."""
+    for i, number in enumerate(numbers):
+        if number not in known:
+            yield (*path, i), f"there is no marker {number}; markers: {_listed(known)}"
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:20]))
+    return shown + (" …" if len(numbers) > 20 else "")

@@ -5,13 +5,12 @@ import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from projservo_cli.config.loading import Override, apply_overrides, problem_lines, read_text, translated
+from projservo_cli.config.loading import Override, read_text, validated
 from projservo_cli.config.models import folder_name
 from projservo_cli.config.robot import Count, Number, Positive, Section, Whole
 from projservo_cli.config.yaml_source import Document, Problem
-from projservo_cli.records import InputError
 
 BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 
@@ -135,17 +134,11 @@ def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> Sweep
     """
     document = Document(read_text(path), str(path))
     if not isinstance(document.values, dict):
-        problems = document.problems or [Problem((), "expected keys and values such as base: paper.yaml")]
-        raise InputError("\n".join(problem_lines(document, problems)))
-    values = document.values
-    problems = list(document.problems)
-    problems += apply_overrides(values, [Override.parse(text) for text in overrides], document)
-    values.setdefault("name", pathlib.Path(path).stem)
-    try:
-        sweep = SweepConfig.model_validate(values)
-    except ValidationError as error:
-        problems += translated(SweepConfig, error.errors(include_url=False), values)
-    if problems:
-        raise InputError("\n".join(problem_lines(document, problems)))
+        what = "expected keys and values such as base: paper.yaml"
+        raise document.refused(document.problems or [Problem((), what)])
+    for change in map(Override.parse, overrides):
+        document.override(change.path, change.value, change.flag)
+    document.values.setdefault("name", pathlib.Path(path).stem)
+    sweep = validated(SweepConfig, document)
     folder = pathlib.Path(path).parent
     return sweep.model_copy(update={"base": tuple(str((folder / base).resolve()) for base in sweep.base)})

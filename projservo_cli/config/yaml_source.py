@@ -4,12 +4,15 @@ Numbers and booleans follow the YAML 1.2 core schema: ``1e-3`` is a number, ``on
 text. Duplicate keys are refused; aliases, nesting and size are bounded.
 """
 
+import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import yaml
+
+from projservo_cli.records import InputError
 
 try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
     from yaml import CSafeLoader as _Parser
@@ -21,6 +24,8 @@ Path = tuple[str | int, ...]
 MAX_BYTES = 1_000_000
 MAX_VALUES = 50_000  # aliases counted as often as they are used
 MAX_DEPTH = 32
+_MOST_LINES = 50  # that are told of what is wrong
+_STANDARD = "tag:yaml.org,2002:"
 
 
 @dataclass(frozen=True)
@@ -41,45 +46,20 @@ def shortened(text: str, most: int = 80) -> str:
     return text if len(text) <= most else text[: most - 1] + "…"
 
 
-_STANDARD = "tag:yaml.org,2002:"
-_COLLECTIONS = (f"{_STANDARD}map", f"{_STANDARD}seq")
-
-
-def _boolean(text: str) -> bool:
-    return {"true": True, "false": False}[text.lower()]
-
-
-def _float(text: str) -> float:
-    return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
-
-
-# tag: how to convert, what plain text gets the tag, its first characters
-_CORE: dict[str, tuple[Callable[[str], Any], str, str]] = {
-    "null": (lambda _: None, r"~|null|Null|NULL|", "~nN"),
-    "bool": (_boolean, r"true|True|TRUE|false|False|FALSE", "tTfF"),
-    "int": (int, r"[-+]?[0-9]+", "-+0123456789"),
-    "float": (
-        _float,
-        r"[-+]?(\.[0-9]+|[0-9]+\.[0-9]*|[0-9]+(?=[eE]))([eE][-+]?[0-9]+)?"
-        r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        "-+0123456789.",
-    ),
-}
-_SCALARS: dict[str, Callable[[str], Any]] = {_STANDARD + "str": str}
-
-
 class _Loader(_Parser):
-    """Scalars of the YAML 1.2 core schema."""
+    """Leaves plain text as it stands."""
 
 
 _Loader.yaml_implicit_resolvers = {}
 
-
-for _name, (_convert, _pattern, _first) in _CORE.items():
-    _SCALARS[_STANDARD + _name] = _convert
-    _Loader.add_implicit_resolver(
-        _STANDARD + _name, re.compile(f"(?:{_pattern})$"), [*_first, *([""] if _name == "null" else [])]
-    )
+# Plain text that means something else, and what it means.
+_CORE: tuple[tuple[re.Pattern[str], Callable[[str], Any]], ...] = (
+    (re.compile(r"~|null|Null|NULL|"), lambda text: None),
+    (re.compile(r"true|True|TRUE|false|False|FALSE"), lambda text: text.lower() == "true"),
+    (re.compile(r"[-+]?[0-9]+"), int),
+    (re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"), float),
+    (re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"), lambda text: float(text.replace(".", ""))),
+)
 
 
 class Document:
@@ -95,24 +75,20 @@ class Document:
             self._parse(text)
         except _UnfitError as error:
             self.problems.append(Problem((), str(error), name))
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            place = self._place(mark) if mark else name
+            self.problems.append(Problem((), f"not valid YAML: {error.problem or error.context}", place))
+        except yaml.YAMLError as error:
+            self.problems.append(Problem((), f"not valid YAML: {' '.join(str(error).split())}", name))
 
     def _parse(self, text: str) -> None:
         if len(text) > MAX_BYTES:
             raise _UnfitError(f"larger than {MAX_BYTES} bytes; this is no configuration")
         if any("\ud800" <= character <= "\udfff" for character in text):
             raise _UnfitError("not UTF-8 text")
-        try:
-            _require_bounded(text)
-            root = _Loader(text).get_single_node()
-        except yaml.MarkedYAMLError as error:
-            mark = error.problem_mark or error.context_mark
-            place = self._place(mark) if mark else self.name
-            self.problems.append(Problem((), f"not valid YAML: {error.problem or error.context}", place))
-            return
-        except yaml.YAMLError as error:
-            what = " ".join(str(error).split())
-            self.problems.append(Problem((), f"not valid YAML: {what}", self.name))
-            return
+        _require_bounded(text)
+        root = _Loader(text).get_single_node()
         if root is not None:
             self.values = self._value(root, ())
 
@@ -126,8 +102,11 @@ class Document:
         if len(path) > MAX_DEPTH:
             raise _UnfitError(f"nested more than {MAX_DEPTH} levels deep, or an alias holds itself")
         self.places.setdefault(path, self._place(node.start_mark))
-        if isinstance(node, yaml.CollectionNode) and node.tag not in _COLLECTIONS:
-            return self._refused(node, path)
+        if node.tag not in {_STANDARD + kind for kind in ("map", "seq", "str")}:
+            tag = shortened(node.tag.replace(_STANDARD, "!!"))
+            what = f"the tag {tag} is not allowed; plain values only"
+            self.problems.append(Problem(path, what, self._place(node.start_mark)))
+            return None
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, path)
         if isinstance(node, yaml.SequenceNode):
@@ -142,41 +121,71 @@ class Document:
             key = key_node.value
             if not isinstance(key_node, yaml.ScalarNode):
                 self.problems.append(Problem(path, "a key must be plain text", place))
-                continue
-            if key in values:
+            elif key in values:
                 first = self.places[(*path, key)].removeprefix(f"{self.name}:")
                 what = f"the key stands here a second time (first at {first}); keep one"
                 self.problems.append(Problem((*path, key), what, place))
-                continue
-            self.places[(*path, key)] = place
-            values[key] = self._value(value_node, (*path, key))
+            else:
+                self.places[(*path, key)] = place
+                values[key] = self._value(value_node, (*path, key))
         return values
 
     def _scalar(self, node: yaml.ScalarNode, path: Path) -> Any:
-        convert = _SCALARS.get(node.tag)
-        if convert is None:
-            return self._refused(node, path)
+        if node.style:  # in quotes, or a block of text
+            return node.value
+        meaning = next((meaning for pattern, meaning in _CORE if pattern.fullmatch(node.value)), str)
         try:
-            return convert(node.value)
-        except (ValueError, KeyError):
-            what = f"cannot be read as {node.tag.removeprefix(_STANDARD)}"
+            return meaning(node.value)
+        except ValueError:  # of more digits than Python converts
+            what = "cannot be read as a number"
             self.problems.append(Problem(path, what, self._place(node.start_mark)))
             return None
 
-    def _refused(self, node: yaml.Node, path: Path) -> None:
-        what = f"the tag {shortened(node.tag.replace(_STANDARD, '!!'))} is not allowed; plain values only"
-        self.problems.append(Problem(path, what, self._place(node.start_mark)))
-
-    def overridden(self, path: Path, flag: str) -> None:
-        """Note that the value at ``path``, and all inside it, now comes from elsewhere."""
-        self.places = {known: place for known, place in self.places.items() if known[: len(path)] != path}
-        self.places[path] = flag
+    def override(self, path: Path, value: Any, flag: str) -> None:
+        """Set a value that comes from elsewhere, making the mappings on the way to it."""
+        holder: Any = self.values
+        for i, step in enumerate(path):
+            here = path[: i + 1]
+            key = str(step) if isinstance(holder, dict) else step
+            if isinstance(holder, list):
+                if not isinstance(step, int) or step >= len(holder):
+                    what = f"expected a list position from 0 to {len(holder) - 1}"
+                    return self.problems.append(Problem(here, what, flag))
+            elif not isinstance(holder, dict):
+                what = "there is a plain value where a section is expected"
+                return self.problems.append(Problem(here, what, flag))
+            if here == path or (isinstance(holder, dict) and holder.get(key) is None):
+                holder[key] = value if here == path else {}
+                inside = [known for known in self.places if known[: len(here)] == here]
+                for known in inside:
+                    del self.places[known]
+                self.places[here] = flag
+            holder = holder[key]
+        return None
 
     def place(self, path: Path) -> str:
         """Where ``path`` stands, or the nearest mapping or list around it."""
         while path and path not in self.places:
             path = path[:-1]
         return self.places.get(path, self.name)
+
+    def refused(self, found: Sequence[Problem]) -> InputError:
+        """One line a problem, flags last, otherwise in the order of the file; of very many the first."""
+        told = []
+        for problem in found:
+            place = problem.source or self.place(problem.path)
+            dotted = shortened(".".join(map(str, problem.path)), 200)
+            parts = (place, dotted, shortened(problem.what, 1000))
+            told.append((_position(place), ": ".join(part for part in parts if part)))
+        different = list(dict.fromkeys(line for _, line in sorted(told, key=lambda item: item[0])))
+        left = len(different) - _MOST_LINES
+        more = [f"{self.name}: and {left} more"] if left > 0 else []
+        return InputError("\n".join(different[:_MOST_LINES] + more))
+
+
+def _position(place: str) -> tuple[float, float]:
+    numbers = re.search(r":(\d+):(\d+)$", place)
+    return (float(numbers[1]), float(numbers[2])) if numbers else (math.inf, math.inf)
 
 
 def _require_bounded(text: str) -> None:
