@@ -16,8 +16,9 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     del names
     if rest and options["output"] is not None:
         raise click.UsageError("show takes one run, as an argument or with -o")
-    from projservo_cli.cli.words import stage_object, summary
+    from projservo_cli.cli.words import summary
     from projservo_cli.config import load_config
+    from projservo_cli.report.values import stage_object
     from projservo_cli.store import SERVO, load
 
     found = load(rest[0] if rest else options["output"] or DEFAULT)

@@ -168,7 +168,8 @@ def _compilation(call: _Call) -> AbstractContextManager[None]:
 
 
 def _tell(call: _Call, *, as_json: bool) -> int:
-    from projservo_cli.cli.words import failed_object, stage_object, summary
+    from projservo_cli.cli.words import summary
+    from projservo_cli.report.values import failed_object, stage_object
 
     values = {}
     for name in call.names:

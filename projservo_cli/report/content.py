@@ -22,6 +22,7 @@ from projservo_cli.report.figures import FIGURES, FigureSpec
 from projservo_cli.report.figures.drift import drift_rows
 from projservo_cli.report.material import VIEWS, title
 from projservo_cli.report.style import FORMATS
+from projservo_cli.report.values import ANIMATION_FILE, VIEW_FILE
 from projservo_cli.store import Run
 
 MINUS = "\N{MINUS SIGN}"
@@ -301,7 +302,6 @@ def _drawn(content: bytes, kind: str, prefix: str, alt: str) -> Markup | None:
     return Markup('<img src="data:image/png;base64,{}" alt="{}">').format(data, alt)
 
 
-VIEW_FILE, ANIMATION_FILE = "view.html", "animation.gif"
 # What may lie beside the page, and what the page calls it.
 _EXTRAS = {VIEW_FILE: "3D view with a time slider", ANIMATION_FILE: "animation of both camera images (GIF)"}
 # What made a run: key in the provenance, and what the page calls it.

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 
 from projservo_cli.files import replacing
 from projservo_cli.report.content import (
-    ANIMATION_FILE,
-    VIEW_FILE,
     View,
     claim_rows,
     differences,
@@ -19,6 +17,7 @@ from projservo_cli.report.content import (
     short,
     view_of,
 )
+from projservo_cli.report.values import PAGE_FILE
 from projservo_cli.store import Run
 
 if TYPE_CHECKING:
@@ -40,11 +39,6 @@ def template(name: str) -> "Template":
     )
     environment.filters |= {"number": number, "short": short}
     return environment.get_template(name)
-
-
-__all__ = ["ANIMATION_FILE", "PAGE_FILE", "VIEW_FILE", "write_comparison", "write_page"]
-
-PAGE_FILE = "report.html"
 
 
 def write_page(run: Run) -> Path:

@@ -24,7 +24,8 @@ from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES, FigureSpec
 from projservo_cli.report.figures.drift import converged, drift_rows, table
 from projservo_cli.report.material import DIRECT, Data, Fit, Material, Studies
-from projservo_cli.report.page import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, write_page
+from projservo_cli.report.page import write_page
+from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.report.view import motion, plotly, write_view
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task

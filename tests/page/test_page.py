@@ -10,7 +10,8 @@ import pytest
 from projservo_cli.records import CrossValidation, Report
 from projservo_cli.report.content import calibration_words, inline, number, short
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.page import PAGE_FILE, write_comparison, write_page
+from projservo_cli.report.page import write_comparison, write_page
+from projservo_cli.report.values import PAGE_FILE
 from projservo_cli.stages import report
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.cli.words import _scalars as scalars
 from projservo_cli.cli.words import summary
 from projservo_cli.config import load_config
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.records import WorkFailed
+from projservo_cli.report.values import scalars
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.plan import demands_of, plan_task
 from projservo_cli.task.along import planning_workspace
