@@ -27,9 +27,8 @@ from projservo_cli.loop.step import Limits
 from projservo_cli.loop.trial import NUMBERS, Desk, Setting, new_desk, trials
 from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.robots.simulated import Plant
-from projservo_cli.stages.scenario import plant_of, reach_of, truth_of
-from projservo_cli.stages.servo import gains_of, limits_of
-from projservo_cli.stages.traces import ends_of
+from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal, true_ends
+from projservo_cli.stages.world import truth_of
 from projservo_cli.task.body import NO_BODY, body_of
 from projservo_cli.task.face import Task, task_from_images
 from projservo_cli.task.target import task_from_body
@@ -81,24 +80,25 @@ class Case:
 
     def __init__(self, config: "Config") -> None:
         truth = truth_of(config)
-        reach = reach_of(config, truth)
-        self.truth, self.q_start, self.model = truth, reach.q_start, truth.model
+        ends = start_and_goal(config, truth, range(len(truth.pins)))
+        self.truth, self.q_start, self.model = truth, ends.q_start, truth.model
         self.gains, self.bounds = gains_of(config), limits_of(config)
         self.bounds = self.bounds._replace(
             image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
-        self.plant = plant_of(config, truth, reach.q_start)
-        self.shown = np.array([reach.s_start, reach.s_star])
-        self.ends = ends_of(self.plant, truth, reach.goal_pose)
-        self.task = task_from_images(self.model, reach.s_start, reach.s_star, truth.center)
+        self.plant = plant_of(config, truth, ends.q_start)
+        s_start, s_star = ends.first(len(truth.face))
+        self.shown = np.array([s_start, s_star])
+        self.ends = true_ends(truth, ends.goal_pose)
+        self.task = task_from_images(self.model, s_start, s_star, truth.center)
         pins = np.ascontiguousarray(truth.M[list(truth.pins)])
         self.body_plant = self.plant._replace(pins=pins)
         self.body_task = task_from_body(
             self.model,
             body_of(self.model, truth.M[[*truth.face, *truth.pins]]),
-            reach.q_start,
-            np.concatenate([reach.s_start, reach.pins_start], axis=1),
-            np.concatenate([reach.s_star, reach.pins_star], axis=1),
+            ends.q_start,
+            ends.s_start,
+            ends.s_star,
             truth.center,
             len(truth.face),
         )

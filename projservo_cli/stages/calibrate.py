@@ -9,8 +9,8 @@ from projservo_cli.calibration import calibrate, cross_validate
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.motion import joints_of, reference_of
-from projservo_cli.stages.scenario import Truth, calibration_generator, calibration_seed, truth_of
+from projservo_cli.stages.scenario import CALIBRATION_NOISE, calibration_seed, generator
+from projservo_cli.stages.world import Truth, joints_of, reference_of, truth_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -51,7 +51,7 @@ def trial_motions(config: "Config") -> FloatArray:
 def simulate(config: "Config", truth: Truth) -> Observation:
     """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
     q = trial_motions(config)
-    rng = calibration_generator(config)
+    rng = generator(calibration_seed(config), CALIBRATION_NOISE)
     noise = config.noise.calibration_px * rng.standard_normal((len(q), 2, len(truth.number), 2))
     images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)

@@ -16,16 +16,8 @@ from projservo_cli.geometry.mechanisms import COORDINATES, joint_motion, span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import BoolArray, Calibration, FloatArray, Model, Plan, WorkFailed, signed
 from projservo_cli.stages.calibrate import image_size_of
-from projservo_cli.stages.motion import joints_of
-from projservo_cli.stages.scenario import (
-    Reach,
-    Sight,
-    center_index,
-    face_numbers,
-    measured_task,
-    reach_for,
-    sight_for,
-)
+from projservo_cli.stages.scenario import Scenario, Sight, measured_task, scenario_of, sight_of
+from projservo_cli.stages.world import center_index, face_numbers, joints_of
 from projservo_cli.task.along import Along, along
 from projservo_cli.task.face import Task, center_of, face_plane, require_found
 from projservo_cli.task.margins import CONSTRAINTS, IMAGE, JOINTS, VISIBILITY, Demands, Reaching, limit_margin
@@ -431,18 +423,17 @@ def run(config: "Config", calibration: Calibration) -> Plan:
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    reach = reach_for(config, calibration)
+    scenario = scenario_of(config, calibration)
     return plan_task(
         calibration.model(),
-        reach.q_start,
-        reach.s_start,
-        reach.s_star,
+        scenario.ends.q_start,
+        *scenario.ends.first(scenario.watched.face),
         center_index(config),
         config.trajectory.profile,
         config.trajectory.delta,
         config.trajectory.samples,
         demands_of(config, calibration.joint_types),
-        sight_for(config, calibration, reach),
+        sight_of(scenario),
         Pace(config.trajectory.duration_s, config.trajectory.ramp_s),
     )
 
@@ -621,7 +612,7 @@ class Sense(NamedTuple):
         return self.motions
 
 
-def rotation_sense(config: "Config", calibration: Calibration, reach: Reach, sight: Sight | None) -> Sense:
+def rotation_sense(scenario: Scenario) -> Sense:
     """The sense that the plan of a task takes; only the profile constrained needs the whole plan for it.
 
     Raises
@@ -629,18 +620,18 @@ def rotation_sense(config: "Config", calibration: Calibration, reach: Reach, sig
     WorkFailed
         If the task cannot be partitioned.
     """
+    config, calibration = scenario.config, scenario.calibration
     profile = config.trajectory.profile
     if profile == CONSTRAINED:
         return Sense(run(config, calibration).rotation_sense(), None)
     joints = joints_of(config, calibration.joint_types)
     state, task, parts, _ = partitioned_at_start(
         calibration.model(),
-        reach.q_start,
-        reach.s_start,
-        reach.s_star,
+        scenario.ends.q_start,
+        *scenario.ends.first(scenario.watched.face),
         center_index(config),
         profile,
         (joints.lower, joints.upper),
-        sight,
+        sight_of(scenario),
     )
     return Sense(signed(parts.theta_r, parts.theta_p, joint_motions(state)[1:3]), task)

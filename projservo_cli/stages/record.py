@@ -12,8 +12,9 @@ from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.yours import Robot, at_rest_after
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.calibrate import images_at, trial_motions
-from projservo_cli.stages.motion import drive_to, foreign_robot, joints_of, near
-from projservo_cli.stages.scenario import Truth, calibration_generator, truth_of
+from projservo_cli.stages.own_robot import drive_to, foreign_robot, near, step_limit
+from projservo_cli.stages.scenario import CALIBRATION_NOISE, calibration_seed, generator
+from projservo_cli.stages.world import Truth, joints_of, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 if TYPE_CHECKING:
@@ -181,7 +182,7 @@ def record(
     if robot is None and config.plant.use is not None:
         robot = foreign_robot(config, joints_of(config), len(recording.marker))
     driven = robot or simulated(config, recording)
-    limit = step_limit(config)
+    limit = step_limit(config, joints_of(config))
     total, saved, took = len(recording.targets), time.monotonic(), 0.0
     unsaved = False
     try:
@@ -207,11 +208,6 @@ def record(
 def simulated(config: "Config", recording: Recording) -> SimulatedRobot:
     """The robot of a configuration at its reference, with the noise that ``calibrate`` would add."""
     truth = truth_of(config)
-    rng = calibration_generator(config)
+    rng = generator(calibration_seed(config), CALIBRATION_NOISE)
     noise = rng.standard_normal((len(recording.targets), 2, len(truth.number), 2))
     return SimulatedRobot(truth, recording.targets[0], config.noise.calibration_px * noise[recording.pending])
-
-
-def step_limit(config: "Config") -> FloatArray:
-    """Largest joint step (n,) in one control period, rad or m; infinite without a speed limit."""
-    return joints_of(config).speed * config.control.period_s * config.plant.speed_scale

@@ -23,12 +23,13 @@ from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.report.view import motion, plotly, write_view
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task
-from projservo_cli.stages.scenario import Truth, plant_of, truth_of
+from projservo_cli.stages.scenario import plant_of
+from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.stages.studies import (
     LAMBDAS,
     STEP_LIMIT_DEG,
-    Bench,
-    bench_of,
+    Comparison,
+    comparison_of,
     composition_error,
     metric_plan,
     run_studies,
@@ -68,7 +69,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     material: Fit = Fit(run.calibration, run.observation, held_out=run.cross_validation)
     studies, eq22, claims = None, None, []
     if has_task(config):
-        bench = bench_of(config, run.calibration.model(), run.plan)
+        bench = comparison_of(config, run.calibration, run.plan)
         material = material_of(run, bench, left_out, progress)
         studies, eq22 = material.studies, composition(bench, config, left_out)
         claims = [claim.row() for claim in claims_of(material, eq22)]
@@ -89,7 +90,7 @@ def missing(run: "Run") -> bool:
     return not all((run.path.parent / name).is_file() for name in (*figures, CLAIMS_FILE, PAGE_FILE))
 
 
-def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progress: Progress) -> Material:
+def material_of(run: "Run", bench: Comparison, left_out: list[dict[str, str]], progress: Progress) -> Material:
     """All that the figures may show; extra runs that fail are named in ``left_out``."""
     truth, studies, reason = bench.truth, None, ""
     try:
@@ -102,13 +103,13 @@ def material_of(run: "Run", bench: Bench, left_out: list[dict[str, str]], progre
         run.observation,
         bench.models["calibrated"],
         truth.robot,
-        bench.plant,
+        bench.scenario.plant_of("direct_three"),
         run.plan,
         tuple(truth.number[i] for i in truth.face),
         run.traces,
         studies,
         reason,
-        bench.limits.plateau_steps,
+        bench.scenario.limits.plateau_steps,
         held_out=run.cross_validation,
     )
 
@@ -157,7 +158,7 @@ def draw_all(
     return written
 
 
-def composition(bench: Bench, config: "Config", left_out: list[dict[str, str]]) -> _Eq22 | None:
+def composition(bench: Comparison, config: "Config", left_out: list[dict[str, str]]) -> _Eq22 | None:
     """Shares λ, and how far both sides of [RH00] eq. (22) differ at each, m; None, and why, if they fail."""
     try:
         distance, _ = composition_error(metric_plan(bench, config.trajectory.delta))

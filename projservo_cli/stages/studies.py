@@ -16,15 +16,14 @@ from projservo_cli.geometry.displacement import (
     exp_translation,
     twist_exponential,
 )
-from projservo_cli.geometry.kinematics import project
-from projservo_cli.loop.step import Limits
-from projservo_cli.records import PRISMATIC, FloatArray, Model, Plan, Trace
+from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.report.material import DIRECT, Studies
-from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.scenario import Reach, Truth, plant_of, reach_of, truth_of
-from projservo_cli.stages.servo import drive, gains_of, limits_of
+from projservo_cli.stages.plan import Sense, plan_task
+from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
+from projservo_cli.stages.servo import drive
+from projservo_cli.stages.trace import trace_of
+from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.task.margins import within
 
 if TYPE_CHECKING:
@@ -40,38 +39,39 @@ H_PE = np.array([[1.1, 0.2, -0.1, 0.3], [-0.2, 0.9, 0.2, -0.1], [0.1, -0.1, 1.2,
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
-    """What all extra runs share: the truth, a task without noise, the configured gains and limits.
+class Comparison:
+    """What all extra runs share: the task without noise, with the configured gains.
 
     Attributes
     ----------
+    scenario : without noise and disturbances, and without an end at a border or a joint limit.
     models : by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and
         ``calibrated``.
-    sense : (2, n) joint motions of the planned rotations, which decide the sense of a half turn.
+    sense : in which the plan turns, which decides the sense of a half turn.
     """
 
-    truth: Truth
-    plant: Plant
-    reach: Reach
-    gains: Gains
-    limits: Limits
+    scenario: Scenario
     models: dict[str, Model]
-    sense: FloatArray
+    sense: Sense
+
+    @property
+    def truth(self) -> Truth:
+        """Robot, rig and markers as they are."""
+        assert self.scenario.truth is not None
+        return self.scenario.truth
 
     def run(self, law: str, operators: str, gains: Gains, *, limited: bool) -> Trace:
-        """Drive a direct law without noise, with 5° per step as limit or with none.
+        """Drive a direct law, with 5° per step as limit or with none.
 
         Where there is a limit, the speed of prismatic joints is limited as configured.
         """
-        speed = np.full(len(self.reach.q_start), math.inf)
+        limits = self.scenario.limits
+        speed = np.full(len(self.scenario.ends.q_start), math.inf)
         if limited:
             prismatic = self.truth.robot.joint_types == PRISMATIC
-            revolute = math.radians(STEP_LIMIT_DEG) / gains.period
-            speed = np.where(prismatic, self.limits.speed, revolute)
-        noise = np.zeros((self.limits.max_steps + 1, 2, len(self.truth.face), 2))
-        limits = self.limits._replace(speed=speed)
-        model = self.models[operators]
-        return drive(law, model, self.plant, self.truth, self.reach, gains, limits, noise, self.sense)
+            speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
+        scenario = replace(self.scenario, gains=gains, limits=limits._replace(speed=speed))
+        return trace_of(scenario, drive(scenario, self.sense, law, self.models[operators]))
 
 
 def projective_twin(model: Model) -> Model:
@@ -87,7 +87,7 @@ def projective_twin(model: Model) -> Model:
     )
 
 
-def bench_of(config: "Config", calibrated: Model, plan: Plan) -> Bench:
+def comparison_of(config: "Config", calibration: Calibration, plan: Plan) -> Comparison:
     """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
 
     Raises
@@ -95,19 +95,16 @@ def bench_of(config: "Config", calibrated: Model, plan: Plan) -> Bench:
     InputError, WorkFailed
         If the configuration describes no simulated task, or the task cannot be done.
     """
-    truth = truth_of(config)
-    reach = reach_of(config, truth)
-    s_star = reach.s_star
-    if reach.goal_pose is not None:
-        s_star = project(truth.P, truth.M_face @ (reach.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T)
-    s_start = truth.images(reach.q_start, truth.M_face)
-    clean = replace(reach, s_start=s_start, s_star=s_star)
-    limits = limits_of(config)._replace(
+    truth_of(config)  # refuses what lacks a part of the simulation
+    scenario = idealized(scenario_of(config, calibration))
+    limits = scenario.limits._replace(
         image_px=config.stop.image_px, stop_at_joint_limit=False, stop_at_border=False
     )
-    models = {"true": truth.model, "twin": projective_twin(truth.model), "calibrated": calibrated}
-    plant, sense = plant_of(config, truth, reach.q_start), plan.rotation_sense()
-    return Bench(truth, plant, clean, gains_of(config), limits, models, sense)
+    scenario = replace(scenario, limits=limits)
+    assert scenario.truth is not None
+    metric = scenario.truth.model
+    models = {"true": metric, "twin": projective_twin(metric), "calibrated": calibration.model()}
+    return Comparison(scenario, models, Sense(plan.rotation_sense(), None))
 
 
 def with_gain(gains: Gains, gain_per_step: float) -> Gains:
@@ -117,7 +114,7 @@ def with_gain(gains: Gains, gain_per_step: float) -> Gains:
 
 
 def run_studies(
-    bench: Bench,
+    bench: Comparison,
     gains: Sequence[float] = GAINS,
     periods: Sequence[float] = PERIODS_S,
     progress: Progress = silent,
@@ -136,7 +133,7 @@ def run_studies(
     WorkFailed
         If the task cannot be partitioned with one of the models.
     """
-    own = bench.gains
+    own = bench.scenario.gains
     most = max(own.gain_t, own.gain_r, own.gain_p, own.gain_s)
     periods = [period for period in periods if most * period < 1.0]
     sweep_cases = [
@@ -164,7 +161,7 @@ def run_studies(
     return Studies(tuple(gains), tuple(periods), own, STEP_LIMIT_DEG, sweep, by_model, rate)
 
 
-def metric_plan(bench: Bench, delta: float) -> Plan:
+def metric_plan(bench: Comparison, delta: float) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres.
 
     Raises
@@ -172,12 +169,12 @@ def metric_plan(bench: Bench, delta: float) -> Plan:
     WorkFailed
         If the task cannot be partitioned.
     """
-    reach, robot = bench.reach, bench.truth.robot
+    ends, robot = bench.scenario.ends, bench.truth.robot
     return plan_task(
         bench.models["true"],
-        reach.q_start,
-        reach.s_start,
-        reach.s_star,
+        ends.q_start,
+        ends.s_start,
+        ends.s_star,
         bench.truth.center,
         "linear",
         delta,

@@ -11,7 +11,8 @@ from projservo_cli.calibration.suggestions import Region, Suggestion, suggest
 from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, FloatArray, Observation
 from projservo_cli.stages.calibrate import image_size_of
-from projservo_cli.stages.scenario import SUGGESTIONS, generator, robot_of
+from projservo_cli.stages.scenario import SUGGESTIONS, generator
+from projservo_cli.stages.world import robot_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -45,7 +46,7 @@ def run(
     image = _image(config, observation)
     targets = _region(config, observation.q, WIDER, image)
     candidates = targets if config.recorded else _region(config, observation.q, FARTHER, image)
-    return suggest(calibration, observation, candidates, targets, count, generator(config, SUGGESTIONS))
+    return suggest(calibration, observation, candidates, targets, count, generator(config.seed, SUGGESTIONS))
 
 
 def _image(config: "Config", observation: Observation) -> FloatArray:

@@ -5,7 +5,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,15 +13,18 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
 from projservo_cli.config.sweep import Distribution
-from projservo_cli.loop.step import VERDICTS
-from projservo_cli.loop.trial import NUMBERS, VERDICT
-from projservo_cli.records import Calibration, IntArray, Plan, Trace, WorkFailed
+from projservo_cli.control import CODES
+from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.loop.step import RUNNING, VERDICTS
+from projservo_cli.loop.trial import NUMBERS, VERDICT, Desk, Setting, new_desk, trials
+from projservo_cli.records import BODY_LAWS, Calibration, FloatArray, IntArray, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.plan import Sense, rotation_sense
-from projservo_cli.stages.servo import Simulated, record, scene_of, sense_is_enough, simulate
-from projservo_cli.stages.traces import ends_of, path_between_mm, summary_of
-from projservo_cli.stages.trials import is_compiled, numbers_of, prepare
+from projservo_cli.stages.plan import rehearses, rotation_sense
+from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.servo import drive, recorded, sense_is_enough
+from projservo_cli.stages.trace import deviation_between_samples_mm, summary_of
 from projservo_cli.sweep.design import RUNS, Design, TaskSet, name_of_run, seed_of
+from projservo_cli.task.body import NO_BODY
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
 ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
@@ -216,7 +219,7 @@ def _inputs(design: Design, run: int) -> dict[str, Any]:
 def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
     """What is measured of compiled runs, by column."""
     try:
-        numbers = numbers_of(prepare(config, calibration, name_of_run(config)), seeds.tolist())
+        numbers = numbers_of(scenario_of(config, calibration), name_of_run(config), seeds.tolist())
     except WorkFailed:
         return {"verdict": NOT_STARTED}
     found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
@@ -224,6 +227,73 @@ def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict
         found[name] = np.where(numbers[:, VERDICT] < 0, NONE, found[name])
     found["verdict"] = [SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
     return found
+
+
+# Noise is drawn for so many instants, and for so many times as many where a run is not over then.
+INSTANTS, FURTHER = 192, 4
+# Runs that compiled code makes in one call: their noise is a few hundred kilobytes.
+TOGETHER = 16
+
+
+def is_compiled(config: Config, name: str) -> bool:
+    """Whether runs of a name are made by the kernel of whole runs; others need their plan or Python."""
+    six = config.robot is not None and len(config.robot.joint_types) == COORDINATES
+    return six and sense_is_enough(config, name) and rehearses(config.trajectory.profile)
+
+
+def setting_of(scenario: Scenario, law: str) -> Setting:
+    """All that compiled runs of a law share whose seeds differ."""
+    watched, model = scenario.watched, scenario.calibration.model()
+    return Setting(
+        CODES[law],
+        model,
+        scenario.believed_by(law),
+        NO_BODY if watched.body is None else watched.body,
+        law in BODY_LAWS,
+        rehearses(scenario.config.trajectory.profile),
+        scenario.gains,
+        scenario.limits,
+        scenario.plant_of(law),
+        scenario.joints.lower,
+        scenario.joints.upper,
+        scenario.exact.q_start,
+        scenario.true_ends(),
+    )
+
+
+def numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
+    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone.
+
+    Raises
+    ------
+    WorkFailed
+        If the task cannot be begun, whatever the seed.
+    """
+    setting = setting_of(scenario, law)
+    desk = new_desk(setting, len(scenario.watched.numbers))
+    found = np.empty((len(seeds), len(NUMBERS)))
+    for first in range(0, len(seeds), TOGETHER):
+        last = first + TOGETHER
+        _make(scenario, law, setting, desk, seeds[first:last], found[first:last])
+    return found
+
+
+def _make(
+    scenario: Scenario, law: str, setting: Setting, desk: Desk, seeds: Sequence[int], numbers: FloatArray
+) -> None:
+    """Write the numbers (k, ``NUMBERS``) of runs; those that outlast their noise are made anew with more."""
+    instants, most = INSTANTS, setting.limits.max_steps + 1
+    running = list(range(len(seeds)))
+    while running:
+        drawn = min(instants, most)
+        shown = [scenario.shown_at(seeds[i]) for i in running]
+        images = np.array([(ends.s_start, ends.s_star) for ends in shown])
+        noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
+        found = np.empty((len(running), len(NUMBERS)))
+        trials(setting, images, noise, desk, found)
+        numbers[running] = found
+        running = [i for i, row in zip(running, found, strict=True) if row[VERDICT] == RUNNING]
+        instants *= FURTHER
 
 
 _designs: dict[str, Design] = {}
@@ -242,45 +312,17 @@ def _run(
 ) -> tuple[dict[str, Any], Trace | None]:
     """What is measured of one run, by column, and its trace where it is kept."""
     config = design.config(run, part.tasks)
+    name = name_of_run(config)
     try:
-        made, plan = trial(config, calibration)
+        scenario = scenario_of(config, calibration)
+        plan = (
+            rotation_sense(scenario) if sense_is_enough(config, name) else planning.run(config, calibration)
+        )
+        made = drive(scenario, plan, name)
     except WorkFailed:
         return {"verdict": NOT_STARTED}, None
-    row = measures(config, made, between_samples=design.sweep.between_samples)
-    return row, record(config, name_of_run(config), plan, made) if keep else None
-
-
-class Trial(NamedTuple):
-    """A run, and the plan it was made with or as much of it as it needs."""
-
-    made: Simulated
-    plan: Plan | Sense
-
-
-def trial(config: Config, calibration: Calibration) -> Trial:
-    """One run of the only law of a configuration.
-
-    Raises
-    ------
-    WorkFailed
-        If the task cannot be begun.
-    """
-    name = name_of_run(config)
-    scene = scene_of(config, calibration)
-    plan: Plan | Sense
-    if sense_is_enough(config, name):
-        plan = rotation_sense(config, calibration, scene.reach, scene.sight)
-    else:
-        plan = planning.run(config, calibration)
-    return Trial(simulate(config, calibration, plan, name, scene), plan)
-
-
-def measures(config: Config, made: Simulated, *, between_samples: bool) -> dict[str, Any]:
-    """What is measured of a run, by column."""
-    outcome, period = made.outcome, config.control.period_s
-    ends = ends_of(made.plant, made.truth, made.reach.goal_pose)
-    summary = summary_of(outcome, made.plant, ends, period)
-    found = {"verdict": outcome.verdict, "steps": outcome.steps, **summary._asdict()}
-    if between_samples:
-        found[BETWEEN.name] = path_between_mm(outcome, made.plant, ends, period, summary)
-    return found
+    summary = summary_of(scenario, made)
+    row = {"verdict": made.verdict, "steps": made.steps, **summary._asdict()}
+    if design.sweep.between_samples:
+        row[BETWEEN.name] = deviation_between_samples_mm(scenario, made, summary)
+    return row, recorded(scenario, plan, name, made) if keep else None

@@ -8,12 +8,12 @@ import sys
 from typing import NamedTuple
 
 import numpy as np
+from projservo_cli.stages.traces import rotation_between
 
 from projservo_cli.config import load_config
 from projservo_cli.records import BODY_LAWS, REPLAN, law_and_mode
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import plant_of, reach_of, sight_of, truth_of
-from projservo_cli.stages.traces import rotation_between
 from tests.conftest import ROOT
 
 NOISE = ["noise.calibration_px=0.5", "noise.servo_px=0.5"]

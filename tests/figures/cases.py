@@ -4,6 +4,7 @@ import dataclasses
 from functools import lru_cache
 
 import numpy as np
+from projservo_cli.stages.noisy import noisy_runs
 
 from projservo_cli.calibration.prediction import prediction_derivative
 from projservo_cli.config import load_config
@@ -11,7 +12,6 @@ from projservo_cli.records import LAWS, METRIC_LAWS, Calibration, following_mode
 from projservo_cli.report.material import Material
 from projservo_cli.stages import calibrate, plan, servo, studies
 from projservo_cli.stages import scenario as truth
-from projservo_cli.stages.noisy import noisy_runs
 from projservo_cli.stages.plan import Pace
 from projservo_cli.stages.scenario import servo_noise
 from projservo_cli.task.margins import within

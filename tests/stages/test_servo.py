@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-
 from projservo_cli.stages.traces import longest_plateau, rotation_between
+
 from tests.samples import displacement
 from tests.stages.cases import Case, case
 

@@ -7,12 +7,12 @@ from functools import cache
 
 import numpy as np
 import pytest
+from projservo_cli.stages.traces import rotation_between
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import plant_of, reach_of, sight_of, truth_of
-from projservo_cli.stages.traces import rotation_between
 from tests.stages.cases import Case, case
 
 STEPS, TAIL, GAIN = 200, 150, 0.1

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from projservo_cli.stages.trials import is_compiled, numbers_of, prepare
 
 from projservo_cli.loop.trial import NUMBERS, VERDICT
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, trials
-from projservo_cli.stages.trials import is_compiled, numbers_of, prepare
 from projservo_cli.sweep.design import changed, name_of_run
 from tests.sweep.cases import design
 

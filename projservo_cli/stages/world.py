@@ -1,0 +1,250 @@
+"""The world of a simulated experiment: robot, rig and markers as a configuration describes them."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.kinematics import project
+from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.robots.truth import (
+    Robot,
+    dh_robot,
+    inverse_kinematics,
+    look_at_camera,
+    rigid,
+    roll_axis,
+    rotation_about_axis,
+    twist,
+)
+from projservo_cli.task.face import MIDPOINT
+
+if TYPE_CHECKING:
+    from projservo_cli.config import Config
+    from projservo_cli.config.models import Perturbation
+    from projservo_cli.config.models import Task as TaskSettings
+    from projservo_cli.config.robot import Camera, JointVector, Markers, Rig
+    from projservo_cli.config.robot import Robot as DescribedRobot
+
+
+class Joints(NamedTuple):
+    """What a configuration says of the joints.
+
+    Attributes
+    ----------
+    types : one letter a joint, R or P.
+    lower, upper : (n,) limits, rad or m; infinite where none is set.
+    speed : (n,) most motion per second, rad/s or m/s; infinite for none.
+    """
+
+    types: str
+    lower: FloatArray
+    upper: FloatArray
+    speed: FloatArray
+
+    def require_inside(self, q: FloatArray, where: str) -> None:
+        """Refuse readings (n,) outside the limits."""
+        for i in np.flatnonzero((q < self.lower) | (q > self.upper)):
+            raise InputError(
+                f"{where} puts joint {i + 1} at {q[i]:.6g}, beyond its limits {self.lower[i]:.6g} to "
+                f"{self.upper[i]:.6g} (rad or m): choose another"
+            )
+
+
+def reference_of(config: "Config") -> "JointVector | None":
+    """Joints around which the trial motions are made."""
+    start = config.task.start if config.task is not None else None
+    return config.calibration.reference or start
+
+
+def joints_of(config: "Config", default_types: str = "") -> Joints:
+    """Joints of the robot; of the calibration's ``default_types`` where the configuration does not tell."""
+    vector = reference_of(config)
+    types = config.joint_types or default_types or "R" * (len(vector.joints) if vector is not None else 0)
+    robot = config.robot
+    bounds = robot.limits if robot is not None else ((-math.inf, math.inf),) * len(types)
+    c = config.control
+    revolute = math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s)
+    prismatic = math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s
+    lower, upper = np.array(bounds, dtype=np.float64).reshape(-1, 2).T.copy()
+    speed = np.array([prismatic if kind == "P" else revolute for kind in types])
+    return Joints(types, lower, upper, speed)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Robot, rig and markers as they are.
+
+    Attributes
+    ----------
+    robot : true kinematics.
+    P : (2, 3, 4) true cameras, px.
+    M : (m, 4) all markers at the robot's reference, m.
+    number : (m,) their numbers.
+    face : indices of the face markers; none where the configuration has no face.
+    center : position of the centre marker within the face, or ``MIDPOINT``.
+    image_size : (2,) px.
+    """
+
+    robot: Robot
+    P: FloatArray
+    M: FloatArray
+    number: tuple[int, ...]
+    face: tuple[int, ...]
+    center: int
+    image_size: FloatArray
+
+    @cached_property
+    def model(self) -> Model:
+        """Metric model, for the plant and for the law that is given one."""
+        return self.robot.model(self.P)
+
+    @cached_property
+    def M_face(self) -> FloatArray:
+        """Face markers (k, 4) at the robot's reference, m."""
+        return np.ascontiguousarray(self.M[list(self.face)])
+
+    @cached_property
+    def pins(self) -> tuple[int, ...]:
+        """Indices of the markers that are not on the face."""
+        return tuple(i for i in range(len(self.M)) if i not in self.face)
+
+    def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
+        """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
+        return project(self.P, M @ self.displacement(q).T)
+
+    def displacement(self, q: FloatArray) -> FloatArray:
+        """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
+        return self.robot.pose(q) @ self._from_tool
+
+    @cached_property
+    def _from_tool(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
+
+
+def face_numbers(config: "Config") -> tuple[int, ...]:
+    """Numbers of the face markers."""
+    if config.markers is None or config.markers.face is None:
+        raise InputError(
+            "this stage needs to know the face: set markers.face to three marker numbers or more"
+        )
+    return config.markers.face
+
+
+def center_index(config: "Config") -> int:
+    """Position of the centre marker within the face, or ``MIDPOINT``."""
+    assert config.markers is not None
+    center = config.markers.center
+    return MIDPOINT if center == "midpoint" else face_numbers(config).index(center)
+
+
+def truth_of(config: "Config") -> Truth:
+    """Build the truth, or find it again where it was built for another seed or task.
+
+    Raises
+    ------
+    InputError
+        If the configuration lacks a part of it, naming the key to set.
+    """
+    if config.robot is None:
+        raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
+    if config.rig is None:
+        raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
+    if config.markers is None or config.markers.positions_m is None:
+        raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
+    return _built(config.robot, config.rig, config.markers)
+
+
+@lru_cache(maxsize=16)
+def _built(described: "DescribedRobot", rig: "Rig", markers: "Markers") -> Truth:
+    robot = robot_of(described)
+    numbers = markers.known
+    assert numbers is not None
+    points = np.c_[np.array(markers.positions_m), np.ones(len(numbers))]
+    face = markers.face or ()
+    return Truth(
+        robot,
+        np.array([camera_of(rig.left), camera_of(rig.right)]),
+        points @ robot.base_tool.T,
+        numbers,
+        tuple(numbers.index(number) for number in face),
+        face.index(markers.center) if face and markers.center != "midpoint" else MIDPOINT,
+        np.array(rig.image_size_px, dtype=np.float64),
+    )
+
+
+def robot_of(described: "DescribedRobot") -> Robot:
+    """Robot of a DH table or of screws."""
+    limits = described.limits
+    if described.dh is not None:
+        table = described.dh
+        rows = [
+            (j.type == "P", math.radians(j.theta_deg), j.d_m, j.a_m, math.radians(j.alpha_deg))
+            for j in table.joints
+        ]
+        return dh_robot(rows, table.convention == "modified", np.array(table.tool), limits)
+    screws = described.screws
+    assert screws is not None
+    types = described.joint_types
+    bounds = np.array(limits)
+    return Robot(
+        np.array([twist(j.w, j.v) for j in screws.joints]),
+        np.array([PRISMATIC if t == "P" else REVOLUTE for t in types], dtype=np.int64),
+        np.array(screws.reference.values(types)),
+        np.array(screws.base_tool),
+        np.ascontiguousarray(bounds[:, 0]),
+        np.ascontiguousarray(bounds[:, 1]),
+    )
+
+
+def camera_of(camera: "Camera") -> FloatArray:
+    """Camera (3, 4) to px of its matrix or its look-at description."""
+    if camera.matrix is not None:
+        P = np.array(camera.matrix)
+        # A camera is given up to scale; the loop needs the scale that makes depths positive metres.
+        scale = float(np.sign(np.linalg.det(P[:, :3])) * np.linalg.norm(P[2, :3]))
+        if scale == 0.0:
+            raise InputError("rig: a camera matrix needs an invertible left 3×3 block: a finite camera")
+        return P / scale if abs(scale - 1.0) > 1e-12 else P
+    assert camera.focal_px is not None
+    assert camera.principal_point_px is not None
+    assert camera.position_m is not None
+    assert camera.target_m is not None
+    return look_at_camera(
+        camera.focal_px, camera.principal_point_px, camera.position_m, camera.target_m, camera.up
+    )
+
+
+def goal_joints(task: "TaskSettings", types: str, truth: Truth, q_start: FloatArray) -> FloatArray:
+    """Joints (n,) of a goal that is given by them or by a turn of the true robot, rad or m."""
+    if task.goal.joints is not None:
+        return np.array(task.goal.joints.values(types))
+    assert task.goal.turn_deg is not None
+    return _turned(truth, q_start, task.goal.turn_deg, task.goal.perturbation)
+
+
+def _turned(
+    truth: Truth, q_start: FloatArray, turn_deg: float, perturbation: "Perturbation | None"
+) -> FloatArray:
+    """Joints after a turn about the roll axis of the rig and a small displacement of the tool."""
+    point, direction = roll_axis(truth.P)
+    goal = rotation_about_axis(point, direction, math.radians(turn_deg)) @ truth.robot.pose(q_start)
+    if perturbation is not None:
+        v = np.array(perturbation.rotation_rad)
+        t = np.array(perturbation.translation_m)
+        angle = float(np.linalg.norm(v))
+        turn = rotation_about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
+        goal = goal @ rigid(np.eye(3), t) @ turn
+    return inverse_kinematics(truth.robot, goal, q_start)
+
+
+def require_limits(robot: Robot, q: FloatArray, where: str) -> None:
+    """Refuse joints outside the limits."""
+    for i, value in enumerate(q):
+        if not robot.lower[i] <= value <= robot.upper[i]:
+            raise WorkFailed(
+                f"{where}: joint {i + 1} would be at {value:.4g}, outside its limits "
+                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose others or wider limits"
+            )
