@@ -12,8 +12,10 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Config, load_config
 from projservo_cli.records import Calibration, FloatArray, Plan, Trace
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import plant_of, reach_of, servo_noise, truth_of
-from projservo_cli.task.margins import within
+from projservo_cli.stages.world import truth_of
+from tests.known import driven as driven_with
+from tests.known import known_scenario
+from tests.known import planned as planned_with
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 ARMS = ("paper", "ur5")
@@ -42,10 +44,8 @@ def driven(arm: str, seed: int, law: str) -> Trace:
 
 def true_run(arm: str, law: str, *overrides: str, frame: FloatArray | None = None) -> Trace:
     """A run with the true operators, in the metric frame or in a projective one."""
-    config = configured(arm, *overrides)
-    truth = truth_of(config)
-    reach = reach_of(config, truth)
-    model = truth.model
+    scenario = known_scenario(configured(arm, *overrides))
+    model = scenario.truth.model
     if frame is not None:
         back = np.linalg.inv(frame)
         model = model._replace(
@@ -53,28 +53,7 @@ def true_run(arm: str, law: str, *overrides: str, frame: FloatArray | None = Non
             H_hat_0=np.ascontiguousarray(back @ model.H_hat_0 @ frame),
             a_inf=frame.T @ model.a_inf,
         )
-    planned = plan.plan_task(
-        model,
-        reach.q_start,
-        reach.s_start,
-        reach.s_star,
-        truth.center,
-        "linear",
-        0.9,
-        11,
-        within(truth.robot.lower, truth.robot.upper),
-    )
-    return servo.drive(
-        law,
-        model,
-        plant_of(config, truth, reach.q_start),
-        truth,
-        reach,
-        servo.gains_of(config),
-        servo.limits_of(config),
-        servo_noise(config, len(truth.face)),
-        planned.rotation_sense(),
-    )
+    return driven_with(scenario, planned_with(scenario, model), law, model)
 
 
 def held_out_rms(arm: str, calibration: Calibration, poses: int = 200) -> float:

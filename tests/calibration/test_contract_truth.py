@@ -9,7 +9,7 @@ import pytest
 from projservo_cli.calibration import predict
 from projservo_cli.config import load_config
 from projservo_cli.stages import calibrate as stage
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.tables import write_table
 
 PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"

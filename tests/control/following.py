@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.records import NO_LENS
 from projservo_cli.stages.plan import Pace, plan_task
-from projservo_cli.stages.servo import followed
+from projservo_cli.task.following import followed
 from projservo_cli.task.margins import within
 from tests.scene import GAINS, Run, limits
 

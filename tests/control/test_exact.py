@@ -1,42 +1,19 @@
 """The law without drift, with the true operators."""
 
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config
-from projservo_cli.stages import plan, servo
-from projservo_cli.stages.scenario import plant_of, reach_of, servo_noise, truth_of
-from projservo_cli.task.margins import within
-
-CONFIGS = Path(__file__).parents[2] / "configs"
+from tests.known import configured, driven, known_scenario, planned
 
 
 @lru_cache(maxsize=32)
 def exact_run(arm, gain, limit, *overrides):
     gains = [f"control.gain_{part}={gain / 0.04}" for part in "ts"]
-    config = load_config(
-        CONFIGS / f"{arm}.yaml", [*gains, f"control.joint_speed_limit_deg_s={limit}", *overrides]
-    )
-    truth = truth_of(config)
-    reach = reach_of(config, truth)
-    bounds = within(truth.robot.lower, truth.robot.upper)
-    sense = plan.plan_task(
-        truth.model, reach.q_start, reach.s_start, reach.s_star, truth.center, "linear", 0.9, 3, bounds
-    ).rotation_sense()
-    return servo.drive(
-        "exact",
-        truth.model,
-        plant_of(config, truth, reach.q_start),
-        truth,
-        reach,
-        servo.gains_of(config),
-        servo.limits_of(config),
-        servo_noise(config, len(truth.face)),
-        sense,
-    )
+    scenario = known_scenario(configured(arm, *gains, f"control.joint_speed_limit_deg_s={limit}", *overrides))
+    model = scenario.truth.model
+    return driven(scenario, planned(scenario, model, samples=3), "exact", model)
 
 
 @pytest.mark.volume

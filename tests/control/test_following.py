@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
 from projservo_cli.records import MODES_OF, TRACK, InputError, WorkFailed
 from projservo_cli.stages.plan import from_rest
-from projservo_cli.stages.servo import followed, instants
+from projservo_cli.task.following import followed
 from projservo_cli.task.trajectory import (
     NO_REFERENCE,
     following,
@@ -163,7 +163,7 @@ def test_a_task_that_is_done_is_followed_at_rest():
 def test_a_plan_without_time_or_joints_is_refused():
     sc = scene()
     with pytest.raises(InputError, match=r"set trajectory\.duration_s"):
-        instants(planned(sc, speed=math.inf), GAINS.period)
+        followed(sc.model, sc.task(), planned(sc, speed=math.inf), GAINS.period, 1.0)
     plan = planned(sc)
     plan.q[50:] = np.nan
     with pytest.raises(WorkFailed, match="cannot follow"):

@@ -4,17 +4,23 @@ Run as ``python -m tests.control.tracking [SEEDS] [NAME …] [KEY=VALUE …]`` f
 a seed.
 """
 
+import math
 import sys
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from projservo_cli.stages.traces import rotation_between
 
 from projservo_cli.config import load_config
-from projservo_cli.records import BODY_LAWS, REPLAN, law_and_mode
+from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.loop.summary import angle_between
+from projservo_cli.records import REPLAN, law_and_mode
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import plant_of, reach_of, sight_of, truth_of
+from projservo_cli.stages.plan import Sense
+from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
+from tests.known import driven
 
 NOISE = ["noise.calibration_px=0.5", "noise.servo_px=0.5"]
 # Within this of the goal, mm and deg, a run has arrived; it has until one period after the planned time.
@@ -70,17 +76,9 @@ def off_the_line(trace, goal):
 
 def goal_shown(config, calibration, planned, name):
     """Pose (4, 4) in which the loop comes to rest without noise: the goal as its images show it."""
-    law, mode = law_and_mode(name)
-    truth = truth_of(config)
-    reach = reach_of(config, truth)
-    sight = sight_of(config, calibration, truth, reach) if law in BODY_LAWS else None
-    observed = len(truth.face) + (0 if sight is None else len(sight.pins))
-    limits = servo.limits_of(config)._replace(image_px=1e-3, noise_px=0.0, max_steps=400)
-    plant = plant_of(config, truth, reach.q_start)
-    model, gains, sense = calibration.model(), servo.gains_of(config), planned.rotation_sense()
-    plan_to_follow = None if mode == REPLAN else planned
-    silent = np.zeros((401, 2, observed, 2))
-    trace = servo.drive(law, model, plant, truth, reach, gains, limits, silent, sense, sight, plan_to_follow)
+    scenario = replace(scenario_of(config, calibration), ideal=True)
+    plan = Sense(planned.rotation_sense(), None) if law_and_mode(name)[1] == REPLAN else planned
+    trace = driven(scenario, plan, name, None, image_px=1e-3, noise_px=0.0, max_steps=400)
     assert trace.verdict == "converged"
     return trace.pose[-1]
 
@@ -89,7 +87,9 @@ def errors_to(trace, truth, goal_pose):
     """Distance of the centre, mm, and rotation, deg, to a goal at every instant."""
     body = np.linalg.solve(truth.robot.base_tool, truth.M_face.mean(axis=0))
     position = 1e3 * np.linalg.norm(trace.center - (goal_pose @ body)[:3], axis=1)
-    return position, np.array([rotation_between(pose, goal_pose) for pose in trace.pose])
+    return position, np.array(
+        [math.degrees(angle_between(as_mat(pose), as_mat(goal_pose))) for pose in trace.pose]
+    )
 
 
 def kept(trace, truth, shown):

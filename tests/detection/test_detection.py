@@ -11,7 +11,7 @@ from projservo_cli.detection.pairs import crossing
 from projservo_cli.detection.tags import TagFinder
 from projservo_cli.records import InputError
 from projservo_cli.stages.calibrate import trial_motions
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.tables import read_table
 from tests.detection.rendering import render, square
 

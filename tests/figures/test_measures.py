@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from projservo_cli.stages.traces import longest_plateau
 
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.report import measures
+from projservo_cli.stages.trace import longest_plateau
 from tests.figures.cases import case, geometric
 
 

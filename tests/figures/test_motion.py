@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.report import view as motion
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from tests.figures.cases import SHORT, case
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.task.face import MIDPOINT, task_from_images
 
 CALLS = []

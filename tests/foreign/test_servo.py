@@ -5,6 +5,7 @@ import shutil
 import sys
 from importlib import metadata
 from pathlib import Path
+from types import SimpleNamespace
 
 import click
 import numpy as np
@@ -13,7 +14,8 @@ import pytest
 from projservo_cli import files
 from projservo_cli.config import load_config
 from projservo_cli.records import Calibration
-from projservo_cli.stages.servo import adapted, gains_of, innovation_of, limits_of, untested
+from projservo_cli.stages.own_robot import untested
+from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.store import load
 from tests.fake_records import fake
 from tests.foreign import robots
@@ -207,9 +209,9 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
 def test_a_calibration_without_covariance_tests_nothing_and_says_so():
     config = load_config(UR5)
     bare = fake(Calibration, covariance=np.full((3, 3), np.nan))
-    assert "has no covariance" in untested(config, bare)
-    assert innovation_of(config, bare, 10) is None
-    assert untested(config, fake(Calibration, covariance=np.eye(3))) == ""
+    assert "has no covariance" in untested(SimpleNamespace(config=config, calibration=bare))
+    sound = fake(Calibration, covariance=np.eye(3))
+    assert untested(SimpleNamespace(config=config, calibration=sound)) == ""
 
 
 def test_single_bad_frames_are_no_disturbance(servo):
@@ -232,9 +234,11 @@ def test_lost_markers_are_waited_for(servo):
 
 
 def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
-    config = load_config(UR5, ["plant.joint_limits=report", "noise.servo_px=0.1"])
+    use = f"plant={{use: '{HERE}:Sound', joint_limits: report}}"
+    config = load_config(UR5, [use, "noise.servo_px=0.1"])
     calibration = load(calibrated).calibration
-    gains, limits = adapted(config, calibration, gains_of(config), limits_of(config))
+    scenario = scenario_of(config, calibration)
+    gains, limits = scenario.gains, scenario.limits
     assert limits.stop_at_joint_limit
     assert limits.image_px == 0.01 + 2.0 * calibration.sigma_fitted_px
     np.testing.assert_array_equal(gains.speed, np.full(6, np.radians(125.0)))

@@ -28,7 +28,7 @@ def reaching_of(name, model=None, border_px=20.0):
 def constrained(name, model=None, samples=101, **demands):
     """A shipped task planned under constraints, some of them changed."""
     example = case(name)
-    reach = example.reach
+    reach = example.ends
     return plan_task(
         example.truth.model if model is None else model,
         reach.q_start,

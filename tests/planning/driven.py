@@ -18,7 +18,7 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.preparation import STRATA, random_tasks
 from tests.conftest import ROOT
 from tests.planning.arm import arm_of, feasible

@@ -13,8 +13,8 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.records import Plan, WorkFailed
 from projservo_cli.stages.plan import demands_of, plan_task
-from projservo_cli.stages.scenario import truth_of
 from projservo_cli.stages.studies import projective_twin
+from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.preparation import random_tasks
 from tests.conftest import ROOT
 from tests.planning.oracle import TrueTask

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from tests.planning.arm import arm_of, feasible, flood, pivot_ratio, pose, solve
 from tests.planning.driven import configured, driven, feasible_tasks, true_task, words
 from tests.samples import poe
@@ -79,7 +79,7 @@ def test_a_task_that_needs_coupled_parts_is_driven_in_sight():
     example = case("coupled")
     assert not example.planned(example.truth.model, "rotation_first", 101).feasible
     q_goal = np.array(example.config.task.goal.joints.values("RRRRRR"))
-    run = driven("coupled", 0, example.reach.q_start, q_goal)
+    run = driven("coupled", 0, example.ends.q_start, q_goal)
     assert run.planned
     assert run.converged, run.reason
     assert run.occluded == 0

@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.stages.plan import demands_of, plan_task
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 
 pytestmark = pytest.mark.volume

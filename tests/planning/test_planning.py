@@ -45,7 +45,7 @@ def test_a_planned_motion_keeps_what_it_says(name):
     M = np.array([plan.A @ (poe(example.truth.model, q) @ start).T for q in plan.q])
     s = np.stack([pixels(example.truth.P, points) for points in M])
     np.testing.assert_allclose(s, plan.s, atol=1e-5)
-    np.testing.assert_allclose(s[-1], example.reach.s_star, atol=1e-5)
+    np.testing.assert_allclose(s[-1], example.ends.s_star, atol=1e-5)
     border = np.minimum(s + 0.5, example.truth.image_size - 0.5 - s).min(axis=(2, 3))
     np.testing.assert_allclose(plan.border_distance, border, atol=1e-5)
     assert plan.margin.min() > 0.0
@@ -85,7 +85,7 @@ def test_only_coupled_parts_keep_the_face_in_sight(task):
 def test_the_shipped_task_needs_coupled_parts():
     example = case("coupled")
     q_goal = np.array(example.config.task.goal.joints.values("RRRRRR"))
-    _proves_coupling(example.config, example.truth, example.reach.q_start, q_goal)
+    _proves_coupling(example.config, example.truth, example.ends.q_start, q_goal)
     plan = example.plan
     assert 0 < np.nanmin(plan.tau_0[plan.tau_0 > 0]) < plan.tau
 
@@ -94,7 +94,7 @@ def test_the_shipped_task_that_even_shares_hide_from_both_cameras():
     """Shares that grow evenly lose sight of the face by true geometry; the planned ones never do."""
     example = case("apart")
     q_goal = np.array(example.config.task.goal.joints.values("RRRRRR"))
-    q_start = example.reach.q_start
+    q_start = example.ends.q_start
     outcome = outcome_of(0, example.config, example.truth, example.truth.model, q_start, q_goal)
     assert not outcome.linear
     assert outcome.kept
@@ -123,9 +123,9 @@ def test_what_makes_a_task_infeasible_is_named():
     assert "470 px asked for" in plan.reason
     assert "mu_t" in plan.reason
     upper = example.truth.robot.upper.copy()
-    upper[0] = example.reach.q_start[0] + 0.01
+    upper[0] = example.ends.q_start[0] + 0.01
     lower = example.truth.robot.lower.copy()
-    lower[0] = example.reach.q_start[0] - 0.01
+    lower[0] = example.ends.q_start[0] - 0.01
     plan = constrained("paper", lower=lower, upper=upper)
     assert not plan.feasible
     assert plan.constraint == "joints"
@@ -139,7 +139,7 @@ def test_what_makes_a_task_infeasible_is_named():
 
 def test_a_start_that_is_the_goal_is_planned_as_no_motion():
     example = case("ur5")
-    reach = example.reach
+    reach = example.ends
     demands = demands_of(example.config)
     plan = plan_task(
         example.truth.model, reach.q_start, reach.s_start, reach.s_start, -1, "constrained", 0.9, 5, demands

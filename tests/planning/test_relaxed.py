@@ -62,7 +62,7 @@ def test_truly_infeasible_tasks_stay_so():
     """Joint limits and views are never given up."""
     example = case("paper")
     lower, upper = example.truth.robot.lower.copy(), example.truth.robot.upper.copy()
-    lower[0], upper[0] = example.reach.q_start[0] - 0.01, example.reach.q_start[0] + 0.01
+    lower[0], upper[0] = example.ends.q_start[0] - 0.01, example.ends.q_start[0] + 0.01
     plan = constrained("paper", lower=lower, upper=upper)
     assert not plan.feasible
     assert plan.constraint == "joints"
@@ -82,7 +82,7 @@ def stretched(**demands):
     goal = expm(X) @ poe(truth.model, STRETCHED)
     s_star = pixels(truth.P, truth.M_face @ goal.T)
     asked = demands_of(example.config)._replace(**demands)
-    reach = example.reach
+    reach = example.ends
     return plan_task(
         truth.model, reach.q_start, reach.s_start, s_star, truth.center, "constrained", 0.9, 101, asked
     )

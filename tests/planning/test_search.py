@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.geometry.mechanisms import span_of, workspace
 from projservo_cli.stages.plan import demands_of, plan_task
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.task.lattice import near, view_shares, widest
 from projservo_cli.task.margins import limit_margin
 from projservo_cli.task.search import MOST_STRIDE, WAYS, best_way, carry, orientation, traced

@@ -11,7 +11,8 @@ from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.stages import record as stage
 from projservo_cli.stages.calibrate import simulate
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.own_robot import drive_to, step_limit
+from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.store import load
 from projservo_cli.tables import read_joints, read_table
 
@@ -178,7 +179,7 @@ def test_every_step_keeps_the_speed_limit_and_the_joint_limits():
     steps = np.array(robot.steps)
     limit = np.array([125 * np.pi / 180 * 0.04] * 6)
     limit[2] = 0.5 * 0.04
-    np.testing.assert_allclose(stage.step_limit(config), limit, rtol=1e-15)
+    np.testing.assert_allclose(step_limit(config, joints_of(config)), limit, rtol=1e-15)
     assert (np.abs(steps) <= limit * (1 + 1e-12)).all()
     assert recording.commands == len(steps)
     path = recording.targets[0] + np.cumsum(steps, axis=0)
@@ -218,10 +219,10 @@ def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo)
 
 def test_no_limit_is_one_step():
     config = load_config(UR5, ["control.joint_speed_limit_deg_s=null"])
-    assert np.isinf(stage.step_limit(config)).all()
+    assert np.isinf(step_limit(config, joints_of(config))).all()
     robot = Watched(truth_of(config), np.zeros(6), np.zeros((1, 2, 10, 2)))
     target = np.array([1.0, -2.0, 0.1, 1e-9, 0.0, 3.0])
-    assert stage.drive(robot, target, np.full(6, np.inf), 0.04) <= 2
+    assert drive_to(robot, target, np.full(6, np.inf), 0.04) <= 2
     np.testing.assert_array_equal(robot.joints(), target)
 
 

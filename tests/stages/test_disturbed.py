@@ -9,8 +9,8 @@ from projservo_cli.loop.python import BuiltInLaw, run
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.records import InputError
 from projservo_cli.robots.simulated import AnalyticPlant
-from projservo_cli.stages.scenario import disturbance_of, lose_markers
 from tests.conftest import ROOT
+from tests.known import known_scenario
 from tests.loop.test_python_loop import same_logs
 from tests.scene import GAINS, Run, limits, scene, with_pins
 
@@ -27,14 +27,13 @@ def config(*overrides):
 
 def disturbed(*overrides, pins=False):
     sc = with_pins(scene()) if pins else scene()
-    return sc._replace(plant=sc.plant._replace(disturbance=disturbance_of(config(*overrides), 6)))
+    disturbance = known_scenario(config(*overrides)).plant_of("exact").disturbance
+    return sc._replace(plant=sc.plant._replace(disturbance=disturbance))
 
 
-def noise_of(sc, steps, *overrides):
-    markers = len(sc.plant.M) + len(sc.plant.pins)
-    noise = np.zeros((steps + 1, 2, markers, 2))
-    lose_markers(config(*overrides), noise, range(markers))
-    return noise
+def noise_of(steps, *overrides):
+    """Zero but for lost markers."""
+    return known_scenario(config(*overrides)).noise_of("exact", 1, steps + 1)
 
 
 @pytest.mark.parametrize("pins", [False, True], ids=["points", "body"])
@@ -44,7 +43,9 @@ def noise_of(sc, steps, *overrides):
 def test_both_loops_suffer_alike(overrides, pins):
     sc = disturbed(*overrides, pins=pins)
     bounds = limits(max_steps=60, lost_steps=5)
-    noise = noise_of(sc, 60, *overrides)
+    noise = noise_of(60, *overrides)
+    if pins:
+        noise = np.concatenate([noise, np.zeros((61, 2, len(sc.plant.pins), 2))], axis=2)
     task = sc.body_task() if pins else sc.task()
     compiled = Run(sc, "exact", bounds=bounds, noise=noise, task=task)
     plant = AnalyticPlant(sc.plant, sc.q_start, noise)
@@ -90,11 +91,11 @@ def test_late_images_show_what_was(delay):
 
 
 def test_markers_named_are_lost_and_no_others():
-    noise = noise_of(scene(), 9, LOST)
+    noise = noise_of(9, LOST)
     gone = np.isnan(noise)
     assert gone[3:5, :, 1].all()
     assert gone.sum() == 2 * 2 * 2
-    for_ever = noise_of(scene(), 9, "disturbance.lost_markers={from_step: 4}")
+    for_ever = noise_of(9, "disturbance.lost_markers={from_step: 4}")
     assert (np.isnan(for_ever).all(axis=(1, 2, 3)) == (np.arange(10) >= 4)).all()
 
 

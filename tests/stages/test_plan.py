@@ -95,7 +95,7 @@ def test_an_infeasible_profile_is_named():
 
 def test_a_start_that_is_the_goal_is_a_plan_without_motion():
     example = case("ur5")
-    reach = example.reach
+    reach = example.ends
     bounds = within(example.truth.robot.lower, example.truth.robot.upper)
     plan = plan_task(
         example.truth.model, reach.q_start, reach.s_start, reach.s_start, -1, "linear", 0.9, 5, bounds

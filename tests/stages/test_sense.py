@@ -6,7 +6,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.stages import calibrate, plan
 from projservo_cli.stages.plan import rotation_sense
-from projservo_cli.stages.scenario import reach_for, sight_for
+from projservo_cli.stages.scenario import scenario_of
 from tests.conftest import ROOT
 
 CASES = [
@@ -21,6 +21,5 @@ CASES = [
 def test_the_sense_is_that_of_the_whole_plan(name, overrides):
     config = load_config(ROOT / "configs" / f"{name}.yaml", ["trajectory.samples=11", *overrides])
     _, calibration, _ = calibrate.run(config)
-    reach = reach_for(config, calibration)
-    found = rotation_sense(config, calibration, reach, sight_for(config, calibration, reach))
+    found = rotation_sense(scenario_of(config, calibration))
     assert np.array_equal(found.rotation_sense(), plan.run(config, calibration).rotation_sense())

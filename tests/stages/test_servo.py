@@ -4,8 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from projservo_cli.stages.traces import longest_plateau, rotation_between
 
+from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.loop.summary import angle_between
+from projservo_cli.stages.trace import longest_plateau
 from tests.samples import displacement
 from tests.stages.cases import Case, case
 
@@ -92,4 +94,4 @@ def test_angle_between_rotations(angle):
     """Accurate at both ends, where an arc cosine would lose half its digits."""
     start = displacement([0.3, 0.2, -0.5], [0, 0, 0])
     goal = displacement([0, angle, 0], [1, 2, 3]) @ start
-    assert rotation_between(start, goal) == pytest.approx(math.degrees(angle), abs=1e-12)
+    assert angle_between(as_mat(start), as_mat(goal)) == pytest.approx(angle, abs=1e-14)

@@ -7,12 +7,16 @@ from functools import cache
 
 import numpy as np
 import pytest
-from projservo_cli.stages.traces import rotation_between
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.config.models import Noise
+from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import plant_of, reach_of, sight_of, truth_of
+from projservo_cli.stages.plan import Sense
+from projservo_cli.stages.scenario import StartAndGoal, Watched, scenario_of
+from tests.known import driven
 from tests.stages.cases import Case, case
 
 STEPS, TAIL, GAIN = 200, 150, 0.1
@@ -30,7 +34,7 @@ def bounds_at_goal(example, sigma):
     """Least rms errors of the centre, mm, and of the rotation, deg, of one look at the goal (Cramér–Rao)."""
     truth = example.truth
     M = truth.M[[*truth.face, *truth.pins]]
-    M = M @ (example.reach.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T
+    M = M @ (example.ends.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T
 
     def images(x):
         R = Rotation.from_rotvec(x[3:]).as_matrix()
@@ -46,36 +50,27 @@ def bounds_at_goal(example, sigma):
 def steady(law, sigma, observation, runs):
     """Rms errors of centre, mm, and rotation, deg, over the last instants of noisy runs, and the verdicts."""
     example, calibration, planned = calibrated()
-    truth = example.truth
-    order = [*truth.face, *truth.pins]
-    sight = sight_of(example.config, calibration, truth, example.reach)
-    clean = truth.images(example.reach.q_start, truth.M[order])
-    M_goal = truth.M[order] @ (example.reach.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T
-    m = M_goal @ np.swapaxes(truth.P, 1, 2)
-    limits = example.limits._replace(image_px=1e-9, max_steps=STEPS)
+    scenario = scenario_of(example.config, calibration)
+    assert scenario.exact.s_start.shape[1] == 10
+    if observation == "points":
+        scenario = replace(scenario, watched=Watched(4, scenario.watched.numbers[:4]))
+    exact, sense = scenario.exact, Sense(planned.rotation_sense(), None)
+    noisy = scenario.config.model_copy(update={"noise": Noise(servo_px=sigma)})
     position, rotation, verdicts = [], [], Counter()
     for seed in range(runs):
         rng = np.random.default_rng(seed)
-        start = clean + sigma * rng.standard_normal(clean.shape)
-        star = m[..., :2] / m[..., 2:] + sigma * rng.standard_normal(clean.shape)
-        noise = sigma * rng.standard_normal((STEPS + 1, *clean.shape))
-        points = observation == "points"
-        trace = servo.drive(
-            law,
-            calibration.model(),
-            example.plant,
-            truth,
-            replace(example.reach, s_start=start[:, :4], s_star=star[:, :4]),
-            example.gains,
-            limits,
-            np.ascontiguousarray(noise[:, :, :4]) if points else noise,
-            planned.rotation_sense(),
-            None if points else replace(sight, s_start=start, s_star=star),
-        )
+        shown = [s + sigma * rng.standard_normal(s.shape) for s in (exact.s_start, exact.s_star)]
+        ends = StartAndGoal(exact.q_start, exact.goal_pose, *shown)
+        config = noisy.model_copy(update={"seed": seed})
+        limits = {"image_px": 1e-9, "max_steps": STEPS}
+        trace = driven(replace(scenario, config=config, ends=ends), sense, law, None, **limits)
         verdicts[trace.verdict] += 1
         assert trace.observation == observation
         gap = 1e3 * np.linalg.norm(trace.center[TAIL:] - example.goal_center, axis=1)
-        turn = [rotation_between(pose, example.reach.goal_pose) for pose in trace.pose[TAIL:]]
+        turn = [
+            math.degrees(angle_between(as_mat(pose), as_mat(example.ends.goal_pose)))
+            for pose in trace.pose[TAIL:]
+        ]
         position.append(np.mean(gap**2))
         rotation.append(np.mean(np.square(turn)))
     return np.sqrt([np.mean(position), np.mean(rotation)]), verdicts
@@ -133,36 +128,35 @@ def test_points_measure_the_face_alone():
     example, calibration, planned = noisy("control.observation=points")
     trace = servo.run(example.config, calibration, planned, "direct_two")
     assert trace.observation == "points"
-    assert sight_of(example.config, calibration, example.truth, example.reach) is None
+    assert scenario_of(example.config, calibration).watched.body is None
 
 
 def test_a_calibration_that_is_not_usable_has_no_body_unless_one_is_asked_for():
     example, calibration, _ = calibrated()
     poor = replace(calibration, usable=False)
-    assert sight_of(example.config, poor, example.truth, example.reach) is None
+    assert scenario_of(example.config, poor).watched.body is None
     asked = Case("paper", ["control.observation=body"])
-    assert sight_of(asked.config, poor, asked.truth, asked.reach) is not None
+    assert scenario_of(asked.config, poor).watched.body is not None
 
 
 def test_only_markers_that_the_calibration_knows_are_used():
     example, calibration, _ = calibrated()
     keep = np.array([9, 3, 1, 0, 2, 5])
     fewer = replace(calibration, marker=calibration.marker[keep], M=calibration.M[keep])
-    sight = sight_of(example.config, fewer, example.truth, example.reach)
-    full = sight_of(example.config, calibration, example.truth, example.reach)
-    assert len(sight.pins) == 2
+    some = scenario_of(example.config, fewer)
+    full = scenario_of(example.config, calibration)
+    assert len(some.watched.pins) == 2
     order = [0, 1, 2, 3, 5, 9]
-    assert np.abs(sight.body.M - full.body.M[order]).max() < 1e-15
-    assert (sight.pins == example.truth.M[[5, 9]]).all()
-    assert (sight.s_star == full.s_star[:, order]).all()
+    assert np.abs(some.watched.body.M - full.watched.body.M[order]).max() < 1e-15
+    assert (some.watched.pins == example.truth.M[[5, 9]]).all()
+    assert (some.ends.s_star == full.ends.s_star[:, order]).all()
 
 
 def test_a_goal_known_by_images_of_the_face_is_reached_with_the_body():
     example, calibration, _ = calibrated()
-    images = {view: example.reach.s_star[i].tolist() for i, view in enumerate(("left", "right"))}
+    images = {view: example.ends.s_star[i].tolist() for i, view in enumerate(("left", "right"))}
     config = Case("paper", [f"task.goal={{images: {images}}}"]).config
-    truth = truth_of(config)
-    assert np.isnan(reach_of(config, truth).pins_star).all()
+    assert np.isnan(scenario_of(config, calibration).ends.s_star[:, 4:]).all()
     trace = servo.run(config, calibration, plan.run(config, calibration), "exact")
     assert trace.verdict == "converged"
     # In the loop the face alone is fitted too, so that the calibration's errors cancel at the goal.
@@ -176,5 +170,4 @@ def test_a_body_that_cannot_be_known_says_what_to_set():
     across = np.linalg.svd(calibration.a_inf[None])[2][1]
     stretch = np.repeat(np.outer(across, across)[None], 6, axis=0)
     with pytest.raises(WorkFailed, match=r"control\.observation: points"):
-        sight_of(example.config, replace(calibration, H_hat_0=stretch), example.truth, example.reach)
-    assert len(plant_of(example.config, example.truth, example.reach.q_start).pins) == 0
+        scenario_of(example.config, replace(calibration, H_hat_0=stretch))

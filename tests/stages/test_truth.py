@@ -6,22 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.scenario import (
-    calibration_generator,
-    camera_of,
-    generator,
-    plant_of,
-    reach_of,
-    truth_of,
-)
-from tests.conftest import ROOT
+from projservo_cli.stages.scenario import calibration_seed, generator, plant_of, start_and_goal
+from projservo_cli.stages.world import camera_of, truth_of
+from tests.known import configured as loaded
+from tests.known import known_scenario
 from tests.stages.cases import case
-
-
-def loaded(name, *overrides):
-    return load_config(ROOT / "configs" / f"{name}.yaml", list(overrides))
 
 
 @pytest.mark.parametrize("name", ["ur5", "stanford"])
@@ -44,11 +34,11 @@ def test_the_reference_task(reference_truth):
     """First task of the reference robot: 180° of which 158.87° are onto the plane."""
     task = reference_truth("ur5")["tasks"][0]
     example = case("ur5")
-    assert example.reach.q_start.tolist() == task["q_start"]
+    assert example.ends.q_start.tolist() == task["q_start"]
     assert example.plan.theta_r == pytest.approx(math.radians(task["theta_r_deg"]), abs=1e-9)
     assert example.plan.theta_s == pytest.approx(math.pi, abs=1e-9)
     goal = example.truth.robot.pose(np.array(task["q_goal"]))
-    assert example.reach.goal_pose == pytest.approx(goal, abs=0)
+    assert example.ends.goal_pose == pytest.approx(goal, abs=0)
 
 
 @pytest.mark.parametrize("turn_deg", [180, 165])
@@ -56,7 +46,7 @@ def test_turn_about_the_roll_axis_of_the_rig(turn_deg):
     """Start and goal differ by that rotation about the axis midway between the cameras."""
     config = loaded("paper", f"task.goal.turn_deg={turn_deg}")
     truth = truth_of(config)
-    reach = reach_of(config, truth)
+    reach = start_and_goal(config, truth)
     T = reach.goal_pose @ np.linalg.inv(truth.robot.pose(reach.q_start))
     axis = np.array([-1.0, 0, 0])  # the cameras look along −x of the base, symmetric about y = 0
     eigenvalues = np.linalg.eigvals(T[:3, :3])
@@ -74,7 +64,7 @@ def test_the_benchmark_is_within_its_promised_dimensions():
     truth = example.truth
     centers = np.array([-np.linalg.solve(P[:, :3], P[:, 3]) for P in truth.P])
     assert 0.2 <= np.linalg.norm(centers[1] - centers[0]) <= 0.5
-    face = truth.M_face @ (truth.robot.pose(example.reach.q_start) @ np.linalg.inv(truth.robot.base_tool)).T
+    face = truth.M_face @ (truth.robot.pose(example.ends.q_start) @ np.linalg.inv(truth.robot.base_tool)).T
     for center in centers:
         assert 1.2 <= np.linalg.norm(face[:, :3].mean(axis=0) - center) <= 1.6
     spread = np.linalg.norm(face[:, None, :3] - face[None, :, :3], axis=2).max()
@@ -102,18 +92,18 @@ def test_a_camera_is_given_up_to_scale(scale):
 def test_goal_beyond_a_limit_is_refused():
     config = loaded("ur5", "task.goal.joints.joints=[0, 0, 3.5, 0, 0, 0]")
     with pytest.raises(WorkFailed, match=r"task\.goal: joint 3"):
-        reach_of(config, truth_of(config))
+        start_and_goal(config, truth_of(config))
 
 
 def test_an_unreachable_goal_is_refused():
     config = loaded("paper", "task.goal.perturbation.translation_m=[0, 0, 5]",
                     "task.goal.perturbation.rotation_rad=[0, 0, 0]")  # fmt: skip
     with pytest.raises(WorkFailed, match=r"task\.goal: the robot cannot put its tool"):
-        reach_of(config, truth_of(config))
+        start_and_goal(config, truth_of(config))
 
 
 def test_perturbation_displaces_the_goal_by_what_it_says():
-    exact, other = case("paper").reach, case("paper_perturbed").reach
+    exact, other = case("paper").ends, case("paper_perturbed").ends
     gap = np.linalg.inv(exact.goal_pose) @ other.goal_pose
     assert 5e-4 < np.linalg.norm(gap[:3, 3]) < 2e-3
     assert 5e-4 < np.linalg.norm(gap[:3, :3] - np.eye(3)) / math.sqrt(2) < 2e-3
@@ -121,17 +111,16 @@ def test_perturbation_displaces_the_goal_by_what_it_says():
 
 def test_streams_of_noise_are_independent_and_repeatable():
     config = loaded("ur5")
-    draws = [generator(config, stream).standard_normal(4) for stream in (0, 1, 2)]
+    draws = [generator(config.seed, stream).standard_normal(4) for stream in (0, 1, 2)]
     assert np.abs(np.diff(draws, axis=0)).min() > 0
-    assert generator(config, 1).standard_normal(4).tolist() == draws[1].tolist()
-    other = generator(loaded("ur5", "seed=2"), 1).standard_normal(4)
+    assert generator(config.seed, 1).standard_normal(4).tolist() == draws[1].tolist()
+    other = generator(2, 1).standard_normal(4)
     assert np.abs(other - draws[1]).min() > 0
 
 
 def test_servo_noise_is_on_start_and_goal_images():
-    clean = case("ur5").reach
-    config = loaded("ur5", "noise.servo_px=0.5")
-    noisy = reach_of(config, truth_of(config))
+    clean = case("ur5").ends
+    noisy = known_scenario(loaded("ur5", "noise.servo_px=0.5")).ends
     for a, b in ((clean.s_start, noisy.s_start), (clean.s_star, noisy.s_star)):
         assert 0.2 < np.std(b - a) < 0.9
 
@@ -142,7 +131,7 @@ def test_a_face_that_shows_the_cameras_different_sides_is_refused():
     refused = 0
     seen = set()
     for turn in np.linspace(0, 2 * math.pi, 60):
-        q = example.reach.q_start + turn * np.eye(6)[4]
+        q = example.ends.q_start + turn * np.eye(6)[4]
         M = (
             example.truth.M_face
             @ (example.truth.robot.pose(q) @ np.linalg.inv(example.truth.robot.base_tool)).T
@@ -166,24 +155,24 @@ def test_a_face_that_shows_the_cameras_different_sides_is_refused():
 def test_missing_parts_are_named(section, message):
     bare = case("ur5").config.model_copy(update={section: None})
     with pytest.raises(InputError, match=message):
-        reach_of(bare, truth_of(bare))
+        start_and_goal(bare, truth_of(bare))
 
 
 def test_an_offset_moves_the_start_and_leaves_the_goal():
     plain = loaded("paper")
     moved = loaded("paper", "task.start_offset={joints: [1, -2, 3, 0, 0, 0], unit: deg}")
     truth = truth_of(plain)
-    start, goal = reach_of(plain, truth), reach_of(moved, truth_of(moved))
+    start, goal = start_and_goal(plain, truth), start_and_goal(moved, truth_of(moved))
     assert np.allclose(np.degrees(goal.q_start - start.q_start), [1, -2, 3, 0, 0, 0], atol=1e-12)
     assert np.array_equal(start.goal_pose, goal.goal_pose)
     beyond = loaded("paper", "task.start_offset={joints: [300, 0, 0, 0, 0, 0], unit: deg}")
     with pytest.raises(WorkFailed, match=r"task\.start_offset: joint 1"):
-        reach_of(beyond, truth)
+        start_and_goal(beyond, truth)
 
 
 def test_the_seed_of_the_calibration_is_its_own():
     """The noise of the trials follows calibration.seed, that of the loop follows seed."""
     own, other, both = (loaded("ur5", *sets) for sets in ((), ("calibration.seed=7",), ("seed=7",)))
-    same = [calibration_generator(config).standard_normal() for config in (own, other, both)]
-    assert same[1] == same[2] != same[0]
-    assert generator(other, 2).standard_normal() == generator(own, 2).standard_normal()
+    seeds = [calibration_seed(config) for config in (own, other, both)]
+    assert seeds[1] == seeds[2] != seeds[0]
+    assert other.seed == own.seed

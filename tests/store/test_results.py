@@ -11,7 +11,7 @@ import projservo_cli
 from projservo_cli import cli, store
 from projservo_cli.config import load_config
 from projservo_cli.records import Calibration, InputError, Plan, Trace
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.store import Result, Run, save
 from tests.fake_records import fake
 

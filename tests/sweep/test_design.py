@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.config.sweep import Distribution, load_sweep
 from projservo_cli.records import InputError
-from projservo_cli.stages.scenario import truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.design import from_recipe, read_design, sample
 from projservo_cli.sweep.preparation import drawn_tasks, in_turn
 from tests.conftest import ROOT

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from projservo_cli.stages.trials import is_compiled, numbers_of, prepare
 
 from projservo_cli.loop.trial import NUMBERS, VERDICT
 from projservo_cli.records import WorkFailed
-from projservo_cli.stages import calibrate, trials
+from projservo_cli.stages import calibrate
+from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.sweep import runs
 from projservo_cli.sweep.design import changed, name_of_run
+from projservo_cli.sweep.runs import is_compiled, numbers_of
 from tests.sweep.cases import design
 
 pytestmark = pytest.mark.volume
@@ -17,13 +19,13 @@ def prepared(**settings):
     """What runs of a small sweep share, with a value or two of its configuration changed."""
     config = changed(design().calibrated(0, 0), settings, "test")
     _, calibration, _ = calibrate.run(config)
-    return prepare(config, calibration, name_of_run(config))
+    return scenario_of(config, calibration), name_of_run(config)
 
 
 def test_numbers_depend_on_the_seed_alone():
     found = prepared()
-    together = numbers_of(found, [5, 6, 7])
-    apart = np.concatenate([numbers_of(found, [seed]) for seed in (7, 6, 5)])[::-1]
+    together = numbers_of(*found, [5, 6, 7])
+    apart = np.concatenate([numbers_of(*found, [seed]) for seed in (7, 6, 5)])[::-1]
     assert together.tobytes() == apart.tobytes()
     assert len(np.unique(together[:, NUMBERS.index("image_error_px")])) == 3
 
@@ -31,15 +33,15 @@ def test_numbers_depend_on_the_seed_alone():
 def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
     """A run that outlasts its noise is made anew with more of it."""
     found = prepared()
-    whole = numbers_of(found, [1, 2])
+    whole = numbers_of(*found, [1, 2])
     assert whole[:, NUMBERS.index("steps")].min() > 8
-    monkeypatch.setattr(trials, "INSTANTS", 2)
-    assert numbers_of(found, [1, 2]).tobytes() == whole.tobytes()
+    monkeypatch.setattr(runs, "INSTANTS", 2)
+    assert numbers_of(*found, [1, 2]).tobytes() == whole.tobytes()
 
 
 def test_a_task_that_cannot_be_begun_has_a_verdict_and_no_numbers():
     """Images so noisy that markers have no place leave nothing to count; a goal out of reach is an error."""
-    numbers = numbers_of(prepared(**{"noise.servo_px": 3000.0}), [1, 2, 3])
+    numbers = numbers_of(*prepared(**{"noise.servo_px": 3000.0}), [1, 2, 3])
     assert (numbers[:, VERDICT] < 0).any()
     lost = numbers[numbers[:, VERDICT] < 0]
     assert np.isnan(np.delete(lost, VERDICT, axis=1)).all()
