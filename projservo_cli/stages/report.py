@@ -24,7 +24,6 @@ from projservo_cli.report.view import motion, plotly, write_view
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.chain import has_task
 from projservo_cli.stages.scenario import plant_of
-from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.stages.studies import (
     LAMBDAS,
     STEP_LIMIT_DEG,
@@ -34,6 +33,7 @@ from projservo_cli.stages.studies import (
     metric_plan,
     run_studies,
 )
+from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from projservo_cli.task.face import cyclic_order
@@ -90,7 +90,9 @@ def missing(run: "Run") -> bool:
     return not all((run.path.parent / name).is_file() for name in (*figures, CLAIMS_FILE, PAGE_FILE))
 
 
-def material_of(run: "Run", bench: Comparison, left_out: list[dict[str, str]], progress: Progress) -> Material:
+def material_of(
+    run: "Run", bench: Comparison, left_out: list[dict[str, str]], progress: Progress
+) -> Material:
     """All that the figures may show; extra runs that fail are named in ``left_out``."""
     truth, studies, reason = bench.truth, None, ""
     try:

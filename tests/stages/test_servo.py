@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.loop.summary import angle_between
-from projservo_cli.stages.trace import longest_plateau
 from tests.samples import displacement
 from tests.stages.cases import Case, case
 
@@ -83,10 +83,10 @@ def test_noise_widens_the_tolerance_and_is_the_same_for_every_law():
 def test_plateau_is_the_longest_stretch_without_a_fall():
     """20 flat steps in the middle of a steep fall; the window of 5 steps must fall by 1 % to count."""
     error = np.r_[100 * 0.9 ** np.arange(10), np.full(20, 30.0), 30 * 0.9 ** np.arange(1, 10)]
-    assert longest_plateau(error, 5) == 19
-    assert longest_plateau(100 * 0.9 ** np.arange(30), 5) == 0
-    assert longest_plateau(np.ones(3), 5) == 0
-    assert longest_plateau(np.ones(30), 5) == 29
+    assert np.diff(plateau_stretch(error, 5)) == 19
+    assert plateau_stretch(100 * 0.9 ** np.arange(30), 5) is None
+    assert plateau_stretch(np.ones(3), 5) is None
+    assert np.diff(plateau_stretch(np.ones(30), 5)) == 29
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, math.pi - 1e-7, math.pi])
