@@ -21,7 +21,19 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
     "types": ([BIN / "mypy"], {}),
     "imports": ([BIN / "lint-imports"], {}),
     "documentation": (
-        [PYTHON, "-m", "sphinx", "-q", "-W", "-n", "--keep-going", "-d", "build/doctrees", "docs", "build/docs"],
+        [
+            PYTHON,
+            "-m",
+            "sphinx",
+            "-q",
+            "-W",
+            "-n",
+            "--keep-going",
+            "-d",
+            "build/doctrees",
+            "docs",
+            "build/docs",
+        ],
         WITHOUT_COMPILER,
     ),
     "mathematics without the compiler": (

@@ -31,9 +31,5 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
         spread = f"{times['lower']:.2f} to {times['upper']:.2f}"
         numbers = f"{times['least']:10.2f} {times['median']:10.2f}   {spread:16}"
         console.show(f"{name:32} {numbers} {times['over_svd']:10.3f}")
-    console.show(
-        f"two threads: {result['two_threads_speedup']:.2f} times as many runs, "
-        f"{'equal' if result['threads_equal_to_serial'] else 'NOT EQUAL'} to serial to the bit"
-    )
     console.show(f"{machine['cpu']}, {machine['system']}, numpy {machine['numpy']}, numba {machine['numba']}")
     return 0

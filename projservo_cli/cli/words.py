@@ -31,17 +31,17 @@ def suggested(config: Config, run: Run, count: int) -> dict[str, Any]:
     config, run : what is calibrated.
     count : poses to suggest.
     """
-    from projservo_cli.stages import suggest
+    from projservo_cli.stages import calibrate as stage
 
     calibration = run.calibration
     try:
-        found = suggest.run(config, run.observation, calibration, count)
+        found = stage.suggested(config, run.observation, calibration, count)
     except WorkFailed as error:
         return {"suggestions": [], "suggestions_reason": str(error)}
     path = run.path.parent / FILE
     prismatic = [letter == "P" for letter in calibration.joint_types]
     unit = config.data.joint_unit if config.data is not None else None
-    suggest.write(found, path, prismatic, unit)
+    stage.write_suggestions(found, path, prismatic, unit)
     rows = [
         {
             "q": one.q,

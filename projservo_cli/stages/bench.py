@@ -4,11 +4,9 @@ Everything is timed in turn, round by round, in pieces of about a millisecond. R
 least times, which a busy machine disturbs the least.
 """
 
-import importlib.util
 import itertools
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,27 +19,22 @@ from projservo_cli.control.law import ERRORS, Gains, State, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.loop.compiled import Log, new_log
-from projservo_cli.loop.compiled import run as run_loop
+from projservo_cli.loop.compiled import run as run_compiled
 from projservo_cli.loop.repeated import many_steps
 from projservo_cli.loop.step import Limits
-from projservo_cli.loop.trial import NUMBERS, Desk, Setting, new_desk, trials
 from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.robots.simulated import Plant
-from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal, true_ends
+from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
 from projservo_cli.stages.world import truth_of
-from projservo_cli.task.body import NO_BODY, body_of
+from projservo_cli.task.body import body_of
 from projservo_cli.task.face import Task, task_from_images
 from projservo_cli.task.target import task_from_body
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
 
-STATES = 256
-STEPS = 150
-PIECE = 64
+STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
-ROUNDS = 200
-RUNS = 64
 BODY = "exact, body"
 
 
@@ -60,76 +53,56 @@ class Job(NamedTuple):
     log: Log
 
 
-class Times(NamedTuple):
-    """Least, median and both quartiles of what one call takes, in µs, and the least over one SVD's."""
-
-    least: float
-    median: float
-    lower: float
-    upper: float
-    over_svd: float
-
-
 class Case:
-    """A noisy run of 256 states and everything a step of it needs, with the true model.
-
-    Parameters
-    ----------
-    config : a simulated task.
-    """
+    """A noisy run of 256 states of a simulated task and all that a step needs, with the true model."""
 
     def __init__(self, config: "Config") -> None:
         truth = truth_of(config)
         ends = start_and_goal(config, truth, range(len(truth.pins)))
-        self.truth, self.q_start, self.model = truth, ends.q_start, truth.model
-        self.gains, self.bounds = gains_of(config), limits_of(config)
-        self.bounds = self.bounds._replace(
+        self.m, self.q_start, self.model = len(truth.face), ends.q_start, truth.model
+        self.gains = gains_of(config)
+        self.limits = limits_of(config)._replace(
             image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
         self.plant = plant_of(config, truth, ends.q_start)
-        s_start, s_star = ends.first(len(truth.face))
-        self.shown = np.array([s_start, s_star])
-        self.ends = true_ends(truth, ends.goal_pose)
-        self.task = task_from_images(self.model, s_start, s_star, truth.center)
-        pins = np.ascontiguousarray(truth.M[list(truth.pins)])
-        self.body_plant = self.plant._replace(pins=pins)
-        self.body_task = task_from_body(
-            self.model,
-            body_of(self.model, truth.M[[*truth.face, *truth.pins]]),
-            ends.q_start,
-            ends.s_start,
-            ends.s_star,
-            truth.center,
-            len(truth.face),
-        )
-        seen = len(truth.face) + len(truth.pins)
-        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, seen, 2))
-        self.points = self.drive(self.task, self.plant)
-        self.whole = self.drive(self.body_task, self.body_plant)
-        self.state = new_state(len(self.q_start), len(truth.face))
+        self.task = task_from_images(self.model, *ends.first(self.m), truth.center)
+        order = [*truth.face, *truth.pins]
+        body = body_of(self.model, truth.M[order])
+        shown = ends.q_start, ends.s_start, ends.s_star
+        self.body_task = task_from_body(self.model, body, *shown, truth.center, self.m)
+        self.body_plant = self.plant._replace(pins=np.ascontiguousarray(truth.M[list(truth.pins)]))
+        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, len(order), 2))
+        self.points = self._states(self.task, self.plant)
+        self.whole = self._states(self.body_task, self.body_plant)
+        self.state = new_state(len(self.q_start), self.m)
         self.bound = bind(CODES["direct_three"], self.model, self.task, self.gains, self.state)
 
-    def job(self, law: str, task: Task, plant: Plant, bounds: Limits) -> Job:
-        """One run with a state and a log of its own."""
-        n, m = len(self.q_start), len(self.truth.face)
-        seen = m + len(plant.pins)
-        log = new_log(n, seen, bounds.max_steps, len(ERRORS))
-        noise = np.ascontiguousarray(self.noise[:, :, :seen])
-        start = self.q_start.copy()
+    def job(self, task: Task, plant: Plant, limits: Limits) -> Job:
+        """One run of direct_three with a state and a log of its own."""
+        n, seen = len(self.q_start), self.m + len(plant.pins)
         return Job(
-            CODES[law], self.model, task, self.gains, bounds, plant, noise, start, new_state(n, m), log
+            CODES["direct_three"],
+            self.model,
+            task,
+            self.gains,
+            limits,
+            plant,
+            np.ascontiguousarray(self.noise[:, :, :seen]),
+            self.q_start.copy(),
+            new_state(n, self.m),
+            new_log(n, seen, limits.max_steps, len(ERRORS)),
         )
 
-    def drive(self, task: Task, plant: Plant) -> tuple[FloatArray, FloatArray]:
+    def _states(self, task: Task, plant: Plant) -> tuple[FloatArray, FloatArray]:
         """Pixels and joints of the states that are cycled through."""
-        job = self.job("direct_three", task, plant, self.bounds)
-        run_loop(*job)
+        job = self.job(task, plant, self.limits)
+        run_compiled(*job)
         return job.log.s, job.log.q
 
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
         task, (S, Q) = (self.body_task, self.whole) if body else (self.task, self.points)
-        return many_steps(CODES[law], self.model, task, self.gains, S, Q, self.state, self.bounds.speed)
+        return many_steps(CODES[law], self.model, task, self.gains, S, Q, self.state, self.limits.speed)
 
     def one_step(self) -> int:
         """One step of direct_three, called from Python."""
@@ -138,28 +111,7 @@ class Case:
 
     def whole_run(self) -> Job:
         """A run of 150 steps, traced."""
-        return self.job("direct_three", self.task, self.plant, self.bounds._replace(max_steps=STEPS))
-
-    def batches(self, count: int) -> list["Batch"]:
-        """Runs of 150 steps as a sweep makes them, each with noise of its own, in so many equal shares."""
-        plant, bounds = self.plant, self.bounds._replace(max_steps=STEPS)
-        code, limits = CODES["direct_three"], (plant.lower, plant.upper)
-        setting = Setting(
-            code, self.model, self.model, NO_BODY, True, False, self.gains, bounds, plant, *limits,
-            self.q_start, self.ends,
-        )  # fmt: skip
-        m = self.shown.shape[2]
-        noise = NOISE_PX * np.random.default_rng(1).standard_normal((RUNS, STEPS + 1, 2, m, 2))
-        return [
-            Batch(
-                setting,
-                np.tile(self.shown, (len(share), 1, 1, 1, 1)),
-                share,
-                new_desk(setting, m),
-                np.empty((len(share), len(NUMBERS))),
-            )
-            for share in np.split(noise, count)
-        ]
+        return self.job(self.task, self.plant, self.limits._replace(max_steps=STEPS))
 
     def matrices(self) -> FloatArray:
         """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
@@ -173,16 +125,6 @@ class Case:
         return found
 
 
-class Batch(NamedTuple):
-    """The arguments of many runs; ``desk`` and ``numbers`` are their own."""
-
-    setting: Setting
-    shown: FloatArray
-    noise: FloatArray
-    desk: Desk
-    numbers: FloatArray
-
-
 def seconds(function: Callable[[], object]) -> float:
     """Time of one call, s."""
     start = time.perf_counter()
@@ -191,13 +133,7 @@ def seconds(function: Callable[[], object]) -> float:
 
 
 def measure(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
-    """Time everything; see the schema of ``projservo bench --json``.
-
-    Parameters
-    ----------
-    case : what is timed.
-    rounds : how often each is timed.
-    """
+    """Time everything so many rounds; see the schema of ``projservo bench --json``."""
     matrices = itertools.cycle(case.matrices())
     whole = case.whole_run()
     timed: dict[str, tuple[Callable[[], object], int]] = {
@@ -205,58 +141,26 @@ def measure(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
         **{law: (partial(case.steps, law), STATES) for law in LAWS},
         BODY: (lambda: case.steps("exact", body=True), STATES),
         "one call from Python": (lambda: [case.one_step() for _ in range(PIECE)], PIECE),
-        "run of 150 steps": (lambda: run_loop(*whole), 1),
+        "run of 150 steps": (lambda: run_compiled(*whole), 1),
     }
-    toolbox = toolbox_step(case)
-    if toolbox is not None:
-        timed["machinevision-toolbox-python"] = (toolbox, 1)
     with threadpool_limits(1):
         for function, _ in timed.values():
             function()
-        table = np.array(
+        table = 1e6 * np.array(
             [[seconds(function) / count for function, count in timed.values()] for _ in range(rounds)]
         )
-        speedup, same = threads(case)
-    times = {name: _times(1e6 * table[:, i], 1e6 * table[:, 0]) for i, name in enumerate(timed)}
+    svd = float(table[:, 0].min())
+    times = {name: _times(table[:, i], svd) for i, name in enumerate(timed)}
     return {
-        "step_over_svd": max(times["direct_three"].over_svd, times["direct_two"].over_svd),
-        "exact_over_svd": times[BODY].over_svd,
-        "run_150_ms": 1e-3 * times["run of 150 steps"].least,
-        "python_call_us": times["one call from Python"].least,
-        "two_threads_speedup": speedup,
-        "threads_equal_to_serial": same,
-        "times_us": {name: value._asdict() for name, value in times.items()},
+        "step_over_svd": max(times["direct_three"]["over_svd"], times["direct_two"]["over_svd"]),
+        "exact_over_svd": times[BODY]["over_svd"],
+        "run_150_ms": 1e-3 * times["run of 150 steps"]["least"],
+        "python_call_us": times["one call from Python"]["least"],
+        "times_us": times,
     }
 
 
-def _times(values: FloatArray, svd: FloatArray) -> Times:
+def _times(values: FloatArray, svd: float) -> dict[str, float]:
+    """Least, median and both quartiles of what one call takes, µs, and the least over that of one SVD."""
     least, lower, median, upper = (float(x) for x in np.percentile(values, [0, 25, 50, 75]))
-    return Times(least, median, lower, upper, least / float(svd.min()))
-
-
-def threads(case: Case, count: int = 2) -> tuple[float, bool]:
-    """How many times faster many runs are in two threads than in one, and whether their bits agree."""
-    (serial,) = case.batches(1)
-    shares = case.batches(count)
-    with ThreadPoolExecutor(count) as pool:
-
-        def together() -> None:
-            for future in [pool.submit(trials, *share) for share in shares]:
-                future.result()
-
-        rounds = [(seconds(lambda: trials(*serial)), seconds(together)) for _ in range(15)]
-    alone, beside = np.min(rounds, axis=0)
-    same = serial.numbers.tobytes() == np.concatenate([share.numbers for share in shares]).tobytes()
-    return float(alone / beside), same
-
-
-def toolbox_step(case: Case) -> Callable[[], object] | None:
-    """One step of image-based control of one camera by machinevision-toolbox-python, where installed."""
-    if importlib.util.find_spec("machinevisiontoolbox") is None:
-        return None
-    from machinevisiontoolbox import CentralCamera
-
-    camera = CentralCamera.Default()
-    pixels = case.points[0][0, 0, :4].T
-    error = np.ones(pixels.size)
-    return lambda: np.linalg.pinv(camera.visjac_p(pixels, 1.0)) @ error
+    return {"least": least, "median": median, "lower": lower, "upper": upper, "over_svd": least / svd}

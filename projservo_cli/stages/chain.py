@@ -6,7 +6,6 @@ anything is done.
 """
 
 import hashlib
-import importlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,7 +57,21 @@ class Step:
 
 def stage_module(stage: str) -> Any:
     """The module that does the work of a stage, imported when it is needed."""
-    return importlib.import_module(f"projservo_cli.stages.{stage}")
+    if stage == "calibrate":
+        from projservo_cli.stages import calibrate
+
+        return calibrate
+    if stage == "plan":
+        from projservo_cli.stages import plan
+
+        return plan
+    if stage == "servo":
+        from projservo_cli.stages import servo
+
+        return servo
+    from projservo_cli.stages import report
+
+    return report
 
 
 def steps_for(

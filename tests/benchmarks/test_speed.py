@@ -11,19 +11,17 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.config import load_config
-from projservo_cli.loop import trial
 from projservo_cli.loop.compiled import run
 from projservo_cli.records import LAWS
 from projservo_cli.stages import bench
-from tests.conftest import ROOT
+from tests.known import configured
 
 pytestmark = pytest.mark.volume
 
 
 @pytest.fixture(scope="module")
 def case():
-    return bench.Case(load_config(ROOT / "configs" / "paper.yaml"))
+    return bench.Case(configured("paper"))
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -54,18 +52,6 @@ def test_a_whole_run(benchmark, case):
     assert least < 0.01
 
 
-def test_runs_in_threads_are_those_made_one_by_one(case):
-    (serial,) = case.batches(1)
-    trial.trials(*serial)
-    assert len(np.unique(serial.numbers[:, trial.NUMBERS.index("image_error_px")])) == bench.RUNS
-    one = case.batches(bench.RUNS)[3]
-    trial.trials(*one)
-    assert one.numbers.tobytes() == serial.numbers[3].tobytes()
-    assert one.numbers[0, trial.STEPS] == bench.STEPS
-    _, same = bench.threads(case)
-    assert same
-
-
 def test_the_table_holds_every_law_and_ratios_to_the_svd(case):
     result = bench.measure(case, rounds=2)
     times = result["times_us"]
@@ -78,5 +64,4 @@ def test_the_table_holds_every_law_and_ratios_to_the_svd(case):
     worst = max(times[law]["over_svd"] for law in ("direct_three", "direct_two"))
     assert result["step_over_svd"] == worst
     assert result["exact_over_svd"] == times[bench.BODY]["over_svd"]
-    assert result["threads_equal_to_serial"]
     json.dumps(result, allow_nan=False)

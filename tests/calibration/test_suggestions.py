@@ -135,7 +135,7 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
 
 def test_a_recorded_table_gives_poses_near_its_own(shared_data):
     from projservo_cli.config import load_config
-    from projservo_cli.stages import suggest as stage
+    from projservo_cli.stages import calibrate as stage
     from projservo_cli.tables import read_table
 
     path = shared_data / "ur5" / "trials_0.5px.csv"
@@ -143,7 +143,7 @@ def test_a_recorded_table_gives_poses_near_its_own(shared_data):
     some = np.arange(len(table.pose)) % 2 == 0
     table = Observation(table.pose[some], table.marker, table.q[some], table.images[some])
     calibration = calibrate(table, "RRRRRR", source="recorded")
-    found = stage.run(load_config(None, [f"data.table={path}"]), table, calibration, 3)
+    found = stage.suggested(load_config(None, [f"data.table={path}"]), table, calibration, 3)
     span = np.ptp(table.q, axis=0)
     for one in found:
         assert (one.q >= table.q.min(axis=0) - 0.15 * span).all()

@@ -24,7 +24,7 @@ def bench_case():
 def test_a_bound_law_gives_what_the_law_gives(bench_case, law):
     case = bench_case
     S, Q = case.points
-    bound_state, state = (new_state(len(case.q_start), len(case.truth.face)) for _ in range(2))
+    bound_state, state = (new_state(len(case.q_start), case.m) for _ in range(2))
     bound = bind(CODES[law], case.model, case.task, case.gains, bound_state)
     for k in (0, 7, 40):
         status = command(CODES[law], case.model, case.task, case.gains, S[k], Q[k], state)
@@ -37,7 +37,7 @@ def test_a_bound_law_gives_what_the_law_gives(bench_case, law):
 def test_a_bound_law_keeps_its_arrays_alive_and_sees_their_changes(bench_case):
     case = bench_case
     S, Q = case.points
-    state = new_state(len(case.q_start), len(case.truth.face))
+    state = new_state(len(case.q_start), case.m)
     task = case.task._replace(s_star=case.task.s_star.copy())
     bound = bind(CODES["stacked"], case.model, task, case.gains, state)
     bound_command(bound, S[0], Q[0])
