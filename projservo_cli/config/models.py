@@ -13,7 +13,8 @@ from pydantic import (
     ConfigDict,
     Field,
     ModelWrapValidatorHandler,
-    Strict,
+    StrictBool,
+    StrictInt,
     StringConstraints,
     ValidationError,
     WithJsonSchema,
@@ -59,7 +60,7 @@ class Bump(Section):
     joint: Count = Field(description="the joint, counted from 1")
     by_deg: Number | None = Field(None, description="how far, a revolute joint")
     by_m: Number | None = Field(None, description="how far, a prismatic joint")
-    read: Annotated[bool, Strict()] = Field(True, description="whether its reading follows")
+    read: StrictBool = Field(True, description="whether its reading follows")
 
     def contradictions(self) -> Iterator[Finding]:
         """An angle and a distance, or neither."""
@@ -81,9 +82,7 @@ class Disturbance(Section):
     lost_markers: LostMarkers | None = None
     bump: Bump | None = None
     frozen_joint: FrozenJoint | None = None
-    delay_periods: Annotated[int, Strict(), Field(ge=0, le=1000)] = Field(
-        0, description="by how many periods images are late"
-    )
+    delay_periods: StrictInt = Field(0, ge=0, le=1000, description="by how many periods images are late")
 
 
 def _law(name: str) -> str:
@@ -160,24 +159,27 @@ class CalibrationSettings(Section):
     method: Literal["refined", "linear", "closed_form"] = Field(
         "refined", description="bundle adjustment; linear multi-frame; the paper's closed forms"
     )
-    frames_per_joint: Annotated[int, Strict(), Field(ge=0, le=10_000)] = Field(
-        8, description="trial poses of each joint, beside the reference"
+    frames_per_joint: StrictInt = Field(
+        8, ge=0, le=10_000, description="trial poses of each joint, beside the reference"
     )
-    amplitude_deg: Annotated[float, Strict(), Field(ge=0, lt=180, allow_inf_nan=False)] = Field(
-        30.0, description="farthest trial to each side, revolute joints"
+    amplitude_deg: Number = Field(
+        30.0, ge=0, lt=180, description="farthest trial to each side, revolute joints"
     )
     amplitude_m: NotNegative = Field(0.15, description="farthest trial to each side, prismatic joints")
     reference: JointVector | None = Field(
         None, description="joint readings at the reference pose; null for those of task.start"
     )
-    cross_validate: Annotated[int, Strict(), Field(ge=2, le=10_000)] | None = Field(
-        None, description="parts into which poses are divided to predict each from the others; null for none"
+    cross_validate: StrictInt | None = Field(
+        None,
+        ge=2,
+        le=10_000,
+        description="parts into which poses are divided to predict each from the others; null for none",
     )
     init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
         None, description="JSON file of a robot and rig known beforehand, tried first as a start"
     )
     seed: Whole | None = Field(None, description="seed of the noise of the trials; null for that of the run")
-    lens: Annotated[bool, Strict()] = Field(
+    lens: StrictBool = Field(
         False, description="whether to estimate two coefficients of radial distortion a camera"
     )
 
@@ -224,8 +226,8 @@ class Goal(Section):
     """The goal: joint readings, a turn about the rig's roll axis, or the face's goal images."""
 
     joints: JointVector | None = Field(None, description="joint readings at the goal")
-    turn_deg: Annotated[float, Strict(), Field(ge=-360, le=360, allow_inf_nan=False)] | None = Field(
-        None, description="turn from the start about the roll axis of the rig"
+    turn_deg: Number | None = Field(
+        None, ge=-360, le=360, description="turn from the start about the roll axis of the rig"
     )
     perturbation: Perturbation | None = Field(
         None, description="small displacement of a goal given by turn_deg, in the tool frame"
@@ -261,12 +263,10 @@ class Trajectory(Section):
     profile: Literal[
         "linear", "exponential", "rotation_first", "translation_first", "planar_first", "constrained"
     ] = Field("linear", description="which part is driven when")
-    delta: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = Field(
-        0.9, description="share of the translation at which visibility changes that is kept to"
+    delta: Number = Field(
+        0.9, gt=0, le=1, description="share of the translation at which visibility changes that is kept to"
     )
-    samples: Annotated[int, Strict(), Field(ge=2, le=100_001)] = Field(
-        101, description="points of the path that are stored"
-    )
+    samples: StrictInt = Field(101, ge=2, le=100_001, description="points of the path that are stored")
     duration_s: Positive | None = Field(
         None, description="time the motion is given; null for as little as the joint-speed limit lets it take"
     )
@@ -276,8 +276,10 @@ class Trajectory(Section):
     border_px: NotNegative = Field(
         5.0, description="in the profile constrained: least distance of a marker from the border of an image"
     )
-    least_condition: Annotated[float, Strict(), Field(ge=0, lt=1, allow_inf_nan=False)] = Field(
+    least_condition: Number = Field(
         0.001,
+        ge=0,
+        lt=1,
         description="in the profile constrained: least reciprocal condition of the face's image Jacobian",
     )
     most_miss_px: NotNegative = Field(
@@ -348,9 +350,7 @@ class PlantSettings(Section):
     )
     options: Options = Field(Options(), description="arguments that the class is made with")
     timeout_s: Positive = Field(1.0, description="most time an answer of the robot may take")
-    speed_scale: Annotated[float, Strict(), Field(gt=0, le=1, allow_inf_nan=False)] = Field(
-        1.0, description="factor of every command to the robot"
-    )
+    speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of every command to the robot")
     self_occlusion: Literal["transparent", "opaque"] = Field(
         "transparent", description="whether the face hides its markers from a camera behind it"
     )
@@ -368,8 +368,8 @@ class Stop(Section):
     image_px: Positive = Field(0.01, description="converged within this image error, rms")
     noise_factor: NotNegative = Field(2.0, description="widens image_px by so many times noise.servo_px")
     max_steps: Count = Field(2000, description="commands after which a run ends")
-    diverged_factor: Annotated[float, Strict(), Field(gt=1, allow_inf_nan=False)] = Field(
-        10.0, description="diverged where the image error or the distance grows so many times"
+    diverged_factor: Number = Field(
+        10.0, gt=1, description="diverged where the image error or the distance grows so many times"
     )
     plateau_steps: Count = Field(20, description="stands still where the error falls < 1 % in so many steps")
     lost_steps: Whole = Field(25, description="periods for which lost markers are waited for")

@@ -18,9 +18,9 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, InitErrorDetails
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Positive = Annotated[float, Strict(), Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Strict(), Field(ge=0, allow_inf_nan=False)]
+Number = Annotated[float, Strict()]
+Positive = Annotated[float, Strict(), Field(gt=0)]
+NotNegative = Annotated[float, Strict(), Field(ge=0)]
 Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
 Vector2 = tuple[Number, Number]
@@ -43,7 +43,7 @@ _IDENTITY: Matrix44 = (
 class Section(BaseModel):
     """A mapping of the configuration: immutable, no unknown keys, its values fitting together."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def contradictions(self) -> Iterable[Finding]:
         """What does not fit together in this section."""
