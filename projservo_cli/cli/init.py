@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from projservo_cli.cli.output import Console, print_json
-from projservo_cli.config.schema import STARTER, json_schema, schema_text
+from projservo_cli.config.schema import json_schema, schema_text, starter
 from projservo_cli.files import replacing
 from projservo_cli.records import InputError
 
@@ -23,7 +23,7 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     if path.exists() and not options["force"]:
         raise InputError(f"{path}: exists already; choose another name, or replace it with --force")
     schema = path.with_name(SCHEMA)
-    for file, text in ((path, STARTER.read_text(encoding="utf-8")), (schema, schema_text(json_schema()))):
+    for file, text in ((path, starter()), (schema, schema_text(json_schema()))):
         with replacing(file) as temporary:
             temporary.write_text(text, encoding="utf-8")
     if options["json"]:

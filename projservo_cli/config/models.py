@@ -313,7 +313,7 @@ class Control(Section):
     gain_r: Positive = Field(2.5, description="gain of the rotation onto the plane, 1/s")
     gain_p: Positive = Field(2.5, description="gain of the rotation within the plane, 1/s")
     gain_s: Positive = Field(2.5, description="gain of both rotations as one, in direct_two and exact, 1/s")
-    ratio_rp: Positive = Field(1.0, description="λ_r/λ_p, how direct_two composes both rotations into one")
+    ratio_rp: Positive = Field(1.0, description="how direct_two composes both rotations into one, λ_r/λ_p")
     gain: Positive = Field(2.5, description="gain of the classical laws, 1/s")
     joint_speed_limit_deg_s: Positive | None = Field(125.0, description="of revolute joints; null for none")
     prismatic_speed_limit_m_s: Positive | None = Field(None, description="of prismatic joints; null for none")

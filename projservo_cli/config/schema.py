@@ -1,15 +1,19 @@
-"""JSON Schemas of a configuration and of a sweep, by which editors complete and check them."""
+"""What helps to write a configuration: a commented one to start from, and JSON Schemas for editors."""
 
 import json
+import re
+import textwrap
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from projservo_cli.config.models import Config
 from projservo_cli.config.sweep import SweepConfig
 
-# A configuration with a comment on every key, to start from.
-STARTER = Path(__file__).with_name("starter.yaml")
-DRAFT = "https://json-schema.org/draft/2020-12/schema"
+_EXAMPLE = Path(__file__).with_name("starter.yaml")
+_DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def json_schema() -> dict[str, Any]:
@@ -25,7 +29,7 @@ def json_schema() -> dict[str, Any]:
         **schema["$defs"]["Control"]["properties"]["laws"]["items"],
         "description": "Short for control.laws with this law alone.",
     }
-    return {"$schema": DRAFT, **schema, "title": "Configuration of projservo"}
+    return {"$schema": _DRAFT, **schema, "title": "Configuration of projservo"}
 
 
 def sweep_schema() -> dict[str, Any]:
@@ -37,7 +41,7 @@ def sweep_schema() -> dict[str, Any]:
     keys["base"] = {"anyOf": [keys["base"], {"type": "string"}], "description": described}
     values = schema["$defs"]["Linked"]["properties"]["values"]  # alone: of the key that names the axis
     keys["grid"]["additionalProperties"] = {"anyOf": [keys["grid"]["additionalProperties"], values]}
-    return {"$schema": DRAFT, **schema, "title": "Sweep of projservo"}
+    return {"$schema": _DRAFT, **schema, "title": "Sweep of projservo"}
 
 
 def schema_text(schema: dict[str, Any]) -> str:
@@ -51,12 +55,58 @@ def _plain(value: Any) -> Any:
         return [_plain(inner) for inner in value]
     if not isinstance(value, dict):
         return value
-    kept = {key: _plain(inner) for key, inner in value.items() if not _is_title(key, inner)}
+    kept = {
+        key: _plain(inner) for key, inner in value.items() if not (key == "title" and isinstance(inner, str))
+    }
     entries = kept.get("prefixItems")
     if isinstance(entries, list) and all(entry == entries[0] for entry in entries):
         kept["items"] = kept.pop("prefixItems")[0]
     return kept
 
 
-def _is_title(key: str, inner: Any) -> bool:
-    return key == "title" and isinstance(inner, str)
+def starter() -> str:
+    """A configuration to start from that speaks of every key.
+
+    The example comments its sections itself, but for those of settings, of which it holds at most values
+    that are not the defaults: these are filled from the models.
+    """
+    settings = r"^(\w+):\n((?:  \w+: .*\n)*)(?=\n|\Z)"
+    return re.sub(
+        settings,
+        lambda match: "\n".join(_settings(*match.groups())) + "\n",
+        _EXAMPLE.read_text(encoding="utf-8"),
+        flags=re.MULTILINE,
+    )
+
+
+def _settings(name: str, example: str) -> Iterator[str]:
+    """Lines of a section: each key under what it means, behind a # where it shows its default."""
+    section = Config.model_fields[name].default
+    schema = type(section).model_json_schema()
+    defaults = {key: _flow(value) for key, value in section.model_dump(mode="json").items()}
+    given = dict(re.findall(r"^  (\w+): (.*)$", example, flags=re.MULTILINE))
+    given = given or dict(list(defaults.items())[:1])  # a section of comments alone would be null
+    yield from _comment(schema["description"].split("\n\n")[0].replace("`", ""), "")
+    yield f"{name}:"
+    for key, default in defaults.items():
+        about = schema["properties"][key]
+        choices = ", ".join(_choices(about))
+        yield from _comment(about["description"] + (f" ({choices})" if choices else ""), "  ")
+        yield f"  {key}: {given[key]}" if key in given else f"  # {key}: {default}"
+
+
+def _flow(value: Any) -> str:
+    """A value as YAML in one line."""
+    return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
+
+
+def _comment(text: str, indent: str) -> list[str]:
+    sentence = text[0].upper() + text[1:].rstrip(".") + "."
+    return textwrap.wrap(sentence, 108, initial_indent=f"{indent}# ", subsequent_indent=f"{indent}# ")
+
+
+def _choices(schema: Any) -> list[str]:
+    """The words that a value may be, or that a list may hold."""
+    inner = schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ()
+    found = schema.get("enum") if isinstance(schema, dict) else None
+    return found or next(filter(None, map(_choices, inner)), [])

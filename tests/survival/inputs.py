@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.config import load_config
+from projservo_cli.config.schema import starter
 from projservo_cli.config.sweep import load_sweep
 from projservo_cli.records import InputError
 from projservo_cli.tables import read_joints, read_table
@@ -34,8 +35,8 @@ def sources() -> list[tuple[str, bytes, dict[str, Change]]]:
     configs = [
         ROOT / "configs" / name for name in ("paper.yaml", "ur5.yaml", "stanford.yaml", "sweep_noise.yaml")
     ]
-    starter = ROOT / "projservo_cli" / "config" / "starter.yaml"
-    found = [(path.name, path.read_bytes(), YAML) for path in (*configs, starter)]
+    found = [(path.name, path.read_bytes(), YAML) for path in configs]
+    found.append(("starter.yaml", starter().encode(), YAML))
     rows = [
         f"{k},{m},{0.1 * k},{-0.2 * k},{k + m}.5,{2 * k},{3 * m}.25,4" for k in range(12) for m in range(5)
     ]
