@@ -12,7 +12,7 @@ from projservo_cli.version import __version__  # noqa: E402
 
 project = "projservo"
 release = version = __version__
-OWN = ("docstrings", "links", "mathml", "reference")
+OWN = ("docstrings", "mathml", "reference")
 extensions = ["myst_parser", "sphinx.ext.autodoc", *(f"extensions.{name}" for name in OWN)]
 exclude_patterns = ["extensions"]
 nitpicky = True

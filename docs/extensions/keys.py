@@ -4,21 +4,10 @@ from collections.abc import Container, Iterator
 from typing import Any
 
 from extensions.tables import table, text
-from projservo_cli.config.schema import json_schema
-from projservo_cli.config.sweep import SweepConfig
+from projservo_cli.config.schema import flow
 
 # The unit that ends a key, the longest ending first; gains are in 1/s whatever they end in.
-UNITS = {
-    "_deg_s": "°/s",
-    "_m_s": "m/s",
-    "_deg": "°",
-    "_rad": "rad",
-    "_px": "px",
-    "_m": "m",
-    "_s": "s",
-}
-
-
+UNITS = {"deg_s": "°/s", "m_s": "m/s", "deg": "°", "rad": "rad", "px": "px", "m": "m", "s": "s"}
 # Whole numbers beyond which a bound is that of the file, not of what is meant.
 EXACT = 2**53
 
@@ -27,7 +16,7 @@ def unit(key: str) -> str:
     """Unit of a configuration key by its name."""
     if key.startswith("gain"):
         return "1/s"
-    return next((symbol for ending, symbol in UNITS.items() if key.endswith(ending)), "")
+    return next((symbol for ending, symbol in UNITS.items() if key.endswith(f"_{ending}")), "")
 
 
 def kind(schema: dict[str, Any], sections: Container[str]) -> str:
@@ -56,31 +45,23 @@ def kind(schema: dict[str, Any], sections: Container[str]) -> str:
     names = {"number": "number", "integer": "whole number", "string": "text", "boolean": "true or false"}
     bounds = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     limits = [
-        f"{sign} {schema[bound]:,}"
-        for bound, sign in bounds.items()
-        if bound in schema and schema[bound] <= EXACT
+        f"{sign} {schema[key]:,}" for key, sign in bounds.items() if schema.get(key, EXACT + 1) <= EXACT
     ]
     return ", ".join([names.get(schema["type"], schema["type"]), *limits])
 
 
 def default(schema: dict[str, Any], required: bool) -> str:
-    """Default of a key as YAML would say it."""
-    if required:
-        return "required"
-    if isinstance(schema.get("default", {}), dict):
-        return ""  # a section, whose keys have defaults of their own, or what the meaning says
-    value = schema["default"]
-    words = {None: "null", True: "true", False: "false"}
-    if isinstance(value, list):
-        return "`[" + ", ".join(map(str, value)) + "]`"
-    return f"`{words[value] if value is None or isinstance(value, bool) else value}`"
+    """Default of a key as YAML; empty for a section, whose keys have defaults of their own."""
+    value = schema.get("default", {})
+    return "required" if required else "" if isinstance(value, dict) else f"`{flow(value)}`"
 
 
-def named(schema: dict[str, Any]) -> str:
-    """Name of the section that a value is, or is a list of; empty for none."""
-    inner = [schema.get(part) for part in ("items", "additionalProperties")]
-    parts = [schema, *schema.get("anyOf", ()), *(part for part in inner if isinstance(part, dict))]
-    return next((part["$ref"].rsplit("/", 1)[1] for part in parts if "$ref" in part), "")
+def named(schema: Any) -> str:
+    """Name of the section that a value is, or holds; empty for none."""
+    if isinstance(schema, dict) and "$ref" in schema:
+        return str(schema["$ref"]).rsplit("/", 1)[1]
+    inner = schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ()
+    return next(filter(None, map(named, inner)), "")
 
 
 def places(schema: dict[str, Any]) -> dict[str, list[str]]:
@@ -108,18 +89,6 @@ def keys(schema: dict[str, Any], section: dict[str, Any]) -> Iterator[tuple[str,
         about = inner.get("description", of_section)
         required = key in section.get("required", ())
         yield f"`{key}`", kind(inner, sections), default(inner, required), unit(key), text(about)
-
-
-def configuration() -> Iterator[str]:
-    """The keys of a configuration, a table for each section."""
-    yield from all_keys(json_schema())
-
-
-def sweep() -> Iterator[str]:
-    """The keys of the configuration of a sweep."""
-    schema = SweepConfig.model_json_schema()
-    schema["required"].remove("name")  # by default that of the file
-    yield from all_keys(schema)
 
 
 def all_keys(schema: dict[str, Any]) -> Iterator[str]:

@@ -3,6 +3,7 @@
 import re
 import unicodedata
 from html import escape
+from pathlib import Path
 from typing import Any
 
 from docutils import nodes
@@ -18,10 +19,11 @@ ACCENT = re.compile(r"\\(hat|dot|overline)\s*(\{[^{}]*\}|\\[a-zA-Z]+|\w)")
 # letter like any other.
 BOLD = re.compile(r"\\boldsymbol\s*(?:\{([A-Za-z])\}|([A-Za-z]))")
 TEX = re.compile(r"\$\$|\$[^$]*[\\^_][^$]*\$")  # what is between two dollars and looks like a formula
+FROM_NETWORK = re.compile(r'<(?:script|img|link)\b[^>]*(?:src|href)="(?:https?:)?//[^"]*')
 LOG = logging.getLogger(__name__)
 
 
-def _readable(tex: str) -> str:
+def readable(tex: str) -> str:
     """A formula as docutils understands it."""
     return ACCENT.sub(r"{\\\1{\2}}{}", BOLD.sub(_bold, tex))
 
@@ -34,7 +36,7 @@ def _bold(match: re.Match[str]) -> str:
 
 def _formula(node: nodes.Element, *, block: bool) -> str:
     try:
-        return str(tex2mathml(_readable(node.astext()), as_block=block))
+        return str(tex2mathml(readable(node.astext()), as_block=block))
     except MathError as error:
         LOG.warning("%s in the formula %s", error, node.astext(), location=node)
         return escape(node.astext())
@@ -62,8 +64,16 @@ def _left_over(app: Sphinx, doctree: nodes.document, name: str) -> None:
             LOG.warning("a formula that is shown as text: %s", text[:60], location=name)
 
 
+def _offline(app: Sphinx, error: Exception | None) -> None:
+    """Warn of all that a browser would load from the network."""
+    for page in Path(app.outdir).glob("*.html"):
+        for found in FROM_NETWORK.findall(page.read_text(encoding="utf-8")):
+            LOG.warning("%s: loads from the network: %s", page.name, found)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the renderer ``mathml``."""
     app.add_html_math_renderer("mathml", (_inline, None), (_display, None))
     app.connect("doctree-resolved", _left_over)
+    app.connect("build-finished", _offline)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

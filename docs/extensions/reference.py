@@ -16,8 +16,9 @@ from extensions.tables import table, text
 from projservo_cli import records
 from projservo_cli.cli.commands import COMMANDS, allowed
 from projservo_cli.cli.options import OPTIONS
+from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.equations import REGISTER
-from projservo_cli.sweep.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED, Column
+from projservo_cli.sweep.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
 
 # Where a run file holds which record.
 GROUPS = {
@@ -35,34 +36,19 @@ def run_file() -> Iterator[str]:
     for group, record in GROUPS.items():
         about = (record.__doc__ or "").split("\n\n")[0]
         yield from (f"## {text(group)}", "", text(about), "")
-        fields = dataclasses.fields(record)
-        hints = typing.get_type_hints(record)
-        yield from table(
-            ("attribute", "type", "unit", "what it is"),
-            (
-                (
-                    f"`{f.name}`",
-                    plain(hints[f.name]),
-                    text(f.metadata["units"]) if "number" in plain(hints[f.name]) else "",
-                    text(f.metadata["about"]),
-                )
-                for f in fields
-                if "dims" not in f.metadata
-            ),
-        )
-        yield from table(
-            ("array", "dimensions", "unit", "what it is"),
-            (
-                (
-                    f"`{f.name}`",
-                    text(", ".join(f.metadata["dims"])),
-                    text(f.metadata["units"]),
-                    text(f.metadata["about"]),
-                )
-                for f in fields
-                if "dims" in f.metadata
-            ),
-        )
+        yield from table(("attribute", "type", "unit", "what it is"), fields(record, arrays=False))
+        yield from table(("array", "dimensions", "unit", "what it is"), fields(record, arrays=True))
+
+
+def fields(record: type, *, arrays: bool) -> Iterator[tuple[str, ...]]:
+    """Rows of the table of a record's attributes, or of its arrays."""
+    hints = typing.get_type_hints(record)
+    for field in dataclasses.fields(record):
+        about, dims = field.metadata, field.metadata.get("dims")
+        if arrays == (dims is not None):
+            what = plain(hints[field.name]) if dims is None else text(", ".join(dims))
+            units = text(about["units"]) if arrays or "number" in what else ""
+            yield f"`{field.name}`", what, units, text(about["about"])
 
 
 def plain(hint: Any) -> str:
@@ -117,17 +103,17 @@ def sweep_columns() -> Iterator[str]:
     yield from table(
         ("column", "value", "unit", "what it is"),
         (
-            (f"`{column.name}`", kinds[column.dtype[0]], unit_of(column), text(column.about))
+            (
+                f"`{column.name}`",
+                kinds[column.dtype[0]],
+                text(column.units.removeprefix("1")),
+                text(column.about),
+            )
             for column in (*NUMBERED, *MEASURED, BETWEEN)
         ),
     )
     yield from ("", f"`{BETWEEN.name}` is there with `between_samples`. Verdicts are:", "")
     yield ", ".join(f"`{verdict}`" for verdict in ALL_VERDICTS) + "."
-
-
-def unit_of(column: Column) -> str:
-    """Unit of a column; empty where it has none."""
-    return "" if column.units == "1" else text(column.units)
 
 
 class _Written(SphinxDirective):
@@ -139,8 +125,8 @@ class _Written(SphinxDirective):
 
 
 WRITERS = {
-    "configuration-keys": keys.configuration,
-    "sweep-keys": keys.sweep,
+    "configuration-keys": lambda: keys.all_keys(json_schema()),
+    "sweep-keys": lambda: keys.all_keys(sweep_schema()),
     "sweep-columns": sweep_columns,
     "run-file-groups": run_file,
     "commands": commands,

@@ -19,7 +19,7 @@ def mathml():
 
 
 def tree(mathml, tex):
-    text = mathml.tex2mathml(mathml._readable(tex), as_block=True)
+    text = mathml.tex2mathml(mathml.readable(tex), as_block=True)
     text = re.sub(r"&(?!amp;|lt;|gt;)\w+;", "", text)  # names of signs that HTML knows and XML does not
     return ET.fromstring(re.sub(r' xmlns="[^"]*"', "", text))
 
