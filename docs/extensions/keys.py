@@ -1,10 +1,10 @@
 """The keys of configurations as tables, from their JSON Schema."""
 
+import json
 from collections.abc import Container, Iterator
 from typing import Any
 
 from extensions.tables import table, text
-from projservo_cli.config.schema import flow
 
 # The unit that ends a key, the longest ending first; gains are in 1/s whatever they end in.
 UNITS = {"deg_s": "°/s", "m_s": "m/s", "deg": "°", "rad": "rad", "px": "px", "m": "m", "s": "s"}
@@ -53,7 +53,8 @@ def kind(schema: dict[str, Any], sections: Container[str]) -> str:
 def default(schema: dict[str, Any], required: bool) -> str:
     """Default of a key as YAML; empty for a section, whose keys have defaults of their own."""
     value = schema.get("default", {})
-    return "required" if required else "" if isinstance(value, dict) else f"`{flow(value)}`"
+    shown = value if isinstance(value, str) else json.dumps(value).replace('"', "")
+    return "required" if required else "" if isinstance(value, dict) else f"`{shown}`"
 
 
 def named(schema: Any) -> str:

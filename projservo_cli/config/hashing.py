@@ -28,36 +28,21 @@ def digest(
 ) -> str:
     """SHA-256 of parts of a configuration, in hexadecimal.
 
-    Parameters
-    ----------
-    config : Config
-    keys : sequence of str
-        Sections such as ``control``, or values in them such as ``noise.servo_px``, in any order.
-    without : sequence of str
-        Values left out, such as ``control.laws``.
-    extra : mapping, optional
-        Further JSON values that belong into the hash.
-
-    Raises
-    ------
-    KeyError
-        When a key is not one of the configuration.
+    ``keys`` are sections such as ``control``, or values in them such as ``noise.servo_px``, in any order,
+    less the values ``without``, such as ``control.laws``; ``extra`` are further JSON values.
     """
     values = config.model_dump(mode="json")
-    for dotted in without:
-        section, key = dotted.split(".")
-        if values[section] is not None:
-            del values[section][key]
+    for section, key in (dotted.split(".") for dotted in without):
+        (values[section] or {}).pop(key, None)
     parts = {dotted: _part(values, dotted.split(".")) for dotted in keys}
     text = json.dumps([parts, extra or {}], sort_keys=True, allow_nan=False, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _part(values: Any, path: Sequence[str]) -> Any:
+    """The value at a path; None in a section that is absent."""
     for key in path:
-        if values is None:  # a value in a section that is absent
-            return None
-        values = values[key]
+        values = None if values is None else values[key]
     return values
 
 

@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 
 from projservo_cli.config.models import Config
 from projservo_cli.config.robot import Section
-from projservo_cli.config.yaml_source import MAX_BYTES, MAX_DEPTH, Document, Path, Problem, shortened
+from projservo_cli.config.yaml_source import MAX_DEPTH, Document, Path, Problem, shortened
 from projservo_cli.records import InputError
 
 _PHRASES = {
@@ -105,7 +105,10 @@ def load_config(
         All that is wrong, one line ``file:line:column: path: what`` each.
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
-    document = Document("" if path is None else read_text(path) if text is None else text, str(path or ""))
+    if path is not None and text is None:
+        document = Document.read(path)
+    else:
+        document = Document(text or "", str(path or ""))
     if document.values is None:
         document.values = {}
     if not isinstance(document.values, dict):
@@ -119,21 +122,6 @@ def load_config(
         _spell_out(document.values)
     _fill_in(document.values, path)
     return validated(Config, document)
-
-
-def read_text(path: pathlib.Path | str) -> str:
-    """Text of a configuration; an InputError where there is none."""
-    try:
-        with pathlib.Path(path).open("rb") as file:
-            content = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if len(content) > MAX_BYTES:
-        raise InputError(f"{path}: larger than {MAX_BYTES} bytes; this is no configuration")
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text; expected a YAML configuration") from error
 
 
 def validated(model: type[_Model], document: Document) -> _Model:

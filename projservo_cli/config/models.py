@@ -36,8 +36,6 @@ from projservo_cli.config.robot import (
     Vector2,
     Vector3,
     Whole,
-    together,
-    unknown_markers,
 )
 from projservo_cli.records import LAWS, MODES, REPLAN
 from projservo_cli.robots import plugins
@@ -388,11 +386,14 @@ class ReportSettings(Section):
     )
 
 
-def folder_name(name: str) -> str:
+def _folder_name(name: str) -> str:
     """A name that can be that of a folder; else ValueError."""
     if name != name.strip() or name in {"", ".", ".."} or any(c in '/\\:*?"<>|' or c < " " for c in name):
         raise ValueError("must be usable as the name of a folder: no path separators, no surrounding spaces")
     return name
+
+
+FolderName = Annotated[str, StringConstraints(max_length=100), AfterValidator(_folder_name)]
 
 
 def _joint_types(robot: Robot | None, data: Data | None) -> str:
@@ -408,40 +409,31 @@ def _same_joints(robot: Robot | None, data: Data | None) -> Iterator[Finding]:
         yield ("data", "joints"), f"{given} are not the joints of the robot, {robot.joint_types}"
 
 
-def _reference(robot: Robot | None, data: Data | None, calibration: CalibrationSettings) -> Iterator[Finding]:
-    yield from _readings(calibration.reference, robot, data, "calibration", "reference")
-    yield from _within(calibration.reference, robot, "calibration", "reference")
-
-
-def _ends(robot: Robot | None, data: Data | None, task: Task | None) -> Iterator[Finding]:
-    if task is not None:
-        yield from _readings(task.start, robot, data, "task", "start")
-        yield from _within(task.start, robot, "task", "start")
-        yield from _readings(task.start_offset, robot, data, "task", "start_offset")
-        yield from _readings(task.goal.joints, robot, data, "task", "goal", "joints")
-
-
-def _readings(
-    vector: JointVector | None, robot: Robot | None, data: Data | None, *path: str
+def _joint_vectors(
+    robot: Robot | None, data: Data | None, calibration: CalibrationSettings, task: Task | None
 ) -> Iterator[Finding]:
+    """Vectors that are not of the robot's joints, and poses beyond their limits."""
     types = _joint_types(robot, data)
-    if vector is not None and types:
+    vectors: dict[tuple[str, ...], JointVector | None] = {("calibration", "reference"): calibration.reference}
+    if task is not None:
+        vectors["task", "start"] = task.start
+        vectors["task", "start_offset"] = task.start_offset
+        vectors["task", "goal", "joints"] = task.goal.joints
+    for path, vector in vectors.items():
+        if vector is None or not types:
+            continue
         yield from vector.miscounted(types, *path)
+        if path[-1] in ("reference", "start") and robot is not None and len(vector.joints) == len(types):
+            yield from _beyond_limits(robot, vector, *path)
 
 
-def _within(vector: JointVector | None, robot: Robot | None, *path: str) -> Iterator[Finding]:
-    """Readings beyond the limits of the robot."""
-    if vector is None or robot is None or len(vector.joints) != len(robot.joints):
-        return
+def _beyond_limits(robot: Robot, vector: JointVector, *path: str) -> Iterator[Finding]:
     for i, (value, joint) in enumerate(zip(vector.values(robot.joint_types), robot.joints, strict=True)):
         low, high = joint.limits
         if not low <= value <= high:
             turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
-            yield (
-                (*path, "joints", i),
-                f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}, "
-                f"{turn(low):.6g} to {turn(high):.6g} {unit}",
-            )
+            what = f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}"
+            yield (*path, "joints", i), f"{what}, {turn(low):.6g} to {turn(high):.6g} {unit}"
 
 
 def _goal_images(task: Task | None, markers: Markers | None) -> Iterator[Finding]:
@@ -478,8 +470,8 @@ def _disturbed_joints(disturbance: Disturbance, robot: Robot | None) -> Iterator
 
 def _lost_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Finding]:
     lost = disturbance.lost_markers
-    if lost is not None and lost.markers is not None and markers is not None and markers.known is not None:
-        yield from unknown_markers(lost.markers, markers.known, "disturbance", "lost_markers", "markers")
+    if lost is not None and lost.markers is not None and markers is not None:
+        yield from markers.unknown(lost.markers, "disturbance", "lost_markers", "markers")
 
 
 def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Finding]:
@@ -495,8 +487,7 @@ def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Findin
 # Each takes the sections that its parameters name.
 _RULES: tuple[Callable[..., Iterator[Finding]], ...] = (
     _same_joints,
-    _reference,
-    _ends,
+    _joint_vectors,
     _goal_images,
     _simulated_alone,
     _disturbed_joints,
@@ -535,9 +526,7 @@ class Config(Section):
     far as the stages asked for do without them.
     """
 
-    name: Annotated[str, StringConstraints(max_length=100), AfterValidator(folder_name)] = Field(
-        description="of the run and its folder; by default that of the file"
-    )
+    name: FolderName = Field(description="of the run and its folder; by default that of the file")
     seed: Whole = Field(0, description="of all random numbers; the same seed gives the same run")
     robot: Robot | None = None
     rig: Rig | None = None
@@ -566,9 +555,9 @@ class Config(Section):
                 raise
             rest = {key: value for key, value in values.items() if key not in broken}
             sound = {key: value for key, value in handler({"name": "-", **rest}) if key not in broken}
-            raise together(cls, _between(sound), wrong) from None
+            raise cls.refusal(_between(sound), wrong) from None
         if found := list(_between(dict(config))):
-            raise together(cls, found)
+            raise cls.refusal(found)
         return config
 
     @property

@@ -52,23 +52,21 @@ class Section(BaseModel):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if found := list(self.contradictions()):
-            raise together(type(self), found)
+            raise self.refusal(found)
         return self
 
-
-def together(
-    section: type[Section], found: Iterable[Finding], also: Iterable[ErrorDetails] = ()
-) -> ValidationError:
-    """One error for all that is wrong in a section, each at the path of its value."""
-    errors = [
-        InitErrorDetails(type="value_error", loc=path, input=section, ctx={"error": what})
-        for path, what in found
-    ]
-    more = [
-        InitErrorDetails(type=error["type"], loc=error["loc"], input=error["input"], ctx=error.get("ctx", {}))
-        for error in also
-    ]
-    return ValidationError.from_exception_data(section.__name__, [*errors, *more])
+    @classmethod
+    def refusal(cls, found: Iterable[Finding], also: Iterable[ErrorDetails] = ()) -> ValidationError:
+        """One error for all that is wrong in the section, each at the path of its value."""
+        errors = [
+            InitErrorDetails(type="value_error", loc=path, input=cls, ctx={"error": what})
+            for path, what in found
+        ]
+        errors += [
+            InitErrorDetails(type=part["type"], loc=part["loc"], input=part["input"], ctx=part.get("ctx", {}))
+            for part in also
+        ]
+        return ValidationError.from_exception_data(cls.__name__, errors)
 
 
 class JointVector(Section):
@@ -96,7 +94,7 @@ class JointVector(Section):
             yield (*path, "joints"), what
 
 
-class Joint(Section):
+class _Joint(Section):
     """What joints have in common: a type, perhaps a name, perhaps limits."""
 
     type: Literal["R", "P"] = Field(description="R revolute, P prismatic")
@@ -126,7 +124,7 @@ class Joint(Section):
                 yield (name,), f"the lower limit {low:g} must be below the upper limit {high:g}"
 
 
-class DHJoint(Joint):
+class DHJoint(_Joint):
     """A row of a Denavit-Hartenberg table; the joint reading adds to theta (R) or d (P)."""
 
     theta_deg: Number = Field(0.0, description="turn about z")
@@ -135,7 +133,7 @@ class DHJoint(Joint):
     alpha_deg: Number = Field(0.0, description="turn about x")
 
 
-class ScrewJoint(Joint):
+class ScrewJoint(_Joint):
     """A spatial twist (w, v) in the base frame at the reference, per rad or per m."""
 
     w: Vector3 = Field(description="unit axis of a revolute joint, zero for a prismatic one")
@@ -198,7 +196,7 @@ class Robot(Section):
     screws: Screws | None = Field(None, description="joint screws at a reference, instead of dh")
 
     @property
-    def joints(self) -> tuple[Joint, ...]:
+    def joints(self) -> tuple[_Joint, ...]:
         """The joints from base to tool."""
         kinematics = self.dh or self.screws
         return kinematics.joints if kinematics is not None else ()
@@ -312,18 +310,17 @@ class Markers(Section):
                 yield ("numbers",), f"{len(known)} numbers for {len(self.positions_m)} positions_m"
             if len(set(known)) < len(known):
                 yield ("numbers",), "a number stands here twice"
-            yield from unknown_markers(face, known, "face")
+            yield from self.unknown(face, "face")
         if face and self.center not in ("midpoint", *face):
             yield ("center",), f"marker {self.center} is not on the face; face: {_listed(face)}"
         if len(set(face)) < len(face):
             yield ("face",), "a marker stands here twice"
 
-
-def unknown_markers(numbers: Sequence[int], known: Sequence[int], *path: str) -> Iterator[Finding]:
-    """Numbers at a path that no marker has."""
-    for i, number in enumerate(numbers):
-        if number not in known:
-            yield (*path, i), f"there is no marker {number}; markers: {_listed(known)}"
+    def unknown(self, numbers: Sequence[int], *path: str) -> Iterator[Finding]:
+        """Numbers at a path that no marker has, as far as markers are known."""
+        for i, number in enumerate(numbers):
+            if self.known is not None and number not in self.known:
+                yield (*path, i), f"there is no marker {number}; markers: {_listed(self.known)}"
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -83,7 +83,7 @@ def _settings(name: str, example: str) -> Iterator[str]:
     """Lines of a section: each key under what it means, behind a # where it shows its default."""
     section = Config.model_fields[name].default
     schema = type(section).model_json_schema()
-    defaults = {key: flow(value) for key, value in section.model_dump(mode="json").items()}
+    defaults = {key: _flow(value) for key, value in section.model_dump(mode="json").items()}
     given = dict(re.findall(r"^  (\w+): (.*)$", example, flags=re.MULTILINE))
     given = given or dict(list(defaults.items())[:1])  # a section of comments alone would be null
     yield from _comment(schema["description"].split("\n\n")[0].replace("`", ""), "")
@@ -95,7 +95,7 @@ def _settings(name: str, example: str) -> Iterator[str]:
         yield f"  {key}: {given[key]}" if key in given else f"  # {key}: {default}"
 
 
-def flow(value: Any) -> str:
+def _flow(value: Any) -> str:
     """A value as YAML in one line."""
     return yaml.safe_dump(value, default_flow_style=True, width=1000).removesuffix("...\n").strip()
 

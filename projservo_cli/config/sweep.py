@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from projservo_cli.config.loading import Override, read_text, validated
-from projservo_cli.config.models import folder_name
+from projservo_cli.config.loading import Override, validated
+from projservo_cli.config.models import FolderName
 from projservo_cli.config.robot import Count, Number, Positive, Section, Whole
 from projservo_cli.config.yaml_source import Document, Problem
 
@@ -81,9 +81,7 @@ class SweepConfig(Section):
     drawn values as run r of every other cell, so that laws are compared on equal terms.
     """
 
-    name: Annotated[str, AfterValidator(folder_name)] = Field(
-        description="of the sweep and its folder; by default that of the file"
-    )
+    name: FolderName = Field(description="of the sweep and its folder; by default that of the file")
     seed: Whole = Field(0, description="of all that is drawn: tasks, noise, calibrations and random values")
     base: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
         min_length=1, description="configurations (YAML) beside this file; several are an axis of the grid"
@@ -132,7 +130,7 @@ def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> Sweep
     InputError
         All that is wrong, one line ``file:line:column: path: what`` each.
     """
-    document = Document(read_text(path), str(path))
+    document = Document.read(path)
     if not isinstance(document.values, dict):
         what = "expected keys and values such as base: paper.yaml"
         raise document.refused(document.problems or [Problem((), what)])

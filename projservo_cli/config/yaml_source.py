@@ -5,6 +5,7 @@ text. Duplicate keys are refused; aliases, nesting and size are bounded.
 """
 
 import math
+import pathlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,8 +22,8 @@ except ImportError:
 
 Path = tuple[str | int, ...]
 
-MAX_BYTES = 1_000_000
-MAX_VALUES = 50_000  # aliases counted as often as they are used
+_MAX_BYTES = 1_000_000
+_MAX_VALUES = 50_000  # aliases counted as often as they are used
 MAX_DEPTH = 32
 _MOST_LINES = 50  # that are told of what is wrong
 _STANDARD = "tag:yaml.org,2002:"
@@ -82,9 +83,24 @@ class Document:
         except yaml.YAMLError as error:
             self.problems.append(Problem((), f"not valid YAML: {' '.join(str(error).split())}", name))
 
+    @classmethod
+    def read(cls, path: pathlib.Path | str) -> "Document":
+        """The document in a file; an InputError where there is none."""
+        try:
+            with pathlib.Path(path).open("rb") as file:
+                content = file.read(_MAX_BYTES + 1)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        if len(content) > _MAX_BYTES:
+            raise InputError(f"{path}: larger than {_MAX_BYTES} bytes; this is no configuration")
+        try:
+            return cls(content.decode("utf-8-sig"), str(path))
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: not UTF-8 text; expected a YAML configuration") from error
+
     def _parse(self, text: str) -> None:
-        if len(text) > MAX_BYTES:
-            raise _UnfitError(f"larger than {MAX_BYTES} bytes; this is no configuration")
+        if len(text) > _MAX_BYTES:
+            raise _UnfitError(f"larger than {_MAX_BYTES} bytes; this is no configuration")
         if any("\ud800" <= character <= "\udfff" for character in text):
             raise _UnfitError("not UTF-8 text")
         _require_bounded(text)
@@ -97,8 +113,8 @@ class Document:
 
     def _value(self, node: yaml.Node, path: Path) -> Any:
         self._count += 1
-        if self._count > MAX_VALUES:
-            raise _UnfitError(f"more than {MAX_VALUES} values, aliases expanded")
+        if self._count > _MAX_VALUES:
+            raise _UnfitError(f"more than {_MAX_VALUES} values, aliases expanded")
         if len(path) > MAX_DEPTH:
             raise _UnfitError(f"nested more than {MAX_DEPTH} levels deep, or an alias holds itself")
         self.places.setdefault(path, self._place(node.start_mark))
@@ -196,8 +212,8 @@ def _require_bounded(text: str) -> None:
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
             raise _UnfitError(f"nested more than {MAX_DEPTH} levels deep")
-        if count > 2 * MAX_VALUES:  # keys and values
-            raise _UnfitError(f"more than {MAX_VALUES} values")
+        if count > 2 * _MAX_VALUES:  # keys and values
+            raise _UnfitError(f"more than {_MAX_VALUES} values")
 
 
 class _UnfitError(ValueError):
