@@ -484,7 +484,6 @@ def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Findin
         )
 
 
-# Each takes the sections that its parameters name.
 _RULES: tuple[Callable[..., Iterator[Finding]], ...] = (
     _same_joints,
     _joint_vectors,
@@ -494,6 +493,7 @@ _RULES: tuple[Callable[..., Iterator[Finding]], ...] = (
     _lost_markers,
     _plan_to_follow,
 )
+_TAKES = {rule: frozenset(inspect.signature(rule).parameters) for rule in _RULES}  # names of sections
 
 
 def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
@@ -513,9 +513,8 @@ def _between(sections: Mapping[str, Any]) -> Iterator[Finding]:
     """What does not fit together between these sections, of which broken ones are left out."""
     if "data" in sections and sections["data"] is None:
         yield from _missing(sections)
-    for rule in _RULES:
-        wanted = inspect.signature(rule).parameters
-        if wanted.keys() <= sections.keys():
+    for rule, wanted in _TAKES.items():
+        if wanted <= sections.keys():
             yield from rule(**{name: sections[name] for name in wanted})
 
 
