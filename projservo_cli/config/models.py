@@ -109,18 +109,22 @@ Law = Annotated[str, AfterValidator(_law), WithJsonSchema({"anyOf": [{"enum": li
 PlantClass = Annotated[str, AfterValidator(_plant), WithJsonSchema({"type": "string"})]
 
 
+def _plain(value: Any) -> Any:
+    try:
+        json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError("takes text, finite numbers, true, false, null, lists and mappings") from error
+    return value
+
+
+Plain = Annotated[Any, AfterValidator(_plain)]
+
+
 class Options(BaseModel):
     """What the class of a plant is made with: any keys, any plain values."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
-
-    @model_validator(mode="after")
-    def _plain(self) -> "Options":
-        try:
-            json.dumps(self.values(), allow_nan=False)
-        except ValueError as error:
-            raise ValueError("takes text, finite numbers, true, false, null, lists and mappings") from error
-        return self
+    __pydantic_extra__: dict[str, Plain]
 
     def values(self) -> dict[str, Any]:
         """The options by name."""

@@ -5,10 +5,10 @@ import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from projservo_cli.config.loading import Override, validated
-from projservo_cli.config.models import FolderName
+from projservo_cli.config.models import FolderName, Plain
 from projservo_cli.config.robot import Count, Number, Positive, Section, Whole
 from projservo_cli.config.yaml_source import Document, Problem
 
@@ -17,17 +17,6 @@ BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 
 def _one_or_more(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
-
-
-def _plain(value: Any) -> Any:
-    try:
-        json.dumps(value, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError("takes text, finite numbers, true, false, null, lists and mappings") from error
-    return value
-
-
-Plain = Annotated[Any, AfterValidator(_plain)]
 
 
 class Linked(Section):
