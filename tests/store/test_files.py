@@ -8,16 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from projservo_cli.export import write_csv, write_mat, write_npz
 
 from projservo_cli import files
+from projservo_cli.cli.export import write_csv
 from projservo_cli.files import LOCK, clear_leftovers, inside, replacing, require_inside, working_in
 from projservo_cli.records import InputError
 from projservo_cli.report.page import write_comparison
-from projservo_cli.store import load, save
+from projservo_cli.store import save
 from projservo_cli.tables import write_table
 from tests.conftest import ROOT
-from tests.store.first_release import first_release
+from tests.store.sound import sound_run
 
 unix = pytest.mark.skipif(sys.platform == "win32", reason="processes and links as Unix knows them")
 
@@ -149,17 +149,13 @@ def little_disk(tmp_path):
     subprocess.run(["umount", str(tmp_path)], check=True)
 
 
-def test_a_full_disk_is_told_and_the_old_file_stays(little_disk, tmp_path_factory):
-    source = tmp_path_factory.mktemp("source") / "run.h5"
-    source.write_bytes(first_release())  # larger than that disk
-    run = load(source)
+def test_a_full_disk_is_told_and_the_old_file_stays(little_disk):
+    run = sound_run("run.h5", pose=200)  # larger than that disk
     path = little_disk / "file"
     path.write_bytes(b"old")
     (little_disk / "filling").write_bytes(bytes(240_000))
     writers = [
         lambda: save(replace(run, path=path)),
-        lambda: write_npz(run, path),
-        lambda: write_mat(run, path),
         lambda: write_csv(run, little_disk / "csv"),
         lambda: write_comparison([run, run], path),
         lambda: write_table(run.observation, path),

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from projservo_cli.store import load
-from tests.store.first_release import first_release
+from tests.store.sound import sound_file
 from tests.survival.calls import call
 from tests.survival.inputs import SAMPLE, examine
 from tests.survival.kills import Study
@@ -28,7 +28,7 @@ def test_damaged_run_files_end_in_one_line(tmp_path, first):
 
 def test_a_sound_file_is_shown(tmp_path):
     path = tmp_path / "run.h5"
-    path.write_bytes(first_release())
+    path.write_bytes(sound_file())
     ending = call("show", str(path), "--json")
     assert (ending.code, ending.err) == (0, "")
     assert wrong(0, ending) != ""
@@ -37,7 +37,7 @@ def test_a_sound_file_is_shown(tmp_path):
 @pytest.mark.parametrize("first", range(0, 400, 100))
 def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
     run = tmp_path / "run.h5"
-    run.write_bytes(first_release())
+    run.write_bytes(sound_file())
     for number in range(first, first + 100):
         _, _, _, found = examine(number, tmp_path, run if number % SAMPLE == 0 else None)
         assert found == ""
