@@ -116,11 +116,9 @@ def attribute(group: h5py.Group, name: str, kind: type = object) -> Any:
     """A text or a number among the attributes of a group; a list or a dictionary is stored as JSON."""
     if name not in group.attrs:
         raise ValueError(f"{group.name} lacks {name}")
-    if group.attrs.get_id(name).shape not in ((), (1,)):  # netCDF makes numbers arrays of one entry
-        raise ValueError(f"{name} of {group.name} is neither a number nor a text")
     value = group.attrs[name]
     if isinstance(value, (np.generic, np.ndarray)):
-        value = value.item()
+        value = value.item()  # netCDF makes numbers arrays of one entry
     if kind in (list, dict):
         value = json.loads(value)
     if not isinstance(value, kind):
@@ -215,7 +213,7 @@ def _array(data: Any, dims: tuple[str, ...], hint: Any, sizes: dict[str, int]) -
     wanted = np.dtype(typing.get_args(typing.get_args(hint)[1])[0])
     if (data.dtype.kind, data.dtype.itemsize) != _STORED[wanted.name]:
         raise ValueError(f"{data.name} holds {data.dtype}, not {wanted.name}")
-    if data.is_virtual or data.external or data.nbytes > data.id.get_storage_size():
+    if data.external or data.nbytes > data.id.get_storage_size():
         raise ValueError(f"{data.name} claims data that are not stored in it")
     return np.asarray(data[()], dtype=wanted)
 

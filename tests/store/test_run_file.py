@@ -14,7 +14,7 @@ from projservo_cli import store
 from projservo_cli.records import InputError, Trace
 from tests.fake_records import fake
 from tests.store.sound import result, sound_file, sound_run
-from tests.survival.mutations import EDITS, mutate, resealed
+from tests.survival.mutations import EDITS, HEADS, edited, mutate, resealed
 
 SEAL_SIZE = 83  # bytes of the line behind the data
 LONG = "name: ä\n" * 30_000  # 240 kB: beyond what an HDF5 object header holds
@@ -164,11 +164,19 @@ def test_another_schema_says_what_to_do(path, change, message):
 @pytest.mark.parametrize("kind", EDITS)
 def test_what_deceives_with_a_checksum_is_refused(path, kind):
     for seed in range(2):
-        path.write_bytes(sound_file())
-        with h5py.File(path, "a", locking=False) as file:
-            EDITS[kind](file, np.random.default_rng(seed))
-        resealed(path)
+        edited(kind, path, np.random.default_rng(seed))
         refused(path)
+
+
+def test_every_attribute_that_deceives_is_refused(path):
+    for group, name, value in HEADS:
+        path.write_bytes(sound_file())
+        with h5py.File(path, "a") as file:
+            del file[group].attrs[name]
+            if value is not None:
+                file[group].attrs[name] = value
+        resealed(path)
+        assert refused(path), (group, name, value)
 
 
 def test_records_of_robots_with_other_joints_are_refused(tmp_path):
