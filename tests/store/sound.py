@@ -4,6 +4,8 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Report, Trace
 from projservo_cli.store import Result, Run, save
 from tests.conftest import ROOT
@@ -28,7 +30,7 @@ def sound_run(path, **extents):
         {
             "calibrate": result(
                 observation=fake(Observation, 1, extents),
-                calibration=fake(Calibration, 2, extents, advice=("a", "é")),
+                calibration=fake(Calibration, 2, extents, advice=("a", "é"), outlier=np.array([[1, 0, 2]])),
                 cross_validation=fake(CrossValidation, 7, extents, rms_px=0.5),
             ),
             "plan": result(**{"": fake(Plan, 3, tau_limit=float("inf"))}),

@@ -15,11 +15,11 @@ from tests.survival.mutations import KINDS, mutate, wrong
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="calls are forked here")
 
 
-@pytest.mark.parametrize("first", range(0, len(KINDS), 9))
+@pytest.mark.parametrize("first", range(0, len(KINDS), 13))
 def test_damaged_run_files_end_in_one_line(tmp_path, first):
     """Memory is that of this process too, and left to the study."""
     path = tmp_path / "run.h5"
-    for number in range(first, first + 9):
+    for number in range(first, first + 13):
         mutate(number, path)
         ending = call("show", str(path), "--json")
         assert wrong(number, replace(ending, megabytes=0.0)) == ""
@@ -34,7 +34,7 @@ def test_a_sound_file_is_shown(tmp_path):
     assert wrong(0, ending) != ""
 
 
-@pytest.mark.parametrize("first", range(0, 400, 100))
+@pytest.mark.parametrize("first", range(0, 200, 100))
 def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
     run = tmp_path / "run.h5"
     run.write_bytes(sound_file())
