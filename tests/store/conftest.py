@@ -1,12 +1,12 @@
-"""The run file of the first release, for tests that read, damage or rewrite one."""
+"""A sound run file."""
 
 import pytest
 
-from tests.store.first_release import first_release
+from tests.store.sound import sound_file
 
 
 @pytest.fixture
-def run(tmp_path):
-    path = tmp_path / "run.h5"
-    path.write_bytes(first_release())
-    return path
+def path(tmp_path):
+    found = tmp_path / "run.h5"
+    found.write_bytes(sound_file())
+    return found

@@ -8,58 +8,68 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from projservo_cli.export import write_csv, write_mat, write_npz
 
-from projservo_cli import files
-from projservo_cli.files import LOCK, clear_leftovers, inside, replacing, require_inside, working_in
+from projservo_cli.cli.export import write_csv
+from projservo_cli.files import inside, replacing, require_inside, require_writable, working_in
 from projservo_cli.records import InputError
 from projservo_cli.report.page import write_comparison
-from projservo_cli.store import load, save
+from projservo_cli.store import save
 from projservo_cli.tables import write_table
 from tests.conftest import ROOT
-from tests.store.first_release import first_release
+from tests.store.sound import sound_run
 
 unix = pytest.mark.skipif(sys.platform == "win32", reason="processes and links as Unix knows them")
+HOLD = """
+import sys
+from pathlib import Path
+from projservo_cli.files import replacing, working_in
+with {what}(Path(sys.argv[1])) as path:
+    print(path, flush=True)
+    sys.stdin.read()
+"""
 
 
-def ended_process():
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
-
-
-def temporary(folder, name, process, machine=None):
-    path = folder / f".{name}.{machine or files._machine()}.{process}.abcd.part"
-    path.write_text("half", encoding="utf-8")
-    return path
+@contextlib.contextmanager
+def held(what, path):
+    """A process that writes a file or works in a folder, and what it says."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD.format(what=what), str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        text=True,
+    )
+    try:
+        yield process, process.stdout.readline().strip()
+    finally:
+        process.kill()
+        process.communicate()
 
 
 @unix
 def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
-    ended = ended_process()
-    gone = temporary(tmp_path, "run.h5", ended)
-    stay = [
-        temporary(tmp_path, "run.h5", os.getpid()),
-        temporary(tmp_path, "run.h5", ended, "00000000"),
-        temporary(tmp_path, "other.h5", ended),
-        tmp_path / ".mine.part",
-    ]
-    stay[-1].write_text("mine", encoding="utf-8")
+    with held("replacing", tmp_path / "run.h5") as (_, name):
+        gone = Path(name)
+        assert gone.parent == tmp_path
+        head, machine, number, *rest = gone.name.rsplit(".", 4)
+        other = tmp_path / gone.name.replace("run.h5", "other.h5")
+        stay = [
+            other,
+            tmp_path / ".".join([head, "00000000", number, *rest]),
+            tmp_path / ".".join([head, machine, str(os.getpid()), *rest]),
+            tmp_path / ".mine.part",
+        ]
+        for path in stay:
+            path.write_text("half", encoding="utf-8")
+        with replacing(tmp_path / "run.h5") as path:
+            path.write_text("whole", encoding="utf-8")
+        assert gone.exists()  # its process runs
     with replacing(tmp_path / "run.h5") as path:
         path.write_text("whole", encoding="utf-8")
     assert not gone.exists()
     assert all(path.exists() for path in stay)
-    clear_leftovers(tmp_path)
-    assert [path.exists() for path in stay] == [True, True, False, True]
-
-
-@unix
-def test_temporary_files_are_those_that_are_cleared(tmp_path):
-    with replacing(tmp_path / "run.h5") as path:
-        path.write_text("x", encoding="utf-8")
-        found = files._TEMPORARY.fullmatch(path.name)
-        assert found["name"] == "run.h5"
-        assert int(found["process"]) == os.getpid()
+    with working_in(tmp_path):
+        assert [path.exists() for path in stay] == [False, True, True, True]
 
 
 @unix
@@ -79,41 +89,15 @@ def test_links_that_lead_out_are_refused(tmp_path):
             require_inside(out / name, out)
 
 
-HOLD = """
-import sys
-from pathlib import Path
-from projservo_cli.files import working_in
-with working_in(Path(sys.argv[1])):
-    print("in", flush=True)
-    sys.stdin.read()
-"""
-
-
-@contextlib.contextmanager
-def held(folder):
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(folder)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    assert process.stdout.readline() == b"in\n"
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
-
-
 def test_a_folder_is_worked_in_by_one_process_and_free_when_that_is_killed(tmp_path):
-    with held(tmp_path) as process:
+    with held("working_in", tmp_path) as (process, _):
         with pytest.raises(InputError, match=f"process {process.pid} is at work there"), working_in(tmp_path):
             pass
         process.kill()
         process.wait()
         with working_in(tmp_path):
-            assert (tmp_path / LOCK).exists()
-    assert list(tmp_path.iterdir()) == []
+            assert [*tmp_path.iterdir()] != []
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_a_folder_nothing_was_written_into_goes_again(tmp_path):
@@ -129,6 +113,8 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"), working_in(tmp_path / "file" / "folder"):
         pass
+    with pytest.raises(InputError, match="file is no folder; choose another"):
+        require_writable(tmp_path / "file" / "run.h5")
 
 
 @pytest.fixture
@@ -149,17 +135,13 @@ def little_disk(tmp_path):
     subprocess.run(["umount", str(tmp_path)], check=True)
 
 
-def test_a_full_disk_is_told_and_the_old_file_stays(little_disk, tmp_path_factory):
-    source = tmp_path_factory.mktemp("source") / "run.h5"
-    source.write_bytes(first_release())  # larger than that disk
-    run = load(source)
+def test_a_full_disk_is_told_and_the_old_file_stays(little_disk):
+    run = sound_run("run.h5", pose=200)  # larger than that disk
     path = little_disk / "file"
     path.write_bytes(b"old")
     (little_disk / "filling").write_bytes(bytes(240_000))
     writers = [
         lambda: save(replace(run, path=path)),
-        lambda: write_npz(run, path),
-        lambda: write_mat(run, path),
         lambda: write_csv(run, little_disk / "csv"),
         lambda: write_comparison([run, run], path),
         lambda: write_table(run.observation, path),

@@ -94,6 +94,14 @@ def _run(arguments: tuple[str, ...], out: Path, err: Path) -> None:
 
 def prepare() -> None:
     """Import once what calls import, rather than in every one of them."""
-    modules = ("cli.staged", "cli.configuration", "cli.foreign", "export", "lock", "page")
+    modules = (
+        "cli.stages",
+        "cli.configuration",
+        "cli.foreign",
+        "cli.export",
+        "cli.show",
+        "store.run_file",
+        "report.page",
+    )
     for name in (*modules, *(f"stages.{stage}" for stage in STAGES)):
         importlib.import_module(f"projservo_cli.{name}")

@@ -22,7 +22,7 @@ from projservo_cli.config.sweep import load_sweep
 from projservo_cli.records import InputError
 from projservo_cli.tables import read_joints, read_table
 from tests.conftest import ROOT
-from tests.store.first_release import first_release
+from tests.store.sound import sound_file
 from tests.survival.calls import call, prepare
 from tests.survival.changes import CSV, YAML, Change
 
@@ -111,7 +111,7 @@ def study(count: int) -> int:
     failures = []
     with tempfile.TemporaryDirectory() as name:
         run = Path(name, "run.h5")
-        run.write_bytes(first_release())
+        run.write_bytes(sound_file())
         for number in range(count):
             kind, refused, seconds, wrong = examine(number, Path(name), run if number % SAMPLE == 0 else None)
             ends[kind].append((refused, seconds))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from projservo_cli.store import load
-from tests.store.first_release import first_release
+from tests.store.sound import sound_file
 from tests.survival.calls import call
 from tests.survival.inputs import SAMPLE, examine
 from tests.survival.kills import Study
@@ -15,11 +15,11 @@ from tests.survival.mutations import KINDS, mutate, wrong
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="calls are forked here")
 
 
-@pytest.mark.parametrize("first", range(0, len(KINDS), 9))
+@pytest.mark.parametrize("first", range(0, len(KINDS), 13))
 def test_damaged_run_files_end_in_one_line(tmp_path, first):
     """Memory is that of this process too, and left to the study."""
     path = tmp_path / "run.h5"
-    for number in range(first, first + 9):
+    for number in range(first, first + 13):
         mutate(number, path)
         ending = call("show", str(path), "--json")
         assert wrong(number, replace(ending, megabytes=0.0)) == ""
@@ -28,16 +28,16 @@ def test_damaged_run_files_end_in_one_line(tmp_path, first):
 
 def test_a_sound_file_is_shown(tmp_path):
     path = tmp_path / "run.h5"
-    path.write_bytes(first_release())
+    path.write_bytes(sound_file())
     ending = call("show", str(path), "--json")
     assert (ending.code, ending.err) == (0, "")
     assert wrong(0, ending) != ""
 
 
-@pytest.mark.parametrize("first", range(0, 400, 100))
+@pytest.mark.parametrize("first", range(0, 200, 100))
 def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
     run = tmp_path / "run.h5"
-    run.write_bytes(first_release())
+    run.write_bytes(sound_file())
     for number in range(first, first + 100):
         _, _, _, found = examine(number, tmp_path, run if number % SAMPLE == 0 else None)
         assert found == ""

@@ -134,7 +134,7 @@ def test_a_damaged_part_is_named(tmp_path):
     assert SweepTable(folder.table).rows == 1
     assert len(columns(tmp_path)) == len(columns_of(found))
     part.write_bytes(part.read_bytes()[:1000])
-    with pytest.raises(InputError, match=f"{part.name}.*damaged"):
+    with pytest.raises(InputError, match=f"{part.name}.*cut short or changed"):
         make(found, tmp_path)
 
 

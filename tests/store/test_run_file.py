@@ -1,0 +1,208 @@
+"""The run file: round trips, names and units in it, whole or not at all, and what is refused."""
+
+import dataclasses
+import hashlib
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from projservo_cli import store
+from projservo_cli.records import InputError, Trace
+from tests.fake_records import fake
+from tests.store.sound import result, sound_file, sound_run
+from tests.survival.mutations import EDITS, HEADS, edited, mutate, resealed
+
+SEAL_SIZE = 83  # bytes of the line behind the data
+LONG = "name: ä\n" * 30_000  # 240 kB: beyond what an HDF5 object header holds
+
+
+def assert_same(a, b):
+    assert type(a) is type(b)
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        assert type(x) is type(y), field.name
+        if isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype, field.name
+            np.testing.assert_array_equal(x, y, err_msg=field.name)
+        else:
+            assert x == y, field.name
+
+
+def refused(path):
+    with pytest.raises(InputError) as caught:
+        store.load(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    assert len(message) < 500
+    return message
+
+
+def test_everything_comes_back(tmp_path):
+    run = dataclasses.replace(sound_run(tmp_path / "run.h5"), configuration=LONG)
+    store.save(run)
+    back = store.load(tmp_path)
+    assert (back.path, back.configuration, list(back.results)) == (run.path, LONG, list(run.results))
+    for name, stored in run.results.items():
+        loaded = back.results[name]
+        for label, record in stored.records.items():
+            assert_same(record, loaded.records[label])
+        assert dataclasses.replace(loaded, records={}) == dataclasses.replace(stored, records={})
+    assert_same(back.calibration, run.calibration)
+    assert_same(back.plan, run.plan)
+    assert back.cross_validation.rms_px == 0.5
+    assert list(back.traces) == ["stacked", "direct_three"]
+
+
+def test_xarray_shows_dimensions_units_and_coordinates(path):
+    xarray, plan = pytest.importorskip("xarray"), store.load(path).plan
+    with xarray.open_datatree(path, engine="h5netcdf") as tree:
+        calibration = tree["calibrate/calibration"]
+        assert calibration["P"].dims == ("view", "image_row", "coordinate")
+        assert calibration["P"].attrs["units"] == "px"
+        assert calibration["q_reference"].attrs["units"] == "rad or m"
+        assert "marker" in calibration.coords
+        assert calibration["weak"].dtype == bool
+        assert tree["servo/direct_three"].sizes["step"] == 0
+        assert tree["servo/direct_three"].attrs["law"] == "ä"
+        np.testing.assert_array_equal(tree["plan"]["H_d"], plan.H_d)
+        unnamed = [
+            f"{node.path}/{name}"
+            for node in tree.subtree
+            for name, data in node.data_vars.items()
+            if not data.attrs.get("units") or any(str(dim).startswith("phony") for dim in data.dims)
+        ]
+        assert unnamed == []
+    with xarray.open_dataset(path, group="plan") as data:  # found out by its first bytes
+        assert "sample" in data.sizes
+
+
+def test_the_checksum_is_that_of_the_data_and_every_array_has_one_of_its_own(path):
+    data = path.read_bytes()
+    digest = hashlib.sha256(data[:-SEAL_SIZE]).hexdigest()
+    assert data[-SEAL_SIZE:].decode() == f"\nprojservo sha256 {digest}\n"
+    without = []
+
+    def look(name, found):
+        if isinstance(found, h5py.Dataset) and "units" in found.attrs and found.size and not found.fletcher32:
+            without.append(name)
+
+    with h5py.File(path) as file:
+        file.visititems(look)
+    assert without == []
+
+
+def test_same_records_make_the_same_bytes(path):
+    store.save(dataclasses.replace(store.load(path), path=path.parent / "other.h5"))
+    assert path.read_bytes() == (path.parent / "other.h5").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["sigma", "s_start"])
+def test_a_record_of_other_dimensions_is_not_stored(path, name):
+    run = store.load(path)
+    wrong = dataclasses.replace(
+        run.plan, **{name: np.zeros((2, 2)) if name == "sigma" else np.zeros((3, 4, 2))}
+    )
+    with pytest.raises(ValueError, match=name):
+        store.save(dataclasses.replace(run, results={**run.results, "plan": result(**{"": wrong})}))
+    assert path.read_bytes() == sound_file()
+    assert [found.name for found in path.parent.iterdir()] == ["run.h5"]
+
+
+def test_a_failing_save_leaves_the_old_file_and_no_debris(path, monkeypatch):
+    run = store.load(path)
+    monkeypatch.setattr(Path, "replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(InputError, match="No space left"):
+        store.save(run)
+    assert path.read_bytes() == sound_file()
+    assert [found.name for found in path.parent.iterdir()] == ["run.h5"]
+
+
+@pytest.mark.parametrize("place", [0, 12, 30, 100, 50_000, 100_000, -SEAL_SIZE + 5, -20, -1])
+def test_a_single_bit_anywhere_is_noticed_before_it_is_read(path, place, monkeypatch):
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1
+    path.write_bytes(data)
+    monkeypatch.setattr(h5py, "File", None)
+    refused(path)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 10, 100, 5_000, -1, -40, -SEAL_SIZE + 1, -SEAL_SIZE, -SEAL_SIZE - 1])
+def test_a_file_cut_short_is_noticed_before_it_is_read(path, keep, monkeypatch):
+    monkeypatch.setattr(h5py, "File", None)
+    path.write_bytes(path.read_bytes()[:keep])
+    assert "cut short or changed since it was written" in refused(path)
+
+
+def test_a_file_that_another_program_changed_is_refused_with_what_to_do(path):
+    with h5py.File(path, "a") as file:
+        file.attrs["note"] = "mine"
+    message = refused(path)
+    assert "changed since it was written" in message
+    assert "restore it, or make it anew in another folder" in message
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"schema_version": 2}, "pip install --upgrade projservo"),
+        ({"schema_version": 0}, "make it again: projservo calibrate"),
+        ({"schema": "something else"}, "not a run file of projservo"),
+    ],
+)
+def test_another_schema_says_what_to_do(path, change, message):
+    with h5py.File(path, "a") as file:
+        file.attrs.update(change)
+    resealed(path)
+    assert message in refused(path)
+
+
+@pytest.mark.parametrize("kind", EDITS)
+def test_what_deceives_with_a_checksum_is_refused(path, kind):
+    for seed in range(2):
+        edited(kind, path, np.random.default_rng(seed))
+        refused(path)
+
+
+def test_every_attribute_that_deceives_is_refused(path):
+    for group, name, value in HEADS:
+        path.write_bytes(sound_file())
+        with h5py.File(path, "a") as file:
+            del file[group].attrs[name]
+            if value is not None:
+                file[group].attrs[name] = value
+        resealed(path)
+        assert refused(path), (group, name, value)
+
+
+def test_records_of_robots_with_other_joints_are_refused(tmp_path):
+    run = sound_run(tmp_path / "run.h5")
+    other = result(**{"": fake(Trace, 4, {"joint": 5})})
+    store.save(dataclasses.replace(run, results={**run.results, "servo/stacked": other}))
+    assert "5 entries along joint, not 6" in refused(run.path)
+
+
+def test_mutations_depend_on_their_number_alone(tmp_path):
+    paths = [tmp_path / "a.h5", tmp_path / "b.h5"]
+    for number in (0, 2, 3, 5):
+        kinds = [mutate(number, path) for path in paths]
+        assert kinds[0] == kinds[1]
+        assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_what_a_run_lacks_is_named(tmp_path):
+    with pytest.raises(InputError, match="there is no run file"):
+        store.load(tmp_path)
+    with pytest.raises(InputError, match="holds no calibration"):
+        _ = store.Run(tmp_path / "run.h5").calibration
+    assert store.run_path("nowhere/else.h5") == Path("nowhere/else.h5")
+
+
+def test_reading_does_not_import_what_writes(path):
+    code = "import sys, projservo_cli.store as s; s.load(sys.argv[1]); print('h5netcdf' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"

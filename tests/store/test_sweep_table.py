@@ -1,0 +1,75 @@
+"""The table of a sweep: parts put together, texts that open as texts, traces, what is refused."""
+
+import shutil
+from collections import namedtuple
+
+import numpy as np
+import pytest
+
+from projservo_cli.records import InputError, Trace
+from projservo_cli.store import SweepTable, assemble, write_part
+from tests.fake_records import fake
+
+HEADINGS = [("run", "i8", "1", "number"), ("law", "S7", "1", "text"), ("error", "f8", "px", "of the image")]
+LAWS = np.array([b"exact", b"stacked", "dé".encode()])
+
+
+@pytest.fixture
+def parts(tmp_path):
+    found = []
+    for first, last in ((0, 30_000), (30_000, 30_001), (30_001, 30_005)):
+        run = np.arange(first, last)
+        columns = {"run": run, "law": LAWS[run % 3].astype("S9"), "error": 0.5 * run}
+        traces = {first: fake(Trace, first)} if first else {}
+        found.append(tmp_path / f"{first}.part.h5")
+        write_part(found[-1], columns, traces)
+    return found
+
+
+@pytest.fixture
+def table(parts, tmp_path):
+    path = tmp_path / "sweep.h5"
+    assert assemble(path, parts, HEADINGS, {"columns": [name for name, *_ in HEADINGS], "total": 5}) == 30_005
+    return path
+
+
+def test_what_was_in_the_parts_is_in_the_table(table):
+    found = SweepTable(table)
+    assert (found.names, found.rows, found.attributes["total"]) == (("run", "law", "error"), 30_005, 5)
+    np.testing.assert_array_equal(found.column("error"), 0.5 * np.arange(30_005))
+    law = found.column("law")
+    assert (law.dtype, law[:3].tolist(), law[-1]) == (np.dtype("U7"), ["exact", "stacked", "dé"], "stacked")
+    np.testing.assert_array_equal(found.trace(30_001).q, fake(Trace, 30_001).q)
+    with pytest.raises(InputError, match="trace of run 7 was not kept"):
+        found.trace(7)
+
+
+def test_xarray_opens_texts_as_texts(table):
+    xarray = pytest.importorskip("xarray")
+    with xarray.open_dataset(table, engine="h5netcdf") as data:
+        assert data["error"].dims == ("run",)
+        assert data["error"].attrs["units"] == "px"
+        frame = data.to_dataframe()
+    assert frame["law"].iloc[:3].tolist() == ["exact", "stacked", "dé"]
+    assert frame.loc[30_001, "error"] == 15_000.5
+
+
+def test_a_part_that_changed_costs_no_table(table, parts):
+    before = table.read_bytes()
+    parts[1].write_bytes(parts[1].read_bytes()[:-1])
+    with pytest.raises(InputError, match="delete it and run the sweep again"):
+        assemble(table, parts, HEADINGS, {})
+    assert table.read_bytes() == before
+    table.write_bytes(before[:-1])
+    with pytest.raises(InputError, match="cut short or changed"):
+        SweepTable(table)
+    with pytest.raises(InputError, match="not the table of a sweep"):
+        SweepTable(parts[0])
+
+
+def test_a_table_larger_than_the_disk_is_not_begun(parts, tmp_path, monkeypatch):
+    little = namedtuple("usage", "free")(1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: little)
+    with pytest.raises(InputError, match="cannot be written: No space left"):
+        assemble(tmp_path / "sweep.h5", parts, HEADINGS, {})
+    assert {path.suffixes[0] for path in tmp_path.iterdir()} == {".part"}
