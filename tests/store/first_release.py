@@ -15,7 +15,7 @@ from tests.conftest import ROOT
 FILE = Path(__file__).parent / "data" / "first_release.h5.gz"
 SETTINGS = (
     "name=first-release",
-    "calibration.method=linear",
+    "calibration.method=closed_form",
     "calibration.frames_per_joint=4",
     "noise.calibration_px=0.01",
     "control.laws=[direct_three, stacked]",

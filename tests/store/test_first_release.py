@@ -14,7 +14,7 @@ def test_it_holds_what_it_held(run):
     found = store.load(run)
     assert list(found.results) == ["calibrate", "plan", "servo/direct_three", "servo/stacked", "report"]
     assert found.calibration.joint_types == "RRRRRR"
-    assert found.calibration.method == "linear"
+    assert found.calibration.method == "closed_form"
     assert found.observation.images.shape == (25, 2, 10, 2)
     assert found.plan.H_d.shape == (6, 4, 4)
     np.testing.assert_allclose(found.plan.mu[-1], 1.0, rtol=1e-12)  # the whole task is done at the end
