@@ -62,7 +62,7 @@ REGISTER = (
         "4",
         "Projective rotation: algebra to group and group to algebra",
         "geometry.displacement.exp_rotation geometry.displacement.log_rotation "
-        "calibration.adjustment.displacements",
+        "calibration.prediction.displacements",
         "geometry/test_displacement.py::test_rotation_is_the_matrix_exponential "
         "geometry/test_displacement.py::test_logarithm_inverts_the_rotation",
         "Group to algebra is undefined at 0 and ±π: such trial motions are refused.",
@@ -71,7 +71,7 @@ REGISTER = (
         "5",
         "Projective translation: algebra to group and group to algebra",
         "geometry.displacement.exp_translation geometry.displacement.log_translation "
-        "calibration.adjustment.displacements",
+        "calibration.prediction.displacements",
         "geometry/test_displacement.py::test_translation_is_the_matrix_exponential "
         "geometry/test_displacement.py::test_logarithm_inverts_the_translation",
         "Group to algebra is undefined at 0: such trial motions are refused.",
@@ -79,7 +79,7 @@ REGISTER = (
     _entry(
         "6",
         "Forward kinematics as a product of exponentials",
-        "geometry.kinematics.forward_kinematics calibration.adjustment.moved_points",
+        "geometry.kinematics.forward_kinematics calibration.prediction.moved_points",
         "geometry/test_kinematics.py::test_forward_kinematics_is_the_product_of_exponentials",
     ),
     _entry(

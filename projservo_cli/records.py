@@ -106,7 +106,7 @@ class Calibration:
     Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
     """
 
-    method: str = scalar(about="closed_form, linear or refined")
+    method: str = scalar(about="refined or closed_form")
     source: str = scalar(about="simulated or recorded")
     joint_types: str = scalar(about="one letter a joint, R or P")
     usable: bool = scalar(about="whether the calibration may be used for control")
@@ -150,7 +150,6 @@ class Calibration:
     swapped: IntArray = array(
         "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
     )
-    worst_determined: str | None = scalar(about="direction the data determine worst, in words", default=None)
     predicted_rms_px: float | None = scalar(
         units="px",
         about="expected error of images at poses of all joints within their ranges, rms per marker and view",

@@ -1,20 +1,24 @@
-"""Epipolar geometry from noisy correspondences, some of them wrong."""
+"""Epipolar geometry from noisy correspondences, some of them wrong, and reconstructions from it.
 
+The metric reconstruction rests on guesses (focal length, image centre, square pixels): a place to start
+from, never a result. All of it is free in the adjustment, whose result is projective.
+"""
+
+import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from projservo_cli.calibration.rotations import cross
-from projservo_cli.records import BoolArray, FloatArray, WorkFailed
+from projservo_cli.calibration.readings import MAD, Readings
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
-SAMPLES = 500
-PARAMETERS = 7  # of a fundamental matrix
-# Median of |x| over the standard deviation of a normal variable.
-MAD = 0.6744897501960817
-# Correspondences farther than this many standard deviations do not count in the noise.
+# Correspondences and readings farther than this many standard deviations do not count.
 OUTLIER = 5.0
+_SAMPLES = 500
+_PARAMETERS = 7  # of a fundamental matrix
 # Least median distance of the right view from a homography of the left one, in units of the noise.
-LEAST_PARALLAX = 3.0
+_LEAST_PARALLAX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +39,60 @@ class Epipolar:
     @property
     def relative_error(self) -> float:
         """Standard error of the noise as a share of it, one residual a correspondence less those F takes."""
-        return float(1.0 / np.sqrt(2.0 * (np.count_nonzero(self.inlier) - PARAMETERS)))
+        return float(1.0 / np.sqrt(2.0 * (np.count_nonzero(self.inlier) - _PARAMETERS)))
+
+    def within(self, left: FloatArray, right: FloatArray, deviations: float) -> BoolArray:
+        """Which pixels (N, 2) obey the geometry to so many standard deviations."""
+        return np.abs(_sampson(self.F, homogeneous(left), homogeneous(right))) <= deviations * self.sigma_px
+
+
+def epipolar_geometry(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> Epipolar:
+    """Fundamental matrix and noise of corresponding pixels (N, 2), px, some of them wrong.
+
+    The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
+    a Cauchy loss over minimal parameters.
+
+    Raises
+    ------
+    WorkFailed
+        With fewer than eight correspondences, or where they do not determine the geometry.
+    """
+    count = left.shape[0]
+    if count < 8:
+        raise WorkFailed(
+            f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that rows "
+            "hold the pixels of both views"
+        )
+    T, T_ = normalization(left), normalization(right)
+    a, b = homogeneous(left) @ T.T, homogeneous(right) @ T_.T
+    picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
+    candidates = _eight_point(a[picks], b[picks])
+    medians = np.median(np.abs(_sampson(candidates, a, b)), axis=1)
+    F = candidates[np.argmin(medians)]
+    for _ in range(10):
+        incidence, slope = _incidence_and_slope(F, a, b)
+        r = incidence / slope
+        F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
+    F = _refine(F, a, b, 2.0 * _deviation(_sampson(F, a, b), 1e-12))
+    product = T_.T @ F @ T
+    in_pixels: FloatArray = product / float(np.linalg.norm(product))
+    residual = _sampson(in_pixels, homogeneous(left), homogeneous(right))
+    inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
+    if inlier.sum() <= _PARAMETERS:
+        raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
+    sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
+    parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
+    if float(np.median(parallax)) < _LEAST_PARALLAX * sigma:
+        raise WorkFailed(
+            "both cameras see the same up to a change of image coordinates: without a baseline, or with all "
+            "markers always in one plane, there is no depth; move the cameras apart, or the markers in depth"
+        )
+    return Epipolar(in_pixels, sigma, inlier)
+
+
+def _deviation(r: FloatArray, least: float) -> float:
+    """Robust standard deviation of residuals about zero."""
+    return max(float(np.median(np.abs(r))) / MAD, least)
 
 
 def homogeneous(pixels: FloatArray) -> FloatArray:
@@ -44,28 +101,17 @@ def homogeneous(pixels: FloatArray) -> FloatArray:
 
 
 def normalization(pixels: FloatArray) -> FloatArray:
-    """Similarity that brings pixels to zero median and unit mean absolute deviation.
+    """Similarity (3, 3) that brings pixels (N, 2) to zero median and unit mean absolute deviation.
 
     Source: R. Hartley, "In defense of the eight-point algorithm", PAMI 19(6), 1997, with medians.
-
-    Parameters
-    ----------
-    pixels : (N, 2) px.
-
-    Returns
-    -------
-    (3, 3) matrix for homogeneous pixels.
     """
     center = np.median(pixels, axis=0)
     spread = float(np.median(np.abs(pixels - center))) or 1.0
     return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
 
 
-def incidence_and_slope(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residual rightᵀ F left of correspondences and the length of its gradient by all four pixels.
-
-    Parameters are those of ``sampson``; so are the shapes of both results.
-    """
+def _incidence_and_slope(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residual rightᵀ F left of correspondences and the length of its gradient by all four pixels, (…, N)."""
     lines_right = left @ np.swapaxes(F, -1, -2)
     lines_left = right @ F
     incidence: FloatArray = (lines_right * right).sum(axis=-1)
@@ -74,37 +120,19 @@ def incidence_and_slope(F: FloatArray, left: FloatArray, right: FloatArray) -> t
     return incidence, slope
 
 
-def sampson(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Signed first-order distance of correspondences to the epipolar variety.
+def _sampson(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Signed first-order distances (…, N) of points (N, 3) from the epipolar varieties of F (…, 3, 3).
 
     Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., eq. (11.9), its square root.
-
-    Parameters
-    ----------
-    F : (..., 3, 3) fundamental matrices.
-    left, right : (N, 3) homogeneous pixels with last entry one.
-
-    Returns
-    -------
-    (..., N) distances in the joint image plane, in the unit of the pixels.
     """
-    incidence, slope = incidence_and_slope(F, left, right)
+    incidence, slope = _incidence_and_slope(F, left, right)
     return incidence / slope
 
 
-def eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None = None) -> FloatArray:
-    """Fundamental matrices of rank two from eight or more correspondences each.
+def _eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None = None) -> FloatArray:
+    """Matrices (…, 3, 3) of rank two and unit norm from eight or more normalised points (…, N, 3) each.
 
     Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 11.1.
-
-    Parameters
-    ----------
-    left, right : (..., N, 3) normalised homogeneous pixels.
-    weight : (..., N) factors of the equations.
-
-    Returns
-    -------
-    (..., 3, 3) matrices of unit norm.
     """
     rows = (right[..., :, None] * left[..., None, :]).reshape(*left.shape[:-1], 9)
     if weight is not None:
@@ -118,18 +146,12 @@ def eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None =
     return result
 
 
-def refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) -> FloatArray:
-    """Least Cauchy loss of the Sampson distances over the seven parameters of F.
+def _refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) -> FloatArray:
+    """Least Cauchy loss, flat beyond a scale, of the Sampson distances over the seven parameters of F.
 
     F = U diag(cos φ, sin φ, 0) Vᵀ; U and V turn by rotation vectors. Source of the parameters:
     A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters",
     PAMI 26(3), 2004. Reweighted least squares with Levenberg's damping.
-
-    Parameters
-    ----------
-    F : (3, 3) start, rank two, in the normalised frame.
-    left, right : (N, 3) normalised homogeneous pixels.
-    scale : distance beyond which the loss flattens, in normalised units.
     """
     U, s, Vt = np.linalg.svd(F)
     phi = float(np.arctan2(s[1], s[0]))
@@ -137,7 +159,7 @@ def refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) -> 
     loss = np.inf
     for _ in range(100):
         F = (U * np.array([np.cos(phi), np.sin(phi), 0.0])) @ Vt
-        r = sampson(F, left, right)
+        r = _sampson(F, left, right)
         new_loss = float(np.log1p((r / scale) ** 2).sum())
         if new_loss <= loss:
             settled = np.isfinite(loss) and loss - new_loss <= 1e-12 * loss
@@ -158,6 +180,31 @@ def refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) -> 
     return result
 
 
+def _sampson_gradient(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Derivative of each Sampson distance by the entries of F, (N, 3, 3)."""
+    flat = np.array([1.0, 1.0, 0.0])
+    lines_right, lines_left = (left @ F.T) * flat, (right @ F) * flat
+    incidence, slope = (part[:, None, None] for part in _incidence_and_slope(F, left, right))
+    turn = lines_right[:, :, None] * left[:, None, :] + right[:, :, None] * lines_left[:, None, :]
+    result: FloatArray = (right[:, :, None] * left[:, None, :] - incidence / slope**2 * turn) / slope
+    return result
+
+
+def _tangents(U: FloatArray, phi: float, Vt: FloatArray) -> FloatArray:
+    """Derivative of F by the turns of U and V and by φ, (7, 3, 3)."""
+    D = np.diag([np.cos(phi), np.sin(phi), 0.0])
+    turns = np.cross(np.eye(3), np.eye(3)[:, None])  # the matrices of the cross products with e_i
+    middle = [*(turns @ D), *(-D @ turns), np.diag([-np.sin(phi), np.cos(phi), 0.0])]
+    result: FloatArray = U @ np.array(middle) @ Vt
+    return result
+
+
+def _turn(w: FloatArray) -> FloatArray:
+    """Rotation (3, 3) near the identity by the Cayley map, which keeps it one however far it goes."""
+    S = 0.5 * np.cross(np.eye(3), w)
+    return np.asarray(np.linalg.solve(np.eye(3) - S, np.eye(3) + S), dtype=np.float64)
+
+
 def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
     """Distance (N,) of the right points from a homography of the left ones, in normalised units.
 
@@ -172,79 +219,154 @@ def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
     return distance
 
 
-def _sampson_gradient(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Derivative of each Sampson distance by the entries of F, (N, 3, 3)."""
-    flat = np.array([1.0, 1.0, 0.0])
-    lines_right, lines_left = (left @ F.T) * flat, (right @ F) * flat
-    incidence, slope = (part[:, None, None] for part in incidence_and_slope(F, left, right))
-    turn = lines_right[:, :, None] * left[:, None, :] + right[:, :, None] * lines_left[:, None, :]
-    result: FloatArray = (right[:, :, None] * left[:, None, :] - incidence / slope**2 * turn) / slope
-    return result
+# Focal lengths tried, in units of the image size: from a fisheye's centre to a long lens. Without an
+# image size the extent of the data stands in for it, which may be several times smaller.
+_SHORTEST, _LONGEST, _TRIALS = 0.4, 24.0, 28
+_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
-def _tangents(U: FloatArray, phi: float, Vt: FloatArray) -> FloatArray:
-    """Derivative of F by the turns of U and V and by φ, (7, 3, 3)."""
-    D = np.diag([np.cos(phi), np.sin(phi), 0.0])
-    generators = cross(np.eye(3))
-    middle = [*(generators @ D), *(-D @ generators)]
-    middle.append(np.diag([-np.sin(phi), np.cos(phi), 0.0]))
-    result: FloatArray = U @ np.array(middle) @ Vt
-    return result
+@dataclass(frozen=True, eq=False)
+class ImageFrame:
+    """Guessed principal points (2, 2) and sizes (2,) of both images, px; whether the images are known."""
+
+    center: FloatArray
+    size: FloatArray
+    known: bool
 
 
-def _turn(w: FloatArray) -> FloatArray:
-    """Rotation near the identity by the Cayley map, (3, 3) from three numbers."""
-    S = 0.5 * cross(w)
-    return np.asarray(np.linalg.solve(np.eye(3) - S, np.eye(3) + S), dtype=np.float64)
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Cameras and points in a guessed metric frame.
 
-
-def estimate(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> Epipolar:
-    """Fundamental matrix of a rig from correspondences with gross errors among them.
-
-    Least median of squares over samples of eight, Cauchy reweighting, then the seven parameters.
-    Source: P. Rousseeuw, A. Leroy, Robust Regression and Outlier Detection, 1987, chapter 5.
-
-    Parameters
+    Attributes
     ----------
-    left, right : (N, 2) corresponding pixels.
-    rng : draws the samples.
+    P : (2, 3, 4) cameras to pixels.
+    points : (N, 3) reconstructed points, in units of their median distance from the left camera.
+    spread : how much marker distances vary over the poses, median of |log ratio|.
+    focal : guessed focal length over image size.
+    """
+
+    P: FloatArray
+    points: FloatArray
+    spread: float
+    focal: float
+
+
+def image_frame(readings: Readings, image_size: tuple[int, int] | None) -> ImageFrame:
+    """Centre and size of the images of a width and height, px, or of the extent of the data in each view."""
+    if image_size is not None:
+        center = np.tile(0.5 * np.asarray(image_size, dtype=np.float64), (2, 1))
+        return ImageFrame(center, np.full(2, float(max(image_size))), True)
+    # The outermost percent is left out: it may be outliers.
+    low, high = np.stack(
+        [np.percentile(readings.pixels[v][readings.seen[v]], [1, 99], axis=0) for v in (0, 1)], axis=1
+    )
+    size = (high - low).max(axis=1)
+    return ImageFrame(0.5 * (low + high), np.where(size > 0.0, size, 1.0), False)
+
+
+def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: int) -> list[Guess]:
+    """Guessed reconstructions of the pairs seen by both cameras, best first, so many at most.
+
+    The focal length is the one that keeps the distances between markers most constant over the
+    poses, each local minimum of a scan refined by golden section.
 
     Raises
     ------
     WorkFailed
-        With fewer than eight correspondences, or where they do not determine the geometry.
+        If no two markers were seen together at two poses.
     """
-    count = left.shape[0]
-    if count < 8:
-        raise WorkFailed(
-            f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that rows "
-            "hold the pixels of both views"
-        )
-    T, T_ = normalization(left), normalization(right)
-    a, b = homogeneous(left) @ T.T, homogeneous(right) @ T_.T
-    picks = rng.permuted(np.broadcast_to(np.arange(count), (SAMPLES, count)), axis=1)[:, :8]
-    candidates = eight_point(a[picks], b[picks])
-    medians = np.median(np.abs(sampson(candidates, a, b)), axis=1)
-    F = candidates[np.argmin(medians)]
-    for _ in range(10):
-        incidence, slope = incidence_and_slope(F, a, b)
-        r = incidence / slope
-        scale = max(float(np.median(np.abs(r))) / MAD, 1e-12)
-        F = eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * scale)) ** 2)))
-    r = sampson(F, a, b)
-    F = refine(F, a, b, 2.0 * max(float(np.median(np.abs(r))) / MAD, 1e-12))
-    product = T_.T @ F @ T
-    in_pixels: FloatArray = product / float(np.linalg.norm(product))
-    residual = sampson(in_pixels, homogeneous(left), homogeneous(right))
-    scale = max(float(np.median(np.abs(residual))) / MAD, 1e-9)
-    inlier = np.abs(residual) <= OUTLIER * scale
-    if inlier.sum() <= PARAMETERS:
-        raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
-    sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - PARAMETERS)))
-    parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
-    if float(np.median(parallax)) < LEAST_PARALLAX * sigma:
-        raise WorkFailed(
-            "both cameras see the same up to a change of image coordinates: without a baseline, or with all "
-            "markers always in one plane, there is no depth; move the cameras apart, or the markers in depth"
-        )
-    return Epipolar(in_pixels, sigma, inlier)
+    both = readings.both
+    pairs = _marker_pairs(readings.pose_of[both], readings.marker_of[both])
+
+    def guess(log_focal: float) -> Guess:
+        found = guess_at(F, readings, frame, float(np.exp(log_focal)))
+        return dataclasses.replace(found, spread=_distance_spread(found.points, pairs))
+
+    grid = np.linspace(np.log(_SHORTEST), np.log(_LONGEST), _TRIALS)
+    scan = [guess(x) for x in grid]
+    spread = np.array([g.spread for g in scan])
+    if not np.isfinite(spread).any():
+        raise WorkFailed("no two markers are seen together at two poses: more markers must be seen at once")
+    padded = np.concatenate([[np.inf], spread, [np.inf]])
+    minima = np.flatnonzero((spread <= padded[:-2]) & (spread < padded[2:]))
+    minima = minima[np.argsort(spread[minima])][:keep]
+    # A minimum at which the body changes its shape a lot more than at the best is none to start from.
+    minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
+    step = float(grid[1] - grid[0])
+    return [_golden_section(guess, grid[i] - step, grid[i] + step, scan[i]) for i in minima]
+
+
+def _golden_section(guess: Callable[[float], Guess], low: float, high: float, best: Guess) -> Guess:
+    """Least spread between two logarithms of the focal length."""
+    for _ in range(12):
+        width = _GOLDEN * (high - low)
+        inner = [guess(high - width), guess(low + width)]
+        if inner[0].spread < inner[1].spread:
+            high = low + width
+        else:
+            low = high - width
+        best = min([best, *inner], key=lambda g: g.spread)
+    return best
+
+
+def guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float) -> Guess:
+    """Reconstruction of the pairs seen by both cameras from a focal length in units of the image size.
+
+    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., result 9.19; the solution of
+    the four that has most points in front of both cameras.
+    """
+    K = np.zeros((2, 3, 3))
+    K[:, 0, 0] = K[:, 1, 1] = focal * frame.size
+    K[:, :2, 2] = frame.center
+    K[:, 2, 2] = 1.0
+    U, _, Vt = np.linalg.svd(K[1].T @ F @ K[0])
+    U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    x, y = (np.linalg.solve(K[v], homogeneous(readings.pixels[v][readings.both]).T).T for v in (0, 1))
+    best = -1
+    for R in (U @ W @ Vt, U @ W.T @ Vt):
+        for t in (U[:, 2], -U[:, 2]):
+            depth, depth_ = _ray_depths(R, t, x, y)
+            count = int(((depth > 0.0) & (depth_ > 0.0)).sum())
+            if count > best:
+                best, solution = count, (R, t, depth)
+    R, t, depth = solution
+    # A ray nearly parallel to its partner meets it anywhere: the median ignores the few.
+    scale = float(np.median(np.abs(depth))) or 1.0
+    left = np.hstack([np.eye(3), np.zeros((3, 1))])
+    right = np.hstack([R, t[:, None] / scale])
+    return Guess(K @ np.stack([left, right]), x * (depth / scale)[:, None], np.inf, focal)
+
+
+def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Depths (N,) along left and right rays (N, 3) where they come closest, λ' y = λ R x + t."""
+    Rx = x @ R.T
+    xx, yy, xy = (Rx**2).sum(axis=1), (y**2).sum(axis=1), (Rx * y).sum(axis=1)
+    xt, yt = Rx @ t, y @ t
+    determinant = np.maximum(xx * yy - xy**2, 1e-15 * xx * yy)
+    return (xy * yt - yy * xt) / determinant, (xx * yt - xy * xt) / determinant
+
+
+def _marker_pairs(pose_of: IntArray, marker_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Two markers seen at the same pose: rows of the first, of the second, and which two markers they are."""
+    order = np.lexsort((marker_of, pose_of))
+    firsts, seconds = [], []
+    for rows in np.split(order, np.flatnonzero(np.diff(pose_of[order])) + 1):
+        a, b = np.triu_indices(rows.size, 1)
+        firsts.append(rows[a])
+        seconds.append(rows[b])
+    first, second = np.concatenate(firsts), np.concatenate(seconds)
+    pair = marker_of[first] * (int(marker_of.max()) + 1) + marker_of[second]
+    return first, second, np.unique(pair, return_inverse=True)[1]
+
+
+def _distance_spread(points: FloatArray, pairs: tuple[IntArray, IntArray, IntArray]) -> float:
+    """Median over poses and pairs of points (N, 3) of |log distance − its median over the poses|."""
+    first, second, pair = pairs
+    distance = np.linalg.norm(points[first] - points[second], axis=1)
+    log = np.log(np.maximum(distance, 1e-12))
+    order = np.argsort(pair, kind="stable")
+    groups = np.split(log[order], np.flatnonzero(np.diff(pair[order])) + 1)
+    deviations = [np.abs(g - np.median(g)) for g in groups if g.size > 1]
+    return float(np.median(np.concatenate(deviations))) if deviations else np.inf

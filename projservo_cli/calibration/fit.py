@@ -1,36 +1,69 @@
-"""Fits of one start: a robust search, then least squares of the readings that count."""
+"""Fits: a robust search from each start, then least squares of the readings that count, and their noise."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
+from scipy.special import chdtri
 
-from projservo_cli.calibration import adjustment
-from projservo_cli.calibration.adjustment import Scene
-from projservo_cli.calibration.body import LEAST, Alignment, merge
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
-from projservo_cli.calibration.optimization import Fit, Problem, Stalled, Weighting, fixed, minimize, prepare
-from projservo_cli.calibration.quality import LEAST_SIGMA, REFUSE_RATIO, Agreement, Expected, Misfit
-from projservo_cli.calibration.readings import Readings, of_poses, restrict
-from projservo_cli.calibration.reconstruction import Frame, Guess, guess_at, metric_guesses
-from projservo_cli.calibration.start import place, rotation_axes
+from projservo_cli.calibration.adjustment import (
+    Fit,
+    Problem,
+    Scene,
+    Stalled,
+    Weighting,
+    gauge,
+    minimize,
+    prepare,
+)
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
+from projservo_cli.calibration.readings import LEAST_SIGMA
+from projservo_cli.calibration.start import Nominal, starts
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 # Median of the length of a two-dimensional normal vector of unit deviation.
 RAYLEIGH = 1.1774100225154747
-# Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
-CAUCHY = 2.385
-MASK_ROUNDS = 4
-# Least share of the readings of a marker that must count for it to be part of the model.
-LEAST_SHARE = 0.25
-# A start that leaves this many times the epipolar noise after the robust search is a wrong one.
-HOPELESS = 10.0
-# A robust search that would still be refused and has come nearer by less than this share over so many
-# steps is not continued.
-CRAWL, PATIENCE = 0.01, 10
-# A step of the screws alone that moves the images by less than this fraction of the residual is the last.
-ROUGHLY = 1e-2
+
+# Fitted noise over the noise expected: above the first, or so many standard errors above one where that
+# is less, more than pixel noise is left; above the last the model does not describe the data.
+WARN_RATIO, _WARN_ERRORS, REFUSE_RATIO = 1.15, 4.0, 3.0
+_CHI2_TAIL = 1e-4
+
+
+class Misfit(WorkFailed):
+    """No model of the robot describes what was seen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """What a fit leaves of the images.
+
+    Attributes
+    ----------
+    residual : (2, N, 2) predicted minus seen, px.
+    used : (2, N) readings that count; the rest of those seen are outliers.
+    dof : degrees of freedom.
+    """
+
+    residual: FloatArray
+    used: BoolArray
+    dof: int
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squares of the readings used, px²."""
+        return float((self.residual[self.used] ** 2).sum())
+
+    @property
+    def sigma_px(self) -> float:
+        """Noise per coordinate that the residuals show, px."""
+        return float(np.sqrt(self.chi2 / max(self.dof, 1)))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the Euclidean residual per marker and view, px."""
+        return float(np.sqrt(self.chi2 / max(int(self.used.sum()), 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,32 +74,97 @@ class Solution:
     scene: Scene
     agreement: Agreement
 
-
-def hopeless_px(epipolar: Epipolar) -> float:
-    """Noise beyond which least squares is not worth its time, px."""
-    return HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA)
-
-
-def far_px(epipolar: Epipolar) -> float:
-    """Noise with which a fit would be refused, px."""
-    return REFUSE_RATIO * max(epipolar.sigma_px, LEAST_SIGMA)
+    @property
+    def typical_px(self) -> float:
+        """Median residual over all readings seen, outliers included, px."""
+        return median_px(self.agreement.residual, self.problem.readings.seen)
 
 
-def usable_rows(problem: Problem, trusted: BoolArray) -> BoolArray:
-    """Readings (2, N) seen at trusted poses (K,)."""
-    result: BoolArray = problem.readings.seen & trusted[problem.readings.pose_of]
-    return result
+@dataclass(frozen=True)
+class Expected:
+    """The noise a fit is measured by, px per coordinate.
+
+    Attributes
+    ----------
+    sigma_px : noise that was given, else that of the epipolar geometry.
+    known : whether it is the true noise of a simulation, so that χ² decides.
+    origin : where it comes from, in words.
+    error : its own standard error as a share of it, zero where it was given.
+    """
+
+    sigma_px: float
+    known: bool
+    origin: str
+    error: float
+
+    def ratio(self, agreement: Agreement) -> float:
+        """Fitted over expected noise."""
+        return agreement.sigma_px / self.sigma_px
+
+    def noise_px(self, agreement: Agreement) -> float:
+        """Noise a covariance is scaled by, px: the true one of a simulation, else never below the fitted."""
+        return self.sigma_px if self.known else max(self.sigma_px, agreement.sigma_px)
+
+    def warns(self, agreement: Agreement) -> bool:
+        """Whether more than pixel noise is left: both noises come from finitely many residuals."""
+        error = float(np.hypot(self.error, 1.0 / np.sqrt(2.0 * max(agreement.dof, 1))))
+        return self.ratio(agreement) > min(WARN_RATIO, 1.0 + _WARN_ERRORS * error)
+
+    def agrees(self, agreement: Agreement) -> bool:
+        """Whether a fit leaves nothing but the expected noise, so that no other need be sought."""
+        if self.known:
+            low, high = chi2_band(agreement.dof)
+            return low <= self.ratio(agreement) ** 2 <= high
+        return not self.warns(agreement)
+
+    def refusal(self, agreement: Agreement) -> str | None:
+        """Why a fit must not pass, or None where it may."""
+        ratio = self.ratio(agreement)
+        if self.known and not self.agrees(agreement):
+            low, high = chi2_band(agreement.dof)
+            return (
+                f"the fit does not describe the data: χ² per degree of freedom is {ratio**2:.4g} at "
+                f"{self.sigma_px:g} px of noise, expected within {low:.4g} and {high:.4g}"
+            )
+        if ratio > REFUSE_RATIO:
+            return (
+                f"the fit does not describe the data: residuals of {agreement.sigma_px:.3g} px a coordinate "
+                f"are {ratio:.3g} times the {self.sigma_px:.3g} px {self.origin}; check the "
+                "joint readings, their units and types, and the marker numbers"
+            )
+        return None
 
 
-def distances(residual: FloatArray, mask: BoolArray) -> FloatArray:
-    """Lengths of the residuals (2, N, 2) in a mask (2, N), px."""
-    result: FloatArray = np.linalg.norm(residual[mask], axis=1)
-    return result
+def chi2_band(dof: int) -> tuple[float, float]:
+    """Quantiles of χ² per degree of freedom between which a true model stays, all but 2e-4 of the time."""
+    return float(chdtri(dof, 1.0 - _CHI2_TAIL)) / dof, float(chdtri(dof, _CHI2_TAIL)) / dof
 
 
-def typical(solution: Solution) -> float:
-    """Median residual over all readings seen, outliers included, px."""
-    return float(np.median(distances(solution.agreement.residual, solution.problem.readings.seen)))
+def expected_noise(epipolar: Epipolar, sigma_px: float | None, source: str) -> Expected:
+    """Noise to measure a fit by: what was given, px, known for a ``simulated`` source, else the rig's own."""
+    if sigma_px is None:
+        noise = max(epipolar.sigma_px, LEAST_SIGMA)
+        return Expected(noise, False, "that the epipolar geometry shows", epipolar.relative_error)
+    return Expected(sigma_px, source == "simulated", "that were given", 0.0)
+
+
+# Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
+_CAUCHY = 2.385
+_MASK_ROUNDS = 4
+# Least share of the readings of a marker that must count for it to be part of the model.
+_LEAST_SHARE = 0.25
+# A start that leaves this many times the epipolar noise after the robust search is a wrong one.
+_HOPELESS = 10.0
+# A robust search that would still be refused and has come nearer by less than this share over so many
+# steps is not continued.
+_CRAWL, _PATIENCE = 0.01, 10
+# A step of the screws alone that moves the images by less than this fraction of the residual is the last.
+ROUGHLY = 1e-2
+
+
+def median_px(residual: FloatArray, mask: BoolArray) -> float:
+    """Median length of the residuals (2, N, 2) in a mask (2, N), px."""
+    return float(np.median(np.linalg.norm(residual[mask], axis=1)))
 
 
 def cauchy(seen: BoolArray) -> Weighting:
@@ -74,82 +172,91 @@ def cauchy(seen: BoolArray) -> Weighting:
 
     def weighting(residual: FloatArray) -> FloatArray:
         distance = np.linalg.norm(residual, axis=2)
-        width = CAUCHY * max(float(np.median(distance[seen])) / RAYLEIGH, 1e-9)
+        width = _CAUCHY * max(float(np.median(distance[seen])) / RAYLEIGH, 1e-9)
         return np.where(seen, 1.0 / (1.0 + (distance / width) ** 2), 0.0)
 
     return weighting
 
 
-def crawling(seen: BoolArray, far: float) -> Stalled:
-    """Whether a search is far from the noise and hardly comes nearer, asked after each of its steps.
+def _fixed(weight: FloatArray) -> Weighting:
+    """Weights (2, N) that do not depend on the residuals."""
+    return lambda residual: weight
 
-    Parameters
-    ----------
-    seen : (2, N) readings that count.
-    far : noise from which on a search counts as far, px.
-    """
+
+def _crawling(seen: BoolArray, far: float) -> Stalled:
+    """Whether a search is farther off than a noise, px, and hardly comes nearer, asked after each step."""
     levels: list[float] = []
 
     def stalled(residual: FloatArray) -> bool:
-        levels.append(float(np.median(distances(residual, seen))))
-        if len(levels) <= PATIENCE or levels[-1] <= RAYLEIGH * far:
+        levels.append(median_px(residual, seen))
+        if len(levels) <= _PATIENCE or levels[-1] <= RAYLEIGH * far:
             return False
-        return levels[-1] > (1.0 - CRAWL) * levels[-1 - PATIENCE]
+        return levels[-1] > (1.0 - _CRAWL) * levels[-1 - _PATIENCE]
 
     return stalled
 
 
-def robust_search(problem: Problem, scene: Scene, trusted: BoolArray, far: float) -> Fit:
-    """Screws alone, then everything, under a Cauchy loss over the trusted poses (K,).
+def robust_search(problem: Problem, scene: Scene, rows: BoolArray, epipolar: Epipolar) -> Fit:
+    """Screws alone, then everything, under a Cauchy loss over some readings (2, N).
 
-    Parameters
-    ----------
-    problem : what to explain.
-    scene : start.
-    trusted : (K,) poses that count.
-    far : noise beyond which a search that hardly proceeds is given up, px.
+    Given up where the fit would be refused and hardly proceeds.
     """
-    rows = usable_rows(problem, trusted)
     weighting = cauchy(rows)
     scene = minimize(problem, scene, weighting, cameras=False, most=20, settled_at=ROUGHLY).scene
-    return minimize(problem, scene, weighting, most=100, stalled=crawling(rows, far))
+    far = REFUSE_RATIO * max(epipolar.sigma_px, LEAST_SIGMA)
+    return minimize(problem, scene, weighting, most=100, stalled=_crawling(rows, far))
 
 
-def least_squares(problem: Problem, scene: Scene, sigma: float, hopeless: float) -> Solution | None:
+def least_squares(
+    problem: Problem, scene: Scene, sigma: float, epipolar: Epipolar | None = None
+) -> Solution | None:
     """Least squares of the readings within 5σ, in rounds until they no longer change.
 
     Parameters
     ----------
     problem : what to explain.
     scene : start.
-    sigma : robust noise at the start, px.
-    hopeless : noise beyond which least squares is not worth its time, px.
+    sigma : robust noise at the start, px; many times that of the epipolar geometry it is not worth the time.
+    epipolar : of the rig; None where the start is known to be good.
 
     Returns
     -------
     None where the fit does not put the points in front of both cameras.
     """
     residual = problem.residual(scene)
-    if sigma > hopeless:
+    if epipolar is not None and sigma > _HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA):
         seen = problem.readings.seen
-        dof = degrees_of_freedom(problem, scene, seen)
+        dof = _degrees_of_freedom(problem, scene, seen)
         return Solution(problem, scene, Agreement(residual, seen, dof)) if dof > 0 else None
     used = _within(problem, residual, OUTLIER * max(sigma, 1e-9))
-    for _ in range(MASK_ROUNDS):
-        fit = minimize(problem, scene, fixed(used.astype(np.float64)))
+    for _ in range(_MASK_ROUNDS):
+        fit = minimize(problem, scene, _fixed(used.astype(np.float64)))
         scene = fit.scene
-        dof = degrees_of_freedom(problem, scene, used)
+        dof = _degrees_of_freedom(problem, scene, used)
         if dof <= 0:
             return None
         sigma = max(float(np.sqrt(fit.cost / dof)), 1e-9)
         before, used = used, _within(problem, fit.residual, OUTLIER * sigma)
         if np.array_equal(before, used):
             break
-    used = before
-    _, depth = adjustment.predict_pixels(scene, problem.readings, problem.q)
-    if not (np.sign(depth) == np.sign(depth.sum(axis=1))[:, None])[used].all():
+    _, depth = problem.pixels(scene)
+    if not (np.sign(depth) == np.sign(depth.sum(axis=1))[:, None])[before].all():
         return None
-    return Solution(problem, scene, Agreement(fit.residual, used, dof))
+    return Solution(problem, scene, Agreement(fit.residual, before, dof))
+
+
+def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:
+    """Readings (2, N) within a limit, px, at poses where at least half of those seen are."""
+    readings = problem.readings
+    good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
+    most = readings.count_at(good) >= 0.5 * readings.count_at(readings.seen)
+    result: BoolArray = good & most[readings.pose_of]
+    return result
+
+
+def _degrees_of_freedom(problem: Problem, scene: Scene, used: BoolArray) -> int:
+    """Coordinates used minus the rank of their derivative."""
+    return 2 * int(np.count_nonzero(used)) - problem.size + len(gauge(problem, scene).T)
 
 
 def determined(solution: Solution) -> tuple[Solution, BoolArray]:
@@ -157,53 +264,30 @@ def determined(solution: Solution) -> tuple[Solution, BoolArray]:
 
     One reading is less than the three coordinates of a marker, and a few among many wrong ones agree by
     chance; either would spoil what is said about the body as a whole.
-
-    Parameters
-    ----------
-    solution : the fit.
     """
     problem, scene, agreement = solution.problem, solution.scene, solution.agreement
     readings = problem.readings
-    count = [np.bincount(readings.marker_of, mask.sum(axis=0)) for mask in (agreement.used, readings.seen)]
-    keep = count[0] >= np.maximum(2, LEAST_SHARE * count[1])
+    counts = readings.count_of(agreement.used)
+    keep = counts >= np.maximum(2, _LEAST_SHARE * readings.count_of(readings.seen))
     if keep.all():
         return solution, keep
     rows = keep[readings.marker_of]
-    lens = scene.lens is not None
-    smaller = prepare(restrict(readings, keep), problem.q_reference, lens)
+    smaller = prepare(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
     scene = Scene(scene.P, scene.H_hat, scene.M[keep], scene.lens)
     used = agreement.used[:, rows]
-    dof = degrees_of_freedom(smaller, scene, used)
+    dof = _degrees_of_freedom(smaller, scene, used)
     return Solution(smaller, scene, Agreement(agreement.residual[:, rows], used, dof)), keep
-
-
-def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:
-    """Readings (2, N) within a limit, px, at poses where at least half of those seen are."""
-    readings = problem.readings
-    good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
-    K = len(readings.q)
-    seen_at = np.bincount(readings.pose_of, readings.seen.sum(axis=0), K)
-    good_at = np.bincount(readings.pose_of, good.sum(axis=0), K)
-    result: BoolArray = good & (good_at >= 0.5 * seen_at)[readings.pose_of]
-    return result
-
-
-def degrees_of_freedom(problem: Problem, scene: Scene, used: BoolArray) -> int:
-    """Coordinates used minus the rank of their derivative."""
-    free = problem.place.size - adjustment.gauge(scene, problem.readings, problem.place).shape[1]
-    return 2 * int(np.count_nonzero(used)) - int(free)
 
 
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a
 # wrong one often leads where the best does not. After a pass, poses whose residual is so many times
 # the median are left out of the next.
-FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
-SPOILT = 8.0
+_FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
+_SPOILT = 8.0
 # Most searches a pass: data that fit no robot are refused within seconds.
-SEARCHES = 5
+_SEARCHES = 5
 # Relative difference of robust residuals below which two starts have ended at one place.
-SAME_LEVEL = 1e-3
-FOCAL_MINIMA, AXIS_MINIMA = 3, 3
+_SAME_LEVEL = 1e-3
 
 Tell = Callable[[str, int, int], None]
 
@@ -213,10 +297,9 @@ def tell_nobody(what: str, done: int, total: int) -> None:
 
 
 def solve(
-    readings: Readings,
-    q_reference: FloatArray,
+    problem: Problem,
     epipolar: Epipolar,
-    frame: Frame,
+    frame: ImageFrame,
     rng: np.random.Generator,
     expected: Expected,
     tell: Tell = tell_nobody,
@@ -225,8 +308,7 @@ def solve(
 
     Parameters
     ----------
-    readings : what was seen.
-    q_reference : (n,) joint values the model is written about, rad or m.
+    problem : what to explain.
     epipolar : epipolar geometry of the rig.
     frame : guessed image centres and sizes.
     rng : draws starts.
@@ -240,33 +322,32 @@ def solve(
     WorkFailed
         If too little was seen to start from.
     """
-    problem = prepare(readings, q_reference)
-    hopeless = hopeless_px(epipolar)
+    readings = problem.readings
     best: Solution | None = None
     trusted = np.ones(len(readings.q), dtype=bool)
     levels: list[float] = []
-    for number, factors in enumerate(FOCAL_FACTORS):
-        usable = of_poses(readings, trusted)
-        tried = islice(starts(problem, usable, epipolar, frame, rng, factors), SEARCHES)
-        for done, scene in enumerate(tried, number * SEARCHES):
-            tell("calibration, starts", done, len(FOCAL_FACTORS) * SEARCHES)
-            searched = robust_search(problem, scene, trusted, far_px(epipolar))
-            level = float(np.median(distances(searched.residual, usable_rows(problem, trusted))))
+    for number, factors in enumerate(_FOCAL_FACTORS):
+        usable = readings.of_poses(trusted)
+        rows = readings.seen & trusted[readings.pose_of]
+        tried = _told(starts(problem, usable, epipolar, frame, rng, factors), number, tell)
+        for scene in tried:
+            searched = robust_search(problem, scene, rows, epipolar)
+            level = median_px(searched.residual, rows)
             # Different starts that end at one place need not be followed to the end twice.
-            if any(abs(level - other) < SAME_LEVEL * other for other in levels):
+            if any(abs(level - other) < _SAME_LEVEL * other for other in levels):
                 # Twice the same place and no gross misfit: more starts would not better it.
                 if best is not None and expected.ratio(best.agreement) <= REFUSE_RATIO:
                     return best
                 continue
             levels.append(level)
-            found = least_squares(problem, searched.scene, level / RAYLEIGH, hopeless)
+            found = least_squares(problem, searched.scene, level / RAYLEIGH, epipolar)
             if found is None:
                 continue
             if expected.agrees(found.agreement):
                 return found
-            if best is None or typical(found) < typical(best):
+            if best is None or found.typical_px < best.typical_px:
                 best = found
-            if factors != FOCAL_FACTORS[0] and expected.refusal(best.agreement) is None:
+            if factors != _FOCAL_FACTORS[0] and expected.refusal(best.agreement) is None:
                 return best
         if best is not None:
             if expected.refusal(best.agreement) is None:
@@ -283,11 +364,18 @@ def solve(
     return best
 
 
+def _told(scenes: Iterator[Scene], number: int, tell: Tell) -> Iterator[Scene]:
+    """The first scenes of a pass, each told before it is searched from."""
+    for done, scene in enumerate(islice(scenes, _SEARCHES), number * _SEARCHES):
+        tell("calibration, starts", done, len(_FOCAL_FACTORS) * _SEARCHES)
+        yield scene
+
+
 def _explained(solution: Solution) -> BoolArray:
     """Poses (K,) whose median residual is within some times that of all."""
     readings = solution.problem.readings
     distance = np.linalg.norm(solution.agreement.residual, axis=2)
-    limit = SPOILT * typical(solution)
+    limit = _SPOILT * solution.typical_px
     result = np.ones(len(readings.q), dtype=bool)
     for k in np.unique(readings.pose_of):
         here = readings.pose_of == k
@@ -295,40 +383,49 @@ def _explained(solution: Solution) -> BoolArray:
     return result
 
 
-def starts(
-    problem: Problem,
-    readings: Readings,
-    epipolar: Epipolar,
-    frame: Frame,
-    rng: np.random.Generator,
-    factors: tuple[float, ...],
-) -> Iterator[Scene]:
-    """Scenes to start from, most promising first: focal lengths, and axes for each.
+def solve_from(
+    nominal: Nominal, problem: Problem, epipolar: Epipolar, expected: Expected, search: Callable[[], Solution]
+) -> tuple[Solution, str]:
+    """The fit that a given start leads to if it leaves the expected noise, else the best of it and a search.
 
-    Parameters are those of ``solve``; ``readings`` may be those of the problem at some of its poses,
-    and ``factors`` multiply the focal lengths that fit best.
+    Returns
+    -------
+    The fit, and advice about the start where it did not lead there, else empty.
+
+    Raises
+    ------
+    InputError
+        If the start is one for other joints or markers.
+    WorkFailed
+        If neither leads anywhere.
     """
-    guesses = metric_guesses(epipolar.F, readings, frame, FOCAL_MINIMA)
-    for factor in factors:
-        for best in guesses:
-            guess = best if factor == 1.0 else guess_at(epipolar.F, readings, frame, factor * best.focal)
-            alignment = merged(guess, readings)
-            if int(np.isfinite(alignment.body[:, 0]).sum()) < LEAST:
-                raise WorkFailed(
-                    "no three markers are seen together by both cameras: more must be seen at once"
-                )
-            for w in rotation_axes(alignment, problem.q, readings.prismatic, rng, AXIS_MINIMA):
-                screws = place(w, guess.points, readings, problem.q)
-                M = np.hstack([screws.body, np.ones((len(screws.body), 1))])
-                if np.isfinite(screws.H_hat).all() and np.isfinite(M).all():
-                    yield Scene(guess.P, screws.H_hat, M)
+    found = _from(nominal.scene(problem.readings, problem.q_reference), problem, epipolar)
+    if found is not None and expected.agrees(found.agreement):
+        return found, ""
+    try:
+        searched = search()
+    except WorkFailed:
+        if found is None or expected.refusal(found.agreement) is not None:
+            raise
+        return found, ""
+    if found is not None and found.typical_px <= (1.0 + _SAME_LEVEL) * searched.typical_px:
+        return found, ""
+    leads = (
+        "does not put the markers in front of both cameras"
+        if found is None
+        else f"leads to residuals of {found.typical_px:.3g} px instead of {searched.typical_px:.3g} px"
+    )
+    return searched, (
+        f"{nominal.where} was no start: it {leads}; the search from the images alone was used, "
+        "so check whether the file is about this robot and rig"
+    )
 
 
-def merged(guess: Guess, readings: Readings) -> Alignment:
-    """Body and poses from the points of a guessed reconstruction."""
-    both = readings.both
-    shape = (len(readings.q), readings.marker.size)
-    points, seen = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
-    where = readings.pose_of[both], readings.marker_of[both]
-    points[where], seen[where] = guess.points, True
-    return merge(points, seen)
+def _from(scene: Scene, problem: Problem, epipolar: Epipolar) -> Solution | None:
+    """The fit that a scene leads to, None where its points are not in front of both cameras."""
+    seen = problem.readings.seen
+    pixels, depth = problem.pixels(scene)
+    if not np.isfinite(pixels).all() or not (depth[seen] > 0.0).all():
+        return None
+    found = robust_search(problem, scene, seen, epipolar)
+    return least_squares(problem, found.scene, median_px(found.residual, seen) / RAYLEIGH, epipolar)

@@ -1,40 +1,94 @@
-"""Images that a calibration predicts, how certain they are, and how well they agree with data."""
+"""Images at many poses at once: the vectorised forward model, what it predicts, and how certainly.
 
+The twin of the kernels in ``geometry``: the same equations for all poses and points together, which the
+adjustment, predictions and random tasks share.
+"""
+
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import CAMERA, LENS, displacements
-from projservo_cli.calibration.quality import chi2_quantile
-from projservo_cli.geometry.lens import FIRST, bent_derivative, through
-from projservo_cli.records import PRISMATIC, Calibration, FloatArray, InputError, Model, Observation
+from projservo_cli.calibration.readings import LEAST_SIGMA
+from projservo_cli.geometry.lens import FIRST, bent, bent_derivative, through
+from projservo_cli.records import (
+    PRISMATIC,
+    BoolArray,
+    Calibration,
+    FloatArray,
+    InputError,
+    Model,
+    Observation,
+)
+
+CAMERA = 12
+LENS = 2
 
 
-def image_points(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
-    """Homogeneous image points (K, 2, m, 3) of markers at joint readings, [RH00] eqs. (1), (6), no lens.
+def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
+    """Displacements exp(q Ĥ) of every joint at every pose, [RH00] eqs. (4), (5): (n, K, 4, 4).
 
     Parameters
     ----------
-    model : robot and rig in one frame.
-    M : (m, 4) markers at the reference.
-    q : (K, n) joint readings, rad or m.
-
-    Raises
-    ------
-    InputError
-        If the readings have another number of joints or are not finite.
+    H_hat : (n, 4, 4) operators.
+    prismatic : (n,) whether eq. (5) holds.
+    q : (K, n) joint values from the reference, rad or m.
     """
-    dq = _from_reference(model, q)
-    n = len(model.H_hat_0)
-    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, dq)
-    moved = np.broadcast_to(M.T, (len(dq), 4, len(M)))
-    for i in range(n - 1, -1, -1):
-        moved = E[i] @ moved
-    result: FloatArray = np.swapaxes(model.P[None] @ moved[:, None], 2, 3)
+    squared = H_hat @ H_hat
+    sine, versine = (part.T[..., None, None] for part in _sine_and_versine(prismatic, q))
+    result: FloatArray = np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
     return result
 
 
-def _from_reference(model: Model, q: FloatArray) -> FloatArray:
+def _sine_and_versine(prismatic: BoolArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (K, n) of Ĥ and Ĥ² in [RH00] eqs. (4), (5)."""
+    return np.where(prismatic, q, np.sin(q)), np.where(prismatic, 0.0, 2.0 * np.sin(0.5 * q) ** 2)
+
+
+def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
+    """Points after the last joints alone, (n + 1, K, m, 4), [RH00] eq. (6) from its right end.
+
+    Entry n holds the points at the reference, entry 0 the points moved by all joints.
+
+    Parameters
+    ----------
+    E : (n, K, 4, 4) displacements.
+    M : (m, 4) points at the reference, or (K, m, 4) others at each pose.
+    """
+    n, K = E.shape[:2]
+    Y = np.empty((n + 1, K, *M.shape[-2:]))
+    Y[n] = M
+    for i in range(n - 1, -1, -1):
+        Y[i] = Y[i + 1] @ np.swapaxes(E[i], 1, 2)
+    return Y
+
+
+def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
+    """Homogeneous image points (…, 2, m, 3) of points (…, m, 4) in both cameras (2, 3, 4), [RH00] eq. (1)."""
+    return np.asarray(points[..., None, :, :] @ np.swapaxes(P, 1, 2))
+
+
+def projection_derivative(
+    P: FloatArray, lens: FloatArray | None, points: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Pixels (…, 2, m, 2) of points (…, m, 4), and derivatives by image points (…, 2, m, 2, 3) and a lens.
+
+    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lenses (2, 5), if
+    any, with a derivative (…, 2, m, 2, 2) by k1 and k2.
+    """
+    m = image_points(P, points)
+    pixels = m[..., :2] / m[..., 2:]
+    G = np.zeros((*pixels.shape, 3))
+    G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
+    G[..., 2] = -pixels / m[..., 2:]
+    if lens is None:
+        return pixels, G, None
+    by_pixel, by_lens = bent_derivative(lens[:, None], pixels)
+    return bent(lens[:, None], pixels), by_pixel @ G, by_lens
+
+
+def from_reference(model: Model, q: FloatArray) -> FloatArray:
     """Joint values (K, n) from the reference, after a check of the readings (K, n), rad or m."""
     q = np.asarray(q, dtype=np.float64)
     n = len(model.H_hat_0)
@@ -68,11 +122,9 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
 
 
 def marker_pixels(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
-    """Pixels (K, 2, m, 2) of markers at joint readings; NaN as of ``predict``.
-
-    Parameters are those of ``image_points``.
-    """
-    m = image_points(model, M, q)
+    """Pixels (K, 2, m, 2) of markers (m, 4) at joint readings (K, n); NaN and raising as of ``predict``."""
+    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, from_reference(model, q))
+    m = image_points(model.P, moved_points(E, M)[0])
     return through(model.lens[:, None], m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan))
 
 
@@ -98,21 +150,26 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     column = {int(number): j for j, number in enumerate(calibration.marker)}
     order = np.array([column[int(number)] for number in observation.marker[known]], dtype=np.int64)
     pixels = predict(calibration, observation.q)[:, :, order]
-    seen = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
+    seen: BoolArray = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
     ahead = np.isfinite(pixels[..., 0])
     residual = (pixels - observation.images[:, :, known])[seen[:, :, known] & ahead]
-    distance = np.linalg.norm(residual, axis=1)
+    return distance_statistics(np.linalg.norm(residual, axis=1)) | {
+        "skipped": {
+            "unknown_marker": int(seen[:, :, ~known].sum()),
+            "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
+            "missing": int((~seen).sum()),
+        },
+    }
+
+
+def distance_statistics(distance: FloatArray) -> dict[str, Any]:
+    """``count``, ``rms_px``, ``median_px``, ``p95_px`` of distances (L,), the last three None without one."""
     some = distance.size > 0
     return {
         "count": int(distance.size),
         "rms_px": float(np.sqrt(np.mean(distance**2))) if some else None,
         "median_px": float(np.median(distance)) if some else None,
         "p95_px": float(np.percentile(distance, 95)) if some else None,
-        "skipped": {
-            "unknown_marker": int(seen[:, :, ~known].sum()),
-            "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
-            "missing": int((~seen).sum()),
-        },
     }
 
 
@@ -152,95 +209,140 @@ def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatAr
     M : (m, 4) markers at the reference.
     q : (K, n) joint readings, rad or m.
     """
-    H_hat, slides = model.H_hat_0, model.joint_types == PRISMATIC
-    dq = _from_reference(model, q)
+    H_hat, prismatic = model.H_hat_0, model.joint_types == PRISMATIC
+    dq = from_reference(model, q)
     K, n, m = len(dq), len(H_hat), len(M)
-    E = displacements(H_hat, slides, dq)
-    Y = np.empty((n + 1, K, m, 4))
-    Y[n] = M
-    for i in range(n - 1, -1, -1):
-        Y[i] = Y[i + 1] @ np.swapaxes(E[i], 1, 2)
-    image = Y[0][:, None] @ np.swapaxes(model.P, 1, 2)[None]
-    G = np.zeros((K, 2, m, 2, 3))
-    G[..., 0, 0] = G[..., 1, 1] = 1.0 / image[..., 2]
-    G[..., 2] = -image[..., :2] / image[..., 2:] ** 2
-    lenses = model.lens[:, FIRST:].any()
-    size = 2 * CAMERA + 16 * n + 4 * m
-    J = np.zeros((K, 2, m, 2, size + (2 * LENS if lenses else 0)))
-    if lenses:
-        by_pixel, by_lens = bent_derivative(model.lens[:, None], image[..., :2] / image[..., 2:])
-        G = by_pixel @ G
-        for v in (0, 1):
-            J[:, v, ..., size + v * LENS : size + (v + 1) * LENS] = by_lens[:, v]
+    E = displacements(H_hat, prismatic, dq)
+    Y = moved_points(E, M)
+    _, G, by_lens = projection_derivative(model.P, model.lens if model.lens[:, FIRST:].any() else None, Y[0])
+    joints, markers = 2 * CAMERA, 2 * CAMERA + 16 * n
+    J = np.zeros((K, 2, m, 2, markers + 4 * m + (0 if by_lens is None else 2 * LENS)))
     for v in (0, 1):
         camera = G[:, v, :, :, :, None] * Y[0][:, :, None, None, :]
         J[:, v, ..., v * CAMERA : (v + 1) * CAMERA] = camera.reshape(K, m, 2, CAMERA)
+        if by_lens is not None:
+            first = markers + 4 * m + v * LENS
+            J[:, v, ..., first : first + LENS] = by_lens[:, v]
     D = G @ model.P[None, :, None]
-    for i in range(n):
-        sine = np.where(slides[i], dq[:, i], np.sin(dq[:, i]))[:, None, None, None, None]
-        versine = np.where(slides[i], 0.0, 2.0 * np.sin(0.5 * dq[:, i]) ** 2)[:, None, None, None, None]
+    coefficients = (part.T[..., None, None, None, None] for part in _sine_and_versine(prismatic, dq))
+    for i, (sine, versine) in enumerate(zip(*coefficients, strict=True)):
         point = Y[i + 1][:, None, :, None]
         inner = sine * point + versine * (Y[i + 1] @ H_hat[i].T)[:, None, :, None]
         block = D[..., :, None] * inner[..., None, :]
         block = block + (versine * (D @ H_hat[i]))[..., :, None] * point[..., None, :]
-        first = 2 * CAMERA + 16 * i
-        J[..., first : first + 16] = block.reshape(K, 2, m, 2, 16)
+        J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(K, 2, m, 2, 16)
         D = D @ E[i][:, None, None]
     for j in range(m):
-        first = 2 * CAMERA + 16 * n + 4 * j
-        J[:, :, j, :, first : first + 4] = D[:, :, j]
+        J[:, :, j, :, markers + 4 * j : markers + 4 * (j + 1)] = D[:, :, j]
     return J
 
 
-POSES, SEED, HALVINGS = 60, 0, 10
-SURE = 0.99
+# Observations in a row that must agree on a disturbance: one may be blurred, or a marker taken for another.
+WINDOW = 3
+# Chance that a run of undisturbed observations is called disturbed, at most.
+_FALSE_ALARM = 1e-3
+# What the first order leaves out of a prediction's error, at most, as a share of the calibration's own noise:
+# nearer than that no image need come to what is predicted, however good the detector.
+_BEYOND_FIRST_ORDER = 0.02
+# Smallest over largest variance that is no rounding.
+_RANK = 1e-12
 
 
-def predicted_error(
-    model: Model, M: FloatArray, factor: FloatArray, around: FloatArray, q: FloatArray
-) -> tuple[float, float]:
-    """Expected error of images at poses of all joints at once, and what 99 of 100 calibrations stay below.
+@dataclass(eq=False)
+class Innovation:
+    """Whether a sequence of observations still agrees with a calibration: a bumped camera, a moved marker.
 
-    Root mean squares of the Euclidean error per marker and view, in units of the pixel noise, over poses
-    drawn evenly within the ranges that the joints moved through; images that leave the surroundings of the
-    data do not count, and where all do, the ranges are halved about the reference. No residual shows on
-    which side of the expectation a calibration came to lie: to first order the error of a maximum of the
-    likelihood does not depend on what it leaves.
+    At given joint readings the calibration predicts the pixels of every marker. What is seen differs by
+    the pixel noise and by the error of the calibration, r = J δ + ε with δ ~ N(0, Σ) and ε ~ N(0, σ² I),
+    to first order. δ is the same all along, so it is estimated from one observation to the next by a
+    Kalman filter, and each innovation has the χ² distribution of its own S = J C Jᵀ + σ² I. The parts that
+    are tested are the two views and each marker; one that is beyond its threshold several times in a row
+    is no chance and no slip of the detector.
 
-    Parameters
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+    Navigation", Wiley 2001, section 5.4 (innovation as a test of the filter).
+
+    Attributes
     ----------
-    model : projective robot and rig.
-    M : (m, 4) markers at the reference.
-    factor : (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel.
-    around : (2, 2, 2) lower and upper corner of the image region that counts, per view, px.
-    q : (K, n) joint readings of the data, rad or m.
+    calibration : what predicts the pixels, with its covariance.
+    sigma_px : pixel noise per coordinate.
+    observations : most observations of one sequence, which sets the threshold.
     """
-    rng = np.random.default_rng(SEED)
-    poses = rng.uniform(q.min(axis=0), q.max(axis=0), (POSES, q.shape[1]))
-    for _ in range(HALVINGS):
-        pixels = marker_pixels(model, M, poses)
-        counts = ((pixels >= around[:, None, 0]) & (pixels <= around[:, None, 1])).all(axis=-1)
-        if counts.any():
-            break
-        poses = 0.5 * (poses + model.q_reference)
-    spread = prediction_derivative(model, M, poses)[counts].reshape(-1, len(factor)) @ factor
-    variances = np.linalg.eigvalsh(spread.T @ spread) / max(int(counts.sum()), 1)
-    return float(np.sqrt(variances.sum())), float(np.sqrt(quantile(variances, SURE)))
 
+    calibration: Calibration
+    sigma_px: float
+    observations: int
+    _beyond: list[BoolArray] = field(default_factory=list)
 
-def quantile(variances: FloatArray, probability: float) -> float:
-    """Quantile of a sum of squares of independent normal variables, from a χ² of the same three moments.
+    def __post_init__(self) -> None:
+        spread, axes = np.linalg.eigh(self.calibration.covariance)
+        known = spread > _RANK * spread[-1]  # the gauge, and what a rigid robot cannot do, have no spread
+        self._factor: FloatArray = np.sqrt(spread[known]) * axes[:, known]
+        self._mean, self._C = np.zeros(known.sum()), np.eye(known.sum())
+        self._sigma = max(self.sigma_px, _BEYOND_FIRST_ORDER * self.calibration.sigma_px, LEAST_SIGMA)
+        m = len(self.calibration.marker)
+        tail = _FALSE_ALARM / (self.observations * (2 + m))
+        self._threshold: FloatArray = np.asarray(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail))
 
-    Source: M. J. Buckley, G. K. Eagleson, "An approximation to the distribution of quadratic forms in
-    normal random variables", Australian Journal of Statistics 30A, 1988.
+    def disturbed(self, q: FloatArray, images: FloatArray) -> str:
+        """What is wrong, in words; empty while nothing is.
 
-    Parameters
-    ----------
-    variances : (r,) of the variables.
-    probability : that the sum stays below.
-    """
-    mean, square, cube = (float((variances**power).sum()) for power in (1, 2, 3))
-    if cube == 0.0:
-        return mean
-    freedom = square**3 / cube**2
-    return mean + float(np.sqrt(square / freedom) * (chi2_quantile(probability, freedom) - freedom))
+        Parameters
+        ----------
+        q : (n,) joint readings, rad or m.
+        images : (2, m, 2) pixels of the markers of the calibration, NaN where unseen.
+        """
+        J = prediction_derivative(self.calibration.model(), self.calibration.M, q[None])[0] @ self._factor
+        r = images - predict(self.calibration, q[None])[0] - J @ self._mean
+        m = len(self.calibration.marker)
+        views, numbers = np.arange(2)[:, None], np.arange(m)
+        parts = [*(np.tile(views == view, m) for view in range(2))]
+        parts += [np.tile(numbers == j, (2, 1)) for j in range(m)]
+        beyond = np.array([self._beyond_chance(r, J, part) for part in parts])
+        self._beyond = [*self._beyond[1 - WINDOW :], beyond]
+        lasting = np.all(self._beyond, axis=0)
+        if len(self._beyond) == WINDOW and lasting.any():
+            return self._culprit(r, J, lasting[2:])
+        if not beyond.any():
+            self._learn(r, J)
+        return ""
+
+    def _seen(
+        self, r: FloatArray, J: FloatArray, part: BoolArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Innovation, derivative and covariance of the innovation of what was seen of a part (2, m)."""
+        seen = part & np.isfinite(r[..., 0])
+        B = J[seen].reshape(-1, J.shape[-1])
+        return r[seen].ravel(), B, B @ self._C @ B.T + self._sigma**2 * np.eye(len(B))
+
+    def _beyond_chance(self, r: FloatArray, J: FloatArray, part: BoolArray) -> bool:
+        """Whether χ² of what was seen of a part (2, m) is beyond what chance allows."""
+        values, _, S = self._seen(r, J, part)
+        return bool(values @ np.linalg.solve(S, values) > self._threshold[values.size])
+
+    def _learn(self, r: FloatArray, J: FloatArray) -> None:
+        """Kalman update of the error of the calibration."""
+        values, B, S = self._seen(r, J, np.ones(r.shape[:2], dtype=np.bool_))
+        gain = np.linalg.solve(S, B @ self._C).T
+        self._mean = self._mean + gain @ values
+        self._C = self._C - gain @ B @ self._C
+        self._C = 0.5 * (self._C + self._C.T)
+
+    def _culprit(self, r: FloatArray, J: FloatArray, moved: BoolArray) -> str:
+        """The least that explains it: some markers, one camera, or everything."""
+        few = moved.sum() <= len(moved) // 2
+        views = [
+            self._beyond_chance(r, J, np.outer(np.arange(2) == view, ~moved | (not few))) for view in range(2)
+        ]
+        rms = float(np.sqrt(np.nanmean(r**2)))
+        fit = f"images are {rms:.3g} px rms per coordinate off what the calibration predicts"
+        if few and not any(views):
+            numbers = ", ".join(map(str, self.calibration.marker[moved]))
+            return f"{fit}: marker {numbers} was moved on the tool; put it back, or recalibrate"
+        if views[0] != views[1]:
+            side = ("left", "right")[int(views[1])]
+            return f"{fit}, those of the {side} camera alone: it was moved; recalibrate"
+        return (
+            f"{fit}, in both cameras alike: the joint readings are wrong, or the tool or the rig was moved; "
+            "check them and recalibrate"
+        )

@@ -1,14 +1,22 @@
-"""What a calibration works on: joint readings and the marker pairs seen in them, as flat lists."""
+"""What a calibration works on, as flat lists, and refusals of what shows no motion or no two dimensions.
+
+Everything here is known before any geometry: joint readings, marker numbers, pixels.
+"""
 
 import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import chdtri
 
-from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Observation
+from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Observation, WorkFailed
 
 # Two joint readings closer than this are the same reading: far below any encoder's resolution.
 SAME_READING = 1e-7
+# Least noise that is reckoned with, px per coordinate: exact images have round-off, and none is better.
+LEAST_SIGMA = 1e-4
+# Median of |x| over the standard deviation of a normal variable.
+MAD = 0.6744897501960817
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,54 +50,51 @@ class Readings:
         result: BoolArray = np.logical_and(self.seen[0], self.seen[1])
         return result
 
-
-def require_shapes(observation: Observation) -> None:
-    """Refuse an observation whose arrays do not fit each other.
-
-    Raises
-    ------
-    InputError
-        Naming the array and its shape.
-    """
-    if observation.q.ndim != 2:
-        raise InputError(f"joint readings of shape {observation.q.shape}: expected (poses, joints)")
-    for name, numbers in (("pose", observation.pose), ("marker", observation.marker)):
-        if numbers.ndim != 1:
-            raise InputError(f"{name} numbers of shape {numbers.shape}: expected one dimension")
-        values, count = np.unique(numbers, return_counts=True)
-        if (count > 1).any():
-            raise InputError(f"{name} number {values[count > 1][0]} stands twice: number each {name} once")
-    K, m = len(observation.q), len(observation.marker)
-    if len(observation.pose) != K:
-        raise InputError(f"{len(observation.pose)} pose numbers for {K} rows of joint readings")
-    if observation.images.shape != (K, 2, m, 2):
-        raise InputError(
-            f"images of shape {observation.images.shape}: expected {(K, 2, m, 2)} for {K} poses, two views, "
-            f"{m} markers and two coordinates"
+    def rows(self, keep: BoolArray) -> "Readings":
+        """Some of the sightings (N,); the lists of poses and markers stay."""
+        return dataclasses.replace(
+            self,
+            pose_of=self.pose_of[keep],
+            marker_of=self.marker_of[keep],
+            pixels=self.pixels[:, keep],
+            seen=self.seen[:, keep],
         )
+
+    def of_poses(self, keep: BoolArray) -> "Readings":
+        """Sightings at some of the poses (K,); the lists of poses and markers stay."""
+        return self.rows(keep[self.pose_of])
+
+    def of_markers(self, keep: BoolArray) -> "Readings":
+        """Some of the markers (m,) and their sightings."""
+        left = self.rows(keep[self.marker_of])
+        numbers = (np.cumsum(keep) - 1)[left.marker_of]
+        return dataclasses.replace(left, marker=self.marker[keep], marker_of=numbers)
+
+    def count_at(self, mask: BoolArray) -> IntArray:
+        """How many readings of a mask (2, N) each pose has, (K,)."""
+        return np.bincount(self.pose_of, mask.sum(axis=0), len(self.q)).astype(np.int64)
+
+    def count_of(self, mask: BoolArray) -> IntArray:
+        """How many readings of a mask (2, N) each marker has, (m,)."""
+        return np.bincount(self.marker_of, mask.sum(axis=0), self.marker.size).astype(np.int64)
 
 
 def gather(observation: Observation, joint_types: str) -> Readings:
-    """Flatten an observation into the list of what was seen.
-
-    Parameters
-    ----------
-    observation : stereo images of markers at K poses, px, NaN where unseen.
-    joint_types : one letter a joint, R or P.
+    """Flatten an observation into the list of what was seen; one letter a joint, R or P.
 
     Raises
     ------
     InputError
         If the arrays or the letters do not fit each other, or values are not finite.
     """
-    require_shapes(observation)
+    _require_shapes(observation)
     letters = joint_types.upper()
     n = observation.q.shape[1]
     if len(letters) != n or set(letters) - {"R", "P"}:
         raise InputError(f"joint types {joint_types!r}: expected {n} letters R or P, one a joint")
     if not np.isfinite(observation.q).all():
         raise InputError("joint readings must be finite numbers")
-    finite = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
+    finite: BoolArray = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
     if np.isinf(observation.images).any():
         raise InputError("pixels must be finite numbers, or missing where a marker was not seen")
     marker_of, pose_of = np.nonzero(finite.any(axis=1).T)
@@ -108,50 +113,28 @@ def gather(observation: Observation, joint_types: str) -> Readings:
     )
 
 
-def restrict(readings: Readings, keep: BoolArray) -> Readings:
-    """Readings of some of the markers.
-
-    Parameters
-    ----------
-    readings : what was seen.
-    keep : (m,) markers that stay.
-    """
-    rows = keep[readings.marker_of]
-    return dataclasses.replace(
-        readings,
-        marker=readings.marker[keep],
-        pose_of=readings.pose_of[rows],
-        marker_of=(np.cumsum(keep) - 1)[readings.marker_of[rows]],
-        pixels=readings.pixels[:, rows],
-        seen=readings.seen[:, rows],
-    )
-
-
-def of_poses(readings: Readings, keep: BoolArray) -> Readings:
-    """Readings at some of the poses; the lists of poses and markers stay.
-
-    Parameters
-    ----------
-    readings : what was seen.
-    keep : (K,) poses that stay.
-    """
-    rows = keep[readings.pose_of]
-    return dataclasses.replace(
-        readings,
-        pose_of=readings.pose_of[rows],
-        marker_of=readings.marker_of[rows],
-        pixels=readings.pixels[:, rows],
-        seen=readings.seen[:, rows],
-    )
+def _require_shapes(observation: Observation) -> None:
+    """Refuse an observation whose arrays do not fit each other, naming the array and its shape."""
+    if observation.q.ndim != 2:
+        raise InputError(f"joint readings of shape {observation.q.shape}: expected (poses, joints)")
+    for name, numbers in (("pose", observation.pose), ("marker", observation.marker)):
+        if numbers.ndim != 1:
+            raise InputError(f"{name} numbers of shape {numbers.shape}: expected one dimension")
+        values, count = np.unique(numbers, return_counts=True)
+        if (count > 1).any():
+            raise InputError(f"{name} number {values[count > 1][0]} stands twice: number each {name} once")
+    K, m = len(observation.q), len(observation.marker)
+    if len(observation.pose) != K:
+        raise InputError(f"{len(observation.pose)} pose numbers for {K} rows of joint readings")
+    if observation.images.shape != (K, 2, m, 2):
+        raise InputError(
+            f"images of shape {observation.images.shape}: expected {(K, 2, m, 2)} for {K} poses, two views, "
+            f"{m} markers and two coordinates"
+        )
 
 
 def reference_pose(q: FloatArray) -> int | None:
-    """Row from which every other differs in at most one joint, or None: the pose of single-joint trials.
-
-    Parameters
-    ----------
-    q : (K, n) joint readings, rad or m.
-    """
+    """Row of q (K, n) from which all others differ in at most one joint: the pose of single-joint trials."""
     changed = (np.abs(q[:, None] - q[None]) > SAME_READING).sum(axis=2)
     candidates = np.flatnonzero((changed <= 1).all(axis=1))
     if candidates.size == 0:
@@ -162,24 +145,13 @@ def reference_pose(q: FloatArray) -> int | None:
 
 
 def joint_trials(q: FloatArray, home: int) -> list[list[int]]:
-    """Rows of each joint's trials, in which it differs from the reference.
-
-    Parameters
-    ----------
-    q : (K, n) joint readings of single-joint trials, rad or m.
-    home : row of the reference.
-    """
+    """Rows of q (K, n) in which each joint differs from the reference, a list a joint."""
     moved = np.abs(q - q[home]) > SAME_READING
     return [np.flatnonzero(moved[:, i]).tolist() for i in range(q.shape[1])]
 
 
 def reference_joints(q: FloatArray) -> FloatArray:
-    """Joint readings the model is written about: the trials' reference, else the most central pose.
-
-    Parameters
-    ----------
-    q : (K, n) joint readings, rad or m.
-    """
+    """Joints (n,) the model is written about: the reference of trials (K, n), else the most central pose."""
     row = reference_pose(q)
     if row is None:
         span = np.ptp(q, axis=0)
@@ -187,3 +159,208 @@ def reference_joints(q: FloatArray) -> FloatArray:
         row = int(np.argmin((deviation**2).sum(axis=1)))
     result: FloatArray = q[row].copy()
     return result
+
+
+# Reach at which predictions are judged, rad and m.
+REACH_RAD, REACH_M = 0.5, 0.15
+# Farthest trial motion that is advised, in reaches.
+MOST_REACHES = 4.0
+# Least motion of the images over the range of a joint, in units of the pixel noise.
+LEAST_MOTION = 5.0
+# Share of the reach beyond which a joint that moves no image stands still; below, it moved too little.
+_STANDING = 0.1
+# Least range of a joint that is a motion at all, rad or m.
+_LEAST_SPAN = 1e-6
+
+
+def require_motion(readings: Readings) -> FloatArray:
+    """Range of each joint over the poses, (n,) rad or m.
+
+    Raises
+    ------
+    WorkFailed
+        If a joint never moves, fewer than three markers were seen, or there is only one pose.
+    """
+    m = readings.marker.size
+    if m < 3:
+        what = ("no marker was", "only one marker was", "only two markers, which lie on a line, were")[m]
+        raise WorkFailed(
+            f"{what} seen: a rotation about a line through them shows in no image; "
+            "use three or more markers that are not on one line"
+        )
+    if len(readings.q) < 2:
+        raise WorkFailed("only one pose: trial motions of every joint are needed")
+    span: FloatArray = np.ptp(readings.q[np.unique(readings.pose_of)], axis=0)
+    for i in np.flatnonzero(span <= _LEAST_SPAN):
+        raise WorkFailed(
+            f"joint {i + 1} has no trial motion: it never moves in the data; record poses in which it does"
+        )
+    return span
+
+
+def describe_joint(i: int, span: float, prismatic: bool, needed: float | None = None) -> str:
+    """Advice for joint i that moved too little, or never apart from the others, over its range, rad or m.
+
+    ``needed`` is the range of a trial motion that determines it; NaN where none does, None where unknown.
+    """
+    reach = REACH_M if prismatic else REACH_RAD
+    moved = _amount(span, prismatic)
+    if needed is not None and not needed <= MOST_REACHES * reach:
+        return f"joint {i + 1} moved {moved}; no motion of it alone would do: record trials of every joint"
+    if span >= reach:
+        far = "" if needed is None else f", by {_amount(needed, prismatic)} or more"
+        return f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone{far}"
+    if needed is None:
+        needed = min(2.0 * reach, max(4.0 * span, 0.5 * reach))
+    if needed <= span:
+        return (
+            f"joint {i + 1} moved {moved}, in too few poses: record further ones in which it moves alone, by "
+            f"{_amount(needed, prismatic)} or more"
+        )
+    return f"joint {i + 1} moved only {moved}: move it at least {_amount(needed, prismatic)}"
+
+
+def require_moved(i: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> None:
+    """Refuse joint i whose range moves the images by no more than noise: too short, or it did not follow."""
+    if motion_px >= LEAST_MOTION * sigma_px:
+        return
+    seen = (
+        f"the images by {motion_px:.3g} px, less than {LEAST_MOTION:g} times their noise of {sigma_px:.3g} px"
+    )
+    if span < _STANDING * (REACH_M if prismatic else REACH_RAD):
+        raise WorkFailed(
+            f"too little excitation: the range of joint {i + 1} moves {seen}; "
+            f"{describe_joint(i, span, prismatic)}"
+        )
+    raise WorkFailed(
+        f"joint {i + 1} stands still: its readings range over {_amount(span, prismatic)} but move {seen}; "
+        "check that it moved and that its readings are its own, or move a marker off its axis"
+    )
+
+
+def _amount(value: float, prismatic: bool) -> str:
+    """A joint motion in words, mm or degrees."""
+    return f"{1e3 * value:.3g} mm" if prismatic else f"{np.degrees(value):.3g}°"
+
+
+ON_A_LINE = "the markers lie on one line: a turn about it shows in no image; add a marker off the line"
+# Least spread of a view's pixels across their main direction, in units of the noise.
+_LEAST_SPREAD = 5.0
+# Ratio of both spreads beyond which pixels lie on a line rather than in one place.
+_ELONGATED = 10.0
+# Share of the sightings that may move more than the rest where the robot stands still: wrong ones.
+_MOST_WRONG = 0.1
+# Chance with which noise alone puts the markers of an image farther off their best line.
+_OFF_LINE_TAIL = 0.1
+
+
+def require_images(readings: Readings, sigma_px: float | None) -> None:
+    """Refuse images that show one place, one line, or no motion, at a noise known or not, px.
+
+    Raises
+    ------
+    WorkFailed
+        Naming the view, or the joint whose trials show no motion.
+    """
+    sigma = max(sigma_px or 0.0, LEAST_SIGMA)
+    _require_spread(readings, sigma)
+    _require_moving(readings, sigma)
+    _require_no_line(readings, sigma)
+
+
+def _spread(pixels: FloatArray) -> FloatArray:
+    """Robust deviations (2,) of pixels (N, 2) along and across their main direction, px.
+
+    The direction comes from the second moment of the unit vectors from the median, so that far
+    outliers weigh no more than others. Source: S. Visuri, V. Koivunen, H. Oja, "Sign and rank
+    covariance matrices", J. Statistical Planning and Inference 91(2), 2000.
+    """
+    offset = pixels - np.median(pixels, axis=0)
+    length = np.linalg.norm(offset, axis=1, keepdims=True)
+    signs = offset / np.where(length > 0.0, length, 1.0)
+    axes = np.linalg.eigh(signs.T @ signs)[1][:, ::-1]
+    result: FloatArray = np.median(np.abs(offset @ axes), axis=0) / MAD
+    return result
+
+
+def _require_spread(readings: Readings, sigma: float) -> None:
+    """Refuse a view that saw nothing, or whose pixels do not spread in two directions."""
+    for v, view in enumerate(("left", "right")):
+        if not readings.seen[v].any():
+            raise WorkFailed(f"the {view} camera saw no marker: both must see them")
+        along, across = _spread(readings.pixels[v][readings.seen[v]])
+        if across >= _LEAST_SPREAD * sigma:
+            continue
+        if along > _ELONGATED * max(across, sigma):
+            raise WorkFailed(
+                f"the {view} images show all markers at all poses on one line, within {across:.3g} px: check "
+                "the pixel columns, and move the robot and its markers in all directions"
+            )
+        raise WorkFailed(
+            f"the {view} images show no more than noise: their markers spread over {along:.3g} px, "
+            f"less than {_LEAST_SPREAD:g} times the noise of {sigma:.3g} px; check the pixel columns, and "
+            "that the left and right pixels of a row are of one marker at one pose"
+        )
+
+
+def _require_moving(readings: Readings, sigma: float) -> None:
+    """Refuse images that stand still while the readings move: all of them, or those of a joint's trials."""
+    limit = LEAST_MOTION * sigma
+    if _farthest(readings) < limit:
+        raise WorkFailed(
+            f"the images stand still within {limit:.3g} px although the joint readings move: check that the "
+            "robot moved, and that images and readings belong together"
+        )
+    home = reference_pose(readings.q)
+    if home is None:
+        return
+    for i, rows in enumerate(joint_trials(readings.q, home)):
+        poses = np.zeros(len(readings.q), dtype=bool)
+        poses[[home, *rows]] = True
+        square = _squared_path(readings.of_poses(poses))
+        # Noise alone has the variance of both coordinates.
+        path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
+        span = float(np.ptp(readings.q[poses, i]))
+        require_moved(i, span, bool(readings.prismatic[i]), path, sigma)
+
+
+def _squared_path(readings: Readings) -> FloatArray:
+    """Squared length of the path of the images of each marker and view that shows two or more, px².
+
+    Twelve times the variance: a point that moves evenly along a path of length L has L² / 12.
+    """
+    m = readings.marker.size
+    found = []
+    for v in (0, 1):
+        marker_of = readings.marker_of[readings.seen[v]]
+        count = np.bincount(marker_of, minlength=m)
+        square = np.zeros(m)
+        for coordinate in readings.pixels[v, readings.seen[v]].T:
+            mean = np.bincount(marker_of, coordinate, m) / np.maximum(count, 1)
+            square += np.bincount(marker_of, (coordinate - mean[marker_of]) ** 2, m)
+        found.append(12.0 * square[count > 1] / (count[count > 1] - 1))
+    return np.concatenate(found)
+
+
+def _farthest(readings: Readings) -> float:
+    """How far sightings are from the median place of their marker in their view, but for the farthest, px."""
+    distances = []
+    for v in (0, 1):
+        for j in range(readings.marker.size):
+            pixels = readings.pixels[v][readings.seen[v] & (readings.marker_of == j)]
+            if len(pixels) > 1:
+                distances.append(np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1))
+    return float(np.quantile(np.concatenate(distances), 1.0 - _MOST_WRONG)) if distances else np.inf
+
+
+def _require_no_line(readings: Readings, sigma: float) -> None:
+    """Refuse a body whose markers lie on a line in most images, up to the noise: some are wrong."""
+    off = []
+    for v in (0, 1):
+        for k in np.unique(readings.pose_of[readings.seen[v]]):
+            pixels = readings.pixels[v][readings.seen[v] & (readings.pose_of == k)]
+            if len(pixels) > 2:
+                across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
+                off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
+    if off and np.mean(off) < 0.5:
+        raise WorkFailed(ON_A_LINE)

@@ -1,96 +1,147 @@
-"""Screws of the joints in a guessed metric frame: axis directions first, then all places linearly."""
+"""Where the adjustment starts: in a guessed metric frame the marker body, then the axes, then all places.
 
+Or from what is known of a robot and its rig beforehand, which is tried and never trusted.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.body import Alignment
-from projservo_cli.calibration.epipolar import MAD
-from projservo_cli.calibration.readings import Readings
-from projservo_cli.calibration.rotations import (
-    cross,
-    mean_rotation,
-    rotation_about,
-    rotation_exponential,
-    rotation_vector,
+from projservo_cli.calibration.adjustment import Problem, Scene, cross_matrix, prepare
+from projservo_cli.calibration.epipolar import Epipolar, Guess, ImageFrame, guess_at, metric_guesses
+from projservo_cli.calibration.readings import MAD, SAME_READING, Readings
+from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.records import (
+    PRISMATIC,
+    REVOLUTE,
+    BoolArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    Model,
+    WorkFailed,
 )
-from projservo_cli.records import BoolArray, FloatArray
 
-STARTS = 20
-ROTATION_STEPS = 60
-# Minima with so many times the least loss are not worth a try: they do not explain the rotations.
-UNLIKELY = 4.0
-# Sets that differ less, rad, lie in one valley: along it the rotations hardly determine the axes, and
-# images decide.
-DISTINCT = 0.5
-# Loss a pose beyond which axes contradict the rotations: a typical error of 45°, far more than a
-# guessed metric frame or some wrong joint readings bring about.
-CONTRADICTION = 5.5
-# Pull of axis points towards the body, in units of the typical equation: keeps the axes of nearly
-# parallel joints, whose places are hardly determined, from running away.
-RIDGE = 0.03
-# Least width of the loss on points, in units of their distance: the ridge's own bias must not weigh
-# down the motions that show an axis best.
-LEAST_SCALE = 1e-3
+# Shared markers that carry an alignment: four resist one wrong marker, three are the least.
+_SAFE, _LEAST = 4, 3
+_ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Screws:
-    """Joint operators as twists and markers at the reference, in a guessed metric frame.
+class Alignment:
+    """The body in its own frame and its rigid motion to each pose.
 
     Attributes
     ----------
-    H_hat : (n, 4, 4) twists: pure rotations of unit speed, translations of one common speed.
-    body : (m, 3) markers at the reference joints.
+    body : (m, 3) markers, NaN where never merged.
+    R : (K, 3, 3) rotations from the body to the pose.
+    t : (K, 3) translations.
+    merged : (K,) poses whose rotation is known.
     """
 
-    H_hat: FloatArray
     body: FloatArray
+    R: FloatArray
+    t: FloatArray
+    merged: BoolArray
 
 
-def chain_rotations(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
-    """Rotation parts of the truncated products of [RH00] eq. (6): (..., n + 1, K, 3, 3), first the identity.
+def merged(guess: Guess, readings: Readings) -> Alignment:
+    """Body and poses from the points of a guessed reconstruction, those both views saw."""
+    both = readings.both
+    shape = (len(readings.q), readings.marker.size)
+    points, seen = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
+    where = readings.pose_of[both], readings.marker_of[both]
+    points[where], seen[where] = guess.points, True
+    return merge(points, seen)
 
-    Parameters
-    ----------
-    w : (..., n, 3) unit axes.
-    q : (K, n) joint values from the reference, rad.
-    prismatic : (n,) joints that do not turn.
+
+def merge(points: FloatArray, seen: BoolArray) -> Alignment:
+    """Grow the body from the fullest pose until nothing is added, from points (K, m, 3) where seen (K, m)."""
+    K = len(seen)
+    points = np.where(seen[..., None], points, 0.0)
+    R, t = np.tile(np.eye(3), (K, 1, 1)), np.zeros((K, 3))
+    seed = _seed(points, seen)
+    body = np.where(seen[seed][:, None], points[seed], np.nan)
+    found = np.arange(K) == seed
+    for shared in (_SAFE, _LEAST, _LEAST):
+        grown = True
+        while grown:
+            known = np.isfinite(body[:, 0])
+            usable = seen & known
+            rows = usable.sum(axis=1) >= max(min(shared, int(known.sum())), _LEAST)
+            if rows.any():
+                filled = np.where(known[:, None], body, 0.0)
+                R[rows], t[rows] = _robust_align(filled, points[rows], usable[rows])
+            grown = bool((rows & ~found).any())
+            found |= rows
+            local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
+            body = _median_body(local, seen & found[:, None])
+            grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
+    return Alignment(body, R, t, found)
+
+
+def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Rigid motions (K, 3, 3), (K, 3) of least squares of a body (m, 3) to points (K, m, 3), weights (K, m).
+
+    Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point
+    patterns", PAMI 13(4), 1991. All poses at once: ``Rotation.align_vectors`` takes them one by one.
     """
-    K, n = q.shape
-    result = np.empty((*w.shape[:-2], n + 1, K, 3, 3))
-    result[..., 0, :, :, :] = np.eye(3)
-    for i in range(n):
-        if prismatic[i]:
-            result[..., i + 1, :, :, :] = result[..., i, :, :, :]
-        else:
-            turn = rotation_about(w[..., i, None, :], q[:, i])
-            result[..., i + 1, :, :, :] = result[..., i, :, :, :] @ turn
-    return result
+    total = weight.sum(axis=1)[:, None]
+    center_body = (weight @ body) / total
+    center_points = np.einsum("km,kmi->ki", weight, points) / total
+    moments = np.einsum(
+        "km,kmi,kmj->kij", weight, points - center_points[:, None], body[None] - center_body[:, None]
+    )
+    U, _, Vt = np.linalg.svd(moments)
+    U[:, :, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[:, None]
+    R = U @ Vt
+    return R, center_points - np.einsum("kij,kj->ki", R, center_body)
 
 
-def isolated_axes(R: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray | None:
-    """Axis of each joint from the poses that differ from the reference in it alone, None if one has none.
+def _robust_align(body: FloatArray, points: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """``_align`` under a Cauchy loss by reweighting, its scale the median residual of all poses."""
+    R, t = _align(body, points, seen.astype(np.float64))
+    for _ in range(_ROUNDS):
+        residual = np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2)
+        scale = max(float(np.median(residual[seen])) / MAD, 1e-12)
+        R, t = _align(body, points, np.where(seen, 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2), 0.0))
+    return R, t
 
-    Parameters
-    ----------
-    R : (K, 3, 3) rotations of the poses.
-    q : (K, n) joint values from the reference, rad.
-    prismatic : (n,) joints that do not turn.
-    """
-    moved = np.abs(q) > 1e-6
-    home = np.flatnonzero(~moved.any(axis=1))
-    if home.size == 0:
-        return None
-    w = np.tile([0.0, 0.0, 1.0], (q.shape[1], 1))
-    for i in np.flatnonzero(~prismatic):
-        rows = np.flatnonzero(moved[:, i] & (moved.sum(axis=1) == 1))
-        if rows.size == 0:
-            return None
-        vectors = rotation_vector(R[rows] @ R[home[0]].T)
-        total = np.median(vectors * np.sign(q[rows, i])[:, None], axis=0)
-        w[i] = total / max(float(np.linalg.norm(total)), 1e-12)
-    return w
+
+def _seed(points: FloatArray, seen: BoolArray) -> int:
+    """The fullest pose whose markers lie most nearly as in the other poses that show them."""
+    full = np.flatnonzero(seen.sum(axis=1) == seen.sum(axis=1).max())
+    distance = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
+    together = seen[:, :, None] & seen[:, None]
+    # A pair that is never seen together has a distance of zero, for it is nowhere compared.
+    masked = np.where(together | ~together.any(axis=0), np.where(together, distance, 0.0), np.nan)
+    typical = np.array(np.nanmedian(masked, axis=0))
+    others = ~np.eye(seen.shape[1], dtype=bool)
+    deviation = [float(np.median(np.abs(distance[k] - typical)[together[k] & others])) for k in full]
+    return int(full[np.argmin(deviation)])
+
+
+def _median_body(local: FloatArray, seen: BoolArray) -> FloatArray:
+    """Median over the poses of each marker's place in the body, NaN where never seen."""
+    body = np.full(local.shape[1:], np.nan)
+    for j in np.flatnonzero(seen.any(axis=0)):
+        body[j] = np.median(local[seen[:, j], j], axis=0)
+    return body
+
+
+_STARTS, _TURNS = 20, 60
+# Minima with so many times the least loss are not worth a try: they do not explain the rotations.
+_UNLIKELY = 4.0
+# Sets that differ less, rad, lie in one valley: along it the rotations hardly determine the axes, and
+# images decide.
+_DISTINCT = 0.5
+# Loss a pose beyond which axes contradict the rotations: a typical error of 45°, far more than a
+# guessed metric frame or some wrong joint readings bring about.
+_CONTRADICTION = 5.5
+# Residual, rad, beyond which the loss on rotations flattens.
+_WIDTH = 0.05
 
 
 def rotation_axes(
@@ -99,7 +150,7 @@ def rotation_axes(
     prismatic: BoolArray,
     rng: np.random.Generator,
     keep: int,
-    steps: int = ROTATION_STEPS,
+    steps: int = _TURNS,
 ) -> list[FloatArray]:
     """Axis directions that explain the rotations of the poses, the distinct minima, best first.
 
@@ -121,22 +172,62 @@ def rotation_axes(
     the rotations at all.
     """
     R, q = alignment.R[alignment.merged], q[alignment.merged]
-    w = rng.standard_normal((STARTS, q.shape[1], 3))
+    w = rng.standard_normal((_STARTS, q.shape[1], 3))
     w /= np.linalg.norm(w, axis=2, keepdims=True)
-    direct = isolated_axes(R, q, prismatic)
+    direct = _isolated_axes(R, q, prismatic)
     if direct is not None:
         w[0] = direct
     w, loss = _fit_axes(w, R, q, prismatic, steps)
     order = np.argsort(loss)
     kept: list[FloatArray] = []
-    enough = min(UNLIKELY * loss[order[0]] + 1e-9, CONTRADICTION * len(R))
+    enough = min(_UNLIKELY * loss[order[0]] + 1e-9, _CONTRADICTION * len(R))
     for s in order[loss[order] <= enough]:
-        same = [np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < DISTINCT for other in kept]
-        if not any(same):
+        if not any(np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < _DISTINCT for other in kept):
             kept.append(w[s])
         if len(kept) == keep:
             break
     return kept
+
+
+def _rotations(vectors: FloatArray) -> FloatArray:
+    """Rotations (…, 3, 3) of rotation vectors (…, 3), rad; SciPy takes one dimension of them."""
+    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3))
+
+
+def _rotation_vectors(R: FloatArray) -> FloatArray:
+    """Rotation vectors (…, 3) of rotations (…, 3, 3), rad."""
+    return np.asarray(Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1]))
+
+
+def _chain(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
+    """Rotation parts of the truncated products of [RH00] eq. (6): (…, n + 1, K, 3, 3), first the identity.
+
+    From unit axes (…, n, 3) and joint values (K, n) from the reference, rad.
+    """
+    K, n = q.shape
+    turns = _rotations(w[..., :, None, :] * np.where(prismatic, 0.0, q).T[..., None])
+    result = np.empty((*w.shape[:-2], n + 1, K, 3, 3))
+    result[..., 0, :, :, :] = np.eye(3)
+    for i in range(n):
+        result[..., i + 1, :, :, :] = result[..., i, :, :, :] @ turns[..., i, :, :, :]
+    return result
+
+
+def _isolated_axes(R: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray | None:
+    """Axes (n, 3) from the poses that differ from the reference in one joint; None if a joint has none."""
+    moved = np.abs(q) > SAME_READING
+    home = np.flatnonzero(~moved.any(axis=1))
+    if home.size == 0:
+        return None
+    w = np.tile([0.0, 0.0, 1.0], (q.shape[1], 1))
+    for i in np.flatnonzero(~prismatic):
+        rows = np.flatnonzero(moved[:, i] & (moved.sum(axis=1) == 1))
+        if rows.size == 0:
+            return None
+        vectors = _rotation_vectors(R[rows] @ R[home[0]].T)
+        total = np.median(vectors * np.sign(q[rows, i])[:, None], axis=0)
+        w[i] = total / max(float(np.linalg.norm(total)), 1e-12)
+    return w
 
 
 def _fit_axes(
@@ -144,8 +235,8 @@ def _fit_axes(
 ) -> tuple[FloatArray, FloatArray]:
     """Levenberg–Marquardt for all starts at once: axes (S, n, 3) and losses (S,)."""
     S, n = w.shape[:2]
-    chain = chain_rotations(w, q, prismatic)[:, n]
-    base = mean_rotation(np.swapaxes(chain, -1, -2) @ R)
+    away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
+    base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])
     damping = np.full(S, 1e-2)
     residual, J = _axis_residuals(w, base, R, q, prismatic)
     loss, weight = _cauchy(residual)
@@ -156,8 +247,9 @@ def _fit_axes(
         A = weighted @ rows
         g = (weighted @ residual.reshape(S, -1, 1))[..., 0]
         A += (damping * np.trace(A, axis1=1, axis2=2) / size + 1e-12)[:, None, None] * np.eye(size)
-        step = -np.linalg.solve(A, g[..., None]).reshape(S, n + 1, 3)
-        turn = rotation_exponential(np.asarray(step, dtype=np.float64))
+        turn = _rotations(
+            np.asarray(-np.linalg.solve(A, g[..., None]), dtype=np.float64).reshape(S, n + 1, 3)
+        )
         w_new = np.einsum("snij,snj->sni", turn[:, :n], w)
         base_new = turn[:, n] @ base
         residual_new, J_new = _axis_residuals(w_new, base_new, R, q, prismatic)
@@ -165,10 +257,11 @@ def _fit_axes(
         better = loss_new <= loss
         damping = np.where(better, np.maximum(0.2 * damping, 1e-9), np.minimum(8.0 * damping, 1e6))
         settled = np.abs(loss - loss_new) < 1e-9 * loss
-        w[better], base[better], residual[better], J[better] = (
-            w_new[better], base_new[better], residual_new[better], J_new[better],
-        )  # fmt: skip
-        loss[better], weight[better] = loss_new[better], weight_new[better]
+        for kept, new in (
+            (w, w_new), (base, base_new), (residual, residual_new), (J, J_new), (loss, loss_new),
+            (weight, weight_new),
+        ):  # fmt: skip
+            kept[better] = new[better]
         if (settled | (damping >= 1e6)).all():
             break
     return w, loss
@@ -183,8 +276,8 @@ def _axis_residuals(
     logarithm is taken to first order, which vanishes with the residual.
     """
     S, n = w.shape[:2]
-    chain = chain_rotations(w, q, prismatic)
-    residual = rotation_vector(R @ np.swapaxes(chain[:, n] @ base[:, None], -1, -2))
+    chain = _chain(w, q, prismatic)
+    residual = _rotation_vectors(R @ np.swapaxes(chain[:, n] @ base[:, None], -1, -2))
     J = np.empty((S, len(R), 3, n + 1, 3))
     for i in range(n):
         J[..., i, :] = chain[:, i + 1] - chain[:, i]
@@ -193,54 +286,55 @@ def _axis_residuals(
 
 
 def _cauchy(residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cauchy loss (S,) of rotations (S, K, 3) at a width of 0.05 rad, and the weights (S, K)."""
-    square = (residual**2).sum(axis=2) / 0.05**2
+    """Cauchy loss (S,) of rotations (S, K, 3), and the weights (S, K)."""
+    square = (residual**2).sum(axis=2) / _WIDTH**2
     return np.log1p(square).sum(axis=1), 1.0 / (1.0 + square)
 
 
-def place(w: FloatArray, points: FloatArray, readings: Readings, q: FloatArray) -> Screws:
+# Pull of axis points towards the body, in units of the typical equation: keeps the axes of nearly
+# parallel joints, whose places are hardly determined, from running away.
+_RIDGE = 0.03
+# Least width of the loss on points, in units of their distance: the ridge's own bias must not weigh
+# down the motions that show an axis best.
+_LEAST_SCALE = 1e-3
+
+
+def place(w: FloatArray, guess: Guess, readings: Readings, q: FloatArray) -> Scene:
     """Axis points, directions of translation and markers, linear in the points once all axes are known.
 
     A point of marker j at pose k is R̄_n X_j + Σ R̄_{i−1} ((I − R_i) p_i, or q_i v_i if prismatic):
-    least squares under a Cauchy loss with a small ridge.
+    least squares under a Cauchy loss with a small ridge. Translations get one common speed.
 
     Parameters
     ----------
     w : (n, 3) unit axes of the revolute joints.
-    points : (N, 3) reconstruction of the sightings shared by both views.
-    readings : what was seen; its rows with both views are those of ``points``.
+    guess : reconstruction of the sightings shared by both views.
+    readings : what was seen; its rows with both views are those of the reconstruction.
     q : (K, n) joint values from the reference, rad or m.
     """
+    points, prismatic = guess.points, readings.prismatic
     n, m = w.shape[0], readings.marker.size
     pose_of, marker_of = readings.pose_of[readings.both], readings.marker_of[readings.both]
-    chain = chain_rotations(w, q, readings.prismatic)
-    center = np.median(points, axis=0)
+    chain = _chain(w, q, prismatic)
     A = np.zeros((len(points), 3, n + m, 3))
     for i in range(n):
-        if readings.prismatic[i]:
-            A[:, :, i] = (chain[i] * q[:, i, None, None])[pose_of]
-        else:
-            A[:, :, i] = (chain[i] - chain[i + 1])[pose_of]
+        by_joint = chain[i] * q[:, i, None, None] if prismatic[i] else chain[i] - chain[i + 1]
+        A[:, :, i] = by_joint[pose_of]
     A[np.arange(len(points)), :, n + marker_of] = chain[n][pose_of]
     # Axis points and markers are sought from the centre of the points; R̄_n 0 and R̄_i p vanish there
     # only after the centre's own motion is taken out.
-    shift = np.zeros((n + m, 3))
-    shift[:n][~readings.prismatic] = center
-    shift[n:] = center
+    turns = np.r_[~prismatic, np.zeros(m, dtype=bool)]
+    shift = np.where(np.r_[~prismatic, np.ones(m, dtype=bool)][:, None], np.median(points, axis=0), 0.0)
+    ridge = np.where(turns[:, None], _RIDGE**2, np.zeros((1, 3)))
     rows = A.reshape(3 * len(points), -1)
-    target = points.ravel() - rows @ shift.ravel()
-    ridge = np.zeros((n + m, 3))
-    ridge[:n][~readings.prismatic] = RIDGE
-    x = _robust_solve(rows, target, ridge.ravel() ** 2).reshape(n + m, 3) + shift
-    speed = np.linalg.norm(x[:n][readings.prismatic], axis=1)
+    x = _robust_solve(rows, points.ravel() - rows @ shift.ravel(), ridge.ravel()).reshape(n + m, 3) + shift
     H_hat = np.zeros((n, 4, 4))
-    for i in range(n):
-        if readings.prismatic[i]:
-            H_hat[i, :3, 3] = x[i] / np.linalg.norm(x[i]) * np.median(speed)
-        else:
-            H_hat[i, :3, :3] = cross(w[i])
-            H_hat[i, :3, 3] = -np.cross(w[i], x[i])
-    return Screws(H_hat, x[n:])
+    H_hat[~prismatic, :3, :3] = cross_matrix(w[~prismatic])
+    H_hat[~prismatic, :3, 3] = -np.cross(w, x[:n])[~prismatic]
+    length = np.linalg.norm(x[:n], axis=1)[prismatic]
+    if prismatic.any():
+        H_hat[prismatic, :3, 3] = x[:n][prismatic] / length[:, None] * np.median(length)
+    return Scene(guess.P, H_hat, np.hstack([x[n:], np.ones((m, 1))]))
 
 
 def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> FloatArray:
@@ -251,6 +345,114 @@ def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> Fl
         A = (rows.T * W) @ rows + np.diag(ridge + 1e-9 * len(weight))
         x = np.linalg.solve(A, (rows.T * W) @ target)
         residual = np.linalg.norm((target - rows @ x).reshape(-1, 3), axis=1)
-        scale = max(float(np.median(residual)) / MAD, LEAST_SCALE)
+        scale = max(float(np.median(residual)) / MAD, _LEAST_SCALE)
         weight = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
     return np.asarray(x)
+
+
+_FOCAL_MINIMA, _AXIS_MINIMA = 3, 3
+
+
+def starts(
+    problem: Problem,
+    readings: Readings,
+    epipolar: Epipolar,
+    frame: ImageFrame,
+    rng: np.random.Generator,
+    factors: tuple[float, ...],
+) -> Iterator[Scene]:
+    """Scenes to start from, most promising first: focal lengths, and axes for each.
+
+    Parameters
+    ----------
+    problem : what to explain.
+    readings : of the problem, perhaps at some of its poses.
+    epipolar : epipolar geometry of the rig.
+    frame : guessed image centres and sizes.
+    rng : draws axes.
+    factors : multiply the focal lengths that fit best.
+    """
+    guesses = metric_guesses(epipolar.F, readings, frame, _FOCAL_MINIMA)
+    for factor in factors:
+        for best in guesses:
+            guess = best if factor == 1.0 else guess_at(epipolar.F, readings, frame, factor * best.focal)
+            alignment = merged(guess, readings)
+            if int(np.isfinite(alignment.body[:, 0]).sum()) < _LEAST:
+                raise WorkFailed(
+                    "no three markers are seen together by both cameras: more must be seen at once"
+                )
+            yield from placed(problem, readings, guess, alignment, rng)
+
+
+def placed(
+    problem: Problem,
+    readings: Readings,
+    guess: Guess,
+    alignment: Alignment,
+    rng: np.random.Generator,
+    keep: int = _AXIS_MINIMA,
+    steps: int = _TURNS,
+) -> Iterator[Scene]:
+    """Scenes of a guessed metric frame, one for each set of axes that explains its rotations."""
+    for w in rotation_axes(alignment, problem.q, readings.prismatic, rng, keep, steps):
+        scene = place(w, guess, readings, problem.q)
+        if np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all():
+            yield scene
+
+
+@dataclass(frozen=True, eq=False)
+class Nominal:
+    """What is believed of robot, rig and markers, in one metric frame.
+
+    Attributes
+    ----------
+    where : name of its file, for messages.
+    P : (2, 3, 4) cameras to pixels.
+    H_hat : (n, 4, 4) twists at the reference: unit rotations without pitch, or unit translations.
+    q_reference : (n,) rad or m.
+    marker : (m,) numbers of the markers.
+    M : (m, 4) markers at the reference, last coordinate one.
+    """
+
+    where: str
+    P: FloatArray
+    H_hat: FloatArray
+    q_reference: FloatArray
+    marker: IntArray
+    M: FloatArray
+
+    @property
+    def joint_types(self) -> str:
+        """One letter a joint, R or P."""
+        return "".join("R" if H_hat[:3, :3].any() else "P" for H_hat in self.H_hat)
+
+    def scene(self, readings: Readings, q_reference: FloatArray) -> Scene:
+        """Start for the readings, about their reference joints (n,), rad or m.
+
+        Raises
+        ------
+        InputError
+            If the joints are others, or a marker that was seen is not known.
+        """
+        own, letters = self.joint_types, "".join("P" if slides else "R" for slides in readings.prismatic)
+        if own != letters:
+            raise InputError(
+                f"{self.where}: its joints are {own}, those of the data {letters}; "
+                "give one screw a joint, or leave --init out"
+            )
+        missing = np.setdiff1d(readings.marker, self.marker)
+        if missing.size:
+            raise InputError(
+                f"{self.where}: marker {missing[0]} of the data is not in it; add the marker (marker_numbers "
+                "says which is which), or leave --init out"
+            )
+        types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
+        model = Model(self.P, self.H_hat, types, self.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
+        column = {int(number): j for j, number in enumerate(self.marker)}
+        M = self.M[[column[int(number)] for number in readings.marker]]
+        M = M @ forward_kinematics(model, q_reference).T
+        scene = Scene(self.P, joint_operators(model, q_reference), M)
+        # A camera is given up to scale and sign: most points are to lie in front of it.
+        _, depth = prepare(readings, q_reference).pixels(scene)
+        sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
+        return Scene(self.P * sign[:, None, None], scene.H_hat, scene.M)

@@ -115,7 +115,6 @@ def _calibrate_words(value: dict[str, Any]) -> list[str]:
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s",
         *(_lens_words(value["lens"]) if value["lens"] else []),
         wrapped(f"weak joints: {', '.join(weak) or 'none'}" + "".join(f"; {text}" for text in found), "  "),
-        *([wrapped(f"worst determined: {worst}", "  ")] if (worst := value["worst_determined"]) else []),
         *_predicted_words(value["predicted_rms_px"], value["predicted_p99_px"]),
         *_held_out_words(value.get("cross_validation")),
         *(wrapped(f"advice: {text}", "  ") for text in value["advice"]),

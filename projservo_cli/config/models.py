@@ -158,8 +158,8 @@ class Noise(Section):
 class CalibrationSettings(Section):
     """Trial motions of one joint each around a reference, and the method that evaluates them."""
 
-    method: Literal["refined", "linear", "closed_form"] = Field(
-        "refined", description="bundle adjustment; linear multi-frame; the paper's closed forms"
+    method: Literal["refined", "closed_form"] = Field(
+        "refined", description="bundle adjustment; the paper's closed forms"
     )
     frames_per_joint: StrictInt = Field(
         8, ge=0, le=10_000, description="trial poses of each joint, beside the reference"

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
-from projservo_cli.calibration.nominal import Nominal
+from projservo_cli.calibration import Nominal
 from projservo_cli.records import FloatArray, InputError
 
 # Unit vectors may be written with few digits.

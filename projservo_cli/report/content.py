@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from projservo_cli.calibration.quality import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
+from projservo_cli.calibration import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
 from projservo_cli.config import Config, load_config
 from projservo_cli.files import inside
 from projservo_cli.records import Calibration, CrossValidation, Plan, Report, Trace, name_of
@@ -72,8 +72,6 @@ def calibration_words(calibration: Calibration, *, estimated: bool) -> list[str]
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
     found.append(_worst_joint(calibration))
-    if calibration.worst_determined:
-        found.append(f"Worst determined of all is {calibration.worst_determined}.")
     if calibration.predicted_rms_px is not None and calibration.predicted_p99_px is not None:
         found.append(
             f"Within the ranges of the joints images are expected to err by "

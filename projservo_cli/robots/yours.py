@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.innovation import WINDOW, Innovation
+from projservo_cli.calibration import WINDOW, Innovation
 from projservo_cli.geometry.displacement import as_array
 from projservo_cli.geometry.kinematics import start_pose
 from projservo_cli.records import FloatArray, IntArray, WorkFailed

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.calibration import calibrate, cross_validate
-from projservo_cli.calibration.fit import Solution
-from projservo_cli.calibration.suggestions import Region, Suggestion, suggest
+from projservo_cli.calibration import Region, Solution, Suggestion, calibrate, cross_validate, suggest
 from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent

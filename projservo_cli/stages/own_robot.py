@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.calibration.innovation import WINDOW, Innovation
+from projservo_cli.calibration import WINDOW, Innovation
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.simulated import Plant

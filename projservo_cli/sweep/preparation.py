@@ -12,6 +12,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli import provenance
+from projservo_cli.calibration.prediction import displacements, image_points, moved_points
 from projservo_cli.config import Config, to_yaml
 from projservo_cli.files import replacing
 from projservo_cli.geometry.stereo import optical_centers
@@ -121,14 +122,8 @@ def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.G
 def _poses(truth: Truth, q: FloatArray) -> FloatArray:
     """Displacements (k, 4, 4) from the reference at joints (k, n), [RH00] eq. (6) for many at once."""
     robot = truth.robot
-    H = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    for i, (operator, kind) in enumerate(zip(robot.H_hat_0, robot.joint_types, strict=True)):
-        amount = (q[:, i] - robot.q_reference[i])[:, None, None]
-        if kind == PRISMATIC:
-            H = H @ (np.eye(4) + amount * operator)
-        else:
-            H = H @ (np.eye(4) + np.sin(amount) * operator + (1.0 - np.cos(amount)) * operator @ operator)
-    return H
+    E = displacements(robot.H_hat_0, robot.joint_types == PRISMATIC, q - robot.q_reference)
+    return np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)
 
 
 def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
@@ -145,7 +140,7 @@ def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
 
 def _accepted(truth: Truth, poses: FloatArray, front: float, rejected: dict[str, int]) -> IntArray:
     """Indices of the poses that show the face to both cameras; the others are counted by reason."""
-    m = np.einsum("vij,kmj->kvmi", truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
+    m = image_points(truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
     before = (m[..., 2] > 0.0).all(axis=(1, 2))
     turned = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)

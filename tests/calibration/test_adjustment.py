@@ -1,4 +1,4 @@
-"""The vectorised forward model and its derivatives: against finite differences, scipy and the kernels."""
+"""The vectorised forward model, its derivatives, and the search: against differences, scipy, the kernels."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.calibration import adjustment
-from projservo_cli.calibration.adjustment import Scene
-from projservo_cli.calibration.optimization import fixed, minimize, prepare
+from projservo_cli.calibration.adjustment import Scene, minimize, prepare
+from projservo_cli.calibration.prediction import displacements
 from projservo_cli.calibration.readings import gather
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.records import Model
@@ -25,7 +25,7 @@ def problem_of(robot: Robot, count: int = 5, unseen: float = 0.0):
 
 def full_jacobian(problem, J):
     """Compact derivative spread over all parameters, (4 N, size)."""
-    return problem.dense(J, np.ones(J.shape[:2]))
+    return problem.dense(J, np.ones(J.shape[:2], dtype=bool))
 
 
 @pytest.mark.parametrize("types", ["RPR", "RRRRRR", "P"])
@@ -40,17 +40,14 @@ def test_forward_model_agrees_with_matrix_exponentials(types):
 def test_derivative_agrees_with_central_differences(types):
     robot = random_robot(types, np.random.default_rng(4), markers=4)
     problem, scene = problem_of(robot)
-    _, J = adjustment.derivative(scene, problem.readings, problem.q)
+    _, J = adjustment.derivative(problem, scene)
     analytic = full_jacobian(problem, J)
     scale = np.linalg.norm(analytic, axis=0)
-    for k in range(problem.place.size):
-        step = np.zeros(problem.place.size)
+    for k in range(problem.size):
+        step = np.zeros(problem.size)
         # A step that moves images by 1e-2 px: truncation and round-off of the quotient are both below 1e-6.
         step[k] = 0.05 / scale[k]
-        ahead, behind = (
-            problem.residual(adjustment.retract(scene, problem.readings, problem.place, s))
-            for s in (step, -step)
-        )
+        ahead, behind = (problem.residual(adjustment.retract(problem, scene, s)) for s in (step, -step))
         numeric = (ahead - behind).ravel() / (2.0 * step[k])
         assert np.abs(numeric - analytic[:, k]).max() < 1e-6 * scale[k]
 
@@ -58,8 +55,8 @@ def test_derivative_agrees_with_central_differences(types):
 def test_gauge_directions_change_no_image():
     for types, dimension in (("RRR", 9), ("RPR", 8)):
         problem, scene = problem_of(random_robot(types, np.random.default_rng(5)))
-        _, J = adjustment.derivative(scene, problem.readings, problem.q)
-        G = adjustment.gauge(scene, problem.readings, problem.place)
+        _, J = adjustment.derivative(problem, scene)
+        G = adjustment.gauge(problem, scene)
         assert G.shape[1] == dimension
         dense = full_jacobian(problem, J)
         assert np.abs(dense @ G).max() < 1e-11 * np.abs(dense).max()
@@ -70,15 +67,15 @@ def test_gauge_directions_change_no_image():
 
 def test_blocks_of_the_normal_matrix_are_those_of_the_whole():
     problem, scene = problem_of(random_robot("RPR", np.random.default_rng(6)), unseen=0.3)
-    _, J = adjustment.derivative(scene, problem.readings, problem.q)
+    _, J = adjustment.derivative(problem, scene)
     rng = np.random.default_rng(0)
     weight = rng.uniform(0.0, 1.0, J.shape[:2])
     residual = rng.standard_normal(J.shape[:3])
-    dense = problem.dense(J, weight)
+    dense = full_jacobian(problem, J) * np.sqrt(np.repeat(weight.ravel(), 2))[:, None]
     assert np.allclose(problem.normal(J, weight), dense.T @ dense, rtol=1e-12, atol=1e-9)
     whole = full_jacobian(problem, J)
     assert np.allclose(problem.gradient(J, residual), whole.T @ residual.ravel(), rtol=1e-12, atol=1e-9)
-    x = rng.standard_normal(problem.place.size)
+    x = rng.standard_normal(problem.size)
     assert np.allclose(problem.change(J, x).ravel(), whole @ x, rtol=1e-12, atol=1e-9)
 
 
@@ -87,12 +84,12 @@ def test_twin_of_the_kernels():
     types = np.array([int(letter == "P") for letter in robot.joint_types])
     model = Model(robot.cameras, robot.twists, types, robot.q_reference, np.array([0.0, 0.0, 0.0, 1.0]))
     problem, scene = problem_of(robot, count=3)
-    E = adjustment.displacements(scene.H_hat, problem.readings.prismatic, problem.q)
+    E = displacements(scene.H_hat, problem.readings.prismatic, problem.q)
     for k, q in enumerate(problem.readings.q):
         H = np.linalg.multi_dot(list(E[:, k]))
         assert np.abs(H - forward_kinematics(model, q)).max() < 1e-12
-    _, J = adjustment.joint_derivative(scene, problem.readings, problem.q)
-    moved = adjustment.moved_points(E, scene.M, problem.readings)[0]
+    _, J = adjustment.joint_derivative(problem, scene)
+    moved = adjustment.carried(problem, scene)[1][0]
     for row in range(0, len(moved), 7):
         q = problem.readings.q[problem.readings.pose_of[row]]
         kernel = image_jacobian(robot.cameras, moved[row : row + 1], joint_operators(model, q))
@@ -104,8 +101,8 @@ def test_twin_of_the_kernels():
 def test_a_step_of_any_length_keeps_the_constraints(seed, length):
     rng = np.random.default_rng(seed)
     problem, scene = problem_of(random_robot("RPRP", rng, markers=3), count=2)
-    step = length * rng.standard_normal(problem.place.size)
-    H_hat = adjustment.retract(scene, problem.readings, problem.place, step).H_hat
+    step = length * rng.standard_normal(problem.size)
+    H_hat = adjustment.retract(problem, scene, step).H_hat
     slides = problem.readings.prismatic
     turning = H_hat[~slides]
     assert np.abs(turning @ turning @ turning + turning).max() < 1e-11 * (1.0 + np.abs(turning).max() ** 3)
@@ -119,13 +116,13 @@ def test_search_returns_to_the_truth_from_a_disturbed_start():
     robot = random_robot("RRPR", np.random.default_rng(8))
     problem, scene = problem_of(robot, count=30)
     rng = np.random.default_rng(2)
-    _, J = adjustment.derivative(scene, problem.readings, problem.q)
+    _, J = adjustment.derivative(problem, scene)
     scale = np.linalg.norm(full_jacobian(problem, J), axis=0)
     # Every parameter off by what moves all images by about 3 px.
     step = 3.0 * np.sqrt(J.size / J.shape[-1]) / scale * rng.uniform(-1.0, 1.0, scale.size)
-    start = adjustment.retract(scene, problem.readings, problem.place, step)
+    start = adjustment.retract(problem, scene, step)
     assert np.abs(problem.residual(start)).max() > 5.0
-    fit = minimize(problem, start, fixed(problem.readings.seen.astype(float)))
+    fit = minimize(problem, start, lambda residual: problem.readings.seen.astype(float))
     assert fit.settled
     assert fit.cost < 1e-12
 
@@ -134,6 +131,6 @@ def test_cameras_stay_where_they_are_held():
     robot = random_robot("RRR", np.random.default_rng(9))
     problem, scene = problem_of(robot, count=10)
     start = Scene(scene.P, scene.H_hat, scene.M + np.array([0.01, 0.0, 0.0, 0.0]))
-    fit = minimize(problem, start, fixed(problem.readings.seen.astype(float)), cameras=False)
+    fit = minimize(problem, start, lambda residual: problem.readings.seen.astype(float), cameras=False)
     assert np.array_equal(fit.scene.P, scene.P)
     assert fit.cost < 1e-9

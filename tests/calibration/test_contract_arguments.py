@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, predict, prediction_variance, residual_statistics
+from projservo_cli.calibration import calibrate, predict, prediction_variance
 from projservo_cli.records import InputError
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -43,7 +43,7 @@ CASES = {
     "image size not a number": (OBSERVATION, "RPR", {"image_size": (np.nan, 10)}, "positive width"),
     "negative image size": (OBSERVATION, "RPR", {"image_size": (-5, 10)}, "positive width"),
     "negative seed": (OBSERVATION, "RPR", {"seed": -1}, "seed -1"),
-    "method": (OBSERVATION, "RPR", {"method": "best"}, "refined, linear, closed_form"),
+    "method": (OBSERVATION, "RPR", {"method": "best"}, "refined, closed_form"),
     "source": (OBSERVATION, "RPR", {"source": "dreamt"}, "simulated or recorded"),
     "no noise": (OBSERVATION, "RPR", {"sigma_px": 0.0}, "positive"),
     "negative noise": (OBSERVATION, "RPR", {"sigma_px": -0.5}, "positive"),
@@ -60,12 +60,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("method", ["refined", "linear", "closed_form"])
 @pytest.mark.parametrize("name", CASES)
-def test_calibrate_refuses(name, method):
+def test_calibrate_refuses(name):
     observation, types, given, word = CASES[name]
     with pytest.raises(InputError) as caught:
-        calibrate(observation, types, **{"method": method, "source": "recorded", **given})
+        calibrate(observation, types, **{"source": "recorded", **given})
     assert word in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -113,33 +112,7 @@ def test_arguments_are_left_as_they_were():
     }
     for name in before:
         getattr(OBSERVATION, name).setflags(write=False)
-    for method in ("refined", "linear", "closed_form"):
+    for method in ("refined", "closed_form"):
         calibrate(OBSERVATION, "RPR", method=method, source="recorded")
     for name, value in before.items():
         np.testing.assert_array_equal(getattr(OBSERVATION, name), value)
-
-
-def test_statistics_by_hand(calibration):
-    """Every count and percentile against a loop over single sightings."""
-    q = around(ROBOT, 6, np.random.default_rng(9))
-    observation = ROBOT.observe(q, 3.0, np.random.default_rng(10))
-    images = observation.images.copy()
-    images[1, 0, 2] = np.nan
-    images[3, :, 1] = np.nan
-    images[4, 1, 4, 0] = np.nan  # half a pixel is no pixel
-    marker = observation.marker.copy()
-    marker[3] = 777
-    found = residual_statistics(calibration, dataclasses.replace(observation, marker=marker, images=images))
-    predicted = predict(calibration, q)
-    distances = []
-    for k in range(6):
-        for view in range(2):
-            for j in (0, 1, 2, 4):
-                du, dv = predicted[k, view, j] - images[k, view, j]
-                if not np.isnan(du + dv):
-                    distances.append((du * du + dv * dv) ** 0.5)
-    assert found["count"] == len(distances) == 6 * 2 * 4 - 4
-    assert found["rms_px"] == pytest.approx(np.sqrt(np.mean(np.square(distances))))
-    assert found["median_px"] == pytest.approx(np.median(distances))
-    assert found["p95_px"] == pytest.approx(np.quantile(distances, 0.95))
-    assert found["skipped"] == {"unknown_marker": 12, "behind_camera": 0, "missing": 4}

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, cross_validate, predict
-from projservo_cli.calibration.crossvalidation import divide
-from projservo_cli.calibration.readings import gather
 from projservo_cli.records import InputError
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -116,21 +114,18 @@ def spun(robot, configurations, spins, rng):
 
 def test_poses_that_differ_in_one_joint_stay_together(robot):
     rng = np.random.default_rng(6)
-    readings = gather(robot.observe(spun(robot, 9, 4, rng), SIGMA, rng), "RRP")
-    part, unit = divide(readings, 3, rng)
-    assert unit == "configurations"
-    assert (part.reshape(9, 4) == part[::4, None]).all()
-    np.testing.assert_array_equal(np.bincount(part), [12, 12, 12])
+    found = cross_validate(*solved(robot.observe(spun(robot, 9, 4, rng), SIGMA, rng), "RRP"), 3, seed=0)
+    assert found.unit == "configurations"
+    assert (found.fold.reshape(9, 4) == found.fold[::4, None]).all()
+    np.testing.assert_array_equal(np.bincount(found.fold), [12, 12, 12])
 
 
-def test_a_pose_without_a_reading_belongs_to_no_part(robot, observation):
+def test_a_pose_without_a_reading_belongs_to_no_part(observation):
     images = observation.images.copy()
     images[3] = np.nan
-    part, _ = divide(
-        gather(dataclasses.replace(observation, images=images), "RRP"), 5, np.random.default_rng(0)
-    )
-    assert part[3] == -1
-    assert set(part) == {-1, 0, 1, 2, 3, 4}
+    found = cross_validate(*solved(dataclasses.replace(observation, images=images), "RRP"), 5, seed=0)
+    assert found.fold[3] == -1
+    assert set(found.fold) == {-1, 0, 1, 2, 3, 4}
 
 
 @pytest.mark.parametrize("folds", [1, 32])

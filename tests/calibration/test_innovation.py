@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from projservo_cli.calibration import calibrate, innovation
-from projservo_cli.calibration.innovation import WINDOW, Innovation
+from projservo_cli.calibration import WINDOW, Innovation, calibrate, prediction
 from tests.calibration.simulated_robot import random_robot, trials
 
 SIGMA = 0.5
@@ -40,7 +39,7 @@ def test_each_innovation_has_the_distribution_it_is_tested_by(arm, monkeypatch):
     """χ² of every part and instant, for errors of the calibration drawn from its covariance."""
     robot, calibration = arm
     m, shares = len(calibration.marker), []
-    monkeypatch.setattr(innovation, "predict", lambda calibration, q: np.zeros((1, 2, m, 2)))
+    monkeypatch.setattr(prediction, "predict", lambda calibration, q: np.zeros((1, 2, m, 2)))
     q = walk(robot, 12, np.random.default_rng(1))[0]
     left = np.outer([True, False], np.ones(m, dtype=bool))
     for seed in range(30):
@@ -48,7 +47,7 @@ def test_each_innovation_has_the_distribution_it_is_tested_by(arm, monkeypatch):
         test = Innovation(calibration, SIGMA, 100)
         error = rng.standard_normal(len(test._mean))
         for row in q:
-            J = innovation.prediction_derivative(calibration.model(), calibration.M, row[None])[0]
+            J = prediction.prediction_derivative(calibration.model(), calibration.M, row[None])[0]
             J = J @ test._factor
             r = J @ error + SIGMA * rng.standard_normal((2, m, 2))
             values, _, S = test._seen(r - J @ test._mean, J, left)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import adjustment, calibrate, predict, prediction_variance
-from projservo_cli.calibration.adjustment import Scene
-from projservo_cli.calibration.optimization import prepare
+from projservo_cli.calibration.adjustment import Scene, prepare
 from projservo_cli.calibration.readings import gather
 from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot
@@ -62,25 +61,23 @@ def test_derivative_agrees_with_central_differences(robot):
     )
     problem = prepare(readings, robot.q_reference, lens=True)
     scene = Scene(robot.cameras, robot.twists, robot.markers, LENS)
-    _, J = adjustment.derivative(scene, readings, problem.q)
-    dense = problem.dense(J, np.ones(J.shape[:2]))
+    _, J = adjustment.derivative(problem, scene)
+    dense = problem.dense(J, np.ones(J.shape[:2], dtype=bool))
     scale = np.linalg.norm(dense, axis=0)
-    for k in range(problem.place.size):
+    for k in range(problem.size):
         # As without a lens: a step that moves the images by 1e-2 px; truncation and round-off < 1e-6.
-        step = 0.05 / scale[k] * np.eye(problem.place.size)[k]
-        ahead, behind = (
-            problem.residual(adjustment.retract(scene, readings, problem.place, s)) for s in (step, -step)
-        )
+        step = 0.05 / scale[k] * np.eye(problem.size)[k]
+        ahead, behind = (problem.residual(adjustment.retract(problem, scene, s)) for s in (step, -step))
         numeric = (ahead - behind).ravel() / (2.0 * step[k])
         assert np.abs(numeric - dense[:, k]).max() < 1e-6 * scale[k]
-    gauge = adjustment.gauge(scene, readings, problem.place)
+    gauge = adjustment.gauge(problem, scene)
     assert np.abs(dense @ gauge).max() < 1e-10 * np.abs(dense).max()
-    pixels, by_joint = adjustment.joint_derivative(scene, readings, problem.q)
+    pixels, by_joint = adjustment.joint_derivative(problem, scene)
     for i in range(len(robot.joint_types)):
         dq = 1e-5 * np.eye(len(robot.joint_types))[i]
-        ahead, behind = (adjustment.predict_pixels(scene, readings, problem.q + d)[0] for d in (dq, -dq))
+        ahead, behind = (dataclasses.replace(problem, q=problem.q + d).pixels(scene)[0] for d in (dq, -dq))
         assert np.abs((ahead - behind) / 2e-5 - by_joint[..., i]).max() < 1e-4
-    assert np.array_equal(pixels, adjustment.predict_pixels(scene, readings, problem.q)[0])
+    assert np.array_equal(pixels, problem.pixels(scene)[0])
 
 
 def test_known_distortion_is_recovered_within_its_uncertainty(fitted):
@@ -178,7 +175,7 @@ def test_outliers_are_told_from_distortion(robot, bent):
 
 
 def test_what_cannot_be_asked_for(robot, bent):
-    with pytest.raises(InputError, match="linear"):
-        calibrate(bent, robot.joint_types, method="linear", lens=True)
+    with pytest.raises(InputError, match="closed_form"):
+        calibrate(bent, robot.joint_types, method="closed_form", lens=True)
     with pytest.raises(InputError, match="width before height"):
         calibrate(bent, robot.joint_types, image_size=(500, 1024), lens=True)

@@ -64,7 +64,6 @@ def agree(one, other, q):
 
 def test_the_file_is_the_robot_it_describes(robot, observation, written):
     found = read_nominal(written(described(robot, observation)))
-    assert found.joint_types == "RPRR"
     np.testing.assert_allclose(found.H_hat, robot.twists, atol=1e-12)
     np.testing.assert_array_equal(found.P, robot.cameras)
     np.testing.assert_allclose(found.M, robot.markers, atol=1e-15)
@@ -87,7 +86,7 @@ def test_the_same_optimum_as_from_the_images_alone(robot, observation, alone, wr
 
 def test_the_reference_of_the_file_may_be_any_pose(robot, observation, written):
     """The truth about another reference predicts the images of all poses without any fit."""
-    from projservo_cli.calibration.adjustment import predict_pixels
+    from projservo_cli.calibration.adjustment import prepare
     from projservo_cli.calibration.readings import gather, reference_joints
 
     values = described(robot, observation)
@@ -96,7 +95,7 @@ def test_the_reference_of_the_file_may_be_any_pose(robot, observation, written):
     home = reference_joints(readings.q)
     for q_reference in (home, home + np.array([0.3, 0.1, -0.5, 0.8])):
         scene = nominal.scene(readings, q_reference)
-        pixels, depth = predict_pixels(scene, readings, readings.q - q_reference)
+        pixels, depth = prepare(readings, q_reference).pixels(scene)
         truth = robot.images(observation.q).transpose(1, 0, 2, 3)[:, readings.pose_of, readings.marker_of]
         np.testing.assert_allclose(pixels, truth, atol=1e-9)
         assert (depth > 0.0).all()

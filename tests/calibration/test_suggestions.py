@@ -6,8 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, predict, prediction_variance
-from projservo_cli.calibration.suggestions import Region, suggest
+from projservo_cli.calibration import Region, calibrate, predict, prediction_variance, suggest
 from projservo_cli.records import InputError, Observation, WorkFailed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
 
@@ -128,8 +127,8 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
     nowhere = dataclasses.replace(region, image=IMAGE + 1e5)
     with pytest.raises(WorkFailed, match="no further pose to suggest"):
         suggest(calibration, observation, nowhere, region, 1, np.random.default_rng(0))
-    bare = dataclasses.replace(calibration, covariance=np.full((2, 2), np.nan), method="linear")
-    with pytest.raises(InputError, match="the method linear has not"):
+    bare = dataclasses.replace(calibration, covariance=np.full((2, 2), np.nan), method="closed_form")
+    with pytest.raises(InputError, match="the method closed_form has not"):
         suggest(bare, observation, region, region, 1, np.random.default_rng(0))
 
 

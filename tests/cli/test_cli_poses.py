@@ -62,7 +62,10 @@ def test_the_number_of_parts_is_part_of_the_configuration(made, projservo):
         (["--cross-validate", "1"], "--cross-validate 1: calibration.cross_validate"),
         (["--cross-validate", "many"], "--cross-validate many: calibration.cross_validate"),
         (["--cross-validate", "26"], "there are 25 poses; choose 2 to 25 parts"),
-        (["--cross-validate", "3", "--set", "calibration.method=linear"], "belongs to the method refined"),
+        (
+            ["--cross-validate", "3", "--set", "calibration.method=closed_form"],
+            "belongs to the method refined",
+        ),
         (["--init", "none.json"], "none.json: cannot be read"),
         (["--init", "bad.json"], "bad.json:1:1: not JSON"),
     ],

@@ -136,14 +136,6 @@ def test_what_was_run_and_why_each_law_ended(page, run):
     assert configuration.text.strip() == run.configuration.strip()
 
 
-def test_the_worst_determined_direction_is_told(run):
-    calibration = dataclasses.replace(run.calibration, worst_determined="joint 2's axis: its tilt")
-    assert "Worst determined of all is joint 2's axis: its tilt." in calibration_words(
-        calibration, estimated=False
-    )
-    assert not any("of all" in sentence for sentence in calibration_words(run.calibration, estimated=False))
-
-
 def test_the_same_run_gives_the_same_bytes(run):
     path = run.path.parent / PAGE_FILE
     texts = []
@@ -320,8 +312,10 @@ def test_a_weak_joint_and_what_was_left_out_are_named(run, tmp_path):
     assert "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times" in text
     assert "so this one is weak." in text
     assert "2 readings left out as outliers. 1 joint reading contradicts the images." in text
-    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan), method="linear")
-    assert "The method linear states no uncertainty" in " ".join(calibration_words(unknown, estimated=False))
+    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan), method="closed_form")
+    assert "The method closed_form states no uncertainty" in " ".join(
+        calibration_words(unknown, estimated=False)
+    )
     result = run.results["calibrate"]
     result = dataclasses.replace(result, records={**result.records, "calibration": calibration})
     other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})

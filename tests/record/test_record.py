@@ -128,7 +128,7 @@ def test_a_table_of_another_configuration_is_refused_unless_forced(projservo):
 
 def test_what_does_not_change_the_pixels_does_not_matter(projservo):
     assert projservo("record", "-c", UR5, *FEW, "-o", "t.csv", "-q").code == 0
-    for change in ("calibration.method=linear", "control.period_s=0.02", "markers.face=[0, 1, 2]"):
+    for change in ("calibration.method=closed_form", "control.period_s=0.02", "markers.face=[0, 1, 2]"):
         answer = projservo("record", "-c", UR5, *FEW, "--set", change, "-o", "t.csv", "--json")
         assert (answer.code, answer.json["recorded"]) == (0, 0), change
 

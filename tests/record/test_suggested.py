@@ -80,7 +80,7 @@ def test_a_table_in_degrees_gets_suggestions_in_degrees(projservo):
     [
         (["calibrate", "--suggest", "0"], "--suggest"),
         (["calibrate", "--suggest=many"], "--suggest"),
-        (["calibrate", "--suggest", "3", "--set", "calibration.method=linear"], "has no covariance"),
+        (["calibrate", "--suggest", "3", "--set", "calibration.method=closed_form"], "has no covariance"),
         (["plan", "--suggest", "3"], "--suggest: not used by plan"),
     ],
 )

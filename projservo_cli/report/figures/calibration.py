@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from projservo_cli.calibration import predict, prediction_variance
-from projservo_cli.calibration.quality import chi2_quantile
 from projservo_cli.records import BoolArray, Calibration, CrossValidation, FloatArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
@@ -259,7 +259,7 @@ def _poses(axes: "Axes", data: Data) -> None:
     x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
     expected = x if held_out else expected_residual(x, sigma)
     coordinates = float(np.median(data["pose_coordinates"])) if predicted.size else 1.0
-    low, high = np.sqrt(chi2_quantile(BAND, coordinates) / coordinates)
+    low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(BAND)) / coordinates)
     axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)
     axes.plot(x, expected, **MODEL)
     axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)

@@ -1,0 +1,310 @@
+"""What is wrong with readings that do not fit: joint readings, marker numbers, detections, or a joint."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.calibration.adjustment import Problem, Scene, joint_derivative, minimize, prepare
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, metric_guesses
+from projservo_cli.calibration.fit import (
+    RAYLEIGH,
+    ROUGHLY,
+    Misfit,
+    Solution,
+    Tell,
+    cauchy,
+    least_squares,
+    median_px,
+    robust_search,
+)
+from projservo_cli.calibration.prediction import displacements, image_points, moved_points
+from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.start import merged, placed
+from projservo_cli.geometry.lens import through
+from projservo_cli.records import NO_LENS, BoolArray, Calibration, FloatArray, IntArray, WorkFailed
+
+# A pose is explained by a corrected joint reading when its median residual falls below so many σ.
+_CORRECTED = 3.0
+_STEPS = 12
+# Sightings both views agree on, in units of the epipolar noise, are no errors of detection.
+_CONSISTENT = 3.0
+# Shares of sightings both views agree on, and of poses, that may be left out of a fit.
+_MOST_UNEXPLAINED, _MOST_SUSPECT = 0.02, 0.4
+_VIEWS = ("left", "right", "both")
+
+
+@dataclass(frozen=True, eq=False)
+class Outliers:
+    """Explanations of what was left out.
+
+    Attributes
+    ----------
+    suspect : (S, 2) row of the pose and index of the joint whose reading no image agrees with.
+    swapped : (W, 3) row of the pose, index of the marker that was read and of the one it is.
+    explained : (2, N) readings that these explain.
+    """
+
+    suspect: IntArray
+    swapped: IntArray
+    explained: BoolArray
+
+
+def none_explained(readings: Readings) -> Outliers:
+    """No explanation of anything."""
+    nothing = np.zeros((0, 3), dtype=np.int64)
+    return Outliers(nothing[:, :2], nothing, np.zeros_like(readings.seen))
+
+
+def explain(solution: Solution) -> Outliers:
+    """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings."""
+    problem, scene, used = solution.problem, solution.scene, solution.agreement.used
+    readings, sigma = problem.readings, solution.agreement.sigma_px
+    out = readings.seen & ~used
+    swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
+    suspects: list[tuple[int, int]] = []
+    for k in np.flatnonzero(readings.count_at(used) == 0):
+        here = readings.pose_of == k
+        pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
+        if int(pose.seen.any(axis=0).sum()) < 3:
+            continue
+        pose = dataclasses.replace(
+            pose, q=readings.q[k : k + 1], pose_of=np.zeros(int(here.sum()), dtype=np.int64)
+        )
+        joints = _wrong_joints(prepare(pose, problem.q_reference, scene.lens is not None), scene, sigma)
+        suspects += [(int(k), i) for i in joints]
+        if joints:
+            explained[:, here] |= out[:, here]
+    return Outliers(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
+
+
+def _swaps(problem: Problem, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
+    """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N)."""
+    readings = problem.readings
+    E = displacements(scene.H_hat, readings.prismatic, problem.q)
+    m = image_points(scene.P, moved_points(E, scene.M)[0])
+    lens = NO_LENS if scene.lens is None else scene.lens
+    predicted = through(lens[:, None], m[..., :2] / m[..., 2:])
+    rows = np.flatnonzero(out.any(axis=0))
+    distance = np.linalg.norm(
+        predicted[readings.pose_of[rows]] - readings.pixels[:, rows].transpose(1, 0, 2)[:, :, None], axis=3
+    )
+    # A view that did not see the marker has no say.
+    distance = np.where(readings.seen[:, rows].T[..., None], distance, 0.0)
+    fits: BoolArray = np.max(distance, axis=1) <= limit
+    fits[np.arange(rows.size), readings.marker_of[rows]] = False
+    matched = fits.sum(axis=1) == 1
+    explained = np.zeros_like(out)
+    explained[:, rows[matched]] = out[:, rows[matched]]
+    read, actual = readings.marker_of[rows[matched]], np.argmax(fits[matched], axis=1)
+    triples = zip(readings.pose_of[rows[matched]].tolist(), read.tolist(), actual.tolist(), strict=True)
+    found = set(triples)
+    # An exchange shows in both markers and is one finding.
+    listed = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
+    return np.array(listed, dtype=np.int64).reshape(-1, 3), explained
+
+
+def _wrong_joints(pose: Problem, scene: Scene, sigma: float) -> tuple[int, ...]:
+    """The joint, or else the pair of joints, whose correction explains the images of a pose; or none."""
+    for size in (1, 2):
+        pairs = list(itertools.combinations(range(pose.q.shape[1]), size))
+        levels = [_corrected_level(pose, scene, list(joints)) for joints in pairs]
+        if min(levels, default=np.inf) <= _CORRECTED * RAYLEIGH * sigma:
+            return pairs[int(np.argmin(levels))]
+    return ()
+
+
+def _corrected_level(pose: Problem, scene: Scene, joints: list[int]) -> float:
+    """Median residual after some joints of a pose are fitted to its images under a Cauchy loss, px."""
+    seen = pose.readings.seen
+    best = np.inf
+    for _ in range(_STEPS):
+        pixels, J = joint_derivative(pose, scene)
+        residual = np.where(seen[..., None], pixels - pose.readings.pixels, 0.0)
+        level = median_px(residual, seen)
+        if not np.isfinite(level) or level > 0.999 * best:
+            break
+        best = level
+        distance = np.linalg.norm(residual, axis=2)
+        root = np.where(seen, 1.0 / np.sqrt(1.0 + (distance / max(2.0 * level, 1e-9)) ** 2), 0.0)
+        rows = (J[..., joints] * root[..., None, None]).reshape(-1, len(joints))
+        q = pose.q.copy()
+        q[0, joints] -= np.linalg.lstsq(rows, (residual * root[..., None]).ravel(), rcond=None)[0]
+        pose = dataclasses.replace(pose, q=q)
+    return best
+
+
+def require_explained(readings: Readings, used: BoolArray, found: Outliers, epipolar: Epipolar) -> None:
+    """Refuse a fit that leaves out too many sightings both views agree on, or poses for their joint readings.
+
+    Errors of detection break the epipolar geometry; what obeys it and still does not fit speaks
+    against the model of the robot.
+
+    Parameters
+    ----------
+    readings : what was seen, as projective cameras would have.
+    used : (2, N) readings that count.
+    found : what explains the others.
+    epipolar : epipolar geometry of the rig.
+
+    Raises
+    ------
+    Misfit
+        If the model of the robot, not single errors, is at odds with the data.
+    """
+    both = readings.both
+    out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
+    agree = epipolar.within(readings.pixels[0][both], readings.pixels[1][both], _CONSISTENT)
+    unexplained, sightings = int((out & agree).sum()), int(both.sum())
+    if unexplained > max(3.0, _MOST_UNEXPLAINED * sightings):
+        raise Misfit(
+            f"the fit does not describe the data: in {unexplained} of {sightings} sightings both cameras "
+            "agree with each other but not with the robot; check the joint readings and types (R or P)"
+        )
+    suspects, poses = len(np.unique(found.suspect[:, 0])), len(readings.q)
+    if suspects > _MOST_SUSPECT * poses:
+        raise Misfit(
+            f"the fit does not describe the data: {suspects} of {poses} poses contradict their joint "
+            "readings; check the joint readings, their units and types (R or P)"
+        )
+
+
+def listed(readings: Readings, out: BoolArray) -> IntArray:
+    """Readings of a mask (2, N) as sorted rows (L, 3): pose number, marker number, view (2 for both)."""
+    rows = np.flatnonzero(out.any(axis=0))
+    view = np.where(out[:, rows].all(axis=0), 2, np.where(out[0, rows], 0, 1))
+    found = np.stack(
+        [readings.pose[readings.pose_of[rows]], readings.marker[readings.marker_of[rows]], view], axis=1
+    )
+    return found[np.lexsort(found.T[::-1])].astype(np.int64)
+
+
+def with_lost_markers(record: Calibration, readings: Readings, kept: BoolArray) -> Calibration:
+    """Record that also lists the readings of markers (m,) that could not be kept, and says so."""
+    if kept.all():
+        return record
+    lost = listed(readings, readings.seen & ~kept[readings.marker_of])
+    outlier = np.concatenate([record.outlier, lost])
+    names = ", ".join(str(number) for number in readings.marker[~kept])
+    advice = f"hardly any reading of marker {names} fits: it is not part of the model; see it more often"
+    return dataclasses.replace(
+        record, outlier=outlier[np.lexsort(outlier.T[::-1])], advice=(*record.advice, advice)
+    )
+
+
+def findings(calibration: Calibration) -> dict[str, Any]:
+    """Single observations that do not fit, and how many do, as plain lists for people and JSON.
+
+    Parameters
+    ----------
+    calibration : the record.
+
+    Returns
+    -------
+    ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``.
+    """
+    outliers, suspects, swaps = (
+        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.swapped)
+    )
+    return {
+        "outliers": [{"pose": p, "marker": m, "view": _VIEWS[v]} for p, m, v in outliers],
+        "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
+        "swapped": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
+        "merged_poses": calibration.merged_poses,
+        "merged_markers": calibration.merged_markers,
+    }
+
+
+# Hypotheses that are followed to the end, and steps of the axes and of the screws by which they are
+# compared before.
+_FOLLOWED, _TURNS, _SCREW_STEPS = 2, 25, 8
+# A joint that stands still is a prismatic one of no speed: it is preferred unless the residuals with the
+# other are smaller by more than this share.
+_SIMPLER = 0.1
+
+
+def _hypotheses(readings: Readings, q_reference: FloatArray) -> Iterator[tuple[str, Problem, float]]:
+    """Every joint of the other type, and every joint standing still.
+
+    In words, with the problem as it then is, and by what share an equal one must leave less.
+    """
+    for i, slides in enumerate(readings.prismatic):
+        flipped = readings.prismatic.copy()
+        flipped[i] = not slides
+        given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
+        words = f"by the images joint {i + 1} is {fits}, not {given}: check --joints"
+        yield words, prepare(dataclasses.replace(readings, prismatic=flipped), q_reference), _SIMPLER
+    for i in range(len(q_reference) if len(q_reference) > 1 else 0):
+        moves = "stands still while its readings move: check that they are its own"
+        fewer = dataclasses.replace(
+            readings, q=np.delete(readings.q, i, axis=1), prismatic=np.delete(readings.prismatic, i)
+        )
+        yield f"by the images joint {i + 1} {moves}", prepare(fewer, np.delete(q_reference, i)), 0.0
+
+
+def blamed_joint(
+    problem: Problem,
+    epipolar: Epipolar,
+    frame: ImageFrame,
+    most_px: float,
+    rng: np.random.Generator,
+    tell: Tell,
+) -> str:
+    """The one change of one joint with which the model does describe the data, in words; empty if none.
+
+    All changes are compared in one guessed metric frame, which owes nothing to the joints; the best are
+    followed to the maximum of the likelihood and believed only where that passes as a calibration would.
+
+    Parameters
+    ----------
+    problem : as it was given.
+    epipolar : epipolar geometry of the rig.
+    frame : guessed image centres and sizes.
+    most_px : noise per coordinate that a change must not leave more than, px.
+    rng : draws axes.
+    tell : told before each change how many were compared, of how many.
+    """
+    try:
+        guess = metric_guesses(epipolar.F, problem.readings, frame, keep=1)[0]
+    except WorkFailed:
+        return ""
+    alignment = merged(guess, problem.readings)
+    weighting = cauchy(problem.readings.seen)
+    candidates = []
+    changes = list(_hypotheses(problem.readings, problem.q_reference))
+    for done, (words, changed, handicap) in enumerate(changes):
+        tell("calibration, joint at fault", done, len(changes))
+        for start in placed(changed, changed.readings, guess, alignment, rng, 1, _TURNS):
+            scene = minimize(
+                changed, start, weighting, cameras=False, most=_SCREW_STEPS, settled_at=ROUGHLY
+            ).scene
+            candidates.append((_level(changed, scene) + handicap, words, changed, scene))
+    candidates.sort(key=lambda candidate: candidate[0])
+    for _, words, changed, scene in candidates[:_FOLLOWED]:
+        if _describes(changed, scene, epipolar, most_px):
+            return words
+    return ""
+
+
+def _level(problem: Problem, scene: Scene) -> float:
+    """Mean logarithm of the residuals: neither a few gross errors nor many small ones outweigh the rest."""
+    distance = np.linalg.norm(problem.residual(scene)[problem.readings.seen], axis=1)
+    return float(np.mean(np.log(distance + 1e-9)))
+
+
+def _describes(problem: Problem, scene: Scene, epipolar: Epipolar, most_px: float) -> bool:
+    """Whether a scene leads to a fit that leaves little noise and little out."""
+    readings = problem.readings
+    searched = robust_search(problem, scene, readings.seen, epipolar)
+    sigma = median_px(searched.residual, readings.seen) / RAYLEIGH
+    found = least_squares(problem, searched.scene, sigma, epipolar)
+    if found is None or found.agreement.sigma_px > most_px:
+        return False
+    try:
+        require_explained(readings, found.agreement.used, none_explained(readings), epipolar)
+    except WorkFailed:
+        return False
+    return True
