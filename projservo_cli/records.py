@@ -231,12 +231,9 @@ class Plan:
     profile: str = scalar(about="which part is driven when")
     feasible: bool = scalar(
         about="whether both cameras see the face all along; in the profile constrained, whether all "
-        "constraints hold, but for what ``relaxed`` says"
+        "constraints hold"
     )
     reason: str = scalar(about="what makes the plan feasible or not, in words")
-    relaxed: str = scalar(
-        about="what was given up since no path keeps all constraints, and where; empty where nothing was"
-    )
     tau: float = scalar(about="amplitude of the translation, unit-norm kernel of (8)")
     theta_r: float = scalar(units="rad", about="angle onto the target plane, in the sense chosen")
     theta_p: float = scalar(units="rad", about="angle within the plane")
@@ -264,12 +261,6 @@ class Plan:
     )
     joint_margin: FloatArray = array("sample", about="least distance from a joint limit over half the range")
     condition: FloatArray = array("sample", about="reciprocal condition of the image Jacobian of the face")
-    miss: FloatArray = array(
-        "sample", units="px", about="how far the images stay behind the planned ones; 0 where joints follow"
-    )
-    given_up: BoolArray = array(
-        "sample", about="whether conditioning is below its bound there or the joints stay behind"
-    )
     least: FloatArray = array(
         "constraint",
         about="smallest visibility margin, border distance in px, joint margin, reciprocal condition",

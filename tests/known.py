@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from projservo_cli.config import load_config
 from projservo_cli.stages import servo
-from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
 from projservo_cli.stages.scenario import Scenario, Watched, gains_of, limits_of, start_and_goal
 from projservo_cli.stages.world import joints_of, truth_of
 from tests.conftest import ROOT
@@ -27,13 +27,16 @@ def known_scenario(config):
     return replace(scenario, ends=scenario.shown_at(config.seed))
 
 
+def shown(scenario):
+    """Start and goal of a scenario as a plan has them."""
+    ends = scenario.ends
+    return Shown(ends.q_start, *ends.first(scenario.watched.face), scenario.truth.center)
+
+
 def planned(scenario, model, profile="linear", samples=11, **more):
     """Plan of a scenario with a model of it."""
-    config, ends = scenario.config, scenario.ends
-    return plan_task(
-        model, ends.q_start, *ends.first(scenario.watched.face), scenario.truth.center, profile,
-        config.trajectory.delta, samples, demands_of(config), **more,
-    )  # fmt: skip
+    asked = Profile(profile, scenario.config.trajectory.delta, samples, **more)
+    return plan_task(model, shown(scenario), asked, demands_of(scenario.config))
 
 
 def driven(scenario, plan, name, model, **limits):

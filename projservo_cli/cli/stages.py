@@ -220,14 +220,11 @@ def _verdict(call: _Call) -> int:
 
 
 def _infeasible(call: _Call) -> bool:
-    """Say that no motion keeps the constraints asked for; True where the call was to plan one.
-
-    A plan that gives some of them up so that the joints can follow is one.
-    """
+    """Say that no motion keeps the constraints asked for; True where the call was to plan one."""
     if "plan" not in call.run.results or call.run.plan.profile != "constrained":
         return False
     plan = call.run.plan
-    if not plan.feasible or plan.relaxed:
+    if not plan.feasible:
         click.echo(f"projservo: plan: {plan.reason}", err=True)
     return not plan.feasible and "plan" in call.names
 

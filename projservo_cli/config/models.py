@@ -284,11 +284,6 @@ class Trajectory(Section):
         lt=1,
         description="in the profile constrained: least reciprocal condition of the face's image Jacobian",
     )
-    most_miss_px: NotNegative = Field(
-        5.0,
-        description="in the profile constrained, where no path keeps everything: least_condition is "
-        "given up, and joints may stay behind the planned images by less than this; 0 gives up neither",
-    )
 
 
 class Control(Section):

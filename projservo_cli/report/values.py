@@ -101,6 +101,5 @@ def _plan(run: Run) -> dict[str, Any]:
         "tau_0": plan.tau_0,
         "smallest_margin": plan.margin.min(axis=0),
         "margins": nearest,
-        "most_miss_px": plan.miss.max(),
     }
     return rest | angles | found

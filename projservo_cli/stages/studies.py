@@ -19,7 +19,7 @@ from projservo_cli.geometry.displacement import (
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.plan import Sense, plan_task
+from projservo_cli.stages.plan import Profile, Sense, Shown, plan_task
 from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.trace import trace_of
@@ -172,13 +172,8 @@ def metric_plan(bench: Comparison, delta: float) -> Plan:
     ends, robot = bench.scenario.ends, bench.truth.robot
     return plan_task(
         bench.models["true"],
-        ends.q_start,
-        ends.s_start,
-        ends.s_star,
-        bench.truth.center,
-        "linear",
-        delta,
-        2,
+        Shown(ends.q_start, ends.s_start, ends.s_star, bench.truth.center),
+        Profile("linear", delta, 2),
         within(robot.lower, robot.upper),
     )
 

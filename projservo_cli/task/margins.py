@@ -1,9 +1,9 @@
-"""How far a planned instant is from what must not happen: the margins of a plan.
+"""How far a planned motion is from what must not happen: its joints and its margins.
 
 Each margin is a number, positive where its constraint holds:
 
-- visibility: a·O of the face and a camera over its value at the start, in closed form over the shares
-  μ_t, μ_r, [RH00] section 4.2; 0 where the camera looks along the face;
+- visibility: a·O of the face and a camera over its value at the start, [RH00] section 4.2; 0 where the
+  camera looks along the face;
 - image: distance of a marker from the border of an image less ``border_px``, over half the shorter
   side of the image less ``border_px``; 1 in the middle of a square image;
 - joints: distance of a joint from its nearer limit over half its range; 1 in the middle;
@@ -19,20 +19,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, apply, axpy, dot, mat, put_vec, vec
-from projservo_cli.geometry.jit import internal, njit
+from projservo_cli.geometry.algebra import Mat4, apply, axpy, dot, mat, put_mat, put_vec, vec
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kernels import orthogonalize
-from projservo_cli.geometry.kinematics import image_velocity, row
-from projservo_cli.geometry.lens import bend
-from projservo_cli.geometry.mechanisms import COORDINATES, Work
+from projservo_cli.geometry.kinematics import backward, image_velocity, operators_at, project
+from projservo_cli.geometry.mechanisms import COORDINATES, SETTLED, Work, reach, span_of, workspace
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
 
 CONSTRAINTS = ("visibility", "image", "joints", "conditioning")
 VISIBILITY, IMAGE, JOINTS, CONDITIONING = range(4)
-# A margin this bad is as bad as it gets: a marker behind the camera, joints out of reach.
+# A margin this bad is as bad as it gets: joints out of reach.
 WORST = -10.0
+# Distance, px, from the border of an image of what no camera shows.
+BEHIND = -1e9
+# A joint that moves more than this between neighbours on a path, rad or m, asks for points between.
+MOST_PART = 0.2
+PARTS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
 class Demands(NamedTuple):
@@ -45,8 +49,6 @@ class Demands(NamedTuple):
     image_size : (2,) width and height of both images, px; infinite where an image has no border.
     border_px : least distance of a marker from the border of an image, px.
     conditioning : least reciprocal condition of the image Jacobian of the face.
-    miss_px : how far the images of the face may stay behind the planned ones where the joints cannot
-        follow them, px; 0 where they have to.
     """
 
     lower: FloatArray
@@ -55,7 +57,6 @@ class Demands(NamedTuple):
     image_size: FloatArray
     border_px: float
     conditioning: float
-    miss_px: float = 0.0
 
 
 def within(lower: FloatArray, upper: FloatArray) -> Demands:
@@ -77,7 +78,6 @@ class Reaching(NamedTuple):
     a : (4,) its plane.
     O : (2, 4) optical centres.
     q_start : (n,) joints at the start, rad or m.
-    scale : (4,) margin of each of ``CONSTRAINTS`` at the worse of both ends; 1 where that fails it.
     """
 
     model: Model
@@ -88,10 +88,45 @@ class Reaching(NamedTuple):
     a: FloatArray
     O: FloatArray
     q_start: FloatArray
-    scale: FloatArray
 
 
-@njit
+class View(NamedTuple):
+    """What both cameras have of the face at s instants.
+
+    Attributes
+    ----------
+    H_d : (s, 4, 4) planned displacement.
+    s : (s, 2, m, 2) images of the face, px.
+    visibility : (s, 2) margins a·O, 1 at the start.
+    distance : (s, 2) least distance of a marker from the image border, px; ``BEHIND`` where none shows it.
+    """
+
+    H_d: FloatArray
+    s: FloatArray
+    visibility: FloatArray
+    distance: FloatArray
+
+
+class Along(NamedTuple):
+    """Margins along a path of s instants.
+
+    Attributes
+    ----------
+    view : what both cameras have of the face.
+    q : (s, n) joints, rad or m; NaN from where they cannot follow.
+    limit : (s,) margins of the joint limits, NaN likewise.
+    condition : (s,) reciprocal conditions of the image Jacobian, NaN likewise.
+    margins : (s, 4) the smallest of each of ``CONSTRAINTS``; ``WORST`` where the joints cannot follow.
+    """
+
+    view: View
+    q: FloatArray
+    limit: FloatArray
+    condition: FloatArray
+    margins: FloatArray
+
+
+@merged
 def visibility_margin(reaching: Reaching, view: int, mu_t: float, mu_r: float) -> float:
     """Margin of one camera: the dual motion of its optical centre against the plane, [RH00] section 4.2.
 
@@ -107,111 +142,157 @@ def visibility_margin(reaching: Reaching, view: int, mu_t: float, mu_r: float) -
 
 
 @njit
-def border_distance(
-    m: tuple[float, float, float], depth: float, image_size: FloatArray, lens: FloatArray
-) -> float:
-    """Distance of a pixel from the nearest border, px, negative outside; −1e9 where no camera shows it.
-
-    Parameters
-    ----------
-    m : homogeneous pixel.
-    depth : third coordinate of the marker at the start, where it is in front of the camera.
-    lens : (5,) radial distortion of the view.
-    """
-    if not m[2] * depth > 1e-9 * depth * depth:
-        return -1e9
-    u, v = bend(lens, m[0] / m[2], m[1] / m[2])
-    if not (math.isfinite(u) and math.isfinite(v)):
-        return -1e9
-    across = min(u + 0.5, float(image_size[0]) - 0.5 - u)
-    return min(across, min(v + 0.5, float(image_size[1]) - 0.5 - v))
+def put_displaced(reaching: Reaching, mu: FloatArray, H_d: FloatArray, visibility: FloatArray) -> None:
+    """Write displacements (s, 4, 4) and margins of visibility (s, 2) at the shares mu (s, 3)."""
+    for i in range(mu.shape[0]):
+        put_mat(H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[i, 0], mu[i, 1], mu[i, 2]))
+        for view in range(2):
+            visibility[i, view] = visibility_margin(reaching, view, mu[i, 0], mu[i, 1])
 
 
-@njit
-def image_margin(distance: float, demands: Demands) -> float:
-    """Margin of a distance from the border, px; 1 where images have no border."""
-    half = 0.5 * min(float(demands.image_size[0]), float(demands.image_size[1]))
+def view_at(reaching: Reaching, mu: FloatArray) -> View:
+    """What both cameras have of the face at the shares mu (s, 3)."""
+    model = reaching.model
+    H_d, visibility = np.empty((len(mu), 4, 4)), np.empty((len(mu), 2))
+    put_displaced(reaching, np.ascontiguousarray(mu), H_d, visibility)
+    M = reaching.A @ np.swapaxes(H_d, 1, 2)
+    images = np.moveaxis(project(model.P, M, model.lens), 0, 1)
+    depth, at_start = M @ model.P[:, 2].T, reaching.A @ model.P[:, 2].T
+    shown = np.isfinite(images).all(axis=3) & np.swapaxes(depth * at_start > 1e-9 * at_start**2, 1, 2)
+    border = np.minimum(images + 0.5, reaching.demands.image_size - 0.5 - images).min(axis=3)
+    return View(H_d, images, visibility, np.where(shown, border, BEHIND).min(axis=2))
+
+
+def image_margin(distance: FloatArray, demands: Demands) -> FloatArray:
+    """Margins of distances from the border, px; 1 where images have no border."""
+    half = 0.5 * float(demands.image_size.min())
     if not math.isfinite(half):
-        return 1.0 if distance > 0.0 else WORST
-    return max(WORST, (distance - demands.border_px) / (half - demands.border_px))
+        return np.where(distance > 0.0, 1.0, WORST)
+    return np.maximum(WORST, (distance - demands.border_px) / (half - demands.border_px))
+
+
+def limit_margin(q: FloatArray, demands: Demands) -> FloatArray:
+    """Margins (..., n) of the limits of each joint, at the joints q (..., n); 1 for a joint without."""
+    lower, upper = demands.lower, demands.upper
+    span = np.where(np.isfinite(upper - lower), upper - lower, np.nan)
+    margin = np.where(np.isnan(span), 1.0, 2.0 * np.minimum(q - lower, upper - q) / span)
+    return np.clip(margin, WORST, 1.0)
+
+
+class Carrier(NamedTuple):
+    """What carries the joints along a path.
+
+    Attributes
+    ----------
+    reaching : the task.
+    work : workspace of n joints and 4m rows.
+    newton, before, M : (n,), (n,) and (2, 4) workspaces.
+    """
+
+    reaching: Reaching
+    work: Work
+    newton: FloatArray
+    before: FloatArray
+    M: FloatArray
+
+
+def carrier_of(reaching: Reaching) -> Carrier:
+    """Workspace in which the joints of a task are carried."""
+    n = len(reaching.q_start)
+    work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
+    return Carrier(reaching, work, np.empty(n), np.empty(n), np.empty((2, 4)))
 
 
 @njit
-def image_distance(reaching: Reaching, view: int, H: Mat4) -> float:
-    """Least distance of the displaced markers from the border of one image, px."""
-    P, lens = reaching.model.P[view], reaching.model.lens[view]
-    least = math.inf
-    for k in range(reaching.A.shape[0]):
-        A = vec(reaching.A[k])
-        M = apply(H, A)
-        m = (row(P, 0, M), row(P, 1, M), row(P, 2, M))
-        least = min(least, border_distance(m, row(P, 2, A), reaching.demands.image_size, lens))
-    return least
-
-
-@njit
-def view_share(reaching: Reaching, mu_t: float, mu_r: float, mu_p: float) -> float:
-    """Smallest share of visibility and image over both cameras."""
-    H = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
-    least = math.inf
-    for view in range(2):
-        least = min(least, visibility_margin(reaching, view, mu_t, mu_r) / reaching.scale[VISIBILITY])
-        distance = image_distance(reaching, view, H)
-        least = min(least, image_margin(distance, reaching.demands) / reaching.scale[IMAGE])
-    return least
-
-
-@njit
-def limit_margin(q: FloatArray, demands: Demands) -> float:
-    """Smallest margin of the joint limits; 1 where there are none."""
-    least = 1.0
-    for i in range(q.shape[0]):
-        span = float(demands.upper[i]) - float(demands.lower[i])
-        if math.isfinite(span):
-            least = min(least, 2.0 * min(q[i] - demands.lower[i], demands.upper[i] - q[i]) / span)
-    return max(WORST, least)
-
-
-@internal
-def image_jacobian(reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray) -> None:
-    """Image Jacobian of the displaced face in the workspace, a column a joint, [RH00] eq. (7).
+def carry_joints(
+    carrier: Carrier, ends: FloatArray, parts: int, settled: float, stride: float, q: FloatArray
+) -> float:
+    """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
 
     Parameters
     ----------
-    H : displacement from the start.
-    jacobian : workspace of 4m rows with the operators at the current joints in ``H_hat``.
-    M : (2, 4) workspace.
+    ends : (2, 3) shares at both ends.
+    parts : how many; of none the joints stay where they are.
+    settled : Newton step, rad or m, that is the last of a part.
+    stride : most that a part may move a joint, rad or m.
+
+    Returns
+    -------
+    Reciprocal condition of the image Jacobian there; −1 where a part does not settle or moves too far.
     """
-    for k in range(reaching.A.shape[0]):
-        put_vec(M[0], apply(H, vec(reaching.A[k])))
-        for i in range(jacobian.H_hat.shape[0]):
-            put_vec(M[1], apply(mat(jacobian.H_hat[i]), vec(M[0])))
-            for view in range(2):
-                _, _, du, dv = image_velocity(reaching.model.P[view], M[0], M[1])
-                jacobian.B[i, 4 * k + 2 * view] = du
-                jacobian.B[i, 4 * k + 2 * view + 1] = dv
+    reaching, work, before = carrier.reaching, carrier.work, carrier.before
+    model = reaching.model
+    H_back = backward(model, reaching.q_start)
+    operators_at(model, q, work.H_hat)
+    goal = displaced(reaching.H_hat, reaching.amplitudes, ends[0, 0], ends[0, 1], ends[0, 2])
+    for part in range(1, parts + 1):
+        x = part / parts
+        for i in range(q.shape[0]):
+            before[i] = q[i]
+        mu_t = (1.0 - x) * ends[0, 0] + x * ends[1, 0]
+        mu_r = (1.0 - x) * ends[0, 1] + x * ends[1, 1]
+        mu_p = (1.0 - x) * ends[0, 2] + x * ends[1, 2]
+        goal = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
+        if not reach(model, H_back, goal, reaching.A, q, work, carrier.newton, settled):
+            return -1.0
+        for i in range(q.shape[0]):
+            if not abs(q[i] - before[i]) <= stride:
+                return -1.0
+    return reciprocal_condition(carrier, goal)
 
 
-@internal
-def reciprocal_condition(
-    reaching: Reaching, H: Mat4, jacobian: Work, M: FloatArray, norms: FloatArray
-) -> float:
-    """Reciprocal condition of the image Jacobian of the displaced face.
+@merged
+def reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
+    """Reciprocal condition of the image Jacobian of the displaced face, [RH00] eq. (7).
 
     The ratio of the last to the first pivot of an orthogonalisation, which no projective frame changes.
-
-    Parameters
-    ----------
-    H, jacobian, M : as of ``image_jacobian``.
-    norms : (n,) workspace.
+    The operators at the joints are in the workspace.
     """
-    n = jacobian.H_hat.shape[0]
-    m = reaching.A.shape[0]
-    image_jacobian(reaching, H, jacobian, M)
-    first, _, last = orthogonalize(
-        jacobian.B, 4 * m, n, norms, jacobian.z, jacobian.pivot, jacobian.rhs, False
-    )
+    work, M = carrier.work, carrier.M
+    A, P = carrier.reaching.A, carrier.reaching.model.P
+    n, m = work.H_hat.shape[0], A.shape[0]
+    for k in range(m):
+        put_vec(M[0], apply(H, vec(A[k])))
+        for i in range(n):
+            put_vec(M[1], apply(mat(work.H_hat[i]), vec(M[0])))
+            for view in range(2):
+                _, _, du, dv = image_velocity(P[view], M[0], M[1])
+                work.B[i, 4 * k + 2 * view] = du
+                work.B[i, 4 * k + 2 * view + 1] = dv
+    first, _, last = orthogonalize(work.B, 4 * m, n, carrier.newton, work.z, work.pivot, work.rhs, False)
     if n > COORDINATES:  # further joints add no motion of the face
-        sixth = jacobian.B[COORDINATES - 1, COORDINATES - 1]
+        sixth = work.B[COORDINATES - 1, COORDINATES - 1]
         last = 1.0 / sixth if sixth > 0.0 else 0.0
     return last / first if first > 0.0 else 0.0
+
+
+def along(reaching: Reaching, mu: FloatArray) -> Along:
+    """Joints and margins at the shares mu (s, 3), whose first row is zero.
+
+    Where the joints would move too far between two of them, the way is made in parts.
+    """
+    carrier = carrier_of(reaching)
+    q = np.full((len(mu), len(reaching.q_start)), np.nan)
+    condition = np.full(len(mu), np.nan)
+    for i in range(len(mu)):
+        ends = np.ascontiguousarray(mu[[max(0, i - 1), i]])
+        for parts in (0,) if i == 0 else PARTS:
+            here = (reaching.q_start if i == 0 else q[i - 1]).copy()
+            found = carry_joints(carrier, ends, parts, SETTLED, MOST_PART, here)
+            if found >= 0.0:
+                q[i], condition[i] = here, found
+                break
+        if math.isnan(condition[i]):
+            break
+    view, demands = view_at(reaching, mu), reaching.demands
+    limit = limit_margin(q, demands).min(axis=1)
+    margins = np.stack(
+        [
+            view.visibility.min(axis=1),
+            image_margin(view.distance.min(axis=1), demands),
+            np.where(np.isnan(limit), 1.0, limit),
+            np.where(np.isnan(condition), WORST, condition - demands.conditioning),
+        ],
+        axis=1,
+    )
+    return Along(view, q, limit, condition, margins)

@@ -2,76 +2,111 @@
 
 The coupled constraint of the paper on μ_t and μ_r, for both cameras, beside the image borders, the
 joint limits and the conditioning of the operators. Of all monotone paths from (0, 0, 0) to (1, 1, 1)
-the one whose smallest share (``task.margins``) is largest is taken, among equals the quickest.
+on a lattice of shares μ_t, μ_r, μ_p the one whose smallest share of ``task.margins`` is largest is taken,
+among equals the quickest.
 """
 
 import math
 from functools import lru_cache
-from itertools import pairwise, product
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from projservo_cli.geometry.algebra import apply, mat, sub, vec
 from projservo_cli.geometry.displacement import wrap
-from projservo_cli.geometry.mechanisms import Work
-from projservo_cli.records import FloatArray
-from projservo_cli.task.along import EQUALLY, Path, best_of, planning_workspace, timed
-from projservo_cli.task.lattice import (
-    COARSE,
-    NODES,
-    shortest,
-    slowness,
-    solve_joints,
-    view_shares,
-    widest,
-    with_joints,
-)
+from projservo_cli.records import BoolArray, FloatArray, IntArray
 from projservo_cli.task.margins import (
     CONDITIONING,
     IMAGE,
     JOINTS,
     VISIBILITY,
     WORST,
-    Demands,
+    Along,
     Reaching,
+    along,
+    carrier_of,
+    carry_joints,
     image_margin,
     limit_margin,
+    view_at,
 )
-from projservo_cli.task.path import straightened, view_path
-from projservo_cli.task.search import WAYS, carry, traced
 from projservo_cli.task.visibility import margin_coefficients
 
-# A margin of conditioning that no path is bounded by.
-ENDLESS = 1e9
-# Joints are carried through every so many nodes of the fine lattice.
-EVERY = (5, 4)
-# How far beside a path, in nodes of the fine lattice, a better one is looked for.
-BESIDE = 2
-# The lattices of joints that were not looked at.
-NOTHING = np.empty(0)
+NODES = 41
+# Joints are solved at so many values of each share and interpolated between; if no path shows, at more.
+COARSE = (9, 15)
+# A joint that moves more than this between two such nodes, rad or m, has changed its branch.
+MOST_STRIDE = 1.5
+# Parts in which the way between them is made where the joints do not settle in one.
+BETWEEN = 4
+# Newton step, rad or m, after which joints at such a node are good enough: they are off by its square.
+ROUGH = 1e-2
+# Of two paths equally short, that with longer straight steps: a share of the duration of a rad at 1 rad/s.
+STRAIGHTER = 1e-4
+# A straight piece may take this much longer than the steps of the lattice that it replaces.
+DETOUR = 1.01
+ROUND_OFF = 1e-9
+# Points of a path at which its joints and margins are looked at.
+CHECKS = 151
+# Shares of this part of the best one are as good, joints being interpolated; the quicker path is better.
+EQUALLY = 0.95
+# What leads from a node to the next: one share or several of them.
+STEPS = np.array([step for step in product((0, 1), repeat=3) if any(step)])
 
 
-class Candidate(NamedTuple):
-    """Lattices of one choice of senses, and what their best path is worth.
+class Path(NamedTuple):
+    """A path of shares and what is along it.
 
     Attributes
     ----------
-    reaching : the task in these senses.
-    views : (k, k, k) best smallest share in view of the paths up to each node.
-    in_view : of those to the last node.
-    field, joints, value : joints at coarse nodes, at all nodes, and best smallest share of the paths up
-        to each node; without meaning where ``least`` is −∞.
-    least : largest smallest share; −∞ where the views alone keep it from being good enough.
+    reaching : the task in the senses of both rotations that were chosen.
+    mu : (s, 3) shares.
+    along : joints and margins there.
     """
 
     reaching: Reaching
-    views: FloatArray
-    in_view: float
-    field: FloatArray
-    joints: FloatArray
-    value: FloatArray
-    least: float
+    mu: FloatArray
+    along: Along
+
+    def shares(self) -> FloatArray:
+        """Each margin (s, 4) over that at the worse of both ends, or over 1 where that is not positive."""
+        margins = self.along.margins
+        scale = np.minimum(margins[0], margins[-1])
+        return np.asarray(margins / np.where(scale > 0.0, scale, 1.0))
+
+    def holds(self) -> bool:
+        """Whether all constraints hold."""
+        return bool(self.along.margins.min() > 0.0)
+
+    def duration(self) -> float:
+        """Time it takes at the joint-speed limit, s; NaN where nothing limits or the joints cannot follow."""
+        speed = self.reaching.demands.speed
+        return float(least_time(speed, self.along.q)[-1]) if np.isfinite(speed).any() else math.nan
+
+    def at(self, sigma: FloatArray) -> FloatArray:
+        """Shares (k, 3) at parts sigma (k,) of the duration, or of the motion of the joint that moves most.
+
+        Where the joints cannot follow or nothing moves, of the length of the path in shares.
+        """
+        time = least_time(self.reaching.demands.speed, self.along.q)
+        if not time[-1] > 0.0:
+            time = least_time(np.full(3, math.inf), self.mu)
+        mu = np.stack([np.interp(sigma * time[-1], time, column) for column in self.mu.T], axis=1)
+        mu[sigma <= 0.0], mu[sigma >= 1.0] = self.mu[0], self.mu[-1]
+        return mu
+
+
+def least_time(speed: FloatArray, q: FloatArray) -> FloatArray:
+    """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s."""
+    return np.concatenate([[0.0], np.cumsum(_strides(speed, q[:-1], q[1:]))])
+
+
+def _strides(speed: FloatArray, q: FloatArray, q_next: FloatArray) -> FloatArray:
+    """Time between joints (..., n), s, at the speed limits (n,); the largest motion where there are none."""
+    speed = speed if np.isfinite(speed).any() else np.ones_like(speed)
+    return np.asarray((np.abs(q_next - q) / speed).max(axis=-1))
 
 
 def turning_sense(reaching: Reaching) -> float:
@@ -106,167 +141,194 @@ def plan_path(reaching: Reaching) -> Path:
     """Path whose smallest share is largest, and among those the quickest.
 
     Both senses of the rotation within the plane are looked at where either may be the better: from a
-    quarter turn on, or where the shorter one leads through an image border. Where no path keeps all
-    constraints, one is taken that the joints can follow all the same (``_relaxed``), and where there is
-    none, one that keeps at least the face in sight and in both images.
+    quarter turn on, or where the shorter one leads through what must not happen. Where no path keeps all
+    constraints, one is taken that keeps at least the face in sight and in both images.
+    """
+    tau, _, theta_p = (float(x) for x in reaching.amplitudes)
+    theta_r = turning_sense(reaching)
+    angles = [theta_p] if theta_p == 0.0 else [theta_p, theta_p - math.copysign(2.0 * math.pi, theta_p)]
+    senses = [reaching._replace(amplitudes=np.array([tau, theta_r, angle])) for angle in angles]
+    paths: list[Path] = []
+    for coarse in COARSE:
+        found = [_Lattice(senses[0], coarse)]
+        if abs(theta_p) > 0.5 * math.pi or found[0].least <= 0.0:
+            found += [_Lattice(sense, coarse) for sense in senses[1:]]
+        good = EQUALLY * max(0.0, *(lattice.least for lattice in found))
+        paths += [lattice.quickest() for lattice in found if lattice.least > good]
+        if any(path.holds() for path in paths):
+            return _best_of(paths)
+    return _best_of([*paths, max(map(_Lattice, senses), key=lambda lattice: lattice.least).quickest()])
+
+
+def _best_of(paths: list[Path]) -> Path:
+    """Of the paths in view, or of all if none is, the quickest whose smallest share is as good as any."""
+    in_view = [path for path in paths if path.shares()[:, [VISIBILITY, IMAGE]].min() > 0.0]
+    paths = in_view or paths
+    least = [float(path.shares().min()) for path in paths]
+    good = min(EQUALLY * max(least), max(least))
+    paths = [path for path, share in zip(paths, least, strict=True) if share >= good]
+    return min(paths, key=lambda path: path.duration() if math.isfinite(path.duration()) else math.inf)
+
+
+class _Lattice:
+    """Shares of the constraints over μ_t, μ_r, μ_p in one choice of senses, and their widest path.
 
     Parameters
     ----------
-    reaching : the task; its scale is not used.
+    reaching : the task in these senses.
+    coarse : values of each share at which joints are solved; 0 where they need not follow: the views alone
+        are looked at, and what takes time are the shares themselves.
     """
-    relaxed = reaching.demands
-    reaching = reaching._replace(demands=relaxed._replace(miss_px=0.0))
-    work, newton = planning_workspace(reaching), np.empty(len(reaching.q_start))
-    theta_p = float(reaching.amplitudes[2])
-    reaching = _turned(reaching, turning_sense(reaching), theta_p)
-    other = _turned(reaching, reaching.amplitudes[1], theta_p - math.copysign(2.0 * math.pi, theta_p))
-    candidates = [_candidate(reaching, 0.0, work, newton)]
-    least = candidates[0].least
-    if theta_p != 0.0 and (abs(theta_p) > 0.5 * math.pi or least <= 0.0):
-        candidates.append(_candidate(other, max(EQUALLY * least, 0.0), work, newton))
-    good = max(EQUALLY * max(candidate.least for candidate in candidates), 0.0)
-    paths = [_quickest(candidate) for candidate in candidates if candidate.least > good]
-    best = best_of(paths)
-    if best is None or not best.holds():
-        if theta_p != 0.0 and len(candidates) == 1:
-            candidates.append(_candidate(other, 0.0, work, newton))
-        best = best_of([*paths, *_narrow(candidates, work)])
-    if (best is None or not best.holds()) and relaxed.miss_px > 0.0:
-        best = _relaxed(candidates, relaxed._replace(conditioning=0.0), work, newton)
-    if best is None or not best.holds():
-        best = best_of([*paths, _in_view(candidates)])
-    assert best is not None
-    return best
+
+    def __init__(self, reaching: Reaching, coarse: int = 0) -> None:
+        self.reaching = reaching
+        self.speed = reaching.demands.speed if coarse else np.full(3, math.inf)
+        first_and_last = view_at(reaching, np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]))
+        self.scale = np.ones(4)
+        self.scale[VISIBILITY] = _positive(first_and_last.visibility)
+        self.scale[IMAGE] = _positive(image_margin(first_and_last.distance, reaching.demands))
+        self.field: RegularGridInterpolator | None = None
+        if coarse:
+            nodes = _coarse_joints(reaching, _grid(coarse))
+            ends = np.stack([nodes[0, 0, 0], nodes[-1, -1, -1]])
+            self.scale[JOINTS] = _positive(limit_margin(ends[:, :-1], reaching.demands))
+            self.scale[CONDITIONING] = _positive(ends[:, -1])
+            self.field = RegularGridInterpolator((np.linspace(0.0, 1.0, coarse),) * 3, nodes)
+        shares, self.joints = self.worth(_grid(NODES).reshape(-1, 3))
+        self.value = widest(shares.reshape((NODES,) * 3))
+        self.least = float(self.value[-1, -1, -1])
+
+    def worth(self, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Smallest share (s,) of all constraints at mu (s, 3), and the joints (s, n) interpolated there."""
+        demands, view = self.reaching.demands, view_at(self.reaching, mu)
+        sight = view.visibility.min(axis=1) / self.scale[VISIBILITY]
+        shares = np.minimum(sight, image_margin(view.distance.min(axis=1), demands) / self.scale[IMAGE])
+        if self.field is None:
+            return shares, mu
+        found = self.field(mu)
+        q, condition = found[:, :-1], found[:, -1]
+        within = limit_margin(q, demands).min(axis=1) / self.scale[JOINTS]
+        return np.minimum(shares, np.minimum(within, condition / self.scale[CONDITIONING])), q
+
+    def quickest(self) -> Path:
+        """Quickest path among those of the largest smallest share, in straight pieces."""
+        joints = self.joints.reshape((*self.value.shape, -1))
+        nodes = shortest(self.value >= self.least, joints, self.speed)
+        corners = self._straightened(nodes / (NODES - 1))
+        length = np.r_[0.0, np.cumsum(np.abs(np.diff(corners, axis=0)).max(axis=1))]
+        places = np.linspace(0.0, length[-1], CHECKS)
+        mu = np.stack([np.interp(places, length, column) for column in corners.T], axis=1)
+        return Path(self.reaching, mu, along(self.reaching, mu))
+
+    def _straightened(self, nodes: FloatArray) -> FloatArray:
+        """Corners (c, 3) of the path of nodes (k, 3) that is left when straight pieces serve as well.
+
+        A piece grows as long as its shares stay as good and it takes no longer than the nodes.
+        """
+        time = least_time(self.speed, self.worth(nodes)[1])
+        kept = [0]
+        for j in range(2, len(nodes)):
+            anchor = kept[-1]
+            x = np.linspace(0.0, 1.0, 2 * (j - anchor) + 1)[:, None]
+            shares, q = self.worth((1.0 - x) * nodes[anchor] + x * nodes[j])
+            late = least_time(self.speed, q)[-1] > DETOUR * (time[j] - time[anchor]) + ROUND_OFF
+            if late or shares.min() < self.least - ROUND_OFF:
+                kept.append(j - 1)
+        return nodes[[*kept, len(nodes) - 1]]
 
 
-def _turned(reaching: Reaching, theta_r: float, theta_p: float) -> Reaching:
-    """The same task with other senses of the rotations, and the scales of visibility and image."""
-    turned = reaching._replace(amplitudes=np.array([reaching.amplitudes[0], theta_r, theta_p]))
-    ends = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
-    visibility, distance = np.empty((2, 2)), np.empty((2, 2))
-    view_path(turned, ends, visibility, distance)
-    scale = np.ones(4)
-    scale[VISIBILITY] = _positive(visibility.min())
-    scale[IMAGE] = _positive(image_margin(distance.min(), reaching.demands))
-    return turned._replace(scale=scale)
+def _positive(margins: FloatArray) -> float:
+    """The least margin, or 1 where that is not positive."""
+    return float(margins.min()) if margins.min() > 0.0 else 1.0
 
 
-def _positive(margin: float) -> float:
-    return margin if margin > 0.0 else 1.0
-
-
-def _candidate(reaching: Reaching, good: float, work: Work, newton: FloatArray) -> Candidate:
-    """Fill the lattices of one choice of senses; those of the joints only where the views let it be good."""
-    shares, views = np.empty((NODES, NODES, NODES)), np.empty((NODES, NODES, NODES))
-    view_shares(reaching, shares, np.empty((2 * len(reaching.A), 7)))
-    in_view = widest(shares, views)
-    found = Candidate(reaching, views, in_view, NOTHING, NOTHING, NOTHING, -math.inf)
-    return _with_joints(found, work, newton) if in_view > good else found
-
-
-def _with_joints(candidate: Candidate, work: Work, newton: FloatArray) -> Candidate:
-    """The candidate with the joints of its nodes."""
-    reaching, shares = candidate.reaching, candidate.views.copy()
-    n = len(reaching.q_start)
-    field = np.empty((COARSE, COARSE, COARSE, n + 1))
-    solve_joints(reaching, work, newton, np.empty((2, 4)), np.empty(field.shape[:3]), field)
-    ends = field[0, 0, 0], field[-1, -1, -1]
-    reaching.scale[JOINTS] = _positive(min(limit_margin(end[:n], reaching.demands) for end in ends))
-    reaching.scale[CONDITIONING] = _positive(min(float(end[n]) for end in ends))
-    joints, value = np.empty((*shares.shape, n)), np.empty_like(shares)
-    with_joints(reaching, field, np.empty((COARSE, n + 1)), shares, joints)
-    return candidate._replace(field=field, joints=joints, value=value, least=widest(shares, value))
-
-
-def _quickest(candidate: Candidate) -> Path:
-    """Quickest path of a candidate among those of the largest smallest share."""
-    reaching, field = candidate.reaching, candidate.field
-    mu = _corners(reaching, field, candidate.value, candidate.least, candidate.joints)
-    return timed(reaching, mu)
-
-
-def _narrow(candidates: list[Candidate], work: Work) -> list[Path]:
-    """A path for joints carried from node to node, of the first candidate that has one that holds.
-
-    Through coarse nodes first, and where that does not hold between them, through the fine ones around it.
-    """
-    in_view = [candidate for candidate in candidates if candidate.in_view > 0.0]
-    for every, (reaching, views, *_) in product(EVERY, in_view):
-        corners = _carried(reaching, np.ascontiguousarray(views[::every, ::every, ::every]), work)
-        if not len(corners):
-            continue
-        path = timed(reaching, corners)
-        if path.holds():
-            return [path]
-        corners = _carried(reaching, _around(corners, views), work)
-        if len(corners) and (path := timed(reaching, corners)).holds():
-            return [path]
-    return []
-
-
-def _carried(reaching: Reaching, views: FloatArray, work: Work) -> FloatArray:
-    """Corners (c, 3) of the widest path for joints carried through the nodes (k, k, k) in view; or none."""
-    n, last = len(reaching.q_start), len(views) - 1
-    value, came = np.empty((*views.shape, WAYS)), np.empty((*views.shape, WAYS), dtype=np.int64)
-    joints, start, scratch = np.empty((*value.shape, n)), np.empty((n, 4, 4)), np.empty((10, max(n, 4)))
-    carry(reaching, views, value, joints, came, (NODES - 1) // last, start, scratch, work)
-    path = np.empty((3 * len(views), 3), dtype=np.int64)
-    return np.asarray(path[: traced(value, came, path)] / last)
-
-
-def _around(corners: FloatArray, views: FloatArray) -> FloatArray:
-    """The views (k, k, k) of the nodes near a path, ``WORST`` elsewhere."""
-    near = np.full_like(views, WORST)
-    for first, last in pairwise(corners):
-        for node in np.rint(np.linspace(first, last, COARSE) * (NODES - 1)).astype(int):
-            box = tuple(slice(max(0, i - BESIDE), i + BESIDE + 1) for i in node)
-            near[box] = views[box]
-    return near
-
-
-def _relaxed(candidates: list[Candidate], demands: Demands, work: Work, newton: FloatArray) -> Path | None:
-    """Path of the smallest miss, then of the best conditioning, that joints can follow at all.
-
-    Where the operators are too dependent the joints stay behind by as much as the demands let them.
-    """
-    paths = []
-    for candidate in candidates:
-        if candidate.in_view > 0.0:
-            reaching = candidate.reaching._replace(demands=demands, scale=candidate.reaching.scale.copy())
-            found = _with_joints(candidate._replace(reaching=reaching), work, newton)
-            if found.least > 0.0:
-                paths.append(_quickest(found))
-    paths = [path for path in paths if path.holds()]
-    return min(paths, key=lambda path: (path.along.miss.max(), -path.along.condition.min()), default=None)
-
-
-def _in_view(candidates: list[Candidate]) -> Path:
-    """Shortest path in shares of the candidate that keeps its distance best, joints left aside."""
-    candidate = max(candidates, key=lambda candidate: candidate.in_view)
-    demands = candidate.reaching.demands
-    endless = np.full(3, math.inf)
-    free = candidate.reaching._replace(demands=demands._replace(lower=-endless, upper=endless, speed=endless))
-    shares = _grid(NODES)
-    field = np.concatenate([_grid(COARSE), np.full((COARSE,) * 3 + (1,), ENDLESS)], axis=3)
-    return timed(candidate.reaching, _corners(free, field, candidate.views, candidate.in_view, shares))
-
-
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=3)
 def _grid(nodes: int) -> FloatArray:
     """Shares at the nodes of a lattice (k, k, k, 3)."""
     axis = np.linspace(0.0, 1.0, nodes)
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=3)
 
 
-def _corners(
-    reaching: Reaching, field: FloatArray, value: FloatArray, least: float, joints: FloatArray
-) -> FloatArray:
-    """Corners (c, 3) of the straightened shortest path through nodes of at least that share."""
-    weight = np.empty(joints.shape[3])
-    slowness(reaching.demands.speed, weight)
-    path = np.empty((3 * NODES, 3), dtype=np.int64)
-    cost, came = np.empty_like(value), np.empty(value.shape, dtype=np.int64)
-    path = path[: shortest(value, least, joints, weight, cost, came, path)]
-    kept = np.empty(len(path) + 1, dtype=np.int64)
-    count = straightened(reaching, field, weight, path, NODES - 1, least, kept)
-    return np.asarray(path[kept[:count]] / (NODES - 1))
+def _coarse_joints(reaching: Reaching, grid: FloatArray) -> FloatArray:
+    """Joints and margins of conditioning (a, a, a, n + 1), each node continued from the best before it.
+
+    Where the joints cannot be reached that margin is ``WORST`` and they are those before.
+    """
+    carrier, demands = carrier_of(reaching), reaching.demands
+    field = np.empty((*grid.shape[:3], len(reaching.q_start) + 1))
+    value = np.empty(grid.shape[:3])
+    for node in np.ndindex(value.shape):
+        step, best, before = np.zeros(3, dtype=np.int64), math.inf, reaching.q_start
+        earlier = before
+        steps = STEPS[(node >= STEPS).all(axis=1)][::-1]
+        if len(steps):
+            step = steps[np.argmax(value[tuple((node - steps).T)])]
+            best = value[tuple(node - step)]
+            before = earlier = field[tuple(node - step)][:-1]
+            if (node >= 2 * step).all():
+                earlier = field[tuple(node - 2 * step)][:-1]
+        field[node], value[node] = [*before, WORST], WORST
+        ends = np.stack([grid[tuple(node - step)], grid[node]])
+        for parts in (1, BETWEEN) if best > WORST else ():
+            q = 2.0 * before - earlier if parts == 1 else before.copy()
+            condition = carry_joints(carrier, ends, parts, ROUGH, math.inf, q)
+            if condition >= 0.0 and (np.abs(q - before) <= MOST_STRIDE).all():
+                margin = condition - demands.conditioning
+                field[node] = [*q, margin]
+                value[node] = max(min(best, limit_margin(q, demands).min(), margin), WORST + 1.0)
+                break
+    return field
+
+
+def _levels(shape: tuple[int, ...]) -> tuple[list[IntArray], IntArray]:
+    """Nodes of a lattice by their number of steps from the first, and what each of ``STEPS`` adds to them.
+
+    Nodes are indices into the flat lattice with a layer before the first ones.
+    """
+    padded = tuple(n + 1 for n in shape)
+    nodes = 1 + np.indices(shape).reshape(3, -1)
+    flat, steps = (np.asarray(np.ravel_multi_index(tuple(x), padded)) for x in (nodes, STEPS.T))
+    level = nodes.sum(axis=0)
+    in_order = flat[np.argsort(level, kind="stable")]
+    return np.split(in_order, np.cumsum(np.bincount(level)[3:-1])), steps
+
+
+def _padded(values: FloatArray, before: float) -> FloatArray:
+    """Values (a, b, c, ...) with a layer before the first nodes, the lattice made flat."""
+    found = np.pad(values, [(1, 0)] * 3 + [(0, 0)] * (values.ndim - 3), constant_values=before)
+    return np.asarray(found.reshape(-1, *values.shape[3:]))
+
+
+def widest(shares: FloatArray) -> FloatArray:
+    """Largest smallest share of all monotone paths from the first node up to each, of shares (a, b, c)."""
+    levels, steps = _levels(shares.shape)
+    value = _padded(shares, -math.inf)
+    for level in levels[1:]:
+        value[level] = np.minimum(value[level], value[level - steps[:, None]].max(axis=0))
+    return value.reshape([n + 1 for n in shares.shape])[1:, 1:, 1:]
+
+
+def shortest(free: BoolArray, joints: FloatArray, speed: FloatArray) -> IntArray:
+    """Nodes (k, 3) of the monotone path through free ones that takes the least time, first to last.
+
+    Parameters
+    ----------
+    free : (a, b, c) whether a path may pass a node.
+    joints : (a, b, c, n) at the nodes, rad or m.
+    speed : (n,) limits, rad/s or m/s.
+    """
+    levels, steps = _levels(free.shape)
+    passable, q = _padded(free.astype(float), 0.0), _padded(joints, 0.0)
+    cost, came = np.full(len(q), math.inf), np.zeros(len(q), dtype=np.int64)
+    cost[levels[0]] = 0.0
+    longer = STRAIGHTER * np.sqrt(STEPS.sum(axis=1))[:, None]
+    for level in levels[1:]:
+        nodes = level[passable[level] > 0.0]
+        before = nodes - steps[:, None]
+        total = cost[before] + _strides(speed, q[before], q[nodes]) + longer
+        best = np.argmin(total, axis=0)
+        cost[nodes], came[nodes] = total[best, np.arange(len(nodes))], steps[best]
+    path = [int(levels[-1].item())]
+    while path[-1] != levels[0]:
+        path.append(path[-1] - int(came[path[-1]]))
+    return np.stack(np.unravel_index(path[::-1], [n + 1 for n in free.shape]), axis=1) - 1

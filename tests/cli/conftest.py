@@ -83,7 +83,6 @@ class Stages:
             "profile": config.trajectory.profile,
             "feasible": verdict != "infeasible",
             "reason": "too near",
-            "relaxed": "with less" if verdict == "relaxed" else "",
         }
         return fake(Plan, config.seed, {"joint": len(calibration.q_reference)}, **given)
 

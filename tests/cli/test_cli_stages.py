@@ -107,22 +107,6 @@ def test_a_plan_that_fails_its_constraints_ends_in_1_with_the_reason(projservo, 
     assert projservo("plan", "-c", "tiny.yaml", "-o", "linear").code == 0
 
 
-def test_a_plan_that_gives_something_up_says_so_and_ends_in_0(projservo, stages):
-    stages.verdicts = {"plan": "relaxed"}
-    wanted = ("--set", "trajectory.profile=constrained")
-    answer = projservo("plan", "-c", "tiny.yaml", "-o", "out", *wanted, "--json")
-    assert answer.code == 0
-    assert answer.err.strip().endswith("plan: too near")
-    assert answer.json["feasible"] is True
-    assert answer.json["relaxed"] == "with less"
-    assert answer.json["most_miss_px"] >= 0.0
-    stages.verdicts = {}
-    answer = projservo("plan", "-c", "tiny.yaml", "-o", "kept", *wanted, "--json")
-    assert answer.code == 0
-    assert answer.json["relaxed"] == ""
-    assert "too near" not in answer.err
-
-
 def test_an_interrupted_chain_goes_on_where_it_stopped(projservo, stages, refused):
     stages.fails["stacked"] = KeyboardInterrupt()
     answer = projservo("servo", "-c", "tiny.yaml", "-o", "out")

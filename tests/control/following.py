@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from projservo_cli.records import NO_LENS
-from projservo_cli.stages.plan import Pace, plan_task
+from projservo_cli.stages.plan import Profile, Shown, plan_task
 from projservo_cli.task.following import followed
 from projservo_cli.task.margins import within
 from tests.scene import GAINS, Run, limits
@@ -18,10 +18,9 @@ def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
     model = sc.seen(G)
     n = len(sc.q_start)
     demands = within(np.full(n, -9.0), np.full(n, 9.0))._replace(speed=np.full(n, speed))
-    return plan_task(
-        model._replace(lens=NO_LENS), sc.q_start, sc.s_start, sc.s_star, sc.plant.center, profile, 0.9, 101,
-        demands, None, Pace(duration, ramp),
-    )  # fmt: skip
+    shown = Shown(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
+    asked = Profile(profile, duration=duration, ramp=ramp)
+    return plan_task(model._replace(lens=NO_LENS), shown, asked, demands)
 
 
 def tracked(sc, G=None, plan=None, rate=1.0, task=None):

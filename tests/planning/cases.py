@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.plan import Profile, demands_of, plan_task
 from projservo_cli.task.margins import Reaching
 from tests.stages.cases import case
 
@@ -21,22 +21,15 @@ def reaching_of(name, model=None, border_px=20.0):
         plan.a,
         plan.optical_center,
         plan.q_start,
-        np.ones(4),
     )
 
 
 def constrained(name, model=None, samples=101, **demands):
     """A shipped task planned under constraints, some of them changed."""
     example = case(name)
-    reach = example.ends
     return plan_task(
         example.truth.model if model is None else model,
-        reach.q_start,
-        reach.s_start,
-        reach.s_star,
-        example.truth.center,
-        "constrained",
-        0.9,
-        samples,
+        example.shown,
+        Profile("constrained", samples=samples),
         demands_of(example.config)._replace(**demands),
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.records import Plan, WorkFailed
-from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.preparation import random_tasks
@@ -90,9 +90,8 @@ def outcome_of(number, config, truth, model, q_start, q_goal):
     outcome = Outcome(number, true.feasible())
     begun = time.thread_time()
     try:
-        plan = plan_task(
-            model, q_start, s_start, s_star, truth.center, "constrained", 0.9, 101, demands_of(config)
-        )
+        shown = Shown(q_start, s_start, s_star, truth.center)
+        plan = plan_task(model, shown, Profile("constrained"), demands_of(config))
     except WorkFailed as error:
         outcome.reason = str(error)
     else:

@@ -1,9 +1,17 @@
 """A small part of ``python -m tests.planning.driven ARM 500``, and the grid search with the arm behind it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from projservo_cli.cli.words import summary
+from projservo_cli.config import load_config
+from projservo_cli.records import WorkFailed
+from projservo_cli.report.values import scalars
+from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.world import truth_of
+from tests.conftest import ROOT
 from tests.planning.arm import arm_of, feasible, flood, pivot_ratio, pose, solve
 from tests.planning.driven import configured, driven, feasible_tasks, true_task, words
 from tests.samples import poe
@@ -83,3 +91,33 @@ def test_a_task_that_needs_coupled_parts_is_driven_in_sight():
     assert run.planned
     assert run.converged, run.reason
     assert run.occluded == 0
+
+
+@pytest.fixture(scope="module")
+def lost():
+    """The task of paper.yaml with a plan that no joints can follow to its end."""
+    config = load_config(ROOT / "configs" / "paper.yaml", ["control.mode=track", "noise.servo_px=0.0"])
+    _, calibration, _ = calibrate.run(config)
+    found = plan.run(config, calibration)
+    q = found.q.copy()
+    q[-5:] = np.nan
+    return config, calibration, replace(found, q=q, feasible=False, reason="too near to something")
+
+
+def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
+    config, calibration, planned = lost
+    trace = servo.run(config, calibration, planned, "exact_track")
+    alone = servo.run(config, calibration, planned, "exact")
+    assert (trace.verdict, trace.mode, trace.planned_s) == ("converged", "track", None)
+    assert trace.unplanned == "no joints can follow the plan: too near to something"
+    assert alone.unplanned == ""
+    np.testing.assert_array_equal(trace.q, alone.q)
+    words = summary("servo", {"laws": [scalars(trace)]})
+    assert "driven without a plan: no joints can follow the plan: too near to something" in words
+
+
+def test_a_law_may_be_refused_to_go_without_a_plan(lost):
+    _, calibration, planned = lost
+    refusing = load_config(ROOT / "configs" / "paper.yaml", ["control.without_plan=refuse"])
+    with pytest.raises(WorkFailed, match=r"cannot follow the planned motion.*control\.without_plan replan"):
+        servo.run(refusing, calibration, planned, "exact_track")

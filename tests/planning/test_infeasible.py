@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 
@@ -28,6 +28,11 @@ BORDER = (
     [0.977, -159.178, 190.12, -34.988, 18.725, -56.874],
     [-12.633, -149.758, 180.678, -4.066, 48.153, 174.349],
 )
+# One in which joint 5 would have to pass 180°, where joints 4 and 6 are one axis.
+JUMP = (
+    [219.601, 156.604, 152.68, -319.261, -41.8, -140.096],
+    [68.604, -184.647, 63.518, -239.498, 112.226, 100.466],
+)
 CAMERAS = ("rig.left.position_m=[0.9, {}, 0.63]", "rig.right.position_m=[0.9, {}, 0.63]")
 
 
@@ -38,7 +43,8 @@ def planned(name, task, overrides, **demands):
     q_start, q_goal = np.radians(task)
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
     asked = demands_of(config)._replace(**demands)
-    return plan_task(truth.model, q_start, s_start, s_star, truth.center, "constrained", 0.9, 101, asked)
+    shown = Shown(q_start, s_start, s_star, truth.center)
+    return plan_task(truth.model, shown, Profile("constrained"), asked)
 
 
 @pytest.mark.parametrize(("camera", "y"), [("left", (0.06, 0.18)), ("right", (0.18, 0.06))])
@@ -60,3 +66,10 @@ def test_an_end_too_near_to_the_border_of_an_image(camera, y):
     assert f"px from the border of the {camera} image (5 px asked for)" in plan.reason
     assert 0.0 < plan.least[1] < 5.0
     assert "image fails first" not in planned("coupled", BORDER, overrides, border_px=0.0).reason
+
+
+def test_no_path_jumps_over_a_singular_configuration():
+    """The joints flip the wrist where it is all but singular: that is no path."""
+    plan = planned("ur5", JUMP, ["trajectory.border_px=0.0"])
+    assert not plan.feasible
+    assert plan.constraint == "conditioning"

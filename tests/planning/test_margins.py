@@ -1,14 +1,13 @@
-"""Margins, lattice sweeps and straightening against plain NumPy."""
+"""Margins and lattice sweeps against plain NumPy."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
 
-from projservo_cli.task.along import along
-from projservo_cli.task.lattice import shortest, stride, view_shares, widest
-from projservo_cli.task.margins import Demands, image_distance, limit_margin, view_share, visibility_margin
-from projservo_cli.task.path import interpolate
+from projservo_cli.task.margins import BEHIND, Demands, along, image_margin, limit_margin, view_at
+from projservo_cli.task.planning import least_time, shortest, widest
 from tests.planning.cases import reaching_of
 from tests.samples import frame, in_frame, pixels, poe
 from tests.stages.cases import case
@@ -29,31 +28,37 @@ def test_margins_of_the_views_are_those_of_the_displaced_face(name):
     example = case(name)
     plan, reaching = example.plan, reaching_of(name)
     size = example.truth.image_size
-    for mu in SHARES:
+    found = view_at(reaching, SHARES)
+    for i, mu in enumerate(SHARES):
         H = displacement(plan, mu)
         s = pixels(reaching.model.P, plan.A @ H.T)
+        np.testing.assert_allclose(found.H_d[i], H, atol=1e-12)
+        np.testing.assert_allclose(found.s[i], s, atol=1e-7)
         border = np.minimum(s + 0.5, size - 0.5 - s).min(axis=(1, 2))
+        np.testing.assert_allclose(found.distance[i], border, atol=1e-7)
         sight = plan.a @ np.linalg.inv(H) @ plan.optical_center.T / (plan.optical_center @ plan.a)
-        for view in range(2):
-            assert visibility_margin(reaching, view, mu[0], mu[1]) == pytest.approx(sight[view], abs=1e-12)
-            found = image_distance(reaching, view, tuple(H.ravel()))
-            assert found == pytest.approx(border[view], abs=1e-7)
-        wanted = min(sight.min(), (border.min() - 20.0) / (0.5 * size.min() - 20.0))
-        assert view_share(reaching, *mu) == pytest.approx(wanted, abs=1e-10)
+        np.testing.assert_allclose(found.visibility[i], sight, atol=1e-12)
+        wanted = (border.min() - 20.0) / (0.5 * size.min() - 20.0)
+        assert image_margin(found.distance[i].min(), reaching.demands) == pytest.approx(wanted, abs=1e-9)
 
 
 def test_a_marker_behind_a_camera_is_as_far_outside_as_can_be():
+    """Beyond the cameras, which look along −x from 2 m; cameras have no sign of their own."""
     reaching = reaching_of("paper")
-    H = np.eye(4)
-    H[0, 3] = 3.0  # beyond the cameras, which look along −x from 2 m
-    assert image_distance(reaching, 0, tuple(H.ravel())) == -1e9
+    X = np.zeros((4, 4))
+    X[0, 3] = 1.0
+    there = reaching._replace(H_hat=np.stack([X, *reaching.H_hat[1:]]), amplitudes=np.array([3.0, 0.0, 0.0]))
+    for sign in (1.0, -1.0):
+        model = there.model._replace(P=sign * there.model.P)
+        found = view_at(there._replace(model=model), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+        assert found.distance[0].min() > 0.0
+        assert found.distance[1, 0] == BEHIND
 
 
 def test_margin_of_joint_limits():
     demands = Demands(np.array([-1.0, -np.inf]), np.array([3.0, np.inf]), np.ones(2), np.ones(2), 0.0, 0.0)
-    assert limit_margin(np.array([1.0, 99.0]), demands) == 1.0
-    assert limit_margin(np.array([2.0, 99.0]), demands) == 0.5
-    assert limit_margin(np.array([-1.5, 99.0]), demands) == -0.25
+    q = np.array([[1.0, 99.0], [2.0, 99.0], [-1.5, 99.0]])
+    np.testing.assert_array_equal(limit_margin(q, demands), [[1.0, 1.0], [0.5, 1.0], [-0.25, 1.0]])
 
 
 @pytest.mark.parametrize("name", ["paper", "ur5"])
@@ -73,14 +78,17 @@ def test_joints_follow_the_planned_displacement(name):
     np.testing.assert_allclose(there.condition, found.condition, rtol=1e-6)
 
 
-@pytest.mark.volume
-@pytest.mark.parametrize("name", ["paper", "ur5"])
-def test_lattice_of_the_views_holds_their_shares(name):
-    reaching = reaching_of(name)
-    shares = np.empty((6, 6, 6))
-    view_shares(reaching, shares, np.empty((8, 7)))
-    for i, j, k in itertools.product(range(6), repeat=3):
-        assert shares[i, j, k] == pytest.approx(view_share(reaching, i / 5, j / 5, k / 5), abs=1e-10)
+def test_joints_that_cannot_follow_are_none_from_there_on():
+    """Twice the translation leads out of reach; the margin of conditioning says so."""
+    reaching = reaching_of("ur5")
+    far = reaching._replace(amplitudes=reaching.amplitudes * np.array([8.0, 0.0, 0.0]))
+    found = along(far, np.linspace(0.0, 1.0, 11)[:, None] * np.ones(3))
+    lost = np.isnan(found.q).any(axis=1)
+    assert not lost[0]
+    assert lost[-1]
+    assert (np.diff(lost.astype(int)) >= 0).all()
+    np.testing.assert_array_equal(found.margins[lost, 3], -10.0)
+    np.testing.assert_array_equal(np.isnan(found.condition), lost)
 
 
 def all_paths(shape):
@@ -105,35 +113,22 @@ def test_widest_and_shortest_path_among_all(seed):
     rng = np.random.default_rng(seed)
     shape = (3, 3, 2)
     margins, joints = rng.uniform(-1, 1, shape), rng.normal(size=(*shape, 2))
-    weight = np.array([1.0, 0.3])
+    speed = np.array([1.0, 3.0])
     paths = list(all_paths(shape))
     best = max(min(margins[node] for node in path) for path in paths)
-    value = np.empty(shape)
-    assert widest(margins, value) == best
-    found = np.empty((8, 3), dtype=np.int64)
-    cost, came = np.empty(shape), np.empty(shape, dtype=np.int64)
-    count = shortest(value, best, joints, weight, cost, came, found)
-    taken = [tuple(int(x) for x in node) for node in found[:count]]
+    value = widest(margins)
+    assert value[-1, -1, -1] == best
+    taken = [tuple(int(x) for x in node) for node in shortest(value >= best, joints, speed)]
     assert taken in paths
     assert min(margins[node] for node in taken) == best
 
     def duration(path):
-        ends = itertools.pairwise(path)
-        return sum((weight * np.abs(joints[b] - joints[a])).max() for a, b in ends)
+        return sum((np.abs(joints[b] - joints[a]) / speed).max() for a, b in itertools.pairwise(path))
 
     wide = [path for path in paths if min(margins[node] for node in path) == best]
     # Straighter paths are preferred by 1e-4 a step, at most eight of them.
     assert duration(taken) <= min(map(duration, wide)) + 1e-3
-    assert stride(joints[0, 0, 0], joints[2, 2, 1], weight) == pytest.approx(
-        (weight * np.abs(joints[2, 2, 1] - joints[0, 0, 0])).max()
-    )
-
-
-def test_interpolation_is_exact_for_a_linear_field(rng):
-    x = np.linspace(0, 1, 5)
-    nodes = np.stack(np.meshgrid(x, x, x, indexing="ij"), axis=3)
-    W = rng.normal(size=(3, 2))
-    field, value = nodes @ W, np.empty(2)
-    for mu in (*rng.uniform(size=(20, 3)), np.ones(3), np.zeros(3)):
-        interpolate(field, mu, value)
-        np.testing.assert_allclose(value, mu @ W, atol=1e-14)
+    q = np.array([joints[node] for node in taken])
+    assert least_time(speed, q)[-1] == pytest.approx(duration(taken))
+    unlimited = least_time(np.full(2, math.inf), q)
+    assert unlimited[1] == np.abs(q[1] - q[0]).max()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError
-from projservo_cli.stages.plan import demands_of, plan_task
+from projservo_cli.stages.plan import Profile, demands_of, plan_task
 from projservo_cli.sweep.preparation import STRATA, random_tasks
 from projservo_cli.task.planning import turning_sense
 from tests.planning.cases import constrained, reaching_of
@@ -131,7 +131,7 @@ def test_what_makes_a_task_infeasible_is_named():
     assert plan.constraint == "joints"
     assert "joint 1 is at" in plan.reason
     assert plan.margin.min() > 0.0  # in sight all the same
-    plan = constrained("paper", conditioning=0.5, miss_px=0.0)
+    plan = constrained("paper", conditioning=0.5)
     assert not plan.feasible
     assert plan.constraint == "conditioning"
     assert "0.5 allowed" in plan.reason
@@ -139,11 +139,9 @@ def test_what_makes_a_task_infeasible_is_named():
 
 def test_a_start_that_is_the_goal_is_planned_as_no_motion():
     example = case("ur5")
-    reach = example.ends
-    demands = demands_of(example.config)
-    plan = plan_task(
-        example.truth.model, reach.q_start, reach.s_start, reach.s_start, -1, "constrained", 0.9, 5, demands
-    )
+    shown = example.shown._replace(s_star=example.shown.s_start)
+    asked = Profile("constrained", samples=5)
+    plan = plan_task(example.truth.model, shown, asked, demands_of(example.config))
     assert plan.feasible
     assert plan.duration == pytest.approx(0.0, abs=1e-6)
     assert np.abs(plan.H_d - np.eye(4)).max() < 1e-7

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from projservo_cli.stages.plan import Sense
-from tests.known import configured, driven, known_scenario, planned
+from tests.known import configured, driven, known_scenario, planned, shown
 
 
 class Case:
@@ -16,6 +16,7 @@ class Case:
         self.config = configured(name, *overrides)
         self.scenario = known_scenario(self.config)
         self.truth, self.ends = self.scenario.truth, self.scenario.ends
+        self.shown = shown(self.scenario)
         self.plant = self.scenario.plant_of("direct_three")
         self.gains, self.limits = self.scenario.gains, self.scenario.limits
         self.plan = self.planned(self.truth.model)

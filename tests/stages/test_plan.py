@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.plan import Profile, plan_task
 from projservo_cli.task.margins import within
 from projservo_cli.task.trajectory import PROFILES
 from tests.samples import frame, in_frame, pixels
@@ -95,11 +95,9 @@ def test_an_infeasible_profile_is_named():
 
 def test_a_start_that_is_the_goal_is_a_plan_without_motion():
     example = case("ur5")
-    reach = example.ends
     bounds = within(example.truth.robot.lower, example.truth.robot.upper)
-    plan = plan_task(
-        example.truth.model, reach.q_start, reach.s_start, reach.s_start, -1, "linear", 0.9, 5, bounds
-    )
+    shown = example.shown._replace(s_star=example.shown.s_start)
+    plan = plan_task(example.truth.model, shown, Profile(samples=5), bounds)
     assert plan.tau == 0.0
     assert abs(plan.theta_s) < 1e-9
     assert plan.feasible

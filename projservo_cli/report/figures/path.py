@@ -61,7 +61,6 @@ def _data(material: Material) -> Data:
             ],
             axis=1,
         ),
-        "given_up": plan.given_up,
         "profile": np.array(plan.profile.replace("_", " ")),
     }
 
@@ -117,8 +116,6 @@ def _draw(data: Data, figure: "Figure") -> None:
     handles += _lines(axes[1, 0], data["sigma"], data["mu"], SHARES)
     axes[1, 0].set_ylabel(r"share $\mu$ (1)")
     handles += _lines(axes[1, 1], data["sigma"], data["along"], MARGINS)
-    if data["given_up"].any():
-        handles.append(_mark_given_up(axes[1, 1], data))
     axes[1, 1].axhline(0.0, color=style.BLACK, linewidth=0.6)
     if np.nanmax(data["along"]) > WIDE:  # conditioning may grow a hundredfold
         axes[1, 1].set_yscale("symlog", linthresh=1.0)
@@ -132,12 +129,6 @@ def _region(label: str, name: str) -> Any:
     from matplotlib.patches import Patch
 
     return Patch(label=label, alpha=0.6, edgecolor=style.BLACK, linewidth=0.0, **REGIONS[name])
-
-
-def _mark_given_up(axes: "Axes", data: Data) -> Any:
-    """Mark where conditioning is below its bound or the joints stay behind; returns the legend's entry."""
-    axes.plot(data["sigma"], np.where(data["given_up"], 0.0, np.nan), "x", color=style.PURPLE)
-    return style.line_handle("constraint given up", color=style.PURPLE, marker="x", linestyle="none")
 
 
 def _map(axes: "Axes", data: Data, view: int) -> None:
