@@ -15,7 +15,7 @@ from projservo_cli.report.figures.sweeps import draw_basin, draw_final_errors, d
 from projservo_cli.report.material import Data
 from projservo_cli.stages import Progress
 from projservo_cli.store import SweepTable
-from projservo_cli.sweep.driver import Folder, assembled, stored_design
+from projservo_cli.sweep.folder import Folder
 from projservo_cli.sweep.statistics import Rows, statistics, success_by
 from projservo_cli.tables import to_csv
 
@@ -48,7 +48,7 @@ def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[
         If there is no sweep, none of its runs is done, or a file cannot be written.
     """
     if folder.stored():
-        assembled(stored_design(folder), folder)
+        folder.assemble(folder.design())
     table = SweepTable(folder.table)
     rows = Rows(table)
     found = {"runs": table.rows, "total": table.attributes["total"], **statistics(rows)}
