@@ -15,7 +15,7 @@ from projservo_cli.sweep import preparation
 from projservo_cli.sweep.design import Design, TaskSet, name_of_run
 from projservo_cli.sweep.engine import Engine
 from projservo_cli.sweep.folder import Folder, Status
-from projservo_cli.sweep.preparation import Wanted, calibrate_one
+from projservo_cli.sweep.preparation import calibrate_one
 from projservo_cli.sweep.runs import Part, compiled_by, run_part
 
 PARTS = 4  # of each worker at least
@@ -136,7 +136,7 @@ def _compile_once(
 
 def _first_runs(tasks: Mapping[int, TaskSet], design: Design) -> None:
     """One calibration and a run of each law with it, for the kernels they leave."""
-    records = calibrate_one(Wanted(design.calibration_key(0, 0), design.calibrated(0, 0))).records
+    records = calibrate_one((design.calibration_key(0, 0), design.calibrated(0, 0))).records
     calibration = None if records is None else records[1]
     cells = range(design.cells // len(design.bases))
     by_law = {name_of_run(design.cell(cell)): cell for cell in reversed(cells)}

@@ -195,29 +195,25 @@ class Cluster(Engine):
                 f"{self._name}: no answer within {PATIENCE_S:g} s, or no worker ({what}): start "
                 "dask scheduler and dask worker, and see whether the address is right"
             ) from error
-        self._compare("the scheduler", self._client.run_on_scheduler)
-        self._compare("a worker", self._client.run)
+        self._compare_versions()
         super().__init__(sum(self._client.nthreads().values()))
 
-    def _compare(self, where: str, ask: Callable[[Callable[[], Any]], Any]) -> None:
-        """Refuse a cluster whose results would differ in their last digits."""
+    def _compare_versions(self) -> None:
+        """Refuse workers whose results would differ in their last digits."""
         try:
-            found = ask(versions)
+            found = self._client.run(versions)
         except Exception as error:  # whatever unpickling raises there
             what = " ".join(str(error).split())
             raise InputError(
-                f"{self._name}: {where} cannot import projservo ({what}): install the same "
+                f"{self._name}: a worker cannot import projservo ({what}): install the same "
                 "version there, pip install 'projservo[cluster]'"
             ) from error
         here = versions()
-        for there in [found] if "projservo" in found else found.values():
-            other = [
-                f"{name} {there[name]} instead of {here[name]}" for name in here if there[name] != here[name]
-            ]
-            if other:
+        for name, there in ((name, of_one[name]) for of_one in found.values() for name in here):
+            if there != here[name]:
                 raise InputError(
-                    f"{self._name}: {where} has {', '.join(other)}: results would differ "
-                    "in their last digits; install the same versions"
+                    f"{self._name}: a worker has {name} {there} instead of {here[name]}: results would "
+                    "differ in their last digits; install the same version"
                 )
 
     @contextmanager

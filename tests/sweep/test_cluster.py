@@ -101,8 +101,7 @@ def test_no_scheduler_at_the_address(monkeypatch):
 
 
 def test_a_cluster_of_other_versions_is_refused(cluster, monkeypatch):
-    """As found on the scheduler, which has numba; here there would be none."""
     address = cluster().address
     monkeypatch.setattr(engine.provenance, "collect", lambda **_: dict.fromkeys(engine.DECISIVE, "0.1"))
-    with pytest.raises(engine.InputError, match=r"the scheduler has .*numba [0-9.]+ instead of 0\.1"):
+    with pytest.raises(engine.InputError, match=r"a worker has projservo [0-9.]+ instead of 0\.1"):
         engine.Cluster(address)

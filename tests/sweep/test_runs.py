@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.sweep.design import name_of_run
-from projservo_cli.sweep.preparation import Wanted, calibrate_one, drawn_tasks
+from projservo_cli.sweep.preparation import calibrate_one, drawn_tasks
 from projservo_cli.sweep.runs import Part, run_part
 from tests.sweep.cases import design
 
@@ -44,11 +44,8 @@ SAME = {
 def part_of(found, first=0, last=None):
     """A part with all it needs."""
     tasks = {} if found.sweep.tasks is None else {0: drawn_tasks(found, 0, found.sweep.tasks.random)}
-    made = [
-        calibrate_one(Wanted(found.calibration_key(*place), found.calibrated(*place)))
-        for place in found.calibrations()
-    ]
-    calibrations = {one.wanted.key: one.records and one.records[1] for one in made}
+    made = [calibrate_one(wanted) for wanted in found.calibrations()]
+    calibrations = {one.key: one.records and one.records[1] for one in made}
     return Part(found, first, found.total if last is None else last, calibrations, tasks)
 
 
