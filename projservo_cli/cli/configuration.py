@@ -41,7 +41,7 @@ def _from_sweep(origin: str, options: dict[str, Any], overrides: list[Override])
     """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
     if options["config"]:
         raise InputError("-c and --from: the configuration is that of the sweep; leave -c out")
-    from projservo_cli.sweep.again import run_of
+    from projservo_cli.sweep.folder import run_of
 
     config, calibration = run_of(origin)
     if overrides:

@@ -19,23 +19,23 @@ def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config.sweep import load_sweep
     from projservo_cli.files import require_writable, working_in
-    from projservo_cli.sweep.again import folder_of
     from projservo_cli.sweep.design import read_design
     from projservo_cli.sweep.driver import run as run_sweep
-    from projservo_cli.sweep.driver import status_of
-    from projservo_cli.sweep.engine import engine_for
+    from projservo_cli.sweep.engine import Cluster, Engine
+    from projservo_cli.sweep.folder import Folder
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
     design = read_design(load_sweep(options["config"], options["sets"]))
-    folder = folder_of(options["output"] or Path("results") / design.sweep.name)
-    status = status_of(design, folder, force=options["force"])
+    folder = Folder(options["output"] or Path("results") / design.sweep.name)
+    status = folder.status(design, force=options["force"])
     if options["dry_run"] or status.complete:
         return _tell(console, design, folder, status, options)
     if options["scheduler"] is not None and options["threads"] is not None:
         raise InputError("-j and --scheduler: the workers of a scheduler are as many as it has; leave -j out")
     require_writable(folder.table)
-    engine = engine_for(options["threads"] or os.cpu_count() or 1, options["scheduler"])
-    where = f"{engine.workers} workers of {options['scheduler']}" if options["scheduler"] else "here"
+    scheduler = options["scheduler"]
+    engine = Cluster(scheduler) if scheduler else Engine(options["threads"] or os.cpu_count() or 1)
+    where = f"{engine.workers} workers of {scheduler}" if scheduler else "here"
     console.say(f"{design.total} runs, {design.sweep.runs} in each of {design.cells} cells, {where}")
     try:
         with working_in(folder.path, "parts", "calibrations"):
@@ -86,11 +86,11 @@ def run_report(names: list[str], rest: list[str], options: dict[str, Any]) -> in
             raise InputError(f"--{flag}: not used by report {rest[0]}, which is of a sweep")
     from projservo_cli.files import working_in
     from projservo_cli.report.style import FORMATS
-    from projservo_cli.sweep.again import folder_of
+    from projservo_cli.sweep.folder import Folder
     from projservo_cli.sweep.report import report
 
     console = Console(quiet=options["quiet"], verbose=options["verbose"])
-    folder = folder_of(rest[0])
+    folder = Folder(rest[0])
     try:
         with working_in(folder.path):
             found, files = report(folder, FORMATS, console.progress)

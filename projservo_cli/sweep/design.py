@@ -3,12 +3,12 @@
 import hashlib
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,40 +27,34 @@ def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
     Raises
     ------
     InputError
-        If a value is not one that its key takes.
+        If a value is not one that its key takes; ``what`` it is of.
     """
     resolved = config.model_dump(mode="json")
+    changes = [_override(what, key, value) for key, value in values.items()]
     try:
-        for key, value in values.items():
-            _put(resolved, key.split("."), value)
+        for change in changes:
+            section: Any = resolved
+            for step in change.path[:-1]:
+                section = section[step]
+            section[change.path[-1]] = change.value
         return Config.model_validate(resolved)
     except (ValueError, KeyError, IndexError, TypeError):
-        given = [override(what, key, value) for key, value in values.items()]
-        load_config(config.name, given, text=to_yaml(config))  # says what is wrong in the user's words
+        load_config(config.name, changes, text=to_yaml(config))  # says what is wrong in the user's words
         raise
 
 
-def _put(values: Any, path: Sequence[str], value: Any) -> None:
-    for step in path[:-1]:
-        values = values[int(step)] if isinstance(values, list) else values[step]
-    if isinstance(values, list):
-        values[int(path[-1])] = value
-    else:
-        values[path[-1]] = value
-
-
-def override(what: str, key: str, value: Any) -> Override:
+def _override(what: str, key: str, value: Any) -> Override:
     """A value as an override, which messages call by what it is of."""
     path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(key.split(".")))
     return Override(f"{what}: {key}={json.dumps(value)}", path, value)
 
 
-def overrides(what: str, key: str, value: Any) -> list[Override]:
-    """A value as overrides; that of a law sets its mode too where its name tells one."""
+def _overrides(what: str, key: str, value: Any) -> list[Override]:
+    """A value of the grid as overrides; that of a law sets its mode too where its name tells one."""
     if key != LAW:
-        return [override(what, key, value)]
-    flag = f"{what}: {key}={json.dumps(value)}"
+        return [_override(what, key, value)]
     law, mode = law_and_mode(value)
+    flag = f"{what}: {key}={json.dumps(value)}"
     found = [Override(flag, ("control", "laws"), [law])]
     return found if law == value else [*found, Override(flag, ("control", "mode"), [mode])]
 
@@ -90,8 +84,7 @@ def sample(distribution: Distribution, rng: np.random.Generator) -> Any:
     return distribution.choice[int(uniform * len(distribution.choice))]
 
 
-@dataclass(frozen=True)
-class Axis:
+class Axis(NamedTuple):
     """One dimension of the grid: its name, the keys it sets, its values."""
 
     name: str
@@ -99,16 +92,14 @@ class Axis:
     values: tuple[Any, ...]
 
 
-@dataclass(frozen=True)
-class TaskSet:
+class TaskSet(NamedTuple):
     """Random tasks of a base: joints (k, n) at start and goal, rad or m."""
 
     q_start: FloatArray
     q_goal: FloatArray
 
 
-@dataclass(frozen=True)
-class Numbers:
+class Numbers(NamedTuple):
     """Where run number ``run`` stands: its cell, its number in the cell, and those of what it shares."""
 
     run: int
@@ -135,8 +126,8 @@ class Design:
     def axes(self) -> tuple[Axis, ...]:
         """Dimensions of the grid, the last one running fastest; there is always one of laws."""
         found = [Axis(BASE, (), tuple(name for name, _ in self.bases))] if len(self.bases) > 1 else []
-        for name in self.sweep.grid:
-            found.append(Axis(name, self.sweep.keys_of(name), self.sweep.grid[name].values))
+        for name, axis in self.sweep.grid.items():
+            found.append(Axis(name, self.sweep.keys_of(name), axis.values))
         if all(LAW not in axis.keys for axis in found):
             control = load_config("base", text=self.bases[0][1]).control
             found.append(Axis(LAW, (LAW,), names_of(control.laws, control.mode)))
@@ -197,6 +188,7 @@ class Design:
         """Which base a cell is made from."""
         return cell // (self.cells // len(self.bases))
 
+    @lru_cache(maxsize=1024)  # noqa: B019 - a process has one design
     def cell(self, cell: int) -> Config:
         """Configuration of a cell before anything is drawn.
 
@@ -205,15 +197,52 @@ class Design:
         InputError
             If a value of the grid is not one that its key takes, or a simulated task is missing.
         """
-        return _cell(self, cell)
+        name, text = self.bases[self.base_of(cell)]
+        values = self.values(cell)
+        changes = [
+            change
+            for axis in self.axes
+            for key in axis.keys
+            for change in _overrides(f"grid.{axis.name}", key, values[axis.name])
+        ]
+        config = load_config(name, changes, text=text)
+        if config.recorded or None in (config.robot, config.rig, config.markers, config.task):
+            raise InputError(f"base {name}: a sweep needs a simulated robot with a task, and no data")
+        if config.plant.use is not None:
+            raise InputError(f"base {name}: a sweep drives the simulated robot; leave plant.use out")
+        name_of_run(config)
+        assert config.task is not None
+        control = config.control.model_copy(update={"must_converge": ()})
+        reference = config.calibration.reference or config.task.start
+        calibration = config.calibration.model_copy(update={"reference": reference})
+        update = {"name": self.sweep.name, "control": control, "calibration": calibration}
+        return config.model_copy(update=update)
 
+    @lru_cache(maxsize=4096)  # noqa: B019 - a process has one design
     def calibrated(self, cell: int, calibration: int) -> Config:
         """Configuration of a cell with the seed of a calibration and what is drawn for it."""
-        return _calibrated(self, cell, calibration)
+        config = self.cell(cell)
+        drawn = self._drawn(CALIBRATION_VALUES, calibration)
+        if drawn:
+            config = changed(config, drawn, f"calibration {calibration}")
+        seed = seed_of(self.sweep.seed, CALIBRATIONS, calibration)
+        update = {"calibration": config.calibration.model_copy(update={"seed": seed})}
+        return config.model_copy(update=update)
 
+    @lru_cache(maxsize=4096)  # noqa: B019 - a process has one design
     def calibration_key(self, cell: int, calibration: int) -> str:
         """Hash of all a calibration depends on; cells that share it share the calibration."""
-        return _calibration_key(self, cell, calibration)
+        config = self.calibrated(cell, calibration).model_copy(update={"seed": 0})
+        return digest(config, CALIBRATION_DEPENDS_ON, without=NOT_HASHED["calibrate"])
+
+    def calibrations(self) -> Iterator[tuple[str, Config]]:
+        """Key of each calibration that is needed, each once, and a configuration that needs it."""
+        seen = set()
+        for place in product(range(self.cells), range(min(self.sweep.calibrations, self.sweep.runs))):
+            key = self.calibration_key(*place)
+            if key not in seen:
+                seen.add(key)
+                yield key, self.calibrated(*place)
 
     def config(self, run: int, tasks: Mapping[int, TaskSet]) -> Config:
         """Configuration of a run.
@@ -230,32 +259,30 @@ class Design:
         """
         at = self.numbers(run)
         config = self.calibrated(at.cell, at.calibration)
-        drawn = self._drawn(VALUES, at.draw, per_calibration=False)
+        drawn = self._drawn(VALUES, at.draw)
         if drawn:
             config = changed(config, drawn, f"run {run}")
         update: dict[str, Any] = {"seed": seed_of(self.sweep.seed, RUNS, at.draw)}
         if at.task >= 0:
-            update["task"] = _task(config, tasks[self.base_of(at.cell)], at.task)
+            assert config.task is not None
+            start, goal = (
+                JointVector(joints=tuple(q[at.task].tolist()), unit="rad")
+                for q in tasks[self.base_of(at.cell)]
+            )
+            offset = config.task.start_offset  # stays
+            update["task"] = Task(start=start, start_offset=offset, goal=Goal(joints=goal))
         return config.model_copy(update=update)
 
     def drawn(self, run: int) -> dict[str, Any]:
         """Values drawn for a run and for its calibration, in the order of ``random``."""
         at = self.numbers(run)
-        found = self._drawn(VALUES, at.draw, per_calibration=False)
-        found |= self._drawn(CALIBRATION_VALUES, at.calibration, per_calibration=True)
+        found = self._drawn(VALUES, at.draw) | self._drawn(CALIBRATION_VALUES, at.calibration)
         return {key: found[key] for key in self.sweep.random}
 
-    def calibrations(self) -> Iterator[tuple[int, int]]:
-        """Cell and number of each calibration that is needed, each once."""
-        seen = set()
-        for cell, number in product(range(self.cells), range(min(self.sweep.calibrations, self.sweep.runs))):
-            key = self.calibration_key(cell, number)
-            if key not in seen:
-                seen.add(key)
-                yield cell, number
-
-    def _drawn(self, stream: int, number: int, *, per_calibration: bool) -> dict[str, Any]:
-        keys = [key for key in self.sweep.random if for_calibration(key) is per_calibration]
+    def _drawn(self, stream: int, number: int) -> dict[str, Any]:
+        """Values of the keys that a stream is for: whether the calibration depends on them."""
+        of_calibration = stream == CALIBRATION_VALUES
+        keys = [key for key in self.sweep.random if _for_calibration(key) is of_calibration]
         if not keys:
             return {}
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number)))
@@ -270,7 +297,7 @@ def read_design(sweep: SweepConfig) -> Design:
     InputError
         If a base cannot be read, or a cell is no configuration of a simulated task.
     """
-    changes = [override("set", key, value) for key, value in sweep.set.items()]
+    changes = [_override("set", key, value) for key, value in sweep.set.items()]
     bases = tuple((Path(base).stem, to_yaml(load_config(base, changes))) for base in sweep.base)
     design = Design(sweep, bases)
     for run in (number for number in sweep.traces if number >= design.total):
@@ -286,11 +313,6 @@ def from_recipe(recipe: Mapping[str, Any]) -> Design:
     """The design that a recipe is of."""
     bases = tuple((str(name), str(text)) for name, text in recipe["bases"])
     return Design(SweepConfig.model_validate(recipe["sweep"]), bases)
-
-
-def for_calibration(key: str) -> bool:
-    """Whether the calibration depends on a key of the configuration."""
-    return any(f"{key}.".startswith(f"{part}.") for part in CALIBRATION_DEPENDS_ON)
 
 
 def name_of_run(config: Config) -> str:
@@ -310,53 +332,6 @@ def name_of_run(config: Config) -> str:
     return names[0]
 
 
-@lru_cache(maxsize=1024)
-def _cell(design: Design, cell: int) -> Config:
-    base = design.bases[design.base_of(cell)]
-    values = design.values(cell)
-    changes = [
-        change
-        for axis in design.axes
-        for key in axis.keys
-        for change in overrides(f"grid.{axis.name}", key, values[axis.name])
-    ]
-    config = load_config(base[0], changes, text=base[1])
-    if config.recorded or None in (config.robot, config.rig, config.markers, config.task):
-        raise InputError(f"base {base[0]}: a sweep needs a simulated robot with a task, and no data")
-    if config.plant.use is not None:
-        raise InputError(f"base {base[0]}: a sweep drives the simulated robot; leave plant.use out")
-    name_of_run(config)
-    assert config.task is not None
-    control = config.control.model_copy(update={"must_converge": ()})
-    reference = config.calibration.reference or config.task.start
-    calibration = config.calibration.model_copy(update={"reference": reference})
-    return config.model_copy(
-        update={"name": design.sweep.name, "control": control, "calibration": calibration}
-    )
-
-
-@lru_cache(maxsize=4096)
-def _calibrated(design: Design, cell: int, number: int) -> Config:
-    config = design.cell(cell)
-    drawn = design._drawn(CALIBRATION_VALUES, number, per_calibration=True)
-    if drawn:
-        config = changed(config, drawn, f"calibration {number}")
-    seed = seed_of(design.sweep.seed, CALIBRATIONS, number)
-    calibration = config.calibration.model_copy(update={"seed": seed})
-    return config.model_copy(update={"calibration": calibration})
-
-
-@lru_cache(maxsize=4096)
-def _calibration_key(design: Design, cell: int, number: int) -> str:
-    config = design.calibrated(cell, number).model_copy(update={"seed": 0})
-    return digest(config, CALIBRATION_DEPENDS_ON, without=NOT_HASHED["calibrate"])
-
-
-def _task(config: Config, tasks: TaskSet, number: int) -> Task:
-    """Random task of a number; an offset of the start stays."""
-    assert config.task is not None
-    start, goal = (
-        JointVector(joints=tuple(float(x) for x in q[number]), unit="rad")
-        for q in (tasks.q_start, tasks.q_goal)
-    )
-    return Task(start=start, start_offset=config.task.start_offset, goal=Goal(joints=goal))
+def _for_calibration(key: str) -> bool:
+    """Whether the calibration depends on a key of the configuration."""
+    return any(f"{key}.".startswith(f"{part}.") for part in CALIBRATION_DEPENDS_ON)

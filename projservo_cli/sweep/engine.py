@@ -1,108 +1,147 @@
-"""Where the parts of a sweep are made: here, in processes of this machine, or on a cluster."""
+"""Where jobs of a sweep are made: here, in threads or processes of this machine, or on a Dask cluster.
 
+Plain ``concurrent.futures`` and ``distributed``: results of joblib pile up where they are stored more slowly
+than made, Ctrl-C prints what its processes were at, and they outlive a sweep that is killed.
+"""
+
+import logging
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
-from concurrent.futures.process import ProcessPoolExecutor
-from concurrent.futures.thread import ThreadPoolExecutor
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
 from itertools import islice
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from projservo_cli import provenance
 from projservo_cli.records import InputError, WorkFailed
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 MOST_LOSSES = 5  # of workers in a row, without a job done in between
+PATIENCE_S = 10.0  # for the scheduler to answer and for a first worker
+DECISIVE = ("projservo", "python", "numpy", "scipy", "numba", "jit")  # for the last digits of a result
 
 
-class Engine(Protocol):
-    """What makes jobs, ``workers`` at a time; ``losses`` are raised by futures whose worker was lost."""
+class Engine:
+    """So many workers of this machine; a single one is this process.
 
-    workers: int
-    losses: tuple[type[Exception], ...]
-
-    def suit(self, workers: int, *, threads: bool) -> None:
-        """Make ready for jobs worth so many workers, and whose threads seldom wait for each other."""
-
-    def pool(self, *, anew: bool = False) -> Executor:
-        """The pool to submit jobs to; another one after workers of the first were lost."""
-
-    def check(self) -> None:
-        """Raise WorkFailed where nothing can come back any more."""
-
-    def close(self) -> None:
-        """Give back what was taken; jobs that run are dropped."""
-
-
-class Here(Executor):
-    """The pool of one: a job is made when it is submitted."""
-
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> "Future[Any]":
-        """A future that is done."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(function(*arguments, **named))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-class LocalEngine:
-    """Processes or threads of this machine; a single one is this process.
-
-    Parameters
+    Attributes
     ----------
-    workers : how many.
+    losses : what futures raise whose worker was lost.
     """
 
-    losses: tuple[type[Exception], ...] = ()
+    here = True
+    losses: tuple[type[Exception], ...] = (BrokenExecutor, CancelledError, OSError)
 
     def __init__(self, workers: int) -> None:
-        self.workers = self.most = workers
-        self._threads = False
-        self._pool: Executor | None = None
+        self.workers = workers
 
-    def suit(self, workers: int, *, threads: bool) -> None:
-        """Threads take the memory of one process, and share what it has compiled and worked out."""
-        wanted = min(self.most, workers), threads
-        if wanted != (self.workers, self._threads):
-            self.close()
-            self.workers, self._threads = wanted
+    def completed(
+        self,
+        function: Callable[[Job], Result],
+        jobs: Iterable[Job],
+        *,
+        most: int | None = None,
+        threads: bool = False,
+    ) -> Generator[Result, None, None]:
+        """Results of jobs as they are done, in any order; what a lost worker had is made again.
 
-    def pool(self, *, anew: bool = False) -> Executor:
-        """The workers, started when they are first asked for."""
-        if anew:
-            self.close()
-        if self._pool is None and self.workers == 1:
-            self._pool = Here()
-        elif self._pool is None and self._threads:
-            self._limits = threadpool_limits(1)  # for all threads together, or one would end that of another
-            self._pool = ThreadPoolExecutor(self.workers)
-        elif self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(self.workers, context, _follow_the_parent)
-        return self._pool
+        No more jobs wait than keep all workers busy, and a result is let go when the next is asked for.
 
-    def check(self) -> None:
-        """A pool tells by itself."""
+        Parameters
+        ----------
+        most : workers that the jobs are worth.
+        threads : whether they seldom wait for each other; the memory is that of one process then.
 
-    def close(self) -> None:
-        """End processes at once, threads with their jobs."""
-        if isinstance(self._pool, ThreadPoolExecutor):
-            self._pool.shutdown(cancel_futures=True)
-            self._limits.restore_original_limits()
-        if isinstance(self._pool, ProcessPoolExecutor):
-            processes = list((self._pool._processes or {}).values())
-            self._pool.shutdown(wait=False, cancel_futures=True)
+        Raises
+        ------
+        WorkFailed
+            If workers are lost again and again, or the cluster is.
+        InputError
+            What a job raises.
+        """
+        workers = min(self.workers, most or self.workers)
+        if self.here and workers == 1:
+            yield from map(function, jobs)
+            return
+        left, losses = iter(jobs), 0
+        todo: list[Job] = []
+        while True:
+            futures: dict[Future[Result], Job] = {}
+            with self.pool(workers, threads=threads) as pool:
+                try:
+                    while True:
+                        todo += islice(left, max(0, 2 * workers - len(futures) - len(todo)))
+                        while todo:
+                            future = pool.submit(function, todo[0])
+                            futures[future] = todo.pop(0)
+                        if not futures:
+                            return
+                        done, _ = wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
+                        if not done:
+                            self.check()
+                        for future in done:
+                            result = future.result()
+                            del futures[future]
+                            losses = 0
+                            yield result
+                            del result, future
+                except self.losses as error:
+                    self.check()
+                    reason = error
+                finally:
+                    for future in futures:
+                        future.cancel()
+            todo += futures.values()
+            losses += 1
+            if losses > MOST_LOSSES:
+                raise WorkFailed(
+                    f"workers were lost {losses} times in a row ({' '.join(str(reason).split())}): see "
+                    "whether the machine has memory left; run the sweep again to continue"
+                )
+
+    @contextmanager
+    def pool(self, workers: int, *, threads: bool) -> Iterator[Executor]:
+        """Workers to submit jobs to; in the end processes go at once, threads with the jobs they are at."""
+        if threads:
+            with threadpool_limits(1):  # for all threads together, or one would end that of another
+                pool = ThreadPoolExecutor(workers)
+                try:
+                    yield pool
+                finally:
+                    pool.shutdown(cancel_futures=True)
+            return
+        spawn = multiprocessing.get_context("spawn")
+        of_processes = ProcessPoolExecutor(workers, spawn, _follow_the_parent)
+        try:
+            yield of_processes
+        finally:
+            processes = list((of_processes._processes or {}).values())
+            of_processes.shutdown(wait=False, cancel_futures=True)
             for process in processes:
                 process.terminate()
-        self._pool = None
+
+    def check(self) -> None:
+        """Raise WorkFailed where nothing can come back any more; a pool of this machine tells by itself."""
+
+    def close(self) -> None:
+        """Leave the cluster."""
 
 
 def _follow_the_parent() -> None:
@@ -112,93 +151,92 @@ def _follow_the_parent() -> None:
 
 
 def _end_with(process: Any) -> None:
-    if process is not None:
-        process.join()
+    process.join()
     os._exit(1)
 
 
-def completed(engine: Engine, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
-    """Results of jobs as they are done, in any order; what a lost worker had is made again.
+class Cluster(Engine):
+    """Workers of a Dask scheduler, which makes anew what they lose when they die.
 
-    No more jobs wait than keep all workers busy, and a result is let go when the next is asked for.
+    Parameters
+    ----------
+    address : of the scheduler, such as tcp://host:8786.
 
     Raises
     ------
     WorkFailed
-        If workers are lost again and again, or the engine is.
+        If the scheduler does not answer or has no workers.
     InputError
-        What a job raises.
+        If the package of the cluster is missing here, or ours there, or versions differ.
     """
-    waiting = iter(jobs)
-    pool = engine.pool()
-    futures: dict[Future[Result], Job] = {}
-    again: list[Job] = []
-    losses = 0
-    lost: tuple[type[BaseException], ...] = (BrokenExecutor, CancelledError, OSError, *engine.losses)
-    try:
-        while True:
-            room = max(0, 2 * engine.workers - len(futures) - len(again)) if engine.workers > 1 else 1
-            for job in [*again, *islice(waiting, room)]:
-                futures[_submitted(pool, function, job)] = job
-            again = []
-            if not futures:
-                return
-            done, _ = wait(futures, timeout=1.0, return_when=FIRST_COMPLETED)
-            if not done:
-                engine.check()
-            for future in done:
-                job = futures.pop(future)
-                try:
-                    result = future.result()
-                except lost as error:
-                    engine.check()
-                    again.append(job)
-                    reason = error
-                    continue
-                losses = 0
-                yield result
-                del result
-            if again:
-                losses += 1
-                if losses > MOST_LOSSES:
-                    raise WorkFailed(
-                        f"workers were lost {losses} times in a row ({' '.join(str(reason).split())}): see "
-                        "whether the machine has memory left; run the sweep again to continue"
-                    )
-                again += futures.values()
-                futures.clear()
-                pool = engine.pool(anew=True)
-    finally:
-        for future in futures:
-            future.cancel()
+
+    here = False
+
+    def __init__(self, address: str) -> None:
+        self._name = f"--scheduler {address}"
+        try:
+            import distributed
+            from distributed.scheduler import KilledWorker
+        except ImportError as error:
+            raise InputError(
+                f"{self._name}: the package distributed is missing: pip install 'projservo[cluster]'"
+            ) from error
+        self.losses = (*Engine.losses, KilledWorker)
+        for name in list(logging.root.manager.loggerDict):  # what matters is said in our words
+            if name.split(".")[0] in ("distributed", "tornado", "asyncio"):
+                logging.getLogger(name).setLevel(logging.CRITICAL)
+        try:
+            make: Any = distributed.Client
+            self._client = make(address, timeout=PATIENCE_S, set_as_default=False)
+            self._client.wait_for_workers(1, timeout=PATIENCE_S)
+        except (OSError, TimeoutError, ValueError) as error:
+            what = " ".join(str(error).split())
+            raise WorkFailed(
+                f"{self._name}: no answer within {PATIENCE_S:g} s, or no worker ({what}): start "
+                "dask scheduler and dask worker, and see whether the address is right"
+            ) from error
+        self._compare_versions()
+        super().__init__(sum(self._client.nthreads().values()))
+
+    def _compare_versions(self) -> None:
+        """Refuse workers whose results would differ in their last digits."""
+        try:
+            found = self._client.run(versions)
+        except Exception as error:  # whatever unpickling raises there
+            what = " ".join(str(error).split())
+            raise InputError(
+                f"{self._name}: a worker cannot import projservo ({what}): install the same "
+                "version there, pip install 'projservo[cluster]'"
+            ) from error
+        here = versions()
+        for name, there in ((name, of_one[name]) for of_one in found.values() for name in here):
+            if there != here[name]:
+                raise InputError(
+                    f"{self._name}: a worker has {name} {there} instead of {here[name]}: results would "
+                    "differ in their last digits; install the same version"
+                )
+
+    @contextmanager
+    def pool(self, workers: int, *, threads: bool) -> Iterator[Executor]:
+        """All workers there are, which wait for jobs anyway."""
+        yield self._client.get_executor(retries=MOST_LOSSES, pure=False)
+
+    def check(self) -> None:
+        """Raise WorkFailed where the scheduler is gone."""
+        for _ in range(20):  # a lost connection is noticed a moment after what was lost with it
+            if self._client.status != "running":
+                raise WorkFailed(
+                    f"{self._name}: the connection to the scheduler is lost; what was stored "
+                    "until then is kept: start it anew and run the sweep again to continue"
+                )
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """Leave the scheduler; it drops what is not done."""
+        self._client.close(timeout=2.0)
 
 
-def _submitted(pool: Executor, function: Callable[[Job], Result], job: Job) -> "Future[Result]":
-    """The future of a job; where the pool is broken already, one that failed."""
-    try:
-        return pool.submit(function, job)
-    except (RuntimeError, OSError) as error:
-        failed: Future[Result] = Future()
-        failed.set_exception(error if isinstance(error, OSError) else BrokenExecutor(str(error)))
-        return failed
-
-
-def engine_for(workers: int, scheduler: str | None) -> Engine:
-    """The engine that the command line asks for.
-
-    Raises
-    ------
-    InputError
-        If the package of the cluster is not installed, or its versions differ.
-    WorkFailed
-        If the scheduler does not answer.
-    """
-    if scheduler is None:
-        return LocalEngine(workers)
-    try:
-        from projservo_cli.sweep.cluster import ClusterEngine
-    except ImportError as error:
-        raise InputError(
-            f"--scheduler {scheduler}: the package distributed is missing: pip install 'projservo[cluster]'"
-        ) from error
-    return ClusterEngine(scheduler)
+def versions() -> dict[str, Any]:
+    """Versions that decide the bits of a result."""
+    found = provenance.collect(seed=0, argv=[])
+    return {name: found[name] for name in DECISIVE}

@@ -154,28 +154,22 @@ def _accepted(truth: Truth, poses: FloatArray, front: float, rejected: dict[str,
 REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
 
 
-class Wanted(NamedTuple):
-    """A calibration to make: its key, and the configuration of a run that needs it."""
+class Calibrated(NamedTuple):
+    """What became of the calibration of a key: records, or why there are none."""
 
     key: str
     config: Config
-
-
-class Calibrated(NamedTuple):
-    """What became of it: records, or why there are none."""
-
-    wanted: Wanted
     records: tuple[Observation, Calibration, CrossValidation | None] | None
-    reason: str
+    reason: str = ""
 
 
-def calibrate_one(wanted: Wanted) -> Calibrated:
-    """Make one calibration, on one thread like all that must be the same to the bit."""
+def calibrate_one(wanted: tuple[str, Config]) -> Calibrated:
+    """Make the calibration of a key, on one thread like all that must be the same to the bit."""
     with threadpool_limits(1):
         try:
-            return Calibrated(wanted, calibrate.run(wanted.config), "")
+            return Calibrated(*wanted, calibrate.run(wanted[1]))
         except WorkFailed as error:
-            return Calibrated(wanted, None, str(error))
+            return Calibrated(*wanted, None, str(error))
 
 
 def tasks_of(design: Design, folder: Path, say: Callable[[str], None]) -> dict[int, TaskSet]:
@@ -193,33 +187,25 @@ def tasks_of(design: Design, folder: Path, say: Callable[[str], None]) -> dict[i
         path = folder / f"tasks_{name}.npz"
         if not path.exists():
             say(f"drawing {design.sweep.tasks.random} random tasks of {name}")
-            _write_tasks(path, drawn_tasks(design, number, design.sweep.tasks.random))
+            tasks = drawn_tasks(design, number, design.sweep.tasks.random)
+            with replacing(path) as temporary, open(temporary, "wb") as file:
+                np.savez(file, **tasks._asdict())
         found[number] = read_tasks(path)
     return found
 
 
 def drawn_tasks(design: Design, base: int, count: int) -> TaskSet:
-    """Random tasks of a base, the strata of their angles in turn."""
+    """Random tasks of a base, one of each stratum of their angles after the other."""
     config = design.cell(base * (design.cells // len(design.bases)))
     assert config.task is not None
     assert config.robot is not None
     q_front = np.array(config.task.start.values(config.robot.joint_types))
     rng = np.random.default_rng(np.random.SeedSequence(design.sweep.seed, spawn_key=(TASKS,)))
     tasks = random_tasks(truth_of(config), q_front, count, rng)
-    order = in_turn(count)
-    return TaskSet(tasks.q_start[order], tasks.q_goal[order])
-
-
-def in_turn(count: int) -> IntArray:
-    """Order in which tasks that are sorted by stratum come one of each stratum after the other."""
-    quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]
+    quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]  # they come sorted by stratum
     first = np.cumsum([0, *quota[:-1]])
-    return np.array([first[i] + k for k in range(max(quota)) for i in range(STRATA) if k < quota[i]])
-
-
-def _write_tasks(path: Path, tasks: TaskSet) -> None:
-    with replacing(path) as temporary, open(temporary, "wb") as file:
-        np.savez(file, q_start=tasks.q_start, q_goal=tasks.q_goal)
+    order = [first[i] + k for k in range(max(quota)) for i in range(STRATA) if k < quota[i]]
+    return TaskSet(tasks.q_start[order], tasks.q_goal[order])
 
 
 def read_tasks(path: Path) -> TaskSet:
@@ -237,13 +223,12 @@ def read_tasks(path: Path) -> TaskSet:
         raise InputError(f"{path}: damaged; delete it and run the sweep again") from error
 
 
-def missing_calibrations(design: Design, folder: Path) -> Iterator[Wanted]:
-    """Calibrations that are needed and not yet stored."""
-    for cell, number in design.calibrations():
-        key = design.calibration_key(cell, number)
+def missing_calibrations(design: Design, folder: Path) -> Iterator[tuple[str, Config]]:
+    """Calibrations that are needed and not yet stored: their keys, and configurations that need them."""
+    for key, config in design.calibrations():
         path = calibration_path(folder, key)
         if not path.exists() and not path.with_suffix(REFUSED).exists():
-            yield Wanted(key, design.calibrated(cell, number))
+            yield key, config
 
 
 def calibration_path(folder: Path, key: str) -> Path:
@@ -253,27 +238,23 @@ def calibration_path(folder: Path, key: str) -> Path:
 
 def keep_calibration(folder: Path, made: Calibrated) -> None:
     """Store a calibration as a run file of its own, or why there is none."""
-    path = calibration_path(folder, made.wanted.key)
+    path = calibration_path(folder, made.key)
     if made.records is None:
         with replacing(path.with_suffix(REFUSED)) as temporary:
             temporary.write_text(made.reason + "\n", encoding="utf-8")
         return
-    observation, calibration, held_out = made.records
-    records = {"observation": observation, "calibration": calibration}
-    records |= {} if held_out is None else {"cross_validation": held_out}
-    config = made.wanted.config
-    (step,) = steps_for(config, Run(path), ["calibrate"])
-    origin = provenance.collect(seed=config.seed)
-    text = to_yaml(config)
+    names = ("observation", "calibration", "cross_validation")
+    records = {name: one for name, one in zip(names, made.records, strict=True) if one is not None}
+    (step,) = steps_for(made.config, Run(path), ["calibrate"])
+    origin = provenance.collect(seed=made.config.seed)
+    text = to_yaml(made.config)
     save(Run(path, text, {"calibrate": Result(step.key, text, origin, step.inputs, records)}))
 
 
 def calibrations_of(design: Design, folder: Path) -> dict[str, Calibration | None]:
     """Calibrations by their key, None where one was refused; without covariance, which no run needs."""
     found: dict[str, Calibration | None] = {}
-    for cell, number in design.calibrations():
-        key = design.calibration_key(cell, number)
-        path = calibration_path(folder, key)
-        none = np.zeros((0, 0))
+    for key, _ in design.calibrations():
+        path, none = calibration_path(folder, key), np.zeros((0, 0))
         found[key] = dataclasses.replace(load(path).calibration, covariance=none) if path.exists() else None
     return found

@@ -15,7 +15,7 @@ from projservo_cli.report.figures.sweeps import draw_basin, draw_final_errors, d
 from projservo_cli.report.material import Data
 from projservo_cli.stages import Progress
 from projservo_cli.store import SweepTable
-from projservo_cli.sweep.driver import Folder, assembled, stored_design
+from projservo_cli.sweep.folder import Folder
 from projservo_cli.sweep.statistics import Rows, statistics, success_by
 from projservo_cli.tables import to_csv
 
@@ -26,7 +26,7 @@ BINS = 8  # of a value that is drawn
 POINTS = 2_000  # of a curve
 
 
-class Picture(NamedTuple):
+class _Picture(NamedTuple):
     """A figure: the name of its files, its numbers, how it is drawn, its height in inches."""
 
     name: str
@@ -48,14 +48,14 @@ def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[
         If there is no sweep, none of its runs is done, or a file cannot be written.
     """
     if folder.stored():
-        assembled(stored_design(folder), folder)
+        folder.assemble(folder.design())
     table = SweepTable(folder.table)
     rows = Rows(table)
     found = {"runs": table.rows, "total": table.attributes["total"], **statistics(rows)}
     files = [folder.path / STATISTICS]
     with replacing(files[0]) as temporary:
-        temporary.write_text(json.dumps(_plain(found), indent=1) + "\n", encoding="utf-8")
-    pictures = list(pictures_of(rows))
+        temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    pictures = list(_pictures(rows))
     for done, picture in enumerate(pictures):
         progress("figures", done, len(pictures))
         files += _drawn(picture, folder.path, formats)
@@ -63,7 +63,7 @@ def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[
     return found, files
 
 
-def _drawn(picture: Picture, folder: Path, formats: Sequence[str]) -> Iterator[Path]:
+def _drawn(picture: _Picture, folder: Path, formats: Sequence[str]) -> Iterator[Path]:
     with style.styled():
         figure = style.new_figure(picture.height, 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH)
         picture.draw(picture.data, figure)
@@ -80,24 +80,24 @@ def _drawn(picture: Picture, folder: Path, formats: Sequence[str]) -> Iterator[P
     yield path
 
 
-def pictures_of(rows: Rows) -> Iterator[Picture]:
+def _pictures(rows: Rows) -> Iterator[_Picture]:
     """Every figure that the columns of a sweep allow."""
     axes = {name: values for name, values in rows.axes if len(values) > 1 and _numeric(values)}
     for name in axes:
-        yield Picture(f"success_over_{name}", _success(rows, name, name, None), draw_success, 2.9)
+        yield _Picture(f"success_over_{name}", _success(rows, name, name, None), draw_success, 2.9)
     drawn = [name for name in rows.table.names if name in rows.table.attributes["random"]]
     for name in (name for name in drawn if rows[name].dtype.kind == "f"):
         edges = np.linspace(rows[name].min(), np.nextafter(rows[name].max(), math.inf), BINS + 1)
-        yield Picture(f"success_over_{name}", _success(rows, name, name, edges.tolist()), draw_success, 2.9)
+        yield _Picture(f"success_over_{name}", _success(rows, name, name, edges.tolist()), draw_success, 2.9)
     if np.nanmax(rows["rotation_deg"], initial=0.0) - np.nanmin(rows["rotation_deg"], initial=180.0) > 1.0:
         data = _success(rows, "rotation_deg", "rotation from start to goal (deg)", [*ANGLES[:-1], 180.1])
-        yield Picture("success_over_rotation", data, draw_success, 2.9)
+        yield _Picture("success_over_rotation", data, draw_success, 2.9)
     offsets = [name for name in axes if name.startswith(OFFSET)]
     if len(offsets) >= 2:
-        yield Picture("basin", _basin(rows, offsets[0], offsets[1]), draw_basin, 4.0)
+        yield _Picture("basin", _basin(rows, offsets[0], offsets[1]), draw_basin, 4.0)
     errors = _final_errors(rows)
     if errors:
-        yield Picture("final_error", errors, draw_final_errors, 2.9)
+        yield _Picture("final_error", errors, draw_final_errors, 2.9)
 
 
 def _numeric(values: Sequence[Any]) -> bool:
@@ -134,12 +134,3 @@ def _final_errors(rows: Rows) -> Data:
             data[f"{law}.error"] = np.maximum(finite[shown], 1e-6)
             data[f"{law}.share"] = (shown + 1) / len(errors)
     return data
-
-
-def _plain(value: Any) -> Any:
-    """JSON values without NaN."""
-    if isinstance(value, dict):
-        return {key: _plain(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

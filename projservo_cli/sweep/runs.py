@@ -2,9 +2,8 @@
 
 import json
 import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,7 @@ class Column:
     about: str
 
 
-def text(name: str, values: Sequence[str], about: str) -> Column:
+def _text(name: str, values: Sequence[str], about: str) -> Column:
     """A column of texts, as wide as the longest of the possible ones."""
     return Column(name, f"S{max(len(value.encode()) for value in values)}", "1", about)
 
@@ -55,7 +54,7 @@ NUMBERED = (
     Column("seed", "i8", "1", "seed of the run"),
 )
 MEASURED = (
-    text("verdict", ALL_VERDICTS, "how the run ended"),
+    _text("verdict", ALL_VERDICTS, "how the run ended"),
     Column("usable", "i1", "1", "whether its calibration is usable"),
     Column("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
     Column("rotation_deg", "f8", "deg", "true rotation from start to goal"),
@@ -94,18 +93,18 @@ def _drawn(key: str, distribution: Distribution) -> Column:
 def _input(name: str, values: Sequence[Any], about: str) -> Column:
     if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
         return Column(name, "f8", "1", about)
-    return text(name, [shown(value) for value in values], about)
+    return _text(name, [_shown(value) for value in values], about)
 
 
-def shown(value: Any) -> str:
+def _shown(value: Any) -> str:
     """A value as text, texts as they are."""
     return value if isinstance(value, str) else json.dumps(value)
 
 
-Columns = dict[str, npt.NDArray[Any]]
+_Columns = dict[str, npt.NDArray[Any]]
 # What the table says of a verdict of the kernel.
-SAID = {code: name.encode() for code, name in enumerate(VERDICTS)}
-COUNTS = tuple(column.name for column in MEASURED if column.dtype.startswith("i") and column.name in NUMBERS)
+_SAID = {code: name.encode() for code, name in enumerate(VERDICTS)}
+_COUNTS = tuple(column.name for column in MEASURED if column.dtype.startswith("i") and column.name in NUMBERS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,13 +126,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Made:
-    """Rows of a part, the traces that are kept, and the time of a processor it took, s."""
+    """Rows of a part, and the traces that are kept."""
 
     first: int
     last: int
-    columns: Columns
-    traces: dict[int, Trace] = field(default_factory=dict)
-    seconds: float = 0.0
+    columns: _Columns
+    traces: dict[int, Trace]
 
 
 def run_part(part: Part) -> Made:
@@ -144,14 +142,13 @@ def run_part(part: Part) -> Made:
     InputError
         If a drawn value is not one that its key takes.
     """
-    began = time.thread_time()
     design = _interned(part.design)
     runs = np.arange(part.first, part.last)
     table = _numbered(design, runs)
     traces: dict[int, Trace] = {}
     wanted = set(design.sweep.traces)
     with threadpool_limits(1):  # with more, sums may be taken in another order
-        for these in alike(design, runs):
+        for these in _alike(design, runs):
             rows = these - part.first
             at = design.numbers(int(these[0]))
             calibration = part.calibrations[design.calibration_key(at.cell, at.calibration)]
@@ -169,10 +166,10 @@ def run_part(part: Part) -> Made:
                 _put(table, np.array([run - part.first]), row)
                 if trace is not None:
                     traces[run] = trace
-    return Made(part.first, part.last, table, traces, time.thread_time() - began)
+    return Made(part.first, part.last, table, traces)
 
 
-def alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
+def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
     """Runs in groups that differ in their seeds alone."""
     at = design.placed(runs)
     drawn = at["draw"] if design.sweep.random else np.zeros_like(runs)
@@ -187,7 +184,7 @@ def compiled_by(design: Design, config: Config) -> bool:
     return not design.sweep.between_samples and is_compiled(config, name_of_run(config))
 
 
-def _numbered(design: Design, runs: IntArray) -> Columns:
+def _numbered(design: Design, runs: IntArray) -> _Columns:
     """Rows of runs that are not made yet, with their numbers and seeds."""
     missing = {"f8": math.nan, "i8": NONE, "i1": NONE}
     table = {
@@ -201,7 +198,7 @@ def _numbered(design: Design, runs: IntArray) -> Columns:
     return table
 
 
-def _put(table: Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
+def _put(table: _Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
     """Write values of columns, texts as bytes, one for all rows or one each."""
     for name, value in values.items():
         table[name][rows] = value.encode() if isinstance(value, str) else value
@@ -211,7 +208,7 @@ def _inputs(design: Design, run: int) -> dict[str, Any]:
     """Values of the grid and drawn ones, by column."""
     values = design.values(design.numbers(run).cell) | design.drawn(run)
     return {
-        name: shown(value) if not isinstance(value, (int, float)) or isinstance(value, bool) else value
+        name: _shown(value) if not isinstance(value, (int, float)) or isinstance(value, bool) else value
         for name, value in values.items()
     }
 
@@ -223,9 +220,9 @@ def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict
     except WorkFailed:
         return {"verdict": NOT_STARTED}
     found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
-    for name in COUNTS:
+    for name in _COUNTS:
         found[name] = np.where(numbers[:, VERDICT] < 0, NONE, found[name])
-    found["verdict"] = [SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
+    found["verdict"] = [_SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
     return found
 
 
@@ -241,7 +238,7 @@ def is_compiled(config: Config, name: str) -> bool:
     return six and sense_is_enough(config, name) and rehearses(config.trajectory.profile)
 
 
-def setting_of(scenario: Scenario, law: str) -> Setting:
+def _setting_of(scenario: Scenario, law: str) -> Setting:
     """All that compiled runs of a law share whose seeds differ."""
     watched, model = scenario.watched, scenario.calibration.model()
     return Setting(
@@ -269,7 +266,7 @@ def numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray
     WorkFailed
         If the task cannot be begun, whatever the seed.
     """
-    setting = setting_of(scenario, law)
+    setting = _setting_of(scenario, law)
     desk = new_desk(setting, len(scenario.watched.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))
     for first in range(0, len(seeds), TOGETHER):

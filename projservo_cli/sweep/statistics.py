@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import binomtest
 
 from projservo_cli.config.sweep import LAW
-from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.records import BoolArray
 from projservo_cli.store import SweepTable
 
-Z_95 = 1.959963984540054
 SUCCESS = "converged"
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 MEASURES = (
@@ -34,10 +34,8 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
     """
     if count == 0:
         return math.nan, math.nan
-    share, z2 = successes / count, Z_95 * Z_95
-    middle = (share + z2 / (2.0 * count)) / (1.0 + z2 / count)
-    half = Z_95 / (1.0 + z2 / count) * math.sqrt(share * (1.0 - share) / count + z2 / (4.0 * count * count))
-    return max(0.0, middle - half), min(1.0, middle + half)
+    interval = binomtest(successes, count).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 class Rows:
@@ -88,13 +86,13 @@ def statistics(rows: Rows) -> dict[str, Any]:
     """Statistics of every cell, and laws against each other, as JSON values."""
     return {
         "cells": [
-            {"cell": cell, **rows.values(cell), **of_runs(rows, these)} for cell, these in rows.cells()
+            {"cell": cell, **rows.values(cell), **_of_runs(rows, these)} for cell, these in rows.cells()
         ],
-        "paired": list(paired(rows)),
+        "paired": list(_paired(rows)),
     }
 
 
-def of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
+def _of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
     """Statistics of some runs; quantiles of those that converged."""
     count, good = int(these.sum()), these & rows["success"]
     successes = int(good.sum())
@@ -107,18 +105,18 @@ def of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
         "self_occluded_rate": float(rows["self_occluded"][these].mean()),
         "left_image_rate": float(rows["left_image"][these].mean()),
         "verdicts": dict(zip(verdicts.tolist(), counts.tolist(), strict=True)),
-        "quantiles": {name: quantiles(rows[name][good]) for name in MEASURES},
+        "quantiles": {name: _quantiles(rows[name][good]) for name in MEASURES},
     }
 
 
-def quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
+def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
     """Quantiles of values that are numbers; None where there is none."""
     numbers = values[np.isfinite(values)]
     found = np.quantile(numbers, QUANTILES).tolist() if len(numbers) else [None] * len(QUANTILES)
     return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}
 
 
-def paired(rows: Rows) -> Iterator[dict[str, Any]]:
+def _paired(rows: Rows) -> Iterator[dict[str, Any]]:
     """Each two laws on the same tasks with the same noise, in every combination of the other values."""
     names = [name for name, _ in rows.axes]
     if LAW not in names:
@@ -131,10 +129,10 @@ def paired(rows: Rows) -> Iterator[dict[str, Any]]:
     for laws in groups.values():
         for first, second in combinations(laws, 2):
             values, one = laws[first]
-            yield {**values, "laws": [first, second], **compared(rows, one, laws[second][1])}
+            yield {**values, "laws": [first, second], **_compared(rows, one, laws[second][1])}
 
 
-def compared(rows: Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
+def _compared(rows: Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
     """Runs of two laws that share their draws: how often which arrives, and differences where both do.
 
     The probabilities are of the exact test of McNemar and of the sign test: how often a difference as
@@ -150,25 +148,17 @@ def compared(rows: Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
         "both": int(both.sum()),
         "only": only,
         "neither": int((~a & ~b).sum()),
-        "p_success": chance(*only),
-        "median_difference": {name: median(values) for name, values in differences.items()},
+        "p_success": _chance(*only),
+        "median_difference": {name: _quantiles(values)["0.5"] for name, values in differences.items()},
         "p_difference": {
-            name: chance(int((values > 0).sum()), int((values < 0).sum()))
+            name: _chance(int((values > 0).sum()), int((values < 0).sum()))
             for name, values in differences.items()
         },
     }
 
 
-def median(values: FloatArray) -> float | None:
-    """Median of values that are numbers; None where there is none."""
-    numbers = values[np.isfinite(values)]
-    return float(np.median(numbers)) if len(numbers) else None
-
-
-def chance(first: int, second: int) -> float:
+def _chance(first: int, second: int) -> float:
     """Two-sided probability of a split as uneven as this or more, between equals."""
-    from scipy.stats import binomtest  # a second of importing, for comparisons alone
-
     return float(binomtest(first, first + second).pvalue) if first + second else 1.0
 
 

@@ -3,8 +3,9 @@
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.store import SweepTable
 from projservo_cli.sweep.design import read_design
-from projservo_cli.sweep.driver import Folder, run
-from projservo_cli.sweep.engine import LocalEngine
+from projservo_cli.sweep.driver import run
+from projservo_cli.sweep.engine import Engine
+from projservo_cli.sweep.folder import Folder
 from tests.conftest import ROOT
 
 QUICK = {"stop.max_steps": 60, "noise.servo_px": 0.3, "calibration.frames_per_joint": 6}
@@ -24,9 +25,19 @@ def design(**given):
     return read_design(SweepConfig.model_validate(values | given))
 
 
-def make(found, path, workers=1, **options):
+def make(found, path, workers=1, progress=lambda *_: None, **options):
     """Run a sweep into a folder; its status."""
-    return run(found, Folder(path), LocalEngine(workers), lambda *_: None, lambda _: None, **options)
+    return run(found, Folder(path), Engine(workers), progress, lambda _: None, **options)
+
+
+def interrupt_after(runs):
+    """Ctrl-C when so many runs are stored."""
+
+    def progress(what, done, total):
+        if what == "runs" and done >= runs:
+            raise KeyboardInterrupt
+
+    return progress
 
 
 def columns(path):

@@ -1,54 +1,40 @@
 """A sweep ended in every way and gone on with is the sweep that was not; its table is what readers expect."""
 
 import json
+import os
 import signal
+import subprocess
+import sys
 import threading
 
-import numpy as np
 import pytest
 
+from projservo_cli.cli import run
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.store import SweepTable
+from projservo_cli.store import SweepTable, load
 from projservo_cli.sweep import driver, engine
-from projservo_cli.sweep.driver import Folder, read_manifest, shares_settings, status_of
-from projservo_cli.sweep.runs import columns_of
-from tests.sweep.cases import columns, design, make
-from tests.sweep.processes import differences, finish, kill_group, parts, start, wait_for_parts, written
+from projservo_cli.sweep.driver import shares_settings
+from projservo_cli.sweep.engine import Engine
+from projservo_cli.sweep.folder import Folder
+from projservo_cli.sweep.runs import columns_of, run_part
+from tests.conftest import ROOT
+from tests.sweep.cases import columns, design, interrupt_after, make
+from tests.sweep.processes import (
+    ENVIRONMENT,
+    RUNS,
+    differences,
+    finish,
+    kill_group,
+    parts,
+    start,
+    wait_for_parts,
+)
 
 pytestmark = pytest.mark.volume
 
-RUNS = 300  # a law: some seconds of work, on a busy machine long after its first parts are seen
 
-
-@pytest.fixture(scope="module")
-def long(tmp_path_factory):
-    """Configuration and folder of a sweep of two laws, which takes long enough to be ended in its midst."""
-    folder = tmp_path_factory.mktemp("long")
-    config = written(folder, RUNS)
-    code, _, err = finish(start(config, folder / "out"))
-    assert code == 0, err
-    return config, folder / "out"
-
-
-def test_killed_and_run_again_equals_the_uninterrupted_one(long, tmp_path):
-    """Ten kills at random moments are made by ``python -m tests.sweep.processes 10``."""
-    config, reference = long
-    for stored in (1, 4):
-        process = start(config, tmp_path)
-        wait_for_parts(process, tmp_path, stored)
-        kill_group(process)
-    left = {path.name: path.stat().st_mtime_ns for path in parts(tmp_path)}
-    assert left
-    assert not (tmp_path / "sweep.h5").exists()
-    code, _, err = finish(start(config, tmp_path, "-j", "2"))
-    assert code == 0
-    assert f"{2 * len(left)} of {2 * RUNS} runs are stored already" in err
-    assert not differences(tmp_path, reference)
-    assert not parts(tmp_path)
-
-
-def test_interrupted_it_leaves_a_table_of_what_was_done(long, tmp_path):
-    config, reference = long
+def test_interrupted_then_killed_it_is_in_the_end_as_if_nothing_had_been(whole, tmp_path):
+    config, reference = whole
     process = start(config, tmp_path, "-j", "2")
     wait_for_parts(process, tmp_path, 2)
     process.send_signal(signal.SIGINT)
@@ -60,23 +46,26 @@ def test_interrupted_it_leaves_a_table_of_what_was_done(long, tmp_path):
     assert 4 <= len(rows) < 2 * RUNS
     for name in table.names:
         assert table.column(name).tobytes() == full.column(name)[rows].tobytes()
-    code, out, _ = finish(start(config, tmp_path, "--json"))
+    stored = len(parts(tmp_path))
+    assert 2 * stored == len(rows)
+    process = start(config, tmp_path)
+    wait_for_parts(process, tmp_path, stored + 2)
+    kill_group(process)
+    stored = len(parts(tmp_path))
+    assert stored < RUNS
+    code, out, err = finish(start(config, tmp_path, "-j", "2", "--json"))
+    assert code == 0, err
+    assert f"{2 * stored} of {2 * RUNS} runs are stored already" in err
     told = json.loads(out)
-    assert (code, told["complete"], told["runs"], told["done"], told["cells"]) == (
-        0,
-        True,
-        2 * RUNS,
-        2 * RUNS,
-        2,
-    )
+    assert (told["complete"], told["runs"], told["done"], told["cells"]) == (True, 2 * RUNS, 2 * RUNS, 2)
     assert not differences(tmp_path, reference)
+    assert not parts(tmp_path)
 
 
-def test_the_table_opens_in_xarray_and_pandas(long):
+def test_the_table_opens_in_xarray_and_pandas(whole):
     xarray = pytest.importorskip("xarray", reason="xarray is not installed")
-    pytest.importorskip("h5netcdf", reason="h5netcdf is not installed")
     pytest.importorskip("pandas", reason="pandas is not installed")
-    _, folder = long
+    _, folder = whole
     ours = columns(folder)
     with xarray.open_dataset(folder / "sweep.h5") as data:
         assert dict(data.sizes) == {"run": 2 * RUNS}
@@ -93,44 +82,36 @@ def test_the_table_opens_in_xarray_and_pandas(long):
         assert trace.attrs["law"] == "stacked"
 
 
-def test_another_configuration_is_refused_unless_forced(tmp_path):
-    first, second = design(runs=1, chunk=1), design(runs=1, chunk=1, seed=2)
+def test_what_is_not_of_this_sweep_is_refused(tmp_path):
+    """Another configuration unless forced, other versions, a damaged manifest, a table without one."""
+    first, second, folder = design(runs=1), design(runs=1, seed=2), Folder(tmp_path)
     make(first, tmp_path)
-    before = columns(tmp_path)
+    before = columns(tmp_path)["seed"].tolist()
     assert make(first, tmp_path).complete
     with pytest.raises(InputError, match=r"of another configuration.*--force"):
         make(second, tmp_path)
-    assert all(np.array_equal(columns(tmp_path)[name], before[name]) for name in ("run", "seed"))
+    assert columns(tmp_path)["seed"].tolist() == before
     make(second, tmp_path, force=True)
-    assert columns(tmp_path)["seed"].tolist() != before["seed"].tolist()
-
-
-def test_other_versions_do_not_go_on_with_a_sweep(tmp_path):
-    found, folder = design(runs=1, chunk=1), Folder(tmp_path)
-    make(found, tmp_path)
-    manifest = read_manifest(folder)
+    assert columns(tmp_path)["seed"].tolist() != before
+    manifest = json.loads(folder.manifest.read_text(encoding="utf-8"))
     manifest["provenance"]["numba"] = "0.1"
     folder.manifest.write_text(json.dumps(manifest), encoding="utf-8")
     with pytest.raises(InputError, match=r"made with numba 0\.1, now"):
-        status_of(found, folder, force=False)
+        folder.status(second)
     folder.manifest.write_text("{", encoding="utf-8")
     with pytest.raises(InputError, match="damaged"):
-        status_of(found, folder, force=False)
+        folder.status(second)
+    folder.manifest.unlink()
+    with pytest.raises(InputError, match="is missing; choose another folder"):
+        folder.status(second)
 
 
 def test_a_damaged_part_is_named(tmp_path):
     found, folder = design(runs=1, chunk=1, traces=[0]), Folder(tmp_path)
-
-    def interrupt(what, done, total):
-        if what == "runs" and done == 1:
-            raise KeyboardInterrupt
-
-    from projservo_cli.sweep.driver import run
-
     with pytest.raises(KeyboardInterrupt):
-        run(found, folder, engine.LocalEngine(1), interrupt, lambda _: None)
+        make(found, tmp_path, progress=interrupt_after(1))
     (part,) = folder.stored()
-    assert status_of(found, folder, force=False).done == 1
+    assert folder.status(found).done == 1
     assert SweepTable(folder.table).rows == 1
     assert len(columns(tmp_path)) == len(columns_of(found))
     part.write_bytes(part.read_bytes()[:1000])
@@ -144,19 +125,12 @@ def test_threads_give_the_same_and_are_left_in_order(tmp_path):
     assert shares_settings(found)
     assert make(found, tmp_path / "one").complete
     reference = columns(tmp_path / "one")
-
-    def interrupt(what, done, total):
-        if what == "runs" and done >= 10:
-            raise KeyboardInterrupt
-
-    two, say = Folder(tmp_path / "two"), [].append
     with pytest.raises(KeyboardInterrupt):
-        driver.run(found, two, engine.LocalEngine(2), interrupt, say)
+        make(found, tmp_path / "two", workers=2, progress=interrupt_after(10))
     assert not [thread for thread in threading.enumerate() if "ThreadPool" in thread.name]
-    rows = columns(two.path)["run"]
-    assert 10 <= len(rows) < 60
-    assert make(found, two.path, workers=2).complete
-    for name, values in columns(two.path).items():
+    assert 10 <= len(columns(tmp_path / "two")["run"]) < 60
+    assert make(found, tmp_path / "two", workers=2).complete
+    for name, values in columns(tmp_path / "two").items():
         assert values.tobytes() == reference[name].tobytes(), name
 
 
@@ -174,6 +148,22 @@ def test_runs_that_share_little_are_not_threads(given):
     assert not shares_settings(design(**given))
 
 
+MEMORY = """
+import re, sys
+from projservo_cli.cli import run
+run(["sweep", "-c", sys.argv[1], "--set", "runs=3000", "-o", sys.argv[2], "-j", "2", "-q"])
+print(re.search(r"VmHWM:\\s*([0-9]+) kB", open("/proc/self/status").read()).group(1))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak of memory is read from /proc")
+def test_memory_is_bounded(tmp_path):
+    """Machine code that is not there yet is made by a process of its own."""
+    command = [sys.executable, "-c", MEMORY, str(ROOT / "configs" / "sweep_speed.yaml"), str(tmp_path)]
+    ended = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    assert int(ended.stdout.splitlines()[-1]) <= 300_000
+
+
 def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypatch):
     """All runs are done, but there is no table; or there is, and its parts still are."""
 
@@ -181,50 +171,88 @@ def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypa
         raise SystemExit
 
     found, folder = design(runs=2, chunk=2), Folder(tmp_path)
-    for name in ("assembled", "shutil.rmtree"):
+    for name in ("Folder.assemble", "shutil.rmtree"):
         with monkeypatch.context() as patched:
             patched.setattr(f"projservo_cli.sweep.driver.{name}", killed)
             with pytest.raises(SystemExit):
                 make(found, tmp_path)
-        status = status_of(found, folder, force=False)
+        status = folder.status(found)
         assert (status.done, status.total, status.complete) == (4, 4, False)
     assert make(found, tmp_path).complete
-    assert status_of(found, folder, force=False).complete
+    assert folder.status(found).complete
     assert not parts(tmp_path)
     assert columns(tmp_path)["run"].tolist() == [0, 1, 2, 3]
 
 
-def slow_or_dead(job):
+def dead_once(job):
     """A job that ends its process the first time it is made."""
     number, marker = job
     if number == 3 and not marker.exists():
         marker.touch()
-        import os
-
         os._exit(9)
     return number
 
 
-def test_jobs_of_a_lost_process_are_made_again(tmp_path):
-    found = engine.LocalEngine(2)
-    jobs = [(number, tmp_path / "died") for number in range(12)]
-    try:
-        assert sorted(engine.completed(found, slow_or_dead, jobs)) == list(range(12))
-    finally:
-        found.close()
-    assert (tmp_path / "died").exists()
-
-
 def always_dead(job):
     """A job that no process survives."""
-    import os
-
     os._exit(9)
 
 
-def test_processes_that_die_again_and_again_end_in_words(monkeypatch):
+def test_jobs_of_a_lost_process_are_made_again_until_processes_die_again_and_again(tmp_path, monkeypatch):
+    jobs = [(number, tmp_path / "died") for number in range(12)]
+    assert sorted(Engine(2).completed(dead_once, jobs)) == list(range(12))
+    assert (tmp_path / "died").exists()
     monkeypatch.setattr(engine, "MOST_LOSSES", 1)
-    found = engine.LocalEngine(2)
     with pytest.raises(WorkFailed, match="lost 2 times in a row"):
-        list(engine.completed(found, always_dead, [1]))
-    found.close()
+        list(Engine(2).completed(always_dead, [1]))
+
+
+class Recorded(Engine):
+    """An engine of two that works here, and how many jobs of what it was given, one time after the other."""
+
+    def __init__(self, workers=2):
+        super().__init__(workers)
+        self.given = []
+
+    def completed(self, function, jobs, **_):
+        """Results of jobs in their order."""
+        jobs = list(jobs)
+        self.given.append(len(jobs))
+        yield from map(function, jobs)
+
+
+def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, monkeypatch):
+    """With a run of each law, also where a run of its own left a part; a filled one is left alone."""
+    cache = tmp_path / "cache" / "loop_0123"
+    cache.mkdir(parents=True)
+    monkeypatch.setattr(driver, "CACHE_FOLDER", cache.parent)
+    (cache / "compiled.run-108.py311.nbi").touch()
+    said = []
+    made = []
+    monkeypatch.setattr(driver, "run_part", lambda part: made.append(part) or run_part(part))
+
+    def given(workers=2):
+        found, recorded = design(runs=1, chunk=1), Recorded(workers)
+        made.clear()
+        folder = Folder(tmp_path / f"sweep{len(said)}{workers}")
+        driver.run(found, folder, recorded, lambda *_: None, said.append, force=True)
+        return recorded.given, [(part.first, part.last) for part in made]
+
+    every = [(0, 1), (1, 2)]
+    assert given(workers=1) == ([1, 2], every)
+    assert not said
+    assert given() == ([1, 1, 2], [(1, 2), (0, 1), *every])
+    assert said == ["compiling kernels, once, before the processes start"]
+    (cache / "trial.without_rehearsal-108.py311.nbi").touch()
+    assert given() == ([1, 2], every)
+
+
+def test_a_run_made_anew_has_the_numbers_of_its_row(whole, tmp_path):
+    _, folder = whole
+    for number in (3, RUNS + 4):
+        row = {name: values[number] for name, values in columns(folder).items()}
+        assert run(["servo", "--from", f"{folder}:{number}", "-o", str(tmp_path / str(number)), "-q"]) == 0
+        (trace,) = load(tmp_path / str(number)).traces.values()
+        assert (trace.law, trace.verdict, trace.steps) == (row["law"], row["verdict"], row["steps"])
+        assert trace.position_error_mm == row["position_error_mm"]
+        assert trace.effort == row["effort"]

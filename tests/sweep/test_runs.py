@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.sweep.design import name_of_run
-from projservo_cli.sweep.preparation import Wanted, calibrate_one, drawn_tasks
+from projservo_cli.sweep.preparation import calibrate_one, drawn_tasks
 from projservo_cli.sweep.runs import Part, run_part
 from tests.sweep.cases import design
 
@@ -17,38 +17,40 @@ CASES = {
         "grid": {"law": ["direct_three", "exact", "exact_track", "euclidean_points"]},
         "runs": 1,
     },
-    "points": {"set": {"control.observation": "points"}, "random": {"control.gain_s": {"uniform": [1, 3]}}},
+    "points": {
+        "set": {"control.observation": "points"},
+        "runs": 2,
+        "random": {"control.gain_s": {"uniform": [1, 3]}},
+    },
     "late images": {"set": {"disturbance.delay_periods": 2}, "runs": 2},
     "constrained": {"set": {"trajectory.profile": "constrained"}, "runs": 1, "between_samples": True},
     "python loop": {"set": {"plant.speed_scale": 0.5, "stop.max_steps": 10}, "runs": 1},
     "half turn": {"base": "paper", "runs": 2, "set": {"noise.calibration_px": 0.5}},
     "tasks": {"tasks": {"random": 4}, "grid": {"law": ["direct_two"]}, "runs": 4},
 }
-SAME = {
-    "position_error_mm": "position_error_mm",
-    "rotation_error_deg": "rotation_error_deg",
-    "self_occluded_steps_left": "self_occluded_steps_left",
-    "self_occluded_steps_right": "self_occluded_steps_right",
-    "first_outside_image": "first_outside_image",
-    "first_beyond_limit": "first_beyond_limit",
-    "speed_limited_steps": "speed_limited_steps",
-    "visibility_limited_steps": "visibility_limited_steps",
-    "path_length_mm": "path_length_mm",
-    "center_deviation_at_samples_mm": "center_deviation_at_samples_mm",
-    "center_deviation_mm": "center_deviation_mm",
-    "effort": "effort",
-    "steps": "steps",
-}
+# Columns of the name of a field of the trace.
+SAME = (
+    "position_error_mm",
+    "rotation_error_deg",
+    "self_occluded_steps_left",
+    "self_occluded_steps_right",
+    "first_outside_image",
+    "first_beyond_limit",
+    "speed_limited_steps",
+    "visibility_limited_steps",
+    "path_length_mm",
+    "center_deviation_at_samples_mm",
+    "center_deviation_mm",
+    "effort",
+    "steps",
+)
 
 
 def part_of(found, first=0, last=None):
     """A part with all it needs."""
     tasks = {} if found.sweep.tasks is None else {0: drawn_tasks(found, 0, found.sweep.tasks.random)}
-    made = [
-        calibrate_one(Wanted(found.calibration_key(*place), found.calibrated(*place)))
-        for place in found.calibrations()
-    ]
-    calibrations = {one.wanted.key: one.records and one.records[1] for one in made}
+    made = [calibrate_one(wanted) for wanted in found.calibrations()]
+    calibrations = {one.key: one.records and one.records[1] for one in made}
     return Part(found, first, found.total if last is None else last, calibrations, tasks)
 
 
@@ -57,18 +59,21 @@ def part_of(found, first=0, last=None):
 def test_every_run_redone_by_the_stages_is_its_row(name):
     found = design(**CASES[name])
     part = part_of(found)
-    made = run_part(part)
+    made, calibrations = run_part(part), {}
     for i in range(found.total):
         config = found.config(i, part.tasks)
-        _, calibration, _ = calibrate.run(config)
+        at = found.numbers(i)
+        key = found.calibration_key(at.cell, at.calibration)
+        if key not in calibrations:
+            calibrations[key] = calibrate.run(config)[1]
+        calibration = calibrations[key]
         trace = servo.run(config, calibration, plan.run(config, calibration), name_of_run(config))
         row = {column: values[i] for column, values in made.columns.items()}
         assert row["verdict"].decode() == trace.verdict
         assert row["seed"] == config.seed
         assert row["image_error_px"] == trace.image_error[-1]
-        for column, field in SAME.items():
-            if column in row:
-                assert row[column] == getattr(trace, field), column
+        for column in row.keys() & set(SAME):
+            assert row[column] == getattr(trace, column), column
         R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
         angle = math.degrees(math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
         assert row["rotation_deg"] == pytest.approx(angle, abs=1e-4)

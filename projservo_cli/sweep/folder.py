@@ -1,0 +1,194 @@
+"""The folder of a sweep: what it is of, how far it is, and one of its runs anew.
+
+A manifest says what all else is of. While a sweep runs there is a file for each part; a part that is there
+is done, so after any end the same command goes on with the others. The table is assembled from them, and
+when it is complete they are removed. Calibrations and random tasks stay, to make any run anew.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from projservo_cli import provenance
+from projservo_cli.config import Config
+from projservo_cli.files import replacing
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages.chain import steps_for
+from projservo_cli.store import TABLE, Result, Run, SweepTable, assemble, load
+from projservo_cli.sweep.design import Design, from_recipe
+from projservo_cli.sweep.engine import versions
+from projservo_cli.sweep.preparation import REFUSED, calibration_path, read_tasks
+from projservo_cli.sweep.runs import columns_of
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a sweep is.
+
+    Attributes
+    ----------
+    done, total : runs that are stored, and in all.
+    chunk : runs of a part; 0 before it began.
+    complete : whether nothing is left to do: all runs are in the table, and the parts are removed.
+    """
+
+    done: int
+    total: int
+    chunk: int
+    complete: bool = False
+
+
+class Folder:
+    """The folder of a sweep, by its name or by that of its table."""
+
+    def __init__(self, target: Path | str) -> None:
+        path = Path(target)
+        self.path = path.parent if path.name == TABLE else path
+        self.table = self.path / TABLE
+        self.parts = self.path / "parts"
+        self.manifest = self.path / "manifest.json"
+
+    def part(self, first: int, last: int) -> Path:
+        """File of the runs ``first`` to ``last`` - 1."""
+        return self.parts / f"{first:010d}-{last:010d}.h5"
+
+    def stored(self) -> list[Path]:
+        """Parts that are done, in the order of their runs."""
+        return sorted(self.parts.glob("[0-9]*-[0-9]*.h5"))
+
+    def missing(self, design: Design, chunk: int) -> Iterator[tuple[int, int]]:
+        """First run of each part that is not done, and the one after its last."""
+        stored = set(self.stored())
+        for first in range(0, design.total, chunk):
+            last = min(first + chunk, design.total)
+            if self.part(first, last) not in stored:
+                yield first, last
+
+    def status(self, design: Design, *, force: bool = False) -> Status:
+        """How far a sweep is.
+
+        Raises
+        ------
+        InputError
+            If the folder holds another sweep, or one made with other versions, and ``force`` is not set.
+        """
+        total = design.total
+        if not force and self.table.exists() and not self.manifest.exists():
+            raise InputError(
+                f"{self.table}: its {self.manifest.name} is missing; choose another folder or use --force"
+            )
+        if force or not self.manifest.exists():
+            return Status(0, total, 0)
+        chunk = self._chunk(design)
+        if self.table.exists() and SweepTable(self.table).rows == total:
+            return Status(total, total, chunk, complete=not self.stored())
+        left = sum(last - first for first, last in self.missing(design, chunk))
+        return Status(total - left, total, chunk)
+
+    def _chunk(self, design: Design) -> int:
+        """Runs of a part; refuses what was made of another configuration, or with versions of other bits."""
+        manifest, now = self._read(), versions()
+        if manifest["key"] != design.key:
+            raise InputError(
+                f"{self.manifest}: of another configuration; choose another folder with -o, or begin anew "
+                "with --force"
+            )
+        made_with = manifest["provenance"]
+        other = [f"{name} {made_with[name]}, now {now[name]}" for name in now if made_with[name] != now[name]]
+        if other:
+            raise InputError(
+                f"{self.manifest}: made with {'; '.join(other)}: a sweep is not continued with other "
+                "versions; begin anew with --force"
+            )
+        return int(manifest["chunk"])
+
+    def _read(self) -> dict[str, Any]:
+        """Key and recipe of the design, runs a part, and with what it is made."""
+        if not self.manifest.exists():
+            raise InputError(f"{self.path}: holds no sweep; make one with projservo sweep -c FILE")
+        try:
+            found: dict[str, Any] = json.loads(self.manifest.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{self.manifest}: damaged; begin anew with --force") from error
+        return found
+
+    def design(self) -> Design:
+        """The design of the sweep that the folder holds.
+
+        Raises
+        ------
+        InputError
+            If there is no sweep.
+        """
+        return from_recipe(self._read()["recipe"])
+
+    def begin(self, design: Design, chunk: int) -> None:
+        """Write the manifest."""
+        origin = provenance.collect(seed=design.sweep.seed)
+        values = {"key": design.key, "chunk": chunk, "provenance": origin, "recipe": design.recipe}
+        with replacing(self.manifest) as temporary:
+            temporary.write_text(json.dumps(values), encoding="utf-8")
+
+    def clear(self) -> None:
+        """Remove what a sweep of another configuration left."""
+        for path in (self.parts, self.path / "calibrations"):
+            shutil.rmtree(path, ignore_errors=True)
+        for path in (self.table, self.manifest, *self.path.glob("tasks_*.npz")):
+            path.unlink(missing_ok=True)
+
+    def assemble(self, design: Design) -> None:
+        """Put the stored parts together to the table."""
+        columns = columns_of(design)
+        attributes = {
+            "name": design.sweep.name,
+            "key": design.key,
+            "random": list(design.sweep.random),
+            "axes": [[axis.name, list(axis.values)] for axis in design.axes],
+            "columns": [column.name for column in columns],
+            "provenance": self._read()["provenance"],
+            "total": design.total,
+        }
+        headings = [(column.name, column.dtype, column.units, column.about) for column in columns]
+        assemble(self.table, self.stored(), headings, attributes)
+
+
+def run_of(target: str) -> tuple[Config, Result | None]:
+    """Configuration of a run of a sweep, and the calibration it was made with.
+
+    Parameters
+    ----------
+    target : SWEEP:INDEX, the folder of a sweep (or its table) and the number of the run.
+
+    Returns
+    -------
+    The calibration is None where the sweep has not come to it yet.
+
+    Raises
+    ------
+    InputError
+        If there is no such sweep or run.
+    WorkFailed
+        If the calibration of the run was refused.
+    """
+    sweep, _, index = target.rpartition(":")
+    if not sweep or not index.isdecimal():
+        raise InputError(f"--from {target}: expected SWEEP:INDEX, such as results/sweep_noise:17")
+    folder = Folder(sweep)
+    design = folder.design()
+    at = design.numbers(int(index))
+    base = design.base_of(at.cell)
+    tasks = {}
+    if design.sweep.tasks is not None:
+        tasks[base] = read_tasks(folder.path / f"tasks_{design.bases[base][0]}.npz")
+    config = design.config(at.run, tasks).model_copy(update={"name": f"{design.sweep.name}-{at.run}"})
+    path = calibration_path(folder.path, design.calibration_key(at.cell, at.calibration))
+    refused = path.with_suffix(REFUSED)
+    if refused.exists():
+        raise WorkFailed(f"run {at.run}: {refused.read_text(encoding='utf-8').strip()}")
+    if not path.exists():
+        return config, None
+    (step,) = steps_for(config, Run(path), ["calibrate"])
+    return config, replace(load(path).results["calibrate"], key=step.key)
