@@ -9,14 +9,13 @@ import pytest
 
 from projservo_cli.records import CrossValidation, Report
 from projservo_cli.report.content import calibration_words, inline, number, short
-from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.page import write_comparison, write_page
 from projservo_cli.report.values import PAGE_FILE
 from projservo_cli.stages import report
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from tests.fake_records import fake
-from tests.figures.cases import case
+from tests.figures.cases import SPECS, case
 from tests.page.conftest import SOME, claims_of, numbers, read, stored, words
 
 
@@ -71,9 +70,8 @@ def test_headings_sections_language_and_title(page):
 def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
     figures = list(page.all("figure"))
     assert sorted(figure.attributes["id"] for figure in figures) == sorted(SOME)
-    specs = {spec.name: spec for spec in FIGURES}
     for figure in figures:
-        spec = specs[figure.attributes["id"]]
+        spec = SPECS[figure.attributes["id"]]
         (image,) = figure.all("svg")
         assert image.attributes["role"] == "img"
         assert image.attributes["aria-label"] == spec.alt
@@ -86,12 +84,12 @@ def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
 
 
 def test_all_figures_say_what_can_be_seen():
-    texts = [spec.alt for spec in FIGURES if spec.alt]
+    texts = [spec.alt for spec in SPECS.values() if spec.alt]
     assert len(set(texts)) == len(texts) >= 14
 
 
 def test_numbers_of_a_figure_are_those_that_are_drawn(run):
-    spec = next(spec for spec in FIGURES if spec.name == "fig08_drift")
+    spec = SPECS["fig08_drift"]
     data = spec.data(case()[2])
     with open(run.path.parent / "figures" / "fig08_drift.csv", encoding="utf-8", newline="") as file:
         header, *rows = csv.reader(file)
