@@ -2,20 +2,21 @@
 
 import csv
 import dataclasses
+import math
 import re
 
 import numpy as np
 import pytest
 
 from projservo_cli.records import CrossValidation, Report
-from projservo_cli.report.content import calibration_words, inline, number, short
-from projservo_cli.report.page import write_comparison, write_page
-from projservo_cli.report.values import PAGE_FILE
+from projservo_cli.report.page import calibration_words, inline, number, short, write_comparison, write_page
+from projservo_cli.report.values import PAGE_FILE, stage_object
 from projservo_cli.stages import report
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from tests.fake_records import fake
 from tests.figures.cases import SPECS, case
+from tests.known import configured
 from tests.page.conftest import SOME, claims_of, numbers, read, stored, words
 
 
@@ -132,14 +133,6 @@ def test_what_was_run_and_why_each_law_ended(page, run):
     assert f"Joint {worst} is known worst" in text
     (configuration,) = page.all("pre")
     assert configuration.text.strip() == run.configuration.strip()
-
-
-def test_the_worst_determined_direction_is_told(run):
-    calibration = dataclasses.replace(run.calibration, worst_determined="joint 2's axis: its tilt")
-    assert "Worst determined of all is joint 2's axis: its tilt." in calibration_words(
-        calibration, estimated=False
-    )
-    assert not any("of all" in sentence for sentence in calibration_words(run.calibration, estimated=False))
 
 
 def test_the_same_run_gives_the_same_bytes(run):
@@ -312,17 +305,18 @@ def test_a_weak_joint_and_what_was_left_out_are_named(run, tmp_path):
         advice=("move joint 2",),
         lens=np.array([[640, 512, 800, -0.0625, 0.5], [640, 512, 800, 0.25, 0.0]]),
     )
-    text = " ".join(calibration_words(calibration, estimated=True))
+    result = run.results["calibrate"]
+    result = dataclasses.replace(result, records={**result.records, "calibration": calibration})
+    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
+    found = stage_object("calibrate", other, configured("paper"), [])
+    text = " ".join(calibration_words(found, estimated=True))
     assert text.startswith("Not usable: ")
     assert "an estimate from these images" in text
     assert "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times" in text
     assert "so this one is weak." in text
     assert "2 readings left out as outliers. 1 joint reading contradicts the images." in text
-    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan), method="linear")
-    assert "The method linear states no uncertainty" in " ".join(calibration_words(unknown, estimated=False))
-    result = run.results["calibrate"]
-    result = dataclasses.replace(result, records={**result.records, "calibration": calibration})
-    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
+    unknown = found | {"joints": [joint | {"noise": math.nan} for joint in found["joints"]]}
+    assert "states no uncertainty" in " ".join(calibration_words(unknown, estimated=False))
     shown = words(read(write_page(other)).text)
     assert "✗ not usable" in shown
     assert "What to do next: move joint 2" in shown
