@@ -1,27 +1,545 @@
 """A report as one page of HTML that needs nothing else: no network, no scripts, no other file."""
 
+import base64
+import json
+import math
 import os
-from collections.abc import Sequence
-from dataclasses import replace
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from projservo_cli.files import replacing
-from projservo_cli.report.content import (
-    View,
-    claim_rows,
-    differences,
-    number,
-    picture_rows,
-    short,
-    view_of,
-)
-from projservo_cli.report.values import PAGE_FILE
+import numpy as np
+from markupsafe import Markup
+
+from projservo_cli.calibration.quality import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
+from projservo_cli.config import Config, load_config
+from projservo_cli.files import inside, replacing
+from projservo_cli.records import Plan, Report, name_of
+from projservo_cli.report.figures import FIGURES
+from projservo_cli.report.figures.drift import drift_rows
+from projservo_cli.report.material import VIEWS, FigureSpec, title
+from projservo_cli.report.style import FORMATS
+from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, stage_object
 from projservo_cli.store import Run
 
 if TYPE_CHECKING:
     from jinja2 import Template
+
+_MINUS = "\N{MINUS SIGN}"
+_NONE = "\N{EN DASH}"
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def short(value: float | None, digits: int = 3) -> str:
+    """A number with few digits, powers of ten set as such; a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return _NONE
+    if value == 0 or isinstance(value, (int, np.integer)):
+        return f"{value:.0f}".replace("-", _MINUS)
+    power = math.floor(math.log10(abs(value)))
+    if digits <= power + 1 <= 6:
+        return f"{value:.0f}".replace("-", _MINUS)
+    text = f"{value:.{digits}g}"
+    mantissa, sign, exponent = text.partition("e")
+    if sign:
+        text = f"{mantissa} × 10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+    return text.replace("-", _MINUS)
+
+
+def number(value: Any, digits: int = 3) -> Markup:
+    """A number for the eye that carries all of its digits for programs."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    if plain is None or not math.isfinite(plain):
+        return Markup(_NONE)
+    return Markup('<data value="{}">{}</data>').format(repr(plain), short(plain, digits))
+
+
+def calibration_words(found: Mapping[str, Any], *, estimated: bool) -> list[str]:
+    """Whether a calibration is good, why, and which joint is known worst, a sentence each.
+
+    Parameters
+    ----------
+    found : its plain values, as of ``stage_object``.
+    estimated : whether the noise was estimated from the same images, so that χ² alone decides nothing.
+    """
+    words = [f"{'Usable' if found['usable'] else 'Not usable'}: {found['reason']}."]
+    if math.isfinite(found["chi2_per_dof"]) and found["dof"] > 0:
+        low, high = chi2_band(found["dof"])
+        words.append(
+            f"χ² per degree of freedom is {short(found['chi2_per_dof'])} at {short(found['sigma_px'])} px of "
+            f"noise per coordinate, with {found['dof']} degrees of freedom; where model and noise are true "
+            f"it stays within {short(low)} and {short(high)}."
+            + (" The noise is itself an estimate from these images." if estimated else "")
+        )
+    words.append(_worst_joint(found))
+    if found["predicted_rms_px"] is not None and found["predicted_p99_px"] is not None:
+        rms, bound = short(found["predicted_rms_px"]), short(found["predicted_p99_px"])
+        words.append(
+            f"Within the ranges of the joints images are expected to err by {rms} px rms, and in 99 of 100 "
+            f"calibrations by less than {bound} px."
+        )
+    left_out = (
+        ("outliers", "reading", "left out as an outlier", "left out as outliers"),
+        ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
+        ("swapped", "marker", "was renumbered", "were renumbered"),
+    )
+    for name, what, one, many in left_out:
+        if count := len(found[name]):
+            words.append(f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}.")
+    if "cross_validation" in found:
+        words.append(_held_out_words(found["cross_validation"]))
+    return words
+
+
+def _worst_joint(found: Mapping[str, Any]) -> str:
+    known = [(joint["noise"], i) for i, joint in enumerate(found["joints"]) if math.isfinite(joint["noise"])]
+    if not known:
+        return f"The method {found['method']} states no uncertainty, so no joint can be called the worst."
+    noise, worst = max(known)
+    reach = f"{REACH_M:g} m" if found["joints"][worst]["type"] == "P" else f"{REACH_RAD:g} rad"
+    return (
+        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {short(noise)} times the "
+        f"pixel noise to predicted images; a joint is weak above {WEAK_NOISE:g}, so this one is "
+        f"{'weak' if noise > WEAK_NOISE else 'well determined'}."
+    )
+
+
+def _held_out_words(value: Mapping[str, Any]) -> str:
+    """How well poses were predicted that the fit had not seen, in a sentence or two."""
+    names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")
+    rms, predicted, median, p95 = (short(value[name]) for name in names)
+    reason = value["reason"]
+    text = (
+        f"Held out, in {value['folds']} parts of {value['unit']}: rms {rms} px where noise and covariance "
+        f"predict {predicted} px, median {median} px, 95th percentile {p95} px. "
+        f"{reason[:1].upper()}{reason[1:]}."
+    )
+    return text.replace("..", ".")
+
+
+def _law_words(trace: Mapping[str, Any]) -> str:
+    """Verdict of a law, its reason, and where it ended, in one sentence."""
+    steps, reason = trace["steps"], trace["reason"]
+    took = f"{steps} step{'s' * (steps != 1)} ({short(steps * trace['period'])} s)"
+    text = f"{title(name_of(trace['law'], trace['mode']))}: {trace['verdict']} after {took}"
+    if reason:
+        text += f", because the {reason}" if reason.startswith("image error") else f": {reason}"
+    if trace["position_error_mm"] is not None and trace["rotation_error_deg"] is not None:
+        text += (
+            f"; the face is then {short(trace['position_error_mm'])} mm and "
+            f"{short(trace['rotation_error_deg'])}° from its goal"
+        )
+    return f"{text}."
+
+
+_SVG = "{http://www.w3.org/2000/svg}"
+_HREF = "{http://www.w3.org/1999/xlink}href"
+_SHAPES = ("path", "use", "rect", "circle", "ellipse", "line", "polyline", "polygon", "image")
+_ELEMENTS = frozenset((*_SHAPES, "svg", "g", "defs", "clipPath", "pattern"))
+_PLACES = ("x", "y", "width", "height", "cx", "cy", "r", "rx", "ry", "x1", "x2", "y1", "y2", "points", "d")
+_PAINTS = ("style", "fill", "stroke", "opacity", "clip-path", "transform", "patternUnits")
+_ATTRIBUTES = frozenset((*_PLACES, *_PAINTS, "id", "href", "preserveAspectRatio"))
+_PICTURE = "data:image/png;base64,"
+_REFERENCE = re.compile(r"url\(#([\w.:-]+)\)")
+
+
+def inline(svg: bytes, prefix: str, alt: str) -> Markup | None:
+    """An SVG image to stand within HTML; None where the file is not one.
+
+    Only shapes and what paints them are kept, so that the file of a stranger can neither run a
+    script nor fetch anything; references lead to names that start with ``prefix``.
+
+    Parameters
+    ----------
+    svg : content of the file.
+    prefix : unlike those of all other images of the page.
+    alt : what the image shows, for those who do not see it.
+    """
+    try:
+        root = ET.fromstring(svg)
+    except ET.ParseError:
+        return None
+    if root.tag != f"{_SVG}svg" or "viewBox" not in root.attrib:
+        return None
+    view = " ".join(root.attrib["viewBox"].split())
+    used = _references(root)
+    _clean(root, prefix, used)
+    root.attrib.clear()
+    root.attrib.update({"viewBox": view, "role": "img", "aria-label": alt})
+    return Markup(ET.tostring(root, encoding="unicode"))
+
+
+def _references(root: ET.Element) -> set[str]:
+    """Names that something in the image refers to."""
+    found: set[str] = set()
+    for element in root.iter():
+        for name, value in element.attrib.items():
+            if name in (_HREF, "href") and value.startswith("#"):
+                found.add(value[1:])
+            elif "url(" in value:
+                found.update(_REFERENCE.findall(value))
+    return found
+
+
+def _clean(element: ET.Element, prefix: str, used: set[str]) -> None:
+    element.tag = element.tag.removeprefix(_SVG)
+    element.text = element.tail = None
+    kept = {}
+    for name, value in element.attrib.items():
+        name = "href" if name == _HREF else name
+        text = _attribute(name, value, prefix, used)
+        if text is not None:
+            kept[name] = text
+    element.attrib.clear()
+    element.attrib.update(kept)
+    for child in list(element):
+        tag: Any = child.tag  # of a comment it is a function
+        if isinstance(tag, str) and tag.startswith(_SVG) and tag.removeprefix(_SVG) in _ELEMENTS:
+            _clean(child, prefix, used)
+        else:
+            element.remove(child)
+
+
+def _attribute(name: str, value: str, prefix: str, used: set[str]) -> str | None:
+    """The value of an attribute as the page has it; None where it is to go."""
+    if name not in _ATTRIBUTES:
+        return None
+    value = " ".join(value.split())
+    if name == "id":
+        return prefix + value if value in used else None
+    if name == "href":
+        return f"#{prefix}{value[1:]}" if value.startswith("#") else _picture_vector(value)
+    changed = _REFERENCE.sub(rf"url(#{prefix}\1)", value)
+    foreign = _REFERENCE.sub("", value).lower()
+    return None if any(sign in foreign for sign in ("url", "@", "\\", "expression")) else changed
+
+
+def _picture_vector(value: str) -> str | None:
+    return value.replace(" ", "") if value.startswith(_PICTURE) else None
+
+
+SECTIONS = ("calibration", "plan", "control")
+_MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One figure.
+
+    Attributes
+    ----------
+    anchor : its name within the page.
+    number : as in the names of its files.
+    caption, paper : what it shows, and which figure and section of the paper it follows.
+    drawing : the figure itself; None where there is no file that a page can show.
+    links : (label, path) of its files and of the numbers behind it.
+    """
+
+    anchor: str
+    number: str
+    caption: str
+    paper: str
+    drawing: Markup | None
+    links: tuple[tuple[str, str], ...]
+
+
+def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -> dict[str, list[Picture]]:
+    """Figures by section, in their order.
+
+    Parameters
+    ----------
+    directory : of the run.
+    files : those the report wrote, relative to it.
+    folder : of the run as seen from the page, empty or ending in a slash.
+    prefix : of all names within the page.
+    """
+    found: dict[str, list[Picture]] = {section: [] for section in SECTIONS}
+    for spec in FIGURES:
+        kinds = [kind for kind in FORMATS if _file(spec, kind) in files]
+        if kinds:
+            found[_section(spec)].append(_picture(spec, directory, kinds, folder, prefix))
+    return found
+
+
+def _file(spec: FigureSpec, kind: str) -> str:
+    return f"figures/{spec.name}.{kind}"
+
+
+def _section(spec: FigureSpec) -> str:
+    if not spec.task:
+        return "calibration"
+    return "control" if spec.laws or spec.studies or spec.modes else "plan"
+
+
+def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> Picture:
+    drawing = None
+    for kind in ("svg", "png"):
+        content = _content(directory, _file(spec, kind)) if kind in kinds and drawing is None else None
+        if content is not None:
+            drawing = _drawn(content, kind, f"{prefix}{spec.name}-", spec.alt or spec.title)
+    links = [(kind.upper(), folder + _file(spec, kind)) for kind in kinds]
+    if (directory / _file(spec, "csv")).is_file():
+        links.insert(0, ("numbers (CSV)", folder + _file(spec, "csv")))
+    digits = "".join(c for c in spec.name.partition("_")[0] if c.isdigit())
+    return Picture(
+        f"{prefix}{spec.name}", str(int(digits or 0)), spec.title, spec.paper, drawing, tuple(links)
+    )
+
+
+def _content(directory: Path, name: str) -> bytes | None:
+    """Content of a figure; None where it is none, or one that a link takes from elsewhere."""
+    path = directory / name
+    try:
+        return path.read_bytes() if inside(path, directory) and path.stat().st_size <= _MOST_BYTES else None
+    except OSError:
+        return None
+
+
+def _drawn(content: bytes, kind: str, prefix: str, alt: str) -> Markup | None:
+    if kind == "svg":
+        return inline(content, prefix, alt)
+    data = base64.b64encode(content).decode()
+    return Markup('<img src="data:image/png;base64,{}" alt="{}">').format(data, alt)
+
+
+# What may lie beside the page, and what the page calls it.
+_EXTRAS = {VIEW_FILE: "3D view with a time slider", ANIMATION_FILE: "animation of both camera images (GIF)"}
+# What made a run: key in the provenance, and what the page calls it.
+_MADE = {
+    "date": "date",
+    "argv": "command",
+    "projservo": "projservo",
+    "git_commit": "commit",
+    "host": "host",
+    "system": "system",
+    "cpu": "processor",
+}
+_VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
+
+
+@dataclass(frozen=True)
+class View:
+    """One run as the page shows it; what it lacks is empty or None.
+
+    Attributes
+    ----------
+    name : of its configuration.
+    folder : of the run, relative to the page.
+    config : settings, and ``configuration`` the same as YAML with all defaults.
+    made : (property, value) of what the run was made with.
+    calibration, plan, laws, claims, left_out : plain values of each stage, with what only the page tells.
+    drift : table of the report; None where there is none.
+    pictures : the figures by section.
+    extras : (label, path) of what lies beside the page.
+    """
+
+    name: str
+    folder: str
+    config: Config
+    configuration: str
+    made: list[tuple[str, str]]
+    calibration: dict[str, Any] | None = None
+    plan: dict[str, Any] | None = None
+    laws: list[dict[str, Any]] = field(default_factory=list)
+    claims: Sequence[dict[str, Any]] = ()
+    drift: dict[str, Any] | None = None
+    left_out: dict[str, list[str]] = field(default_factory=dict)
+    reported: bool = False
+    pictures: dict[str, list[Picture]] = field(default_factory=lambda: {name: [] for name in SECTIONS})
+    extras: tuple[tuple[str, str], ...] = ()
+
+
+def _view(run: Run, *, folder: str = "", prefix: str = "") -> View:
+    """What the page shows of a run.
+
+    Parameters
+    ----------
+    run : the run; its figures are read from its folder.
+    folder : of the run as seen from the page, empty or ending in a slash.
+    prefix : of all names within the page, where it shows several runs.
+    """
+    config = load_config(run.path, text=run.configuration)
+    stages = {name.split("/")[0] for name in run.results}
+    found = {stage: stage_object(stage, run, config, list(run.traces)) for stage in stages}
+    shown = View(
+        config.name,
+        folder,
+        config,
+        run.configuration,
+        list(_made(run, config)),
+        calibration=_calibration(found["calibrate"], config) if "calibrate" in found else None,
+        plan=found["plan"] | _visibility(run.plan) if "plan" in found else None,
+        laws=[_law(trace, config) for trace in found["servo"]["laws"]] if "servo" in found else [],
+        extras=tuple(
+            (label, folder + name) for name, label in _EXTRAS.items() if (run.path.parent / name).is_file()
+        ),
+    )
+    if "report" not in found:
+        return shown
+    report: Report = run.results["report"].records[""]
+    left_out: dict[str, list[str]] = {}
+    for entry in report.left_out:
+        left_out.setdefault(entry["reason"], []).append(entry["what"])
+    return replace(
+        shown,
+        claims=report.claims,
+        drift=_drift(report),
+        left_out=left_out,
+        reported=True,
+        pictures=_pictures(run.path.parent, report.figures, folder, prefix),
+    )
+
+
+def _made(run: Run, config: Config) -> Iterator[tuple[str, str]]:
+    """What was run, from what and with what; a value that stages differ in stands with its stages."""
+    yield "configuration", f"{config.name}, {'recorded' if config.recorded else 'simulated'}"
+    yield "seed", str(config.seed)
+    inputs = {key: text for result in run.results.values() for key, text in result.inputs.items()}
+    for key, text in inputs.items():
+        yield key.replace("_", " "), text
+    stages = {name: result.provenance for name, result in run.results.items()}
+    for key, label in _MADE.items():
+        yield from _values(label, {name: _told(key, made) for name, made in stages.items()})
+    versions = {
+        name: ", ".join(f"{package} {made[package]}" for package in _VERSIONS if made.get(package))
+        for name, made in stages.items()
+    }
+    yield from _values("versions", versions)
+
+
+def _told(key: str, made: Any) -> str:
+    value = made.get(key)
+    if value is None:
+        return ""
+    if key == "argv":
+        return " ".join(["projservo", *value[1:]])
+    if key == "date":
+        moment = datetime.fromisoformat(value)
+        return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC" if moment.tzinfo else str(value)
+    if key == "git_commit":
+        return f"{value}{', with changes' if made.get('git_dirty') else ''}"
+    return str(value)
+
+
+def _values(label: str, told: dict[str, str]) -> Iterator[tuple[str, str]]:
+    by_value: dict[str, list[str]] = {}
+    for name, value in told.items():
+        if value:
+            by_value.setdefault(value, []).append(name.split("/")[0])
+    for value, names in by_value.items():
+        yield label, value if len(by_value) == 1 else f"{value} ({', '.join(dict.fromkeys(names))})"
+
+
+def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
+    """Plain values of a calibration with its sentences, and its numbers with their labels and units."""
+    estimated = config.data is not None and config.data.noise_px is None
+    lens = [
+        (f"lens of the {view} camera, {k}", terms[k], "")
+        for view, terms in (found["lens"] or {}).items()
+        for k in ("k1", "k2")
+    ]
+    numbers = [
+        ("method", found["method"], ""),
+        ("source", found["source"], ""),
+        ("residual, rms per marker and view", found["rms_px"], "px"),
+        ("noise per coordinate, as taken", found["sigma_px"], "px"),
+        ("noise per coordinate, from the residuals", found["sigma_fitted_px"], "px"),
+        ("χ² per degree of freedom", found["chi2_per_dof"], ""),
+        ("degrees of freedom", found["dof"], ""),
+        ("poses", found["merged_poses"], ""),
+        ("markers", found["merged_markers"], ""),
+        *lens,
+        ("time", found["seconds"], "s"),
+    ]
+    return found | {"words": calibration_words(found, estimated=estimated), "numbers": numbers}
+
+
+def _visibility(plan: Plan) -> dict[str, Any]:
+    """Where each camera sees the face least, and where that changes; both senses of the rotation."""
+    views = []
+    for v, name in enumerate(VIEWS):
+        least = int(np.argmin(plan.margin[:, v]))
+        views.append(
+            {
+                "name": name,
+                "margin": float(plan.margin[least, v]),
+                "sigma": float(plan.sigma[least]),
+                "tau_0": float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None,
+                "theta_0": np.degrees(plan.theta_0[v]).tolist(),
+                "sense_margins": plan.sense_margin[:, v].tolist(),
+            }
+        )
+    return {"views": views, "senses": np.degrees(plan.sense).tolist()}
+
+
+def _law(trace: dict[str, Any], config: Config) -> dict[str, Any]:
+    return trace | {
+        "title": title(name_of(trace["law"], trace["mode"])),
+        "words": _law_words(trace),
+        "converged": trace["verdict"] == "converged",
+        "must": trace["law"] in config.control.must_converge,
+    }
+
+
+def _drift(report: Report) -> dict[str, Any] | None:
+    """The drift table: a row for law, operators and limit, a column for each gain."""
+    if not report.drift_mm.size:
+        return None
+    rows: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+    for row in drift_rows(report):
+        rows.setdefault((row["law"], row["operators"], row["limit_deg_per_step"]), []).append(row)
+    return {
+        "gains": [float(gain) for gain in report.gain_per_step],
+        "rows": [
+            {"law": title(law), "operators": operators, "limit": limit, "cells": cells}
+            for (law, operators, limit), cells in rows.items()
+        ],
+    }
+
+
+def _differences(views: list[View]) -> list[tuple[str, list[str]]]:
+    """Settings in which runs differ: the key, and what each run has; empty where it lacks the key."""
+    flat = [dict(_leaves("", view.config.model_dump(mode="json", exclude_none=True))) for view in views]
+    keys = dict.fromkeys(key for settings in flat for key in settings)
+    rows = [(key, [settings.get(key, "") for settings in flat]) for key in keys]
+    return [(key, values) for key, values in rows if len(set(values)) > 1]
+
+
+def _leaves(path: str, value: Any) -> Iterator[tuple[str, str]]:
+    """Every value by its key, with positions for lists of mappings; other lists stay whole."""
+    if isinstance(value, list) and any(isinstance(inner, dict) for inner in value):
+        value = {str(position): inner for position, inner in enumerate(value)}
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _leaves(f"{path}.{key}" if path else key, inner)
+    else:
+        yield path, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+def _picture_rows(views: list[View]) -> dict[str, list[list[Picture | None]]]:
+    """Figures by section, a row for each, an entry for each run; None where a run lacks it."""
+    rows: dict[str, list[list[Picture | None]]] = {}
+    for section in SECTIONS:
+        numbered = [{picture.number: picture for picture in view.pictures[section]} for view in views]
+        names = sorted({number for own in numbered for number in own}, key=int)
+        rows[section] = [[own.get(number) for own in numbered] for number in names]
+    return rows
+
+
+def _claim_rows(views: list[View]) -> list[dict[str, Any]]:
+    """Claims of all runs: what is claimed, where, when it holds, and what each run measured."""
+    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for v, view in enumerate(views):
+        for claim in view.claims:
+            key = (claim["claim"], claim["source"], claim["criterion"])
+            row = rows.setdefault(key, {**claim, "runs": [None] * len(views)})
+            row["runs"][v] = claim
+    return list(rows.values())
 
 
 @cache
@@ -37,7 +555,7 @@ def template(name: str) -> "Template":
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"number": number, "short": short}
+    environment.filters |= {"number": number, "degrees": math.degrees}
     return environment.get_template(name)
 
 
@@ -50,7 +568,7 @@ def write_page(run: Run) -> Path:
         If the configuration cannot be read or the page cannot be written.
     """
     path = run.path.parent / PAGE_FILE
-    _write(path, [view_of(run)])
+    _write(path, [_view(run)])
     return path
 
 
@@ -66,7 +584,7 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
     views = []
     for k, run in enumerate(runs, 1):
         folder = os.path.relpath(run.path.parent.resolve(), base)
-        views.append(view_of(run, folder=Path(folder).as_posix() + "/", prefix=f"run{k}-"))
+        views.append(_view(run, folder=Path(folder).as_posix() + "/", prefix=f"run{k}-"))
     shared = {view.name for view in views if sum(view.name == other.name for other in views) > 1}
     named = [
         replace(view, name=f"{view.name} ({view.folder.rstrip('/')})") if view.name in shared else view
@@ -77,7 +595,7 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
 
 def _write(path: Path, views: list[View]) -> None:
     text = template("page.html").render(
-        views=views, claims=claim_rows(views), differences=differences(views), pictures=picture_rows(views)
+        views=views, claims=_claim_rows(views), differences=_differences(views), pictures=_picture_rows(views)
     )
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")

@@ -65,6 +65,8 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
             "name": (given[i].name if i < len(given) else None) or f"q{i + 1}",
             "type": letter,
             "excitation": float(calibration.excitation[i]),
+            "noise": float(calibration.prediction_noise[i]),
+            "defect": float(calibration.operator_defect[i]),
             "weak": bool(calibration.weak[i]),
         }
         for i, letter in enumerate(calibration.joint_types)

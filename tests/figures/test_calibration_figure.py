@@ -8,21 +8,22 @@ from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.config import load_config
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
-from projservo_cli.report.figures import FIGURES, calibration
+from projservo_cli.report.figures import calibration
 from projservo_cli.report.material import Fit
 from projservo_cli.stages import calibrate, chain
 from projservo_cli.store import Result, Run
 from tests.fake_records import fake
-from tests.figures.cases import case, config_of
+from tests.figures.cases import SPECS, case
+from tests.known import configured
 
-SPEC = next(spec for spec in FIGURES if spec.name == "fig13_calibration")
+SPEC = SPECS["fig13_calibration"]
 SHIFT_PX = np.array([[0.3, -0.4], [-0.1, 0.2]])  # of each view
 
 
 @pytest.fixture(scope="module")
 def fitted():
     """The paper's task, calibrated from its simulated trials."""
-    return Fit(*reversed(calibrate.run(config_of("paper"))[:2]))
+    return Fit(*reversed(calibrate.run(configured("paper"))[:2]))
 
 
 def shifted(name="paper", **fields):
@@ -218,6 +219,6 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
     report = made.results["report"].records[""]
     assert report.figures == ("figures/fig13_calibration.svg",)
     assert (tmp_path / report.figures[0]).read_bytes().startswith(b"<?xml")
-    assert [entry["what"] for entry in report.left_out] == [spec.name for spec in FIGURES if spec.task]
+    assert [entry["what"] for entry in report.left_out] == [spec.name for spec in SPECS.values() if spec.task]
     assert all("task" in entry["reason"] for entry in report.left_out)
     assert report.claims == ()

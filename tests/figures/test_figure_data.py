@@ -3,27 +3,25 @@ import dataclasses
 import numpy as np
 import pytest
 
+from projservo_cli.geometry.displacement import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import PRISMATIC, REVOLUTE
 from projservo_cli.report import style
-from projservo_cli.report.figures import (
-    drift,
-    errors,
-    images,
-    joints,
-    partition,
-    path,
-    planned,
-    scene,
-    visibility,
-)
+from projservo_cli.report.figures import path, planned, scene
+from projservo_cli.report.figures.drift import drift_tables
+from projservo_cli.report.material import percent, title
 from projservo_cli.robots.truth import camera_center, look_at_camera
 from projservo_cli.task.trajectory import trajectory_displacement
-from tests.figures.cases import GAINS, case
+from tests.figures.cases import GAINS, SPECS, case
 from tests.samples import prismatic, revolute
 
 # Images of exact data differ by round-off in the projective frame, px.
 PX = 1e-7
+
+
+def data_of(name, material):
+    """Data of a figure, by the rest of its name."""
+    return next(spec for key, spec in SPECS.items() if key[6:] == name).data(material)
 
 
 @pytest.fixture(params=["paper", "ur5"])
@@ -32,7 +30,7 @@ def material(request):
 
 
 def test_partition_leads_from_the_face_to_its_goal(material):
-    data = partition.data(material)
+    data = data_of("partition", material)
     np.testing.assert_allclose(data["within_plane"][0], data["A"], atol=PX)
     np.testing.assert_allclose(data["within_plane"][-1], data["A_r"], atol=PX)
     np.testing.assert_allclose(data["onto_plane"][0], data["A_r"], atol=PX)
@@ -44,7 +42,7 @@ def test_partition_leads_from_the_face_to_its_goal(material):
 
 
 def test_points_on_the_axis_of_the_rotation_stay(material):
-    data = partition.data(material)
+    data = data_of("partition", material)
     plan = material.plan
     middle = project(material.calibrated.P[:1], plan.A_c[None])[0, 0]
     along = data["axis"][1] - data["axis"][0]
@@ -52,16 +50,8 @@ def test_points_on_the_axis_of_the_rotation_stay(material):
     assert abs(along[0] * off[1] - along[1] * off[0]) < 1e-6 * np.linalg.norm(along) ** 2
 
 
-def test_axis_of_a_motion_without_axis_is_the_centre():
-    A = np.c_[np.eye(3), np.ones(3)]
-    A_c = A.mean(axis=0)
-    H_hat = revolute(A_c[:3], [0, 0, 1])
-    points = partition._axis(H_hat, A_c, A_c[None] * np.ones((3, 1)))
-    np.testing.assert_allclose(points, [A_c, A_c], atol=1e-15)
-
-
 def test_margins_begin_at_one_and_vanish_where_visibility_changes(material):
-    data = visibility.data(material)
+    data = data_of("visibility", material)
     np.testing.assert_allclose(data["theta_margin"][:, 0], 1.0, rtol=1e-12)
     for view in range(2):
         at_zero = np.interp(0.0, data["tau_share"], data["tau_margin"][:, view])
@@ -72,13 +62,12 @@ def test_margins_begin_at_one_and_vanish_where_visibility_changes(material):
             assert zero == pytest.approx(0.0, abs=1e-9)  # the margin is linear in τ
         for theta in np.radians(data["theta_0_deg"][view]):
             plan = material.plan
-            value = visibility._margins(plan.a, plan.H_hat[1], plan.optical_center, np.array([theta]))
-            start = plan.a @ plan.optical_center[view]
-            assert value[0, view] / start == pytest.approx(0.0, abs=1e-9)
+            turned = exp_rotation(plan.H_hat[1], -theta).T @ plan.a @ plan.optical_center[view]
+            assert turned / (plan.a @ plan.optical_center[view]) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_both_senses_of_the_rotation_end_at_the_same_face(material):
-    ends = visibility.data(material)["images"][:, -1]
+    ends = data_of("visibility", material)["images"][:, -1]
     np.testing.assert_allclose(ends[0], ends[1], atol=PX)
 
 
@@ -95,11 +84,10 @@ def test_middle_camera_sits_between_the_two(material):
 
 
 def test_rendered_plan_begins_and_ends_at_the_true_faces(material):
-    config_material = material
     camera = planned.middle_camera(material.plant.model.P, material.plant.image_size)
     trace = material.traces["direct_three"]
     inverse = np.linalg.inv(material.robot.base_tool)
-    for data in (planned.data_linear(config_material), planned.data_steep(config_material)):
+    for data in (data_of("planned", material), data_of("planned_steep", material)):
         for j, pose in ((0, trace.pose[0]), (-1, trace.goal_pose)):
             m = material.plant.M[material.plant.order] @ (pose @ inverse).T @ camera.T
             rendered = data["faces"][j]
@@ -108,7 +96,7 @@ def test_rendered_plan_begins_and_ends_at_the_true_faces(material):
 
 
 def test_steep_profile_does_the_translation_early_and_the_same_rotations(material):
-    data = planned.data_steep(material)
+    data = data_of("planned_steep", material)
     early = data["sigma"] >= planned.STEEP
     assert (data["mu"][early, 0] == 1.0).all()
     np.testing.assert_array_equal(data["mu"][:, 1], data["sigma"])
@@ -139,13 +127,13 @@ def test_scene_without_a_known_goal_has_none():
         law: dataclasses.replace(trace, goal_pose=np.full((4, 4), np.nan))
         for law, trace in material.traces.items()
     }
-    data = scene.data(dataclasses.replace(material, traces=unknown))
+    data = data_of("scene", dataclasses.replace(material, traces=unknown))
     assert "face_goal" not in data
-    assert "face_goal" in scene.data(material)
+    assert "face_goal" in data_of("scene", material)
 
 
 def test_scene_shows_the_tool_of_the_robot_at_the_face(material):
-    data = scene.data(material)
+    data = data_of("scene", material)
     trace = material.traces["direct_three"]
     np.testing.assert_allclose(data["robot"][-1], trace.pose[0, :3, 3], atol=1e-12)
     np.testing.assert_allclose(data["line"][0], trace.center[0], atol=1e-12)
@@ -154,34 +142,34 @@ def test_scene_shows_the_tool_of_the_robot_at_the_face(material):
 
 def test_drift_table_holds_each_run_at_its_place():
     studies = case()[2].studies
-    table = drift.table(studies)
-    assert table.shape == (2, 2, 2, len(GAINS))
+    drift, at_samples, converged = drift_tables(studies)
+    assert drift.shape == (2, 2, 2, len(GAINS))
     trace = studies.sweep["direct_two", "calibrated", True, GAINS[0]]
-    assert table[1, 1, 1, 0] == trace.center_deviation_mm
-    assert drift.table(studies, at_samples=True)[1, 1, 1, 0] == trace.center_deviation_at_samples_mm
-    assert not drift.converged(studies).any()  # four steps are too few
+    assert drift[1, 1, 1, 0] == trace.center_deviation_mm
+    assert at_samples[1, 1, 1, 0] == trace.center_deviation_at_samples_mm
+    assert not converged.any()  # four steps are too few
 
 
 def test_translation_error_is_normalised_to_100():
-    np.testing.assert_allclose(errors.percent(np.array([4.0, 2.0, 1.0])), [100, 50, 25])
-    assert np.isnan(errors.percent(np.zeros(3))).all()
+    np.testing.assert_allclose(percent(np.array([4.0, 2.0, 1.0])), [100, 50, 25])
+    assert np.isnan(percent(np.zeros(3))).all()
 
 
 def test_metric_scale_of_the_translation_is_the_true_distance():
-    data = errors.data_three(case()[2])
+    data = data_of("errors_three", case()[2])
     # four steps: the centre has hardly left its line, whose direction fixes the scale of a_inf
     np.testing.assert_allclose(data["tau_affine"], data["distance"], rtol=5e-3)
     assert np.abs(data["tau"] - data["distance"]).max() > 1.0
 
 
 def test_projective_frame_changes_nothing():
-    data = errors.data_three(case()[2])
+    data = data_of("errors_three", case()[2])
     for name in ("theta_r", "theta_p"):
         assert data[f"{name}_difference_deg_true"].max() < 1e-6
 
 
 def test_joint_steps_add_up_to_the_trajectory():
-    data = joints.data(case()[2])
+    data = data_of("joints", case()[2])
     for name in ("free", "limited"):
         np.testing.assert_allclose(np.diff(data[f"q_{name}"], axis=0), data[f"step_{name}"], atol=1e-9)
     assert np.abs(data["step_limited"]).max() <= data["step_limit_deg"] * (1 + 1e-12)
@@ -190,7 +178,7 @@ def test_joint_steps_add_up_to_the_trajectory():
 def test_classical_paths_of_the_laws_that_were_run():
     material = case()[2]
     traces = {"stacked": material.traces["stacked"]}
-    data = images.data_classical(dataclasses.replace(material, traces=traces))
+    data = data_of("classical", dataclasses.replace(material, traces=traces))
     assert "s_stacked" in data
     assert "s_blockwise" not in data
     assert str(data["verdict_stacked"]) == "plateau, 4 steps" or "max steps" in str(data["verdict_stacked"])
@@ -202,13 +190,13 @@ def test_image_errors_end_at_the_goal_by_definition():
         material.traces["direct_three"],
         center=np.tile(material.goal_center(material.traces["stacked"]), (5, 1)),
     )
-    data = images.data_errors(dataclasses.replace(material, traces={"direct_three": trace}))
+    data = data_of("image_errors", dataclasses.replace(material, traces={"direct_three": trace}))
     np.testing.assert_allclose(data["center_e"], 0.0, atol=1e-9)
     np.testing.assert_allclose(data["e"], trace.s - trace.s_star)
 
 
 def test_the_map_of_sight_is_the_margin_of_the_displaced_face(material):
-    data, plan = path.data(material), material.plan
+    data, plan = data_of("path", material), material.plan
     for i, j in ((0, 0), (20, 60), (80, 0), (80, 80)):
         H = trajectory_displacement(
             plan.H_hat, (plan.tau, plan.theta_r, plan.theta_p), np.array([i / 80, j / 80, 0.4])
@@ -226,8 +214,8 @@ def test_the_map_of_sight_is_the_margin_of_the_displaced_face(material):
 
 def test_numbers_on_the_map_of_sight_keep_off_the_path(material):
     figure = style.new_figure(6.0)
-    data = path.data(material)
-    path.draw(data, figure)
+    data = data_of("path", material)
+    SPECS["fig14_path"].draw(data, figure)
     for axes in figure.axes[:2]:
         for text in axes.texts:
             assert np.linalg.norm(data["mu"][:, :2] - text.get_position(), axis=1).min() > path.LABEL
@@ -235,9 +223,47 @@ def test_numbers_on_the_map_of_sight_keep_off_the_path(material):
 
 
 def test_margins_that_grow_a_hundredfold_leave_the_others_to_be_read(material):
-    data, figure = path.data(material), style.new_figure(6.0)
+    data, figure = data_of("path", material), style.new_figure(6.0)
     data["along"][-1, 3] = 200.0
-    path.draw(data, figure)
+    SPECS["fig14_path"].draw(data, figure)
     axes = figure.axes[3]
     one, zero, most = (axes.transData.transform((0.0, y))[1] for y in (1.0, 0.0, 200.0))
     assert one - zero > 0.15 * (most - zero)
+
+
+def test_the_overview_counts_hidden_steps_and_errors_from_a_hundred_percent():
+    material = case()[2]
+    data = data_of("overview", material)
+    for law in ("direct_three", "stacked"):
+        trace = material.traces[law]
+        hidden = data[f"hidden_{law}"]
+        counts = trace.self_occluded_steps_left, trace.self_occluded_steps_right
+        assert tuple(hidden.sum(axis=0)) == counts
+        union = np.count_nonzero(hidden[:, 0] | hidden[:, 1])
+        assert str(data[f"verdict_{law}"]).endswith(f"in {trace.steps} steps, face hidden in {union}")
+    for name in ("tau_affine", "theta_r", "theta_p"):
+        values, e = data[f"{name}_percent"], getattr(material.traces["direct_three"], name)
+        assert values[0] == pytest.approx(100.0, rel=1e-14)
+        np.testing.assert_allclose(values[-1] * np.abs(e[0]), 100.0 * np.abs(e[-1]), rtol=1e-12)
+    # the centre lies inside its face: between the extremes of its markers in each image
+    s, center = data["s_direct_three"], data["center"]
+    assert (center > s.min(axis=2)).all()
+    assert (center < s.max(axis=2)).all()
+
+
+def test_laws_that_follow_the_plan_stand_beside_the_same_that_plan_anew():
+    material = case()[2]
+    compared = ["stacked", "exact", "exact_track", "stacked_image_track"]
+    assert material.compared() == compared
+    assert title("stacked_image_track") == "stacked Jacobians, following planned images"
+    assert title("my_laws:Law") == "my_laws:Law"
+    data = data_of("modes_path", material)
+    assert data["names"].tolist() == compared
+    for name in compared:
+        way, off = data[f"path_mm_{name}"].T
+        assert (way[0], off[0]) == pytest.approx((0.0, 0.0), abs=1e-9)
+        most = material.traces[name].center_deviation_at_samples_mm
+        assert off.max() == pytest.approx(most, abs=1e-9)
+    anew = {name: material.traces[name] for name in ("exact", "stacked")}
+    reason = SPECS["fig15_modes_path"].lacking(dataclasses.replace(material, traces=anew))
+    assert "set control.mode" in reason

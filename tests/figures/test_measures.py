@@ -6,9 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.report import measures
-from projservo_cli.stages.trace import longest_plateau
-from tests.figures.cases import case, geometric
+from projservo_cli.loop.step import on_plateau, plateau_stretch
+from projservo_cli.report import material as measures
+from projservo_cli.report.claims import claims_of
+from tests.figures.cases import SPECS, case, geometric
 
 
 def test_decay_factors_of_a_geometric_sequence_end_above_the_least_value():
@@ -55,16 +56,34 @@ def test_gap_of_a_path_of_one_point():
 
 @given(st.lists(st.sampled_from([0.5, 0.95, 0.9999, 1.0, 1.01]), min_size=0, max_size=60), st.integers(1, 20))
 @settings(deadline=None)
-def test_plateau_is_as_long_as_the_trace_says(factors, window):
+def test_a_plateau_is_the_longest_stretch_on_which_the_verdict_would_be_one(factors, window):
     error = np.cumprod([100.0, *factors])
-    stretch = measures.plateau_stretch(error, window)
-    length = longest_plateau(error, window)
-    assert length == (0 if stretch is None else stretch[1] - stretch[0])
-    if stretch is not None:
+    stretch = plateau_stretch(error, window)
+    still = "".join("x" if on_plateau(error, k, window) else " " for k in range(len(error)))
+    longest = max(still.split(), key=len, default="")
+    if stretch is None:
+        assert not longest
+    else:
         first, last = stretch
-        assert last < len(error)
-        starts = np.arange(first, last - window + 1)
-        assert (error[starts + window] > 0.99 * error[starts]).all()
+        assert last - first == len(longest) + window - 1
+        assert all(on_plateau(error, k, window) for k in range(first + window, last + 1))
+
+
+def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
+    """By the configured steps and the error that the run is judged by, which need not be the image error."""
+    material = case()[2]
+    count = 40
+    judged = np.r_[100.0 * 0.9 ** np.arange(10), np.full(20, 30.0), 30.0 * 0.9 ** np.arange(1, 11)]
+    trace = material.traces["stacked"]
+    s = np.repeat(trace.s[:1], count, axis=0)
+    hidden = np.zeros((count, 2), dtype=bool)
+    steep = 100.0 * 0.9 ** np.arange(count)
+    still = dataclasses.replace(trace, stop_error=judged, image_error=steep, s=s, self_occluded=hidden)
+    given = dataclasses.replace(material, traces={"stacked": still}, plateau_steps=5)
+    assert SPECS["fig04_classical"].data(given)["plateau_stacked"].tolist() == [10, 29]
+    (claim,) = [claim for claim in claims_of(given, None) if "local minimum" in claim.claim]
+    assert claim.measured.startswith("19 steps from step 10 at 30 px")
+    assert claim.criterion.startswith("the error falls < 1 % in 5 steps")
 
 
 def test_way_along_a_line_and_distance_from_it():
@@ -102,7 +121,7 @@ def test_curves_that_differ_by_the_sense_of_a_half_turn_are_compared_by_size():
 
 def test_second_order_contributions_add_up_to_the_deviation_of_a_small_step():
     _, bench, material = case()
-    model, q = material.plant.model, bench.reach.q_start
+    model, q = material.plant.model, bench.scenario.ends.q_start
     center = forward_kinematics(model, q) @ material.middle
     H_hat = joint_operators(model, q)
     rng = np.random.default_rng(1)
@@ -119,7 +138,7 @@ def test_second_order_contributions_add_up_to_the_deviation_of_a_small_step():
 
 def test_no_step_contributes_nothing():
     _, bench, material = case()
-    H_hat = joint_operators(material.plant.model, bench.reach.q_start)
+    H_hat = joint_operators(material.plant.model, bench.scenario.ends.q_start)
     parts = measures.second_order_drift(H_hat, np.zeros(6), material.middle, np.array([1.0, 0, 0]))
     np.testing.assert_array_equal(parts, np.zeros(6))
 

@@ -7,11 +7,10 @@ from html.parser import HTMLParser
 import pytest
 
 from projservo_cli.config import to_yaml
-from projservo_cli.report.figures import FIGURES
 from projservo_cli.stages import report
-from projservo_cli.stages import report as drawing
 from projservo_cli.store import Result, Run
-from tests.figures.cases import SHORT, case, config_of
+from tests.figures.cases import SHORT, SPECS, case
+from tests.known import configured
 
 SOME = ("fig01_partition", "fig08_drift", "fig11_image_errors", "fig13_calibration")
 VOID = {"meta", "br", "img", "link", "hr", "input"}
@@ -21,7 +20,7 @@ MADE = {"argv": ["projservo", "servo"], "host": "here", "projservo": "0.1.0", "d
 def stored(folder, *overrides):
     """A run file as the stages before the report leave it."""
     material = case()[2]
-    config = config_of("paper", f"stop.max_steps={SHORT}", *overrides)
+    config = configured("paper", f"stop.max_steps={SHORT}", *overrides)
     fit = {"calibration": material.calibration, "observation": material.observation}
     results = {
         "calibrate": Result("k", "", MADE, {}, fit),
@@ -35,7 +34,7 @@ def reported(folder, *overrides):
     """A run with its report, which stands in the folder."""
     run = stored(folder, "report.formats=[svg]", *overrides)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drawing, "FIGURES", tuple(spec for spec in FIGURES if spec.name in SOME))
+        patch.setattr(report, "FIGURES", [SPECS[name] for name in SOME])
         patch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
         record = report.run(run, folder)
     made = Result("k", "", MADE, {}, {"": record})

@@ -2,21 +2,21 @@
 
 import csv
 import dataclasses
+import math
 import re
 
 import numpy as np
 import pytest
 
 from projservo_cli.records import CrossValidation, Report
-from projservo_cli.report.content import calibration_words, inline, number, short
-from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.page import write_comparison, write_page
-from projservo_cli.report.values import PAGE_FILE
+from projservo_cli.report.page import calibration_words, inline, number, short, write_comparison, write_page
+from projservo_cli.report.values import PAGE_FILE, stage_object
 from projservo_cli.stages import report
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from tests.fake_records import fake
-from tests.figures.cases import case
+from tests.figures.cases import SPECS, case
+from tests.known import configured
 from tests.page.conftest import SOME, claims_of, numbers, read, stored, words
 
 
@@ -71,9 +71,8 @@ def test_headings_sections_language_and_title(page):
 def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
     figures = list(page.all("figure"))
     assert sorted(figure.attributes["id"] for figure in figures) == sorted(SOME)
-    specs = {spec.name: spec for spec in FIGURES}
     for figure in figures:
-        spec = specs[figure.attributes["id"]]
+        spec = SPECS[figure.attributes["id"]]
         (image,) = figure.all("svg")
         assert image.attributes["role"] == "img"
         assert image.attributes["aria-label"] == spec.alt
@@ -86,12 +85,12 @@ def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
 
 
 def test_all_figures_say_what_can_be_seen():
-    texts = [spec.alt for spec in FIGURES if spec.alt]
+    texts = [spec.alt for spec in SPECS.values() if spec.alt]
     assert len(set(texts)) == len(texts) >= 14
 
 
 def test_numbers_of_a_figure_are_those_that_are_drawn(run):
-    spec = next(spec for spec in FIGURES if spec.name == "fig08_drift")
+    spec = SPECS["fig08_drift"]
     data = spec.data(case()[2])
     with open(run.path.parent / "figures" / "fig08_drift.csv", encoding="utf-8", newline="") as file:
         header, *rows = csv.reader(file)
@@ -306,19 +305,18 @@ def test_a_weak_joint_and_what_was_left_out_are_named(run, tmp_path):
         advice=("move joint 2",),
         lens=np.array([[640, 512, 800, -0.0625, 0.5], [640, 512, 800, 0.25, 0.0]]),
     )
-    text = " ".join(calibration_words(calibration, estimated=True))
+    result = run.results["calibrate"]
+    result = dataclasses.replace(result, records={**result.records, "calibration": calibration})
+    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
+    found = stage_object("calibrate", other, configured("paper"), [])
+    text = " ".join(calibration_words(found, estimated=True))
     assert text.startswith("Not usable: ")
     assert "an estimate from these images" in text
     assert "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times" in text
     assert "so this one is weak." in text
     assert "2 readings left out as outliers. 1 joint reading contradicts the images." in text
-    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan), method="closed_form")
-    assert "The method closed_form states no uncertainty" in " ".join(
-        calibration_words(unknown, estimated=False)
-    )
-    result = run.results["calibrate"]
-    result = dataclasses.replace(result, records={**result.records, "calibration": calibration})
-    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
+    unknown = found | {"joints": [joint | {"noise": math.nan} for joint in found["joints"]]}
+    assert "states no uncertainty" in " ".join(calibration_words(unknown, estimated=False))
     shown = words(read(write_page(other)).text)
     assert "✗ not usable" in shown
     assert "What to do next: move joint 2" in shown

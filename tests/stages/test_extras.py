@@ -14,9 +14,9 @@ from projservo_cli.report import animation as film
 from projservo_cli.report.page import write_page
 from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.stages import report
-from projservo_cli.stages import report as extras
 from projservo_cli.store import Result
-from tests.figures.cases import case, config_of
+from tests.figures.cases import case
+from tests.known import configured
 from tests.page.conftest import MADE, read, stored
 
 MOST_BYTES = {VIEW_FILE: 8_000_000, ANIMATION_FILE: 3_000_000}
@@ -30,7 +30,7 @@ def run(tmp_path_factory):
 @pytest.fixture(scope="module")
 def view(run):
     pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
-    return extras.view(run)
+    return report.view(run)
 
 
 def test_the_view_is_one_file_that_loads_nothing(view):
@@ -63,25 +63,25 @@ def test_the_view_holds_every_instant_of_every_law(run, view):
 def test_without_plotly_the_view_says_what_to_install(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
     with pytest.raises(InputError, match=r"pip install 'projservo\[view\]'"):
-        extras.require(config_of("paper"), ["view"])
-    extras.require(config_of("paper"), ["animation"])
+        report.require(configured("paper"), ["view"])
+    report.require(configured("paper"), ["animation"])
 
 
 def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
     pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
-    config = config_of("paper")
+    config = configured("paper")
     projective = config.model_copy(update={"robot": None})
     with pytest.raises(InputError, match=r"--view: .*no metres.*robot\.dh or robot\.screws.*--animation"):
-        extras.require(projective, ["view"])
-    extras.require(projective, ["animation"])
+        report.require(projective, ["view"])
+    report.require(projective, ["animation"])
     with pytest.raises(InputError, match=r"--animation: .*task"):
-        extras.require(config.model_copy(update={"task": None}), ["animation"])
+        report.require(config.model_copy(update={"task": None}), ["animation"])
 
 
 def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
     monkeypatch.setattr(film, "FRAMES", 6)  # a tenth of them, each of which takes its time
     told = []
-    path = extras.animation(run, lambda *progress: told.append(progress))
+    path = report.animation(run, lambda *progress: told.append(progress))
     assert told == [("animation", k, 6) for k in range(1, 7)]
     assert path.stat().st_size < MOST_BYTES[ANIMATION_FILE] / 10
     with Image.open(path) as image:
@@ -92,14 +92,14 @@ def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
         for k in range(image.n_frames):
             image.seek(k)
             last.append(image.info["duration"])
-        assert last == [extras.FRAME_MS] * 5 + [extras.LAST_MS]
+        assert last == [film.FRAME_MS] * 5 + [film.LAST_MS]
         assert image.convert("RGB").getpixel((1, 1)) == (255, 255, 255)
     before = path.read_bytes()
-    extras.animation(run)
+    report.animation(run)
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("make", [extras.view, extras.animation])
+@pytest.mark.parametrize("make", [report.view, report.animation])
 def test_runs_without_a_step_have_nothing_to_show(run, make):
     pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
     kept = {name: result for name, result in run.results.items() if not name.startswith("servo/")}

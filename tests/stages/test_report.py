@@ -7,14 +7,12 @@ import pytest
 from projservo_cli.config import to_yaml
 from projservo_cli.records import InputError, Report, WorkFailed
 from projservo_cli.report.claims import claims_of, composition_claim, decay_ranges, listed
-from projservo_cli.report.figures import FIGURES
+from projservo_cli.report.figures.drift import drift_tables
 from projservo_cli.report.material import DIRECT
-from projservo_cli.stages import report, studies
-from projservo_cli.stages import report as drawing
+from projservo_cli.stages import chain, report, studies
 from projservo_cli.store import Result, Run, load, save
-from tests.figures.cases import GAINS, PERIODS_S, SHORT, case, config_of
-
-BY_NAME = {spec.name: spec for spec in FIGURES}
+from tests.figures.cases import GAINS, PERIODS_S, SHORT, SPECS, case
+from tests.known import configured
 
 
 def changed(material, **traces):
@@ -45,7 +43,7 @@ def few(monkeypatch):
 
 def stored(tmp_path, material, *overrides):
     """A run file as the stages before leave it."""
-    config = config_of("paper", f"stop.max_steps={SHORT}", *overrides)
+    config = configured("paper", f"stop.max_steps={SHORT}", *overrides)
     fit = {"calibration": material.calibration, "observation": material.observation}
     results = {
         "calibrate": Result("k", "", {}, {}, fit),
@@ -57,8 +55,8 @@ def stored(tmp_path, material, *overrides):
 
 @pytest.mark.usefixtures("few")
 def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatch):
-    specs = tuple(BY_NAME[name] for name in ("fig01_partition", "fig04_classical", "fig08_drift"))
-    monkeypatch.setattr(drawing, "FIGURES", specs)
+    specs = tuple(SPECS[name] for name in ("fig01_partition", "fig04_classical", "fig08_drift"))
+    monkeypatch.setattr(report, "FIGURES", specs)
     material = changed(case()[2], stacked=None, blockwise=None, euclidean_points=None)
     stale = tmp_path / "figures" / "fig04_classical.svg"
     stale.parent.mkdir()
@@ -73,7 +71,7 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     for name in record.figures:
         assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
     assert [entry["what"] for entry in record.left_out] == ["fig04_classical"]
-    assert steps[-1] == ("figures", 2, 2)
+    assert steps[-1] == ("figures", 3, 3)
     content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
     assert content["claims"] == list(record.claims)
     assert len(content["drift"]) == 2 * 2 * 2 * len(GAINS)
@@ -85,39 +83,39 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
 
 def test_every_figure_is_supported_by_a_whole_run():
     material = case()[2]
-    for spec in FIGURES:
-        assert drawing.lacking(spec, material) == ""
-        assert drawing.partly(spec, material) == ""
+    for spec in SPECS.values():
+        assert spec.lacking(material) == ""
+        assert spec.partly(material) == ""
 
 
 @pytest.mark.parametrize("law", DIRECT)
 def test_a_figure_of_both_laws_needs_both(law):
     material = changed(case()[2], **{law: None})
-    assert law in drawing.lacking(BY_NAME["fig07_three_two"], material)
-    assert drawing.lacking(BY_NAME["fig01_partition"], material) == ""
+    assert law in SPECS["fig07_three_two"].lacking(material)
+    assert SPECS["fig01_partition"].lacking(material) == ""
 
 
 def test_a_missing_classical_law_is_named_and_the_others_are_drawn():
     material = changed(case()[2], blockwise=None)
-    spec = BY_NAME["fig04_classical"]
-    assert drawing.lacking(spec, material) == ""
-    assert "blockwise" in drawing.partly(spec, material)
+    spec = SPECS["fig04_classical"]
+    assert spec.lacking(material) == ""
+    assert "blockwise" in spec.partly(material)
 
 
 def test_a_run_without_a_step_has_nothing_to_show():
     material = case()[2]
     material = changed(material, direct_three=short(material.traces["direct_three"], 0))
-    assert "direct_three" in drawing.lacking(BY_NAME["fig11_image_errors"], material)
+    assert "direct_three" in SPECS["fig11_image_errors"].lacking(material)
 
 
 def test_a_run_that_ended_after_three_steps_is_drawn(tmp_path, monkeypatch):
-    of_traces = tuple(spec for spec in FIGURES if spec.laws)
-    monkeypatch.setattr(drawing, "FIGURES", of_traces)
+    of_traces = tuple(spec for spec in SPECS.values() if spec.laws)
+    monkeypatch.setattr(report, "FIGURES", of_traces)
     material = case()[2]
     cut = {law: short(trace, 3) for law, trace in material.traces.items()}
     material = changed(material, **cut)
     left_out = []
-    written = drawing.draw_all(material, tmp_path, ("svg",), left_out)
+    written = report.draw_all(material, tmp_path, ("svg",), left_out)
     assert len(written) == len(of_traces) >= 3
     assert left_out == []
     assert any(claim.claim.startswith("No self-occlusion") for claim in claims_of(material, None))
@@ -147,14 +145,14 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
             rate={key: unknown(trace) for key, trace in extra.rate.items()},
         ),
     )
-    for spec in FIGURES:
-        assert ("pose of the goal is unknown" in drawing.lacking(spec, material)) == spec.goal
-    monkeypatch.setattr(drawing, "FIGURES", (BY_NAME["fig03_scene"], BY_NAME["fig12_joints"]))
-    assert len(drawing.draw_all(material, tmp_path, ("svg",), [])) == 2
+    for spec in SPECS.values():
+        assert ("pose of the goal is unknown" in spec.lacking(material)) == spec.goal
+    monkeypatch.setattr(report, "FIGURES", (SPECS["fig03_scene"], SPECS["fig12_joints"]))
+    assert len(report.draw_all(material, tmp_path, ("svg",), [])) == 2
     rows = [claim.row() for claim in claims_of(material, None)]
     json.dumps(rows, allow_nan=False)
     assert not any("drift" in row["claim"] or "nan" in row["measured"] for row in rows)
-    record = report._record(material.studies, None, (), (), tuple(rows))
+    record = report.record_of(material.studies, None, figures=(), left_out=(), claims=tuple(rows))
     assert all(row["drift_mm"] is None for row in report.drift_rows(record))
 
 
@@ -170,9 +168,9 @@ def test_failed_studies_are_named_and_their_figures_left_out(tmp_path, monkeypat
     made = report.material_of(run, bench, left_out, lambda *_: None)
     assert made.studies is None
     assert left_out == [{"what": "studies", "reason": "the task cannot be partitioned"}]
-    for spec in FIGURES:
-        assert ("cannot be partitioned" in drawing.lacking(spec, made)) == spec.studies
-    record = report._record(None, None, (), (), ())
+    for spec in SPECS.values():
+        assert ("cannot be partitioned" in spec.lacking(made)) == spec.studies
+    record = report.record_of(None, None, figures=(), left_out=(), claims=())
     assert report.drift_rows(record) == []
 
 
@@ -184,8 +182,17 @@ def test_a_failed_comparison_of_eq_22_is_named(monkeypatch):
 
     monkeypatch.setattr(report, "metric_plan", fail)
     left_out = []
-    assert report._composition(bench, config, left_out) is None
+    assert report.composition(bench, config, left_out) is None
     assert left_out == [{"what": "equation (22)", "reason": "no unique motion"}]
+
+
+def test_which_laws_must_converge_outdates_the_page_that_says_so_and_no_run(tmp_path):
+    def keys(*overrides):
+        steps = chain.steps_for(configured("paper", *overrides), Run(tmp_path / "run.h5"), ["report"])
+        return {step.name: step.key for step in steps}
+
+    before, after = keys(), keys("control.must_converge=[exact]")
+    assert {name for name in before if before[name] != after[name]} == {"report"}
 
 
 def test_a_report_needs_a_plan(tmp_path):
@@ -233,7 +240,10 @@ def test_limited_runs_keep_the_limit_and_free_ones_do_not():
 
 def test_periods_at_which_no_loop_survives_are_left_out():
     _, bench, _ = case()
-    few = dataclasses.replace(bench, limits=bench.limits._replace(max_steps=1))
+    few = dataclasses.replace(
+        bench,
+        scenario=dataclasses.replace(bench.scenario, limits=bench.scenario.limits._replace(max_steps=1)),
+    )
     extra = studies.run_studies(few, (0.1,), (0.4, 0.04))  # gain 2.5 1/s
     assert extra.periods == (0.04,)
 
@@ -301,14 +311,14 @@ class TestWholeTask:
 
     def test_drift_falls_strictly_with_the_gain(self, name):
         extra = case(name, 2000, whole=True)[2].studies
-        table = report.table(extra)
-        assert report.converged(extra).all()
+        table, _, converged = drift_tables(extra)
+        assert converged.all()
         for law in range(2):
             assert (np.diff(table[law, 0, 0]) < 0).all()  # gains fall along the table
 
     def test_the_table_of_claims_holds_numbers_for_all(self, name):
         config, bench, material = case(name, 2000, whole=True)
-        claims = claims_of(material, report._composition(bench, config, []))
+        claims = claims_of(material, report.composition(bench, config, []))
         assert all(claim.holds is not None for claim in claims)
         held = {claim.claim for claim in claims if claim.holds}
         assert "No self-occlusion under direct control" in held
@@ -317,9 +327,9 @@ class TestWholeTask:
     def test_all_figures_are_drawn_from_a_whole_run(self, name, tmp_path):
         material = case(name, 2000, whole=True)[2]
         left_out = []
-        written = drawing.draw_all(material, tmp_path, ("svg",), left_out)
+        written = report.draw_all(material, tmp_path, ("svg",), left_out)
         assert left_out == []
-        assert len(written) == len(FIGURES)
+        assert len(written) == len(SPECS)
 
 
 def test_report_is_a_record_of_the_run_file():
