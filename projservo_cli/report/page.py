@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from markupsafe import Markup
 
-from projservo_cli.calibration.quality import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
+from projservo_cli.calibration import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
 from projservo_cli.config import Config, load_config
 from projservo_cli.files import inside, replacing
 from projservo_cli.records import Plan, Report, name_of
