@@ -13,7 +13,7 @@ from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, calibration_seed, generator
-from projservo_cli.stages.world import Truth, joints_of, reference_of, robot_of, truth_of
+from projservo_cli.stages.world import Truth, image_size_of, joints_of, reference_of, robot_of, truth_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -119,13 +119,6 @@ def run(
         tell=progress,
     )
     return observation, calibration, held_out[0] if held_out else None
-
-
-def image_size_of(config: "Config") -> tuple[int, int] | None:
-    """Width and height of the images, px, if they are known."""
-    if config.data is not None and config.data.image_size_px is not None:
-        return config.data.image_size_px
-    return config.rig.image_size_px if config.rig is not None else None
 
 
 def _observed(config: "Config") -> tuple[Observation, str, float | None]:

@@ -15,6 +15,7 @@ from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.records import InputError, names_of
 from projservo_cli.stages import Progress
+from projservo_cli.stages.world import has_task
 from projservo_cli.store import SERVO, Result, Run, save
 
 STAGES = ("calibrate", "plan", "servo", "report")
@@ -109,11 +110,6 @@ def steps_for(
     if steps[0].why and not force:
         _keep_recorded(config, run)
     return steps
-
-
-def has_task(config: Config) -> bool:
-    """Whether there is a robot with a task; a recorded run may be reported on without."""
-    return not config.recorded or None not in (config.robot, config.rig, config.markers, config.task)
 
 
 def _keys(

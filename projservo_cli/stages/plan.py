@@ -14,9 +14,8 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import COORDINATES, joint_motion, span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
-from projservo_cli.stages.calibrate import image_size_of
 from projservo_cli.stages.scenario import Scenario, Sight, measured_task, scenario_of, sight_of
-from projservo_cli.stages.world import center_index, face_numbers, joints_of
+from projservo_cli.stages.world import center_index, face_numbers, image_size_of, joints_of
 from projservo_cli.task.face import Task, center_of, face_plane, require_found
 from projservo_cli.task.margins import (
     BEHIND,

@@ -24,7 +24,6 @@ from projservo_cli.report.page import write_page
 from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.report.view import motion, plotly, write_view
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.chain import has_task
 from projservo_cli.stages.scenario import plant_of
 from projservo_cli.stages.studies import (
     LAMBDAS,
@@ -35,7 +34,7 @@ from projservo_cli.stages.studies import (
     metric_plan,
     run_studies,
 )
-from projservo_cli.stages.world import Truth, truth_of
+from projservo_cli.stages.world import Truth, has_task, truth_of
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from projservo_cli.task.face import cyclic_order

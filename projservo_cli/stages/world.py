@@ -73,6 +73,18 @@ def joints_of(config: "Config", default_types: str = "") -> Joints:
     return Joints(types, lower, upper, speed)
 
 
+def has_task(config: "Config") -> bool:
+    """Whether there is a robot with a task; a recorded run may be reported on without."""
+    return not config.recorded or None not in (config.robot, config.rig, config.markers, config.task)
+
+
+def image_size_of(config: "Config") -> tuple[int, int] | None:
+    """Width and height of the images, px, if they are known."""
+    if config.data is not None and config.data.image_size_px is not None:
+        return config.data.image_size_px
+    return config.rig.image_size_px if config.rig is not None else None
+
+
 @dataclass(frozen=True, eq=False)
 class Truth:
     """Robot, rig and markers as they are.
