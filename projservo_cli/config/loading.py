@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from projservo_cli.config.models import Config
-from projservo_cli.config.robot import Section
+from projservo_cli.config.robot import CONTRADICTION, Section
 from projservo_cli.config.yaml_source import MAX_DEPTH, Document, Path, Problem, shortened
 from projservo_cli.records import InputError
 
@@ -38,6 +38,7 @@ _PHRASES = {
     "string_too_short": "must not be empty",
     "string_too_long": "takes at most {max_length} characters",
     "value_error": "{error}",
+    CONTRADICTION: "{what}",
 }
 
 # Values that name files, relative to the configuration.

@@ -17,12 +17,15 @@ from pydantic import (
     StrictInt,
     StringConstraints,
     ValidationError,
+    ValidationInfo,
     WithJsonSchema,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
 from projservo_cli.config.robot import (
+    CONTRADICTION,
+    LENIENT,
     Count,
     Finding,
     JointVector,
@@ -404,7 +407,7 @@ def _joint_types(robot: Robot | None, data: Data | None) -> str:
 
 def _same_joints(robot: Robot | None, data: Data | None) -> Iterator[Finding]:
     given = _joint_types(robot, data)
-    if robot is not None and given != robot.joint_types:
+    if robot is not None and robot.joints and given != robot.joint_types:
         yield ("data", "joints"), f"{given} are not the joints of the robot, {robot.joint_types}"
 
 
@@ -421,15 +424,16 @@ def _joint_vectors(
     for path, vector in vectors.items():
         if vector is None or not types:
             continue
-        yield from vector.miscounted(types, *path)
-        if path[-1] in ("reference", "start") and robot is not None and len(vector.joints) == len(types):
+        if len(vector.joints) != len(types):
+            yield from vector.miscounted(types, *path)
+        elif path[-1] in ("reference", "start") and robot is not None and robot.joint_types == types:
             yield from _beyond_limits(robot, vector, *path)
 
 
 def _beyond_limits(robot: Robot, vector: JointVector, *path: str) -> Iterator[Finding]:
     for i, (value, joint) in enumerate(zip(vector.values(robot.joint_types), robot.joints, strict=True)):
         low, high = joint.limits
-        if not low <= value <= high:
+        if not low <= value <= high and not any(joint.contradictions()):
             turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
             what = f"{turn(value):.6g} {unit} is outside the limits of joint {i + 1}"
             yield (*path, "joints", i), f"{what}, {turn(low):.6g} to {turn(high):.6g} {unit}"
@@ -454,13 +458,13 @@ def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator
 
 
 def _disturbed_joints(disturbance: Disturbance, robot: Robot | None) -> Iterator[Finding]:
-    if robot is None:
+    if robot is None or not robot.joints:
         return
     types, bump = robot.joint_types, disturbance.bump
     for name, event in (("bump", bump), ("frozen_joint", disturbance.frozen_joint)):
         if event is not None and event.joint > len(types):
             yield ("disturbance", name, "joint"), f"the robot has {len(types)} joints, counted from 1"
-    if bump is not None and bump.joint <= len(types):
+    if bump is not None and bump.joint <= len(types) and not any(bump.contradictions()):
         letter = types[bump.joint - 1]
         fitting = "by_deg" if letter == "R" else "by_m"
         if getattr(bump, fitting) is None:
@@ -542,19 +546,24 @@ class Config(Section):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _all_at_once(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        """Tell what is wrong in the sections together with what is wrong between the sound ones."""
+    def _all_at_once(
+        cls, values: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
+        """Tell what is wrong in the sections together with what is wrong between the well-formed ones."""
         try:
             config = handler(values)
         except ValidationError as error:
             wrong = error.errors(include_url=False)
-            broken = {part["loc"][0] for part in wrong if part["loc"]}
-            if not broken:
+            found = [(part["loc"], part["ctx"]["what"]) for part in wrong if part["type"] == CONTRADICTION]
+            wrong = [part for part in wrong if part["type"] != CONTRADICTION]
+            if any(not part["loc"] for part in wrong):
                 raise
+            broken = {part["loc"][0] for part in wrong}
             rest = {key: value for key, value in values.items() if key not in broken}
-            sound = {key: value for key, value in handler({"name": "-", **rest}) if key not in broken}
-            raise cls.refusal(_between(sound), wrong) from None
-        if found := list(_between(dict(config))):
+            sections = cls.model_validate({"name": "-", **rest}, context=LENIENT)
+            found += _between({key: value for key, value in sections if key not in broken})
+            raise cls.refusal(found, wrong) from None
+        if info.context != LENIENT and (found := list(_between(dict(config)))):
             raise cls.refusal(found)
         return config
 

@@ -13,10 +13,11 @@ from pydantic import (
     PlainValidator,
     Strict,
     ValidationError,
+    ValidationInfo,
     WithJsonSchema,
     model_validator,
 )
-from pydantic_core import ErrorDetails, InitErrorDetails
+from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
 Number = Annotated[float, Strict()]
 Positive = Annotated[float, Strict(), Field(gt=0)]
@@ -30,6 +31,8 @@ Matrix34 = tuple[Vector4, Vector4, Vector4]
 Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
 # The path from a section to a value in it, and what is wrong with that value.
 Finding = tuple[tuple[str | int, ...], str]
+CONTRADICTION = "contradiction"  # type of their errors
+LENIENT = {"contradictions": "kept"}  # context of a validation that lets them be
 TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
 
 _IDENTITY: Matrix44 = (
@@ -38,6 +41,10 @@ _IDENTITY: Matrix44 = (
     (0.0, 0.0, 1.0, 0.0),
     (0.0, 0.0, 0.0, 1.0),
 )
+
+
+def _contradiction(what: str) -> PydanticCustomError:
+    return PydanticCustomError(CONTRADICTION, "{what}", {"what": what})
 
 
 class Section(BaseModel):
@@ -50,18 +57,15 @@ class Section(BaseModel):
         return ()
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if found := list(self.contradictions()):
+    def _consistent(self, info: ValidationInfo) -> Self:
+        if info.context != LENIENT and (found := list(self.contradictions())):
             raise self.refusal(found)
         return self
 
     @classmethod
     def refusal(cls, found: Iterable[Finding], also: Iterable[ErrorDetails] = ()) -> ValidationError:
         """One error for all that is wrong in the section, each at the path of its value."""
-        errors = [
-            InitErrorDetails(type="value_error", loc=path, input=cls, ctx={"error": what})
-            for path, what in found
-        ]
+        errors = [InitErrorDetails(type=_contradiction(what), loc=path, input=cls) for path, what in found]
         errors += [
             InitErrorDetails(type=part["type"], loc=part["loc"], input=part["input"], ctx=part.get("ctx", {}))
             for part in also
@@ -156,12 +160,15 @@ def _dot(u: Sequence[float], v: Sequence[float]) -> float:
     return sum(a * b for a, b in zip(u, v, strict=True))
 
 
-def _rigid(T: Matrix44) -> Matrix44:
-    if T[3] != (0, 0, 0, 1):
-        raise ValueError("the last row must be [0, 0, 0, 1]")
+def _rigid(T: Matrix44, info: ValidationInfo) -> Matrix44:
     R = np.array(T)[:3, :3]
-    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > TOLERANCE or np.linalg.det(R) < 0:
-        raise ValueError("the upper left 3×3 block must be a rotation, written with seven digits or more")
+    what = ""
+    if T[3] != (0, 0, 0, 1):
+        what = "the last row must be [0, 0, 0, 1]"
+    elif abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > TOLERANCE or np.linalg.det(R) < 0:
+        what = "the upper left 3×3 block must be a rotation, written with seven digits or more"
+    if what and info.context != LENIENT:
+        raise _contradiction(what)
     return T
 
 
@@ -258,14 +265,9 @@ def _blind(position: Any, target: Any, up: Vector3) -> Iterator[Finding]:
 class Rig(Section):
     """Two cameras that look at the robot and do not move."""
 
-    image_size_px: tuple[Whole, Whole] = Field(description="width and height")
+    image_size_px: tuple[Count, Count] = Field(description="width and height")
     left: Camera = Field(description="the left camera")
     right: Camera = Field(description="the right camera")
-
-    def contradictions(self) -> Iterator[Finding]:
-        """Images without pixels."""
-        if 0 in self.image_size_px:
-            yield ("image_size_px",), "width and height must be greater than 0"
 
 
 def _center(value: Any) -> Any:

@@ -116,7 +116,7 @@ plant:
     assert errors(path) == [f"{path}:{place.strip()} {what}" for place, what in expected.items()]
 
 
-SCREW = "joints: [{type: R, w: [0, 0, 1], v: [0, 0, 0]}]"
+SCREWS = "joints: [{type: R, w: [0, 0, 1], v: [0, 0, 0]}, {type: P, w: [0, 0, 0], v: [1, 0, 0]}]"
 POSE = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 # what is set, the path named, part of the message
 INCONSISTENT = [
@@ -140,10 +140,10 @@ INCONSISTENT = [
     ("robot.dh.joints.1.limits_m=[2, 1]", "robot.dh.joints.1.limits_m", "below"),
     ("robot.dh.joints.1={type: P, limits_deg: [0, 1]}", "robot.dh.joints.1.limits_deg", "takes limits_m"),
     ("robot.dh.joints.0.limits_rad=[0, 1]", "robot.dh.joints.0.limits_rad", "keep one"),
-    (f"robot.screws={{reference: {{joints: [0], unit: rad}}, {SCREW}, base_tool: {POSE}}}", "robot",
+    (f"robot.screws={{reference: {{joints: [0, 0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}", "robot",
      "exactly one of dh and screws"),
-    (f"robot={{screws: {{reference: {{joints: [0, 0], unit: rad}}, {SCREW}, base_tool: {POSE}}}}}",
-     "robot.screws.reference.joints", "2 values for 1 joints"),
+    (f"robot={{screws: {{reference: {{joints: [0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}}}",
+     "robot.screws.reference.joints", "1 values for 2 joints"),
     ("robot=null", "robot", "a simulated run needs it"),
     ("markers.positions_m=null", "markers.positions_m", "a simulated run needs it"),
     (f"robot.dh.tool={POSE.replace('1, 0, 0]', '2, 0, 0]')}", "robot.dh.tool", "must be a rotation"),
@@ -155,7 +155,7 @@ INCONSISTENT = [
     ("rig.left.up=[1, 0, 0]", "rig.left.up", "line of sight"),
     ("rig.right.matrix=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]", "rig.right.matrix", "singular"),
     ("rig.right.matrix=[[1e200, 0, 0, 0], [0, 1e200, 0, 0], [0, 0, 0, 1]]", "rig.right.matrix", "singular"),
-    ("rig.image_size_px=[0, 10]", "rig.image_size_px", "greater than 0"),
+    ("rig.image_size_px=[0, 10]", "rig.image_size_px.0", "must be at least 1, not 0"),
     ("data={table: t.csv, joints: RR}", "data.joints", "not the joints of the robot, RP"),
     ("disturbance.bump={at_step: 1, joint: 1}", "disturbance.bump", "exactly one of by_deg and by_m"),
     ("disturbance.bump={at_step: 1, joint: 2, by_deg: 1}", "disturbance.bump", "of type P: give by_m"),
@@ -173,6 +173,28 @@ def test_inconsistencies_are_refused_with_path_and_flag(good, override, path, me
     assert found.startswith((f"--set {override}: {path}: ", f"{good}:")), found
     assert f" {path}: " in found
     assert message in found
+
+
+def test_a_contradiction_hides_no_other(good):
+    """Neither within its section nor between that and others, malformed values or not."""
+    told = errors(
+        good,
+        f"robot.dh.tool={POSE.replace('1, 0]', '-1, 0]')}",
+        "robot.dh.joints.1.limits_m=[2, 1]",
+        "task.goal.turn_deg=null",
+        "task.start.joints=[1, 1, 2]",
+        "disturbance.frozen_joint={joint: 3, from_step: 1}",
+        "control.gian=1",
+    )
+    paths = ["task.goal", "robot.dh.joints.1.limits_m", "robot.dh.tool", "task.start.joints",
+             "disturbance.frozen_joint.joint", "control.gian"]  # fmt: skip
+    assert [path for path in paths for line in told if f": {path}: " in line] == paths
+    assert len(told) == len(paths)
+
+
+def test_a_start_for_the_joints_of_the_table_is_not_held_against_those_of_another_robot(good):
+    (line,) = errors(good, "data={table: t.csv, joints: RRR}", "task.start.joints=[1, 0.5, 1]")
+    assert line.endswith("data.joints: RRR are not the joints of the robot, RP")
 
 
 def test_screws_are_checked(good):

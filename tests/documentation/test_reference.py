@@ -45,7 +45,7 @@ def test_a_key_is_told_as_it_is():
         ("`joint_speed_limit_deg_s`", "number, > 0 or null", "`125.0`", "°/s"),
         ("`gain_t`", "number, > 0", "`2.5`", "1/s"),
         ("`self_occlusion`", "`transparent`, `opaque`", "`transparent`", ""),
-        ("`image_size_px`", "list of 2 × (whole number, ≥ 0)", "required", "px"),
+        ("`image_size_px`", "list of 2 × (whole number, ≥ 1, ≤ 1,000,000)", "required", "px"),
         ("`table`", "text", "required", ""),
         ("`lens`", "true or false", "`false`", ""),
     } <= set(rows)
