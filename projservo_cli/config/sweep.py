@@ -2,14 +2,14 @@
 
 import json
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from projservo_cli.config.loading import Override, validated
 from projservo_cli.config.models import FolderName, Plain
-from projservo_cli.config.robot import Count, Number, Positive, Section, Whole
+from projservo_cli.config.robot import Count, Finding, Number, Positive, Section, Whole
 from projservo_cli.config.yaml_source import Document, Problem
 
 BASE, LAW = "base", "law"  # names of axes with a meaning of their own
@@ -46,15 +46,14 @@ class Distribution(Section):
     normal: tuple[Number, Positive] | None = Field(None, description="mean and standard deviation")
     choice: tuple[Plain, ...] | None = Field(None, min_length=1, description="values of equal chances")
 
-    @model_validator(mode="after")
-    def _one(self) -> "Distribution":
+    def contradictions(self) -> Iterator[Finding]:
+        """None of the four or several, or bounds upside down."""
         given = [(name, value) for name, value in self if value is not None]
         if len(given) != 1:
-            raise ValueError("give exactly one of uniform, log_uniform, normal and choice")
-        name, value = given[0]
-        if name in ("uniform", "log_uniform") and not value[0] < value[1]:
-            raise ValueError(f"{name} needs a least value below the largest")
-        return self
+            yield (), "give exactly one of uniform, log_uniform, normal and choice"
+        for name, value in given:
+            if name in ("uniform", "log_uniform") and not value[0] < value[1]:
+                yield (), f"{name} needs a least value below the largest"
 
 
 class Tasks(Section):
@@ -92,18 +91,17 @@ class SweepConfig(Section):
     )
     chunk: Count | None = Field(None, description="runs made and stored at a time; null for about a second's")
 
-    @model_validator(mode="after")
-    def _consistent(self) -> "SweepConfig":
-        if len(set_of := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
-            raise ValueError(f"base: two files of one name, {', '.join(sorted(set_of))}: rename one")
+    def contradictions(self) -> Iterator[Finding]:
+        """Names and values that stand twice."""
+        if len(names := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
+            yield ("base",), f"two files of one name, {', '.join(sorted(names))}: rename one"
         for name, axis in self.grid.items():
             if name == BASE:
-                raise ValueError("grid.base: several configurations are listed under base")
+                yield ("grid", BASE), "several configurations are listed under base"
             if axis.keys == ("",) and name in self.random:
-                raise ValueError(f"random.{name}: stands in the grid as well; keep one")
+                yield ("random", name), "stands in the grid as well; keep one"
             if len({json.dumps(value) for value in axis.values}) < len(axis.values):
-                raise ValueError(f"grid.{name}: a value stands there twice")
-        return self
+                yield ("grid", name), "a value stands there twice"
 
     def keys_of(self, name: str) -> tuple[str, ...]:
         """Keys of the configuration that an axis of the grid sets."""
