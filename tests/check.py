@@ -37,7 +37,7 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
         WITHOUT_COMPILER,
     ),
     "mathematics without the compiler": (
-        [*PYTEST, "--cov-report=", "-m", "not volume", *MATHEMATICS],
+        [*PYTEST, "--cov-report=", "--benchmark-disable", "-m", "not volume", *MATHEMATICS],
         WITHOUT_COMPILER,
     ),
     # The lines of both passes count.
