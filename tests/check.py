@@ -10,7 +10,10 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PYTHON = sys.executable
 BIN = Path(PYTHON).parent
-PYTEST = [PYTHON, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "--cov=projservo_cli"]
+PYTEST = [
+    *(PYTHON, "-m", "pytest", "-q", "-n", "2", "--dist", "worksteal", "--benchmark-disable"),
+    "--cov=projservo_cli",
+]
 # What is compiled, run once more without the compiler: the same bits, and lines that coverage can count.
 MATHEMATICS = [f"tests/{folder}" for folder in ("geometry", "task", "control", "loop", "plants")]
 WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
@@ -37,7 +40,7 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
         WITHOUT_COMPILER,
     ),
     "mathematics without the compiler": (
-        [*PYTEST, "--cov-report=", "--benchmark-disable", "-m", "not volume", *MATHEMATICS],
+        [*PYTEST, "--cov-report=", "-m", "not volume", *MATHEMATICS],
         WITHOUT_COMPILER,
     ),
     # The lines of both passes count.
