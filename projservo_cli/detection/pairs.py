@@ -1,9 +1,10 @@
-"""Which two images belong to which joint readings."""
+"""Stereo pairs: which two images belong to which joint readings, and what both show of the tags."""
 
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,11 +12,10 @@ from projservo_cli.detection.tags import TagFinder
 from projservo_cli.records import FloatArray, InputError, Observation, WorkFailed
 from projservo_cli.tables import JointList
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
+_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 
 
-@dataclass(frozen=True)
-class Pair:
+class Pair(NamedTuple):
     """Both images of one pose."""
 
     pose: int
@@ -41,11 +41,10 @@ def pair_images(left: str, right: str, joints: JointList, where: str) -> list[Pa
     if joints.left is not None and joints.right is not None:
         sides = [_named(left, joints.left, where), _named(right, joints.right, where)]
     else:
-        found = [(side, _images(side)) for side in (left, right)]
         find = _by_number if joints.numbered else _by_order
-        sides = [find(side, files, joints, where) for side, files in found]
-    poses = joints.pose.tolist()
-    return [Pair(pose, *both) for pose, *both in zip(poses, *sides, strict=True)]
+        found = [(side, _images(side)) for side in (left, right)]
+        sides = [find(side, files, joints.pose.tolist(), where) for side, files in found]
+    return [Pair(*row) for row in zip(joints.pose.tolist(), *sides, strict=True)]
 
 
 def _images(source: str) -> list[Path]:
@@ -55,9 +54,9 @@ def _images(source: str) -> list[Path]:
         candidates = list(folder.iterdir())
     else:
         candidates = list(folder.parent.glob(folder.name)) if folder.parent.is_dir() else []
-    files = [file for file in candidates if file.is_file() and file.suffix.lower() in SUFFIXES]
+    files = [file for file in candidates if file.is_file() and file.suffix.lower() in _SUFFIXES]
     if not files:
-        kinds = " ".join(sorted(suffix[1:] for suffix in SUFFIXES))
+        kinds = " ".join(sorted(suffix[1:] for suffix in _SUFFIXES))
         raise InputError(f"{source}: no images there; give a folder or a quoted pattern of files ({kinds})")
     return sorted(files, key=_natural)
 
@@ -76,23 +75,22 @@ def _named(source: str, names: Sequence[str], where: str) -> list[Path]:
     return files
 
 
-def _by_order(source: str, files: list[Path], joints: JointList, where: str) -> list[Path]:
-    if len(files) != len(joints.pose):
+def _by_order(source: str, files: list[Path], poses: list[int], where: str) -> list[Path]:
+    if len(files) != len(poses):
         raise InputError(
-            f"{source}: {len(files)} images for the {len(joints.pose)} rows of {where}; name the images in "
+            f"{source}: {len(files)} images for the {len(poses)} rows of {where}; name the images in "
             "columns left and right, or number the rows in a column pose"
         )
     return files
 
 
-def _by_number(source: str, files: list[Path], joints: JointList, where: str) -> list[Path]:
+def _by_number(source: str, files: list[Path], poses: list[int], where: str) -> list[Path]:
     numbered: dict[int, list[Path]] = {}
     for file in files:
-        numbers = re.findall(r"\d+", file.stem)
-        if numbers:
-            numbered.setdefault(int(numbers[-1]), []).append(file)
+        for number in re.findall(r"\d+", file.stem)[-1:]:
+            numbered.setdefault(int(number), []).append(file)
     chosen = []
-    for pose in joints.pose.tolist():
+    for pose in poses:
         fitting = numbered.get(pose, [])
         if len(fitting) != 1:
             names = ", ".join(file.name for file in fitting)
@@ -103,9 +101,6 @@ def _by_number(source: str, files: list[Path], joints: JointList, where: str) ->
             )
         chosen.append(fitting[0])
     return chosen
-
-
-CORNERS, CENTERS = "corners", "centers"
 
 
 @dataclass
@@ -135,7 +130,7 @@ def observe(
     pairs: Sequence[Pair],
     q: FloatArray,
     finder: TagFinder,
-    points: str = CORNERS,
+    points: str = "corners",
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> tuple[Observation, Findings]:
     """Find tags in pairs of images.
@@ -170,7 +165,7 @@ def observe(
             found.ambiguous += ambiguous
             found.empty += not tags
             for tag, corners in tags.items():
-                pixels = corners if points == CORNERS else crossing(corners)[None]
+                pixels = corners if points == "corners" else crossing(corners)[None]
                 found.unrefined += int(np.isnan(pixels[:, 0]).sum())
                 found.images[k, view, tag] = pixels
         progress("detect", k + 1, len(pairs))
@@ -179,7 +174,7 @@ def observe(
             f"no tag in any of {2 * len(pairs)} images: look whether --dictionary is that of your tags, "
             "and whether a bright margin of one cell surrounds each"
         )
-    observation = _observation([pair.pose for pair in pairs], q, found, 4 if points == CORNERS else 1)
+    observation = _observation([pair.pose for pair in pairs], q, found, 4 if points == "corners" else 1)
     if not np.isfinite(observation.images[..., 0]).all(axis=1).any():
         raise WorkFailed("no tag was seen by both cameras at the same pose: look whether the images pair up")
     return observation, found

@@ -1,6 +1,5 @@
 """Tags in one image, by OpenCV."""
 
-import importlib
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +9,13 @@ from scipy.special import ndtr
 
 from projservo_cli.records import FloatArray, InputError
 
-ROUNDS = 3  # samples are taken anew around the sides that were found
-ITERATIONS = 20
-LEAST_REACH = 1.5  # px on either side of an edge: less is no profile
-MOST_REACH = 6.0
-SPOILT = 0.2  # of the contrast: rms residual of a profile that something covers
-SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
+_ROUNDS = 3  # samples are taken anew around the sides that were found
+_ITERATIONS = 20
+_LEAST_REACH = 1.5  # px on either side of an edge: less is no profile
+_MOST_REACH = 6.0
+_SPOILT = 0.2  # of the contrast: rms residual of a profile that something covers
+_BORDER = 2  # cells of border along a side of a tag, besides those of its code
+_SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
 
 
 def refine_corners(image: FloatArray, corners: FloatArray, cells: int) -> FloatArray:
@@ -32,8 +32,8 @@ def refine_corners(image: FloatArray, corners: FloatArray, cells: int) -> FloatA
     (4, 2) px; NaN where one of the two sides of a corner has no clean edge.
     """
     guess = np.asarray(corners, dtype=np.float64)
-    for _ in range(ROUNDS):
-        lines = [fit_side(image, guess, side, cells) for side in range(4)]
+    for _ in range(_ROUNDS):
+        lines = [_fit_side(image, guess, side, cells) for side in range(4)]
         crossings = np.array([np.cross(lines[k - 1], lines[k]) for k in range(4)])
         with np.errstate(divide="ignore", invalid="ignore"):
             refined = np.asarray(crossings[:, :2] / crossings[:, 2:])
@@ -43,29 +43,24 @@ def refine_corners(image: FloatArray, corners: FloatArray, cells: int) -> FloatA
     return refined
 
 
-def fit_side(image: FloatArray, corners: FloatArray, side: int, cells: int) -> FloatArray:
+def _fit_side(image: FloatArray, corners: FloatArray, side: int, cells: int) -> FloatArray:
     """Line (3,) of the edge from corner ``side`` to the next, l·(u, v, 1) = 0; NaN without a clean edge.
 
     Profiles across the edge are fitted together by b + a Φ((n − n_0 − k t)/σ), Φ the normal
     distribution: an edge straight in t and blurred by σ.
-
-    Parameters
-    ----------
-    image, corners, cells : as for ``refine_corners``.
-    side : number of the side.
     """
     none = np.full(3, np.nan)
     start, end = corners[side], corners[(side + 1) % 4]
     length = float(np.linalg.norm(end - start))
-    if not length > 4.0 * LEAST_REACH:
+    if not length > 4.0 * _LEAST_REACH:
         return none
     along = (end - start) / length
     normal = np.array([along[1], -along[0]])
     depth = float(normal @ (start - corners.mean(axis=0)))
     if depth < 0.0:
         normal, depth = -normal, -depth
-    reach = min(0.65 * 2.0 * depth / cells, MOST_REACH)
-    if reach < LEAST_REACH:
+    reach = min(0.65 * 2.0 * depth / cells, _MOST_REACH)
+    if reach < _LEAST_REACH:
         return none
     margin = 0.12 * length + 1.0
     t = np.linspace(margin, length - margin, max(8, min(64, int(length))))
@@ -91,12 +86,12 @@ def _fit_edge(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> t
     """
     noise = float(np.median(np.abs(np.diff(grey, axis=0))))  # about the standard deviation of a pixel
     clean = np.ones(len(t), dtype=bool)
-    while clean.mean() >= 1.0 - SPOILT_SHARE:
+    while clean.mean() >= 1.0 - _SPOILT_SHARE:
         x = _least_squares(grey[clean], t[clean], n, reach)
         if x is None:
             return None
         residual, _ = _edge_model(x, grey, t, n)
-        spoilt = np.sqrt(np.mean(residual**2, axis=1)) > max(SPOILT * x[1], 3.0 * noise)
+        spoilt = np.sqrt(np.mean(residual**2, axis=1)) > max(_SPOILT * x[1], 3.0 * noise)
         if not (spoilt & clean).any():
             return float(x[2]), float(x[3])
         clean &= ~spoilt
@@ -110,7 +105,7 @@ def _least_squares(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float)
     scale = np.array([1.0, 1.0, reach, reach, reach])
     if not x[1] > 0.0:
         return None
-    for _ in range(ITERATIONS):
+    for _ in range(_ITERATIONS):
         residual, J = _edge_model(x, grey, t, n)
         step = np.linalg.lstsq(J, -residual.ravel(), rcond=None)[0]
         # A start two pixels off is far outside a sharp edge: no step may leap over the profile.
@@ -133,9 +128,6 @@ def _edge_model(
     bell = -a * np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * sigma)
     J = np.stack([np.ones_like(z), phi, bell, bell * t[:, None], bell * z], axis=-1)
     return b + a * phi - grey, J.reshape(-1, 5)
-
-
-BORDER = 2  # cells of border along a side of a tag, besides those of its code
 
 
 class TagFinder:
@@ -162,7 +154,7 @@ class TagFinder:
         parameters = aruco.DetectorParameters()
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._detector = aruco.ArucoDetector(tags, parameters)
-        self._cells = int(tags.markerSize) + BORDER
+        self._cells = int(tags.markerSize) + _BORDER
 
     def read(self, path: Path) -> FloatArray:
         """Grey values (height, width) of an image as the camera took it, unturned.
@@ -208,11 +200,11 @@ class TagFinder:
 
 def _opencv() -> Any:
     try:
-        module = importlib.import_module("cv2")
+        import cv2
     except ImportError as error:
         raise InputError("detect needs OpenCV: pip install 'projservo[detect]'") from error
-    if not hasattr(getattr(module, "aruco", None), "ArucoDetector"):
+    if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
         raise InputError(
-            f"detect needs OpenCV 4.7 or newer, not {module.__version__}: pip install 'projservo[detect]'"
+            f"detect needs OpenCV 4.7 or newer, not {cv2.__version__}: pip install 'projservo[detect]'"
         )
-    return module
+    return cv2
