@@ -1,6 +1,6 @@
 """Calls ended by the system at random moments: ``python -m tests.survival.kills 200`` kills so many.
 
-Calls, in turn, work in a folder that holds a complete run of other settings: ``stages`` up to the laws and
+Calls, in turn, work in a folder that holds a complete run of another seed: ``stages`` up to the laws and
 ``report`` of a recorded calibration; further arguments name others, such as ``all`` for the whole chain. Each
 is killed (SIGKILL) at a random moment. Then every file must be the complete old or the complete new one, and
 the same call must finish and leave nothing behind that does not belong there. The exit code is 1 where
@@ -15,7 +15,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,51 +22,19 @@ import numpy as np
 from projservo_cli import store
 from projservo_cli.records import InputError
 from tests.conftest import ROOT
-from tests.survival.calls import Ending, call, prepare, start
+from tests.survival.calls import call, prepare, start
 
+FRAMES, FORMATS = "calibration.frames_per_joint=4", "report.formats=[svg, png]"
 SIMULATED = (
-    "stop.max_steps=12",
-    "control.laws=[direct_three, stacked]",
-    "control.must_converge=[]",
-    "control.observation=points",
-    "trajectory.samples=6",
+    *(FRAMES, FORMATS, "stop.max_steps=12", "control.laws=[direct_three, stacked]"),
+    *("control.must_converge=[]", "control.observation=points", "trajectory.samples=6"),
 )
-SHARED = ("calibration.frames_per_joint=4", "report.formats=[svg, png]")
-CALLS = {
-    "stages": ("calibrate", "plan", "servo"),
-    "report": ("calibrate", "report", "--data", "{table}", "--set", "name=recorded"),
-    "all": ("calibrate", "plan", "servo", "report"),
-}
-CONFIG = ROOT / "configs" / "paper.yaml"
-DATED = ("run.h5", "report.html")  # files that tell when they were made
+STAGES = {"stages": ("calibrate", "plan", "servo"), "all": ("calibrate", "plan", "servo", "report")}
+CONFIG = str(ROOT / "configs" / "paper.yaml")
 
 
-def arguments(kind: str, folder: Path, seed: int) -> list[str]:
-    """A call that works in a folder; a recorded one reads the table of its seed beside the folder."""
-    table = folder.parent / f"trials{seed}.csv"
-    words = [word.format(table=table) for word in CALLS[kind]]
-    if kind == "report":
-        return [*words, "-q", "-o", str(folder), "--set", SHARED[1]]
-    settings = [part for value in (*SHARED, *SIMULATED, f"seed={seed}") for part in ("--set", value)]
-    return [*words, "-q", "-c", str(CONFIG), "-o", str(folder), *settings]
-
-
-def recorded(folder: Path, seed: int) -> list[str]:
-    """The call that records the table of a seed."""
-    table = str(folder / f"trials{seed}.csv")
-    return ["record", "-c", str(CONFIG), "--output", table, "--set", f"seed={seed}", "--set", SHARED[0]]
-
-
-def complete(path: Path, references: list[Path]) -> bool:
-    """Whether a file is one of the complete ones; those that tell the date, whether they are whole."""
-    if path.name == "run.h5":
-        try:
-            return bool(store.load(path).results)
-        except InputError:
-            return False
-    if path.name in DATED:
-        return path.read_text(encoding="utf-8").endswith("</html>\n")
-    return path.read_bytes() in [other.read_bytes() for other in references if other.exists()]
+def _set(*values: str) -> list[str]:
+    return [part for value in values for part in ("--set", value)]
 
 
 def files_in(folder: Path) -> set[Path]:
@@ -75,81 +42,81 @@ def files_in(folder: Path) -> set[Path]:
     return {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
 
 
-def killed(folder: Path, kind: str, moment: float) -> bool:
-    """Kill a call after so many seconds; whether it still ran."""
-    process = start(*arguments(kind, folder, 1))
-    time.sleep(moment)
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(process.process, signal.SIGKILL)
-    return process.end().code == -signal.SIGKILL
-
-
-def damage(folder: Path, references: list[Path]) -> list[str]:
-    """Files of a folder that are neither the complete old nor the complete new ones."""
-    found = []
-    for name in files_in(folder):
-        if name.name.startswith("."):
-            continue  # a lock, or what was being written
-        try:
-            if not complete(folder / name, [reference / name for reference in references]):
-                found.append(str(name))
-        except FileNotFoundError:  # a figure that the second process of the call has just replaced
-            pass
-    return found
-
-
-def require_done(ending: Ending) -> None:
-    """Nothing can be told of kills where even an undisturbed call fails."""
-    if ending.code != 0:
-        raise SystemExit(ending.err)
-
-
-@dataclass
 class Study:
-    """Kills of some calls within a folder.
+    """Kills of one kind of call within a folder; ``seconds`` is what it takes undisturbed."""
 
-    Attributes
-    ----------
-    folder : of all that is made.
-    seconds : that each call takes undisturbed, once it is timed.
-    """
+    def __init__(self, folder: Path, kind: str) -> None:
+        self.folder, self.kind = folder, kind
+        self.references = [folder / f"{kind}{seed}" for seed in range(2)]
+        for seed, reference in enumerate(self.references):
+            table = str(folder / f"trials{seed}.csv")
+            self._done(["record", "-c", CONFIG, "--output", table, *_set(f"seed={seed}", FRAMES), "--force"])
+            self._done(self._words(reference, seed))
+        self._copy()
+        began = time.monotonic()
+        self._done(self._words(self._killed, 1))
+        self.seconds = time.monotonic() - began
 
-    folder: Path
-    seconds: dict[str, float] = field(default_factory=dict)
+    @property
+    def _killed(self) -> Path:
+        return self.folder / "killed"
 
-    def reference(self, kind: str, seed: int) -> Path:
-        """Folder of a complete run."""
-        return self.folder / f"{kind}{seed}"
+    def _words(self, folder: Path, seed: int) -> list[str]:
+        """The call that works in a folder; a report is that of the recorded table of the seed."""
+        if self.kind == "report":
+            data = ["--data", str(self.folder / f"trials{seed}.csv"), *_set("name=recorded", FORMATS)]
+            return ["calibrate", "report", *data, "-q", "-o", str(folder)]
+        settings = _set(*SIMULATED, f"seed={seed}")
+        return [*STAGES[self.kind], "-q", "-c", CONFIG, "-o", str(folder), *settings]
 
-    def begin(self, kinds: Sequence[str]) -> None:
-        """Make the complete runs, and time the change from one to the other."""
-        for seed in range(2):
-            require_done(call(*recorded(self.folder, seed)))
-            for kind in kinds:
-                require_done(call(*arguments(kind, self.reference(kind, seed), seed)))
-        for kind in kinds:
-            folder = self.copy(kind)
-            began = time.monotonic()
-            require_done(call(*arguments(kind, folder, 1)))
-            self.seconds[kind] = time.monotonic() - began
+    def _done(self, words: list[str]) -> None:
+        """Nothing can be told of kills where even an undisturbed call fails."""
+        if (ending := call(*words)).code != 0:
+            raise SystemExit(ending.err)
 
-    def copy(self, kind: str) -> Path:
-        """A complete run of other settings, to be worked on."""
-        folder = self.folder / "killed"
-        shutil.rmtree(folder, ignore_errors=True)
-        shutil.copytree(self.reference(kind, 0), folder)
-        return folder
+    def _copy(self) -> None:
+        shutil.rmtree(self._killed, ignore_errors=True)
+        shutil.copytree(self.references[0], self._killed)
 
-    def kill(self, kind: str, moment: float) -> tuple[bool, list[str]]:
+    def kill(self, moment: float) -> tuple[bool, list[str]]:
         """Kill a call after so many seconds: whether it still ran, and all that was wrong after it."""
-        folder, references = self.copy(kind), [self.reference(kind, seed) for seed in range(2)]
-        ran = killed(folder, kind, moment)
-        found = damage(folder, references)
-        ending = call(*arguments(kind, folder, 1))
+        self._copy()
+        process = start(*self._words(self._killed, 1))
+        time.sleep(moment)
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process.process, signal.SIGKILL)
+        ran = process.end().code == -signal.SIGKILL
+        found = self._damage(self.references)
+        ending = call(*self._words(self._killed, 1))
         if ending.code != 0:
             found.append(f"the next call: exit code {ending.code}: {ending.err}")
-        found += [f"after the next call: {path}" for path in damage(folder, references[1:])]
-        return ran, found + [f"left: {path}" for path in files_in(folder) ^ files_in(references[1])]
+        found += [f"after the next call: {name}" for name in self._damage(self.references[1:])]
+        return ran, found + [
+            f"left: {path}" for path in files_in(self._killed) ^ files_in(self.references[1])
+        ]
+
+    def _damage(self, references: list[Path]) -> list[str]:
+        """Files that are neither the complete old nor the complete new ones."""
+        found = []
+        for name in files_in(self._killed):
+            with contextlib.suppress(FileNotFoundError):  # a helper of the call has just replaced it
+                # A lock, or what was being written, begins with a dot.
+                if not name.name.startswith(".") and not _complete(self._killed / name, name, references):
+                    found.append(str(name))
+        return found
+
+
+def _complete(path: Path, name: Path, references: list[Path]) -> bool:
+    """Whether a file is one of the complete ones; those that tell the date, whether they are whole."""
+    if path.name == "run.h5":
+        try:
+            return bool(store.load(path).results)
+        except InputError:
+            return False
+    if path.name == "report.html":
+        return path.read_text(encoding="utf-8").endswith("</html>\n")
+    others = [reference / name for reference in references]
+    return path.read_bytes() in [other.read_bytes() for other in others if other.exists()]
 
 
 def study(count: int, kinds: Sequence[str], seed: int = 1) -> int:
@@ -158,19 +125,14 @@ def study(count: int, kinds: Sequence[str], seed: int = 1) -> int:
     rng = np.random.default_rng(seed)
     running = wrong = 0
     with tempfile.TemporaryDirectory() as name:
-        kills = Study(Path(name))
-        kills.begin(kinds)
-        for kind, seconds in kills.seconds.items():
-            print(f"{kind}: {' '.join(CALLS[kind][:4])}: {seconds:.1f} s undisturbed", flush=True)
+        studies = [Study(Path(name), kind) for kind in kinds]
         for number in range(count):
-            kind = kinds[number % len(kinds)]
-            moment = float(rng.uniform(0.0, kills.seconds[kind]))
-            ran, found = kills.kill(kind, moment)
+            kills = studies[number % len(studies)]
+            moment = float(rng.uniform(0.0, kills.seconds))
+            ran, found = kills.kill(moment)
             running, wrong = running + ran, wrong + bool(found)
             if found:
-                print(f"kill {number}, {kind} after {moment:.2f} s: {'; '.join(found)}", flush=True)
-            elif number % 10 == 9:
-                print(f"{number + 1} kills, {wrong} left something wrong", flush=True)
+                print(f"kill {number}, {kills.kind} after {moment:.2f} s: {'; '.join(found)}", flush=True)
     print(f"{count} kills, {running} while the call ran: {wrong} left something wrong")
     return wrong
 

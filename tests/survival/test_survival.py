@@ -45,9 +45,8 @@ def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
 
 @pytest.mark.volume
 def test_a_killed_call_leaves_whole_files_and_is_finished_by_the_next(tmp_path):
-    kills = Study(tmp_path)
-    kills.begin(["stages"])
+    kills = Study(tmp_path, "stages")
     for share in (0.3, 0.8):
-        _, found = kills.kill("stages", share * kills.seconds["stages"])
+        _, found = kills.kill(share * kills.seconds)
         assert found == []
     assert load(tmp_path / "killed").traces.keys() == {"direct_three", "stacked"}
