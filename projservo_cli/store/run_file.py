@@ -29,6 +29,7 @@ from projservo_cli.records import (
 from projservo_cli.store.hdf5 import (
     SCHEMA_VERSION,
     attribute,
+    labelled,
     load_record,
     member,
     new_file,
@@ -134,7 +135,7 @@ def save(run: Run) -> None:
     InputError
         When it cannot be written; the file that stood there stays.
     """
-    with new_file(run.path) as file:
+    with new_file(run.path) as new, labelled(new) as file:
         told = {"configuration": run.configuration, "order": json.dumps(list(run.results))}
         file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION, **told})
         for name, result in run.results.items():

@@ -15,6 +15,7 @@ from projservo_cli.store.hdf5 import (
     SCHEMA_VERSION,
     attribute,
     encoded,
+    labelled,
     load_record,
     new_file,
     opened,
@@ -45,10 +46,12 @@ def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Tr
         If the file cannot be written.
     """
     with new_file(path) as file:
+        if traces:
+            with labelled(file) as groups:
+                for run, trace in traces.items():
+                    save_record(groups.create_group(f"{_TRACES}/{run}"), trace)
         for name, values in columns.items():
-            _new_column(file, name, values.dtype, len(values))[...] = _cells(values)
-        for run, trace in traces.items():
-            save_record(file.create_group(f"{_TRACES}/{run}"), trace)
+            file[name] = values
 
 
 def assemble(
@@ -68,7 +71,7 @@ def assemble(
     rows = sum(_rows(part) for part in parts)
     size = rows * sum(np.dtype(dtype).itemsize for _, dtype, _, _ in headings)
     size += sum(part.stat().st_size for part in parts)  # their traces
-    with new_file(path, size) as file:
+    with new_file(path, size) as new, labelled(new) as file:
         file.attrs.update({"schema": _SCHEMA, "schema_version": SCHEMA_VERSION})
         file.attrs.update({name: encoded(value) for name, value in attributes.items()})
         for name, dtype, units, about in headings:
