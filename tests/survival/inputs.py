@@ -80,7 +80,9 @@ def by_command(path: Path, run: Path) -> str:
     return ""
 
 
-def examine(number: int, folder: Path, run: Path | None) -> tuple[str, bool, float, str]:
+def examine(
+    number: int, folder: Path, run: Path | None, limit: float = SECONDS
+) -> tuple[str, bool, float, str]:
     """Kind, whether it was refused, seconds and what is wrong of the mutated file of a number."""
     name, kind, data = mutated(number)
     path = folder / name
@@ -96,7 +98,7 @@ def examine(number: int, folder: Path, run: Path | None) -> tuple[str, bool, flo
     except Exception:
         wrong = traceback.format_exc(limit=-3)
     seconds = time.process_time() - began
-    if seconds > SECONDS:
+    if seconds > limit:
         wrong = wrong or f"{seconds:.1f} s"
     if run is not None and not wrong:
         wrong = by_command(path, run)

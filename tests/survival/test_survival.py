@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.store import load
 from tests.store.sound import sound_file
 from tests.survival.calls import call
-from tests.survival.inputs import SAMPLE, examine
+from tests.survival.inputs import SAMPLE, SECONDS, examine
 from tests.survival.kills import Study
 from tests.survival.mutations import KINDS, mutate, wrong
 
@@ -39,7 +39,8 @@ def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
     run = tmp_path / "run.h5"
     run.write_bytes(sound_file())
     for number in range(first, first + 100):
-        _, _, _, found = examine(number, tmp_path, run if number % SAMPLE == 0 else None)
+        command = run if number % SAMPLE == 0 else None
+        _, _, _, found = examine(number, tmp_path, command, 3.0 * SECONDS)  # the machine may be busy
         assert found == ""
 
 
