@@ -167,11 +167,23 @@ BAD = {
         r": marker_numbers: give each of the 6 markers its own",
     ),
     "skewed": (
-        {"T_base_tool_at_reference": (2 * np.eye(4)).tolist()},
-        r": T_base_tool_at_reference: expected a r",
+        {"T_base_tool_at_reference": np.diag([2, 2, 2, 1]).tolist()},
+        r": T_base_tool_at_reference: the upper left 3×3 block must be a rotation",
     ),
-    "long axis": ({"screws": [{"w": [0, 0, 2], "v": [0, 0, 0]}] * 4}, r": screws.0: w is a unit vector"),
-    "helix": ({"screws": [{"w": [0, 0, 1], "v": [0, 0, 1]}] * 4}, r": screws.0: v has a part along w"),
+    "long axis": (
+        {"screws": [{"w": [0, 0, 2], "v": [0, 0, 0]}] * 4},
+        r": screws.0: w must be of unit length",
+    ),
+    "helix": ({"screws": [{"w": [0, 0, 1], "v": [0, 0, 1]}] * 4}, r": screws.0: v must be orthogonal to w"),
+    # As strict as a configured robot: what is written with three digits alone is neither.
+    "few digits": (
+        {"screws": [{"w": [0, 0, 1.0005], "v": [0, 0, 0]}] * 4},
+        r": screws.0: w must be of unit length",
+    ),
+    "hardly rigid": (
+        {"T_base_tool_at_reference": (np.diag([1.0004, 1, 1, 1])).tolist()},
+        r": T_base_tool_at_reference: the upper left 3×3 block must be a rotation",
+    ),
 }
 
 
