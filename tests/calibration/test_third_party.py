@@ -1,28 +1,9 @@
 """Tables made by other people's software and by a real robot, from pixels and joint readings alone."""
 
-import csv
-
-import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, residual_statistics
-from projservo_cli.records import Observation
-
-
-def table(path):
-    with open(path, newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    joints = sorted((name for name in rows[0] if name[0] == "q"), key=lambda name: int(name[1:]))
-    poses = {number: k for k, number in enumerate(sorted({int(row["pose"]) for row in rows}))}
-    markers = {number: j for j, number in enumerate(sorted({int(row["marker"]) for row in rows}))}
-    q, images = np.zeros((len(poses), len(joints))), np.full((len(poses), 2, len(markers), 2), np.nan)
-    for row in rows:
-        k, j = poses[int(row["pose"])], markers[int(row["marker"])]
-        q[k] = [float(row[name]) for name in joints]
-        images[k, 0, j] = float(row["u_left"]), float(row["v_left"])
-        images[k, 1, j] = float(row["u_right"]), float(row["v_right"])
-    return Observation(np.array(list(poses)), np.array(list(markers)), q, images)
-
+from projservo_cli.tables import read_table
 
 # Held-out medians and 95th percentiles to reach, px: maximum likelihood a little widened.
 NUMBERS = [
@@ -39,8 +20,10 @@ NUMBERS = [
 
 @pytest.mark.parametrize(("robot", "types", "noise", "median", "p95"), NUMBERS)
 def test_tables_of_other_simulators(shared_data, robot, types, noise, median, p95):
-    calibration = calibrate(table(shared_data / robot / f"trials_{noise}px.csv"), types, source="recorded")
-    found = residual_statistics(calibration, table(shared_data / robot / "validation.csv"))
+    calibration = calibrate(
+        read_table(shared_data / robot / f"trials_{noise}px.csv", types), types, source="recorded"
+    )
+    found = residual_statistics(calibration, read_table(shared_data / robot / "validation.csv", types))
     assert found["count"] == 4000
     assert found["median_px"] <= median
     assert found["p95_px"] <= p95
@@ -52,9 +35,9 @@ def test_tables_of_other_simulators(shared_data, robot, types, noise, median, p9
 @pytest.mark.volume
 def test_real_robot_with_arbitrary_poses(shared_data):
     calibration = calibrate(
-        table(shared_data / "motoman" / "arm2_train.csv"), "RRRRRR", source="recorded", seed=3
+        read_table(shared_data / "motoman" / "arm2_train.csv", "RRRRRR"), "RRRRRR", source="recorded", seed=3
     )
-    found = residual_statistics(calibration, table(shared_data / "motoman" / "arm2_test.csv"))
+    found = residual_statistics(calibration, read_table(shared_data / "motoman" / "arm2_test.csv", "RRRRRR"))
     # The same optimum from every start, and the numbers to beat.
     assert found["rms_px"] == pytest.approx(0.9068, abs=5e-4)
     assert found["median_px"] <= 0.80
