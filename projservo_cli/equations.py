@@ -92,20 +92,20 @@ REGISTER = (
     _entry(
         "8",
         "Translation along an axis through two points",
-        "geometry.mechanisms.translation_along",
+        "geometry.mechanisms.translation_mechanism",
         "geometry/test_mechanisms.py::test_translation_keeps_every_plane_through_its_line",
     ),
     _entry(
         "9",
         "Revolution about an axis through two points",
-        "geometry.mechanisms.rotation_about",
+        "geometry.mechanisms.rotation_mechanism",
         "geometry/test_mechanisms.py::test_revolution_keeps_its_axis",
         "“ker” is missing: q̂_R ν = ker[…]. The text says plane-operators; they are point operators.",
     ),
     _entry(
         "10",
         "Revolution about a point in a plane",
-        "geometry.mechanisms.rotation_within",
+        "geometry.mechanisms.planar_mechanism",
         "geometry/test_mechanisms.py::test_planar_revolution_keeps_its_plane_and_its_point",
         "Scrambled in typesetting: the rows are −Ĥ_iᵀ a_1 and Ĥ_i A_1.",
     ),
@@ -125,21 +125,21 @@ REGISTER = (
     _entry(
         "13",
         "Rotation onto the plane: the circle of a point meets the target plane",
-        "task.partition.onto_plane_part geometry.composition.angles_onto_plane",
-        "geometry/test_composition.py::test_points_are_turned_onto_the_plane",
+        "task.partition.onto_plane_part",
+        "task/test_partition.py::test_square_face",
         "The axis lies in a_t, so p_0 = 0 and θ⁻ = θ⁺ ± π. For the optical centre |p_0| may exceed the "
         "amplitude: visibility then never changes, which is no error.",
     ),
     _entry(
         "14",
         "Its trigonometric equation",
-        "geometry.composition.incidence_coefficients task.visibility.margin_coefficients",
+        "task.visibility.margin_coefficients",
         "task/test_visibility.py::test_margin_coefficients_describe_the_carried_plane",
     ),
     _entry(
         "15",
         "The two solutions of the trigonometric equation",
-        "geometry.composition.incidence_angles geometry.composition.angles_onto_plane",
+        "geometry.displacement.incidence_angles",
         "geometry/test_composition.py::test_solutions_are_all_zeros_of_the_equation "
         "geometry/test_composition.py::test_the_printed_second_solution_holds_only_without_a_cosine",
         "θ⁻ = π − θ⁺ holds only where p_c = 0; θ± = atan2(p_s, p_c) ± arccos(−p_0 / √(p_s² + p_c²)).",
@@ -207,7 +207,7 @@ REGISTER = (
     _entry(
         "24",
         "One rotation for both rotations",
-        "geometry.composition.compose_rotations",
+        "geometry.displacement.compose_rotations",
         "geometry/test_composition.py::test_one_rotation_equals_two "
         "geometry/test_composition.py::test_operator_is_the_matrix_logarithm_of_the_product "
         "control/test_direct.py::test_error_of_both_rotations_is_the_true_angle",
@@ -215,7 +215,7 @@ REGISTER = (
     _entry(
         "25",
         "Coefficients of the composed rotation",
-        "geometry.composition.compose_rotations",
+        "geometry.displacement.compose_rotations",
         "geometry/test_composition.py::test_the_printed_factor_two_is_wrong",
         "c = sin(θ_p/2) sin(θ_r/2), without the factor 2, with [Ĥ_r, Ĥ_p] = Ĥ_r Ĥ_p − Ĥ_p Ĥ_r.",
     ),

@@ -190,7 +190,7 @@ def cross_matrix(w: FloatArray) -> FloatArray:
     return S - np.swapaxes(S, -1, -2)
 
 
-def axis_of(H_hat: FloatArray) -> FloatArray:
+def _axis_of(H_hat: FloatArray) -> FloatArray:
     """Axes (…, 3) of the rotation parts of twists (…, 4, 4)."""
     return np.stack([H_hat[..., 2, 1], H_hat[..., 0, 2], H_hat[..., 1, 0]], axis=-1)
 
@@ -203,7 +203,7 @@ def generators(scene: Scene, prismatic: BoolArray) -> list[FloatArray]:
     center = scene.M[:, :3].mean(axis=0)
     size = float(np.linalg.norm(scene.M[:, :3] - center, axis=1).mean()) or 1.0
     H_hat = scene.H_hat
-    w = np.where(prismatic[:, None], H_hat[:, :3, 3], axis_of(H_hat))
+    w = np.where(prismatic[:, None], H_hat[:, :3, 3], _axis_of(H_hat))
     w = w / np.linalg.norm(w, axis=1, keepdims=True)
     # Two unit vectors across w: from the coordinate axis farthest from it, so that neither is short.
     across = np.empty((len(w), 2, 3))
@@ -237,7 +237,7 @@ def retract(problem: Problem, scene: Scene, x: FloatArray) -> Scene:
         if slides:
             H_hat[i, :3, 3] = v * np.linalg.norm(scene.H_hat[i, :3, 3]) / np.linalg.norm(v)
         else:
-            w = axis_of(0.5 * (moved[i] - moved[i].T))
+            w = _axis_of(0.5 * (moved[i] - moved[i].T))
             w /= np.linalg.norm(w)
             H_hat[i, :3, :3] = cross_matrix(w)
             H_hat[i, :3, 3] = v - w * (w @ v)
@@ -327,17 +327,10 @@ def minimize(
     settled_at: float = SETTLED,
     stalled: Stalled = lambda residual: False,
 ) -> Fit:
-    """Weighted least squares over all parameters, or with the cameras held.
+    """Weighted least squares from a scene over all parameters, or with the cameras held.
 
-    Parameters
-    ----------
-    problem : what to explain.
-    scene : start.
-    weighting : weights (2, N) from residuals (2, N, 2), recomputed after each accepted step.
-    cameras : whether the cameras are free.
-    most : steps after which to give up.
-    settled_at : a step that moves the images by less than this fraction of the residual is the last.
-    stalled : told the residuals (2, N, 2) after each accepted step; true ends the search.
+    Weights (2, N) come from residuals (2, N, 2) anew after each accepted step, and ``stalled``, told the
+    same, may end the search; a step that moves the images by less than a share of the residual is the last.
     """
     first = 0 if cameras else 2 * CAMERA
     residual = problem.residual(scene)

@@ -22,17 +22,7 @@ def closed_form_operators(
     """Projective kinematics from homographies of the trial motions, [RH00] eqs. (2), (4), (5).
 
     The operator of a joint is the mean over its trials weighted by sin² θ (or τ²), the least-squares
-    weights of the quotients in (4) and (5).
-
-    Parameters
-    ----------
-    readings : single-joint trials.
-    F : (3, 3) fundamental matrix, px.
-    sigma_px : pixel noise, for the refusal of coplanar markers.
-
-    Returns
-    -------
-    The scene, the reference joints (n,), and which of the markers it holds (m,).
+    weights of the quotients in (4) and (5). With the reference joints (n,), and which markers (m,) there are.
 
     Raises
     ------

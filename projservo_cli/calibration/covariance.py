@@ -40,19 +40,11 @@ class ProjectiveScene:
 def isotropic(
     P: FloatArray, H_hat: FloatArray, M: FloatArray, a_inf: FloatArray, moved: FloatArray
 ) -> ProjectiveScene:
-    """The one projective frame in which the points seen have the identity as second moment.
+    """The one projective frame in which points seen, ``moved`` (N, 4), have the identity as second moment.
 
     The rotation that leaves free is settled by the left camera: its depth row and then its two image
     rows are triangular, its centre lies along the fourth axis on the positive side of ``a_inf``. So
     the frame depends on images alone: whatever frame the scene comes in, the same numbers come out.
-
-    Parameters
-    ----------
-    P : (2, 3, 4) cameras.
-    H_hat : (n, 4, 4) operators.
-    M : (m, 4) markers at the reference.
-    a_inf : (4,) plane at infinity.
-    moved : (N, 4) markers where they were seen, scaled like M.
     """
     points = moved / (moved @ a_inf)[:, None]
     M = M / (M @ a_inf)[:, None]
@@ -82,10 +74,7 @@ def spread_factor(problem: Problem, scene: Scene, used: BoolArray) -> FloatArray
     """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that readings (2, N) determine.
 
     Singular values of J itself keep the weakest direction, which the normal matrix would lose.
-
-    Returns
-    -------
-    (size, size − g) at a noise of one pixel; a direction the data leave open has a column of enormous length.
+    At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
     """
     J = problem.dense(derivative(problem, scene)[1], used)
     scale = np.linalg.norm(J, axis=0)

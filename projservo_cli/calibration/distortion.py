@@ -7,7 +7,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri, fdtri
 
 from projservo_cli.calibration.adjustment import LEAST_DAMPING, derivative, minimize, prepare, scaled_normal
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, epipolar_geometry
+from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import RAYLEIGH, Solution, cauchy, least_squares, median_px
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.readings import Readings
@@ -109,12 +109,6 @@ def _unfolded(solution: Solution) -> BoolArray:
     assert solution.scene.lens is not None
     straight, _ = solution.problem.pixels(dataclasses.replace(solution.scene, lens=None))
     return within(solution.scene.lens[:, None], straight)
-
-
-def straight_epipolar(solution: Solution, rng: np.random.Generator) -> Epipolar:
-    """Epipolar geometry of the images as projective cameras would have seen them."""
-    straight = straight_readings(solution.problem.readings, solution.scene.lens)
-    return epipolar_geometry(straight.pixels[0][straight.both], straight.pixels[1][straight.both], rng)
 
 
 def straight_readings(readings: Readings, lens: FloatArray | None) -> Readings:

@@ -41,7 +41,6 @@ from projservo_cli.calibration.quality import (
     require_determined,
     require_joints_seen,
     require_off_line,
-    shortfall,
     verdict,
 )
 from projservo_cli.calibration.readings import (
@@ -130,8 +129,7 @@ def calibrate(
             distortion.require_size(readings, image_size)
         require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
-        both = readings.both
-        epipolar = epipolar_geometry(readings.pixels[0][both], readings.pixels[1][both], rng)
+        epipolar = _rig(readings, rng)
         expect = partial(expected_noise, sigma_px=sigma_px, source=source)
         expected = expect(epipolar)
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
@@ -149,6 +147,11 @@ def calibrate(
         if method == "refined" and fitted is not None:
             fitted(solution, expected.noise_px(solution.agreement))
     return dataclasses.replace(result, source=source, seconds=seconds)
+
+
+def _rig(readings: Readings, rng: np.random.Generator) -> Epipolar:
+    """Epipolar geometry of what both views saw."""
+    return epipolar_geometry(readings.pixels[0][readings.both], readings.pixels[1][readings.both], rng)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -180,7 +183,7 @@ def _most_likely(
         if lens:
             tell("calibration, lens", 0, 1)
             solution = distortion.with_lens(solution, frame, epipolar)
-            straight = distortion.straight_epipolar(solution, rng)
+            straight = _rig(distortion.straight_readings(problem.readings, solution.scene.lens), rng)
             expected = expect(straight)
         result = _refined(solution, straight, expected, frame)
     except Misfit as refused:
@@ -250,15 +253,8 @@ def _record(
 ) -> Calibration:
     """Record of a fit in its projective frame; WorkFailed if a joint is not determined.
 
-    Parameters
-    ----------
-    method : name of the method.
-    result : cameras, operators, markers and plane at infinity.
-    solution : what was fitted, and what that leaves of the images.
-    expected : what it should leave.
-    factor : of the covariance as of ``covariance_factor``; None for a method that has none.
-    found : what explains readings left out.
-    suspicion : what may be to blame for more than pixel noise.
+    ``factor`` is that of ``covariance_factor``, None for a method that has none; ``found`` explains readings
+    left out, and ``suspicion`` is what may be to blame for more than pixel noise.
     """
     problem, agreement = solution.problem, solution.agreement
     readings, lens = problem.readings, solution.scene.lens
@@ -284,17 +280,16 @@ def _record(
         error, bound = (sigma * value for value in predicted_error(sure))
     outlier = outliers.listed(readings, readings.seen & ~agreement.used & ~found.explained)
     counts = (len(outlier), len(found.suspect), len(found.swapped))
-    reason, advice = verdict(agreement, expected, joints, counts, suspicion)
-    short = shortfall(method, agreement, expected)
+    usable, reason, advice = verdict(method, agreement, expected, joints, counts, suspicion)
     operator_defect, trace_defect, plane_defect = _defects(result, prismatic)
     used_rows = agreement.used.any(axis=0)
     return Calibration(
         method=method,
         source="",
         joint_types="".join("P" if slides else "R" for slides in prismatic),
-        usable=short is None,
-        reason=short or reason,
-        advice=advice if short is None else (),
+        usable=usable,
+        reason=reason,
+        advice=advice,
         rms_px=agreement.rms_px,
         sigma_px=expected.sigma_px,
         sigma_fitted_px=agreement.sigma_px,

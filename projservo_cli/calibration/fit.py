@@ -212,16 +212,8 @@ def least_squares(
 ) -> Solution | None:
     """Least squares of the readings within 5σ, in rounds until they no longer change.
 
-    Parameters
-    ----------
-    problem : what to explain.
-    scene : start.
-    sigma : robust noise at the start, px; many times that of the epipolar geometry it is not worth the time.
-    epipolar : of the rig; None where the start is known to be good.
-
-    Returns
-    -------
-    None where the fit does not put the points in front of both cameras.
+    Where the robust noise σ at the start, px, is many times that of an epipolar geometry it is not worth the
+    time. None where the fit does not put the points in front of both cameras.
     """
     residual = problem.residual(scene)
     if epipolar is not None and sigma > _HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA):
@@ -306,14 +298,7 @@ def solve(
 ) -> Solution:
     """Best fit over the starts; the first that leaves nothing but the expected noise ends the search.
 
-    Parameters
-    ----------
-    problem : what to explain.
-    epipolar : epipolar geometry of the rig.
-    frame : guessed image centres and sizes.
-    rng : draws starts.
-    expected : noise to measure fits by.
-    tell : told before each start how many were tried, of at most how many.
+    ``tell`` hears before each start how many were tried, of at most how many.
 
     Raises
     ------
@@ -388,9 +373,7 @@ def solve_from(
 ) -> tuple[Solution, str]:
     """The fit that a given start leads to if it leaves the expected noise, else the best of it and a search.
 
-    Returns
-    -------
-    The fit, and advice about the start where it did not lead there, else empty.
+    With advice about the start where it did not lead there, else empty.
 
     Raises
     ------

@@ -141,14 +141,7 @@ def require_explained(readings: Readings, used: BoolArray, found: Outliers, epip
     """Refuse a fit that leaves out too many sightings both views agree on, or poses for their joint readings.
 
     Errors of detection break the epipolar geometry; what obeys it and still does not fit speaks
-    against the model of the robot.
-
-    Parameters
-    ----------
-    readings : what was seen, as projective cameras would have.
-    used : (2, N) readings that count.
-    found : what explains the others.
-    epipolar : epipolar geometry of the rig.
+    against the model of the robot. Readings are those that projective cameras would have seen.
 
     Raises
     ------
@@ -256,16 +249,8 @@ def blamed_joint(
     """The one change of one joint with which the model does describe the data, in words; empty if none.
 
     All changes are compared in one guessed metric frame, which owes nothing to the joints; the best are
-    followed to the maximum of the likelihood and believed only where that passes as a calibration would.
-
-    Parameters
-    ----------
-    problem : as it was given.
-    epipolar : epipolar geometry of the rig.
-    frame : guessed image centres and sizes.
-    most_px : noise per coordinate that a change must not leave more than, px.
-    rng : draws axes.
-    tell : told before each change how many were compared, of how many.
+    followed to the maximum of the likelihood and believed only where that passes as a calibration would
+    and leaves no more than a noise, px.
     """
     try:
         guess = metric_guesses(epipolar.F, problem.readings, frame, keep=1)[0]

@@ -27,13 +27,9 @@ LENS = 2
 
 
 def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
-    """Displacements exp(q Ĥ) of every joint at every pose, [RH00] eqs. (4), (5): (n, K, 4, 4).
+    """Displacements exp(q Ĥ) (n, K, 4, 4) of operators (n, 4, 4) at joints (K, n), [RH00] eqs. (4), (5).
 
-    Parameters
-    ----------
-    H_hat : (n, 4, 4) operators.
-    prismatic : (n,) whether eq. (5) holds.
-    q : (K, n) joint values from the reference, rad or m.
+    Joint values are from the reference, rad or m.
     """
     squared = H_hat @ H_hat
     sine, versine = (part.T[..., None, None] for part in _sine_and_versine(prismatic, q))
@@ -47,14 +43,9 @@ def _sine_and_versine(prismatic: BoolArray, q: FloatArray) -> tuple[FloatArray, 
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
-    """Points after the last joints alone, (n + 1, K, m, 4), [RH00] eq. (6) from its right end.
+    """Points (m, 4) or (K, m, 4) after the last joints alone, (n + 1, K, m, 4): [RH00] eq. (6) from its end.
 
-    Entry n holds the points at the reference, entry 0 the points moved by all joints.
-
-    Parameters
-    ----------
-    E : (n, K, 4, 4) displacements.
-    M : (m, 4) points at the reference, or (K, m, 4) others at each pose.
+    By displacements (n, K, 4, 4). Entry n holds points at the reference, entry 0 those moved by all joints.
     """
     n, K = E.shape[:2]
     Y = np.empty((n + 1, K, *M.shape[-2:]))
@@ -88,7 +79,7 @@ def projection_derivative(
     return bent(lens[:, None], pixels), by_pixel @ G, by_lens
 
 
-def from_reference(model: Model, q: FloatArray) -> FloatArray:
+def _from_reference(model: Model, q: FloatArray) -> FloatArray:
     """Joint values (K, n) from the reference, after a check of the readings (K, n), rad or m."""
     q = np.asarray(q, dtype=np.float64)
     n = len(model.H_hat_0)
@@ -123,7 +114,7 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
 
 def marker_pixels(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
     """Pixels (K, 2, m, 2) of markers (m, 4) at joint readings (K, n); NaN and raising as of ``predict``."""
-    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, from_reference(model, q))
+    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, _from_reference(model, q))
     m = image_points(model.P, moved_points(E, M)[0])
     return through(model.lens[:, None], m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan))
 
@@ -210,7 +201,7 @@ def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatAr
     q : (K, n) joint readings, rad or m.
     """
     H_hat, prismatic = model.H_hat_0, model.joint_types == PRISMATIC
-    dq = from_reference(model, q)
+    dq = _from_reference(model, q)
     K, n, m = len(dq), len(H_hat), len(M)
     E = displacements(H_hat, prismatic, dq)
     Y = moved_points(E, M)

@@ -95,45 +95,36 @@ def require_off_line(result: ProjectiveScene, factor: FloatArray) -> None:
         raise WorkFailed(ON_A_LINE)
 
 
-def shortfall(method: str, agreement: Agreement, expected: Expected) -> str | None:
-    """Why a fit that was not refused cannot be used, or None where it can.
-
-    The closed form is kept for comparison: it returns what it finds, marked so. That is no least-squares
-    fit, so that residuals above the noise are its own doing.
-    """
-    if method == "refined" or not expected.warns(agreement):
-        return None
-    return (
-        f"the {method} method explains the images only to {agreement.sigma_px:.3g} px a coordinate, "
-        f"{expected.ratio(agreement):.3g} times the {expected.sigma_px:.3g} px {expected.origin}: use refined"
-    )
-
-
 def verdict(
-    agreement: Agreement, expected: Expected, joints: Joints, left_out: tuple[int, int, int], suspicion: str
-) -> tuple[str, tuple[str, ...]]:
-    """Why a calibration is usable, what limits it, and what to do next, in words.
+    method: str,
+    agreement: Agreement,
+    expected: Expected,
+    joints: Joints,
+    left_out: tuple[int, int, int],
+    suspicion: str,
+) -> tuple[bool, str, tuple[str, ...]]:
+    """Whether and why a calibration is usable, what limits it, and what to do next, in words.
 
-    Parameters
-    ----------
-    agreement, expected : what the fit leaves, and what it should.
-    joints : what the data say of them.
-    left_out : number of outliers, of suspect joint readings and of exchanged markers.
-    suspicion : what may be to blame for more than pixel noise.
+    From the numbers of outliers, of suspect joint readings and of exchanged markers left out, and a
+    suspicion of what may be to blame for more than pixel noise. The closed form is kept for comparison: it
+    returns what it finds, marked so, for residuals above the noise are its own doing.
     """
     sigma, warned = agreement.sigma_px, expected.warns(agreement)
     outliers, suspects, swaps = left_out
+    wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
+    if method != "refined" and warned:
+        short = f"the {method} method explains the images only to {sigma:.3g} px a coordinate"
+        return False, f"{short}, {expected.ratio(agreement):.3g} times {wanted}: use refined", ()
     weak = np.flatnonzero(joints.noise > WEAK_NOISE)
     advice = [joints.advice(int(i)) for i in weak]
     limit = "noise"
     if warned or suspicion == "lens":
         limit = suspicion
     elif weak.size:
-        short = joints.span[weak] < np.where(joints.prismatic[weak], REACH_M, REACH_RAD)
-        limit = "amplitude" if short.any() else "geometry"
+        few = joints.span[weak] < np.where(joints.prismatic[weak], REACH_M, REACH_RAD)
+        limit = "amplitude" if few.any() else "geometry"
     elif outliers > _MOST_OUTLIERS * agreement.used.shape[1]:
         limit = "outliers"
-    wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
     reason = f"residuals of {sigma:.3g} px a coordinate agree with {wanted}"
     if warned:
         left = f"residuals of {sigma:.3g} px a coordinate are {expected.ratio(agreement):.3g} times {wanted}"
@@ -148,7 +139,7 @@ def verdict(
         )
     if swaps:
         advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
-    return f"{reason}; limited by {limit}", tuple(advice)
+    return True, f"{reason}; limited by {limit}", tuple(advice)
 
 
 # Readings of a joint this near, rad or m, are one: a robot that holds a joint still reads it with jitter.
@@ -252,8 +243,6 @@ def _predicted(
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """What a fit to the other poses leaves of those held out (K,): WorkFailed if they leave the robot open.
 
-    Returns
-    -------
     Readings (2, N) that are predicted, seen minus predicted (2, N, 2) and its deviation (2, N, 2), px.
     """
     whole, q_reference = solution.problem.readings, solution.problem.q_reference

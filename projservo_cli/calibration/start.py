@@ -152,24 +152,11 @@ def rotation_axes(
     keep: int,
     steps: int = _TURNS,
 ) -> list[FloatArray]:
-    """Axis directions that explain the rotations of the poses, the distinct minima, best first.
+    """Sets of axes (n, 3) that explain the rotations at joint values (K, n), the distinct minima, best first.
 
     Levenberg–Marquardt under a Cauchy loss on log(R_k R_predᵀ) from many random sets of axes at once,
-    and from the axes that single-joint trials show directly.
-
-    Parameters
-    ----------
-    alignment : rotations of the poses.
-    q : (K, n) joint values from the reference, rad or m.
-    prismatic : (n,) joints that do not turn.
-    rng : draws the axes.
-    keep : most sets to return.
-    steps : of the search.
-
-    Returns
-    -------
-    Sets of (n, 3) unit vectors, those of prismatic joints without meaning; none where no axes explain
-    the rotations at all.
+    and from the axes that single-joint trials show directly. At most so many sets, none where no axes explain
+    the rotations at all; axes of prismatic joints have no meaning.
     """
     R, q = alignment.R[alignment.merged], q[alignment.merged]
     w = rng.standard_normal((_STARTS, q.shape[1], 3))
@@ -303,14 +290,8 @@ def place(w: FloatArray, guess: Guess, readings: Readings, q: FloatArray) -> Sce
     """Axis points, directions of translation and markers, linear in the points once all axes are known.
 
     A point of marker j at pose k is R̄_n X_j + Σ R̄_{i−1} ((I − R_i) p_i, or q_i v_i if prismatic):
-    least squares under a Cauchy loss with a small ridge. Translations get one common speed.
-
-    Parameters
-    ----------
-    w : (n, 3) unit axes of the revolute joints.
-    guess : reconstruction of the sightings shared by both views.
-    readings : what was seen; its rows with both views are those of the reconstruction.
-    q : (K, n) joint values from the reference, rad or m.
+    least squares under a Cauchy loss with a small ridge. Translations get one common speed. Joint values
+    (K, n) are from the reference; the readings of both views are those of the guess.
     """
     points, prismatic = guess.points, readings.prismatic
     n, m = w.shape[0], readings.marker.size
@@ -361,16 +342,9 @@ def starts(
     rng: np.random.Generator,
     factors: tuple[float, ...],
 ) -> Iterator[Scene]:
-    """Scenes to start from, most promising first: focal lengths, and axes for each.
+    """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each.
 
-    Parameters
-    ----------
-    problem : what to explain.
-    readings : of the problem, perhaps at some of its poses.
-    epipolar : epipolar geometry of the rig.
-    frame : guessed image centres and sizes.
-    rng : draws axes.
-    factors : multiply the focal lengths that fit best.
+    The readings are those of the problem, perhaps at some of its poses.
     """
     guesses = metric_guesses(epipolar.F, readings, frame, _FOCAL_MINIMA)
     for factor in factors:

@@ -8,20 +8,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
 
 from projservo_cli.calibration import Nominal
+from projservo_cli.config.robot import Matrix34, Pose, ScrewJoint, Vector3
 from projservo_cli.records import FloatArray, InputError
-
-# Unit vectors may be written with few digits.
-ROUNDED = 1e-3
-
-Numbers3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-Numbers4 = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 class _Screw(BaseModel):
     """A unit axis w with v = −w × point, or w zero and a unit direction v."""
 
-    w: Numbers3
-    v: Numbers3
+    w: Vector3
+    v: Vector3
 
 
 class _File(BaseModel):
@@ -31,11 +26,11 @@ class _File(BaseModel):
 
     screws: Annotated[list[_Screw], Field(min_length=1)]
     q_reference: list[FiniteFloat]
-    camera_left: Annotated[list[Numbers4], Field(min_length=3, max_length=3)]
-    camera_right: Annotated[list[Numbers4], Field(min_length=3, max_length=3)]
-    markers_tool: Annotated[list[Numbers3], Field(min_length=1)]
+    camera_left: Matrix34
+    camera_right: Matrix34
+    markers_tool: Annotated[list[Vector3], Field(min_length=1)]
     marker_numbers: list[int] | None = None
-    T_base_tool_at_reference: Annotated[list[Numbers4], Field(min_length=4, max_length=4)]
+    T_base_tool_at_reference: Pose
 
 
 def read_nominal(path: Path | str) -> Nominal:
@@ -72,7 +67,7 @@ def read_nominal(path: Path | str) -> Nominal:
         np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(found.screws)]),
         np.array(found.q_reference, dtype=np.float64),
         np.array(numbers, dtype=np.int64),
-        body @ _rigid(f"{path}: T_base_tool_at_reference", found.T_base_tool_at_reference).T,
+        body @ np.array(found.T_base_tool_at_reference).T,
     )
 
 
@@ -90,40 +85,33 @@ def _checked(path: Path) -> _File:
     try:
         return _File.model_validate_json(json.dumps(values))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(map(str, first["loc"])) or "the file"
+        key, what = _first(error)
         raise InputError(
-            f"{path}: {key}: {first['msg'][:1].lower()}{first['msg'][1:]}; expected screws, q_reference, "
+            f"{path}: {key or 'the file'}: {what}; expected screws, q_reference, "
             "camera_left, camera_right, markers_tool and T_base_tool_at_reference"
         ) from error
 
 
+def _first(error: ValidationError) -> tuple[str, str]:
+    """The first key that is wrong, and what is."""
+    first = error.errors(include_url=False)[0]
+    what = first["msg"].removeprefix("Value error, ")
+    return ".".join(map(str, first["loc"])), f"{what[:1].lower()}{what[1:]}"
+
+
 def _twist(where: str, screw: _Screw) -> FloatArray:
-    """Twist (4, 4) of a screw, freed of what rounding left of a pitch."""
+    """Twist (4, 4) of a screw that a configured robot may have, freed of what rounding left of a pitch."""
     w, v = np.array(screw.w), np.array(screw.v)
-    axis = w if w.any() else v
-    if abs(float(np.linalg.norm(axis)) - 1.0) > ROUNDED:
-        raise InputError(
-            f"{where}: w is a unit vector where the joint is revolute; where it is prismatic w is zero and v "
-            "a unit vector"
-        )
+    try:
+        ScrewJoint(type="R" if w.any() else "P", w=screw.w, v=screw.v)
+    except ValidationError as error:
+        key, what = _first(error)
+        raise InputError(f"{where}: {key} {what}") from None
     twist = np.zeros((4, 4))
     if not w.any():
         twist[:3, 3] = v / np.linalg.norm(v)
         return twist
     w = w / np.linalg.norm(w)
-    if abs(float(w @ v)) > ROUNDED * max(1.0, float(np.linalg.norm(v))):
-        raise InputError(
-            f"{where}: v has a part along w: a joint turns about an axis and does not slide along it"
-        )
     twist[:3, :3] = np.cross(np.eye(3), w)
     twist[:3, 3] = v - w * (w @ v)
     return twist
-
-
-def _rigid(where: str, rows: list[Numbers4]) -> FloatArray:
-    T = np.array(rows)
-    off = np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max()
-    if off > ROUNDED or np.linalg.det(T[:3, :3]) < 0.0 or (T[3] != (0.0, 0.0, 0.0, 1.0)).any():
-        raise InputError(f"{where}: expected a rotation and a translation over the row 0, 0, 0, 1")
-    return T

@@ -172,7 +172,7 @@ def _rigid(T: Matrix44, info: ValidationInfo) -> Matrix44:
     return T
 
 
-_Pose = Annotated[Matrix44, AfterValidator(_rigid)]
+Pose = Annotated[Matrix44, AfterValidator(_rigid)]
 
 
 class DH(Section):
@@ -180,14 +180,14 @@ class DH(Section):
 
     convention: Literal["standard", "modified"] = Field("standard", description="of the table")
     joints: tuple[DHJoint, ...] = Field(min_length=1, max_length=64, description="rows, base to tool")
-    tool: _Pose = Field(_IDENTITY, description="pose of the tool in the last joint's frame, m")
+    tool: Pose = Field(_IDENTITY, description="pose of the tool in the last joint's frame, m")
 
 
 class Screws(Section):
     """Joint screws at a reference: T(q) = Π exp(screw_i (q_i − reference_i)) · base_tool."""
 
     reference: JointVector = Field(description="joint readings at which the screws hold")
-    base_tool: _Pose = Field(description="pose of the tool in the base frame there, m")
+    base_tool: Pose = Field(description="pose of the tool in the base frame there, m")
     joints: tuple[ScrewJoint, ...] = Field(min_length=1, max_length=64, description="screws, base to tool")
 
     def contradictions(self) -> Iterable[Finding]:

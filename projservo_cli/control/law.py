@@ -14,8 +14,9 @@ import numpy as np
 from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
 from projservo_cli.geometry.displacement import composed_angle
 from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import operators_at, row
-from projservo_cli.geometry.mechanisms import COORDINATES, OWN, Span, Work, joint_motion, workspace
+from projservo_cli.geometry.mechanisms import OWN, Span, Work, joint_motion, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, carry, fit_body, new_normal

@@ -15,8 +15,6 @@ Mat4 = tuple[
     float, float, float, float, float, float, float, float,
 ]  # fmt: skip
 
-ZERO4: Vec4 = (0.0, 0.0, 0.0, 0.0)
-
 
 @inline
 def vec(A: FloatArray) -> Vec4:
@@ -153,22 +151,10 @@ def apply_transposed(H: Mat4, a: Vec4) -> Vec4:
 def combine(k: float, A: Mat4, l: float, B: Mat4) -> Mat4:
     """Sum k A + l B."""
     return (
-        k * A[0] + l * B[0],
-        k * A[1] + l * B[1],
-        k * A[2] + l * B[2],
-        k * A[3] + l * B[3],
-        k * A[4] + l * B[4],
-        k * A[5] + l * B[5],
-        k * A[6] + l * B[6],
-        k * A[7] + l * B[7],
-        k * A[8] + l * B[8],
-        k * A[9] + l * B[9],
-        k * A[10] + l * B[10],
-        k * A[11] + l * B[11],
-        k * A[12] + l * B[12],
-        k * A[13] + l * B[13],
-        k * A[14] + l * B[14],
-        k * A[15] + l * B[15],
+        k * A[0] + l * B[0], k * A[1] + l * B[1], k * A[2] + l * B[2], k * A[3] + l * B[3],
+        k * A[4] + l * B[4], k * A[5] + l * B[5], k * A[6] + l * B[6], k * A[7] + l * B[7],
+        k * A[8] + l * B[8], k * A[9] + l * B[9], k * A[10] + l * B[10], k * A[11] + l * B[11],
+        k * A[12] + l * B[12], k * A[13] + l * B[13], k * A[14] + l * B[14], k * A[15] + l * B[15],
     )  # fmt: skip
 
 
@@ -176,22 +162,10 @@ def combine(k: float, A: Mat4, l: float, B: Mat4) -> Mat4:
 def multiple(k: float, A: Mat4) -> Mat4:
     """Multiple k A."""
     return (
-        k * A[0],
-        k * A[1],
-        k * A[2],
-        k * A[3],
-        k * A[4],
-        k * A[5],
-        k * A[6],
-        k * A[7],
-        k * A[8],
-        k * A[9],
-        k * A[10],
-        k * A[11],
-        k * A[12],
-        k * A[13],
-        k * A[14],
-        k * A[15],
+        k * A[0], k * A[1], k * A[2], k * A[3],
+        k * A[4], k * A[5], k * A[6], k * A[7],
+        k * A[8], k * A[9], k * A[10], k * A[11],
+        k * A[12], k * A[13], k * A[14], k * A[15],
     )  # fmt: skip
 
 
@@ -262,15 +236,3 @@ def dual_pencil(A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
         e = (0.0, 0.0, 0.0, 1.0)
     w = unit(axpy(-dot(e, u), u, axpy(-dot(e, v), v, e)))
     return w, meet(u, v, w)
-
-
-def as_vec(A: FloatArray) -> Vec4:
-    """(4,) array as the tuple of four floats the kernels take.
-
-    Raises
-    ------
-    ValueError
-        If the array has another shape.
-    """
-    x, y, z, w = (float(v) for v in A)
-    return (x, y, z, w)

@@ -47,47 +47,18 @@ def translation(H_hat: Mat4, tau: float) -> Mat4:
 
 
 def exp_rotation(H_hat: FloatArray, theta: float) -> FloatArray:
-    """Projective rotation of a revolute operator, [RH00] eq. (4).
-
-    Parameters
-    ----------
-    H_hat : (4, 4) operator with Ĥ³ = −Ĥ.
-    theta : angle, rad.
-
-    Returns
-    -------
-    (4, 4) projective rotation.
-    """
+    """Projective rotation (4, 4) of a revolute operator (4, 4) by an angle, rad: [RH00] eq. (4)."""
     H = as_mat(H_hat)
     return as_array(rotation(H, mul(H, H), float(theta)))
 
 
 def exp_translation(H_hat: FloatArray, tau: float) -> FloatArray:
-    """Projective translation of a prismatic operator, [RH00] eq. (5).
-
-    Parameters
-    ----------
-    H_hat : (4, 4) operator with Ĥ² = 0.
-    tau : amplitude, m for a joint.
-
-    Returns
-    -------
-    (4, 4) projective translation.
-    """
+    """Projective translation (4, 4) of a prismatic operator (4, 4), τ in m for a joint: [RH00] eq. (5)."""
     return as_array(translation(as_mat(H_hat), float(tau)))
 
 
 def log_rotation(H: FloatArray, theta: float) -> FloatArray:
-    """Operator of an observed projective rotation, [RH00] eq. (4).
-
-    Parameters
-    ----------
-    H : (4, 4) projective rotation with det H = 1.
-    theta : its angle, rad.
-
-    Returns
-    -------
-    (4, 4) operator Ĥ.
+    """Operator (4, 4) of an observed projective rotation (4, 4), det H = 1, θ in rad: [RH00] eq. (4).
 
     Raises
     ------
@@ -105,16 +76,7 @@ def log_rotation(H: FloatArray, theta: float) -> FloatArray:
 
 
 def log_translation(H: FloatArray, tau: float) -> FloatArray:
-    """Operator of an observed projective translation, [RH00] eq. (5).
-
-    Parameters
-    ----------
-    H : (4, 4) projective translation with det H = 1.
-    tau : its amplitude, m for a joint.
-
-    Returns
-    -------
-    (4, 4) operator Ĥ.
+    """Operator (4, 4) of an observed projective translation (4, 4), det H = 1, τ in m: [RH00] eq. (5).
 
     Raises
     ------
@@ -130,17 +92,7 @@ def log_translation(H: FloatArray, tau: float) -> FloatArray:
 def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Scale a 4×4 homography to a displacement with det H = 1, [RH00] eq. (2).
 
-    The determinant leaves ±H; the sign is the one that keeps the sign of a_inf·A.
-
-    Parameters
-    ----------
-    H : (4, 4) homography.
-    A : (..., 4) points it moves.
-    a_inf : (4,) plane at infinity.
-
-    Returns
-    -------
-    (4, 4) displacement.
+    The determinant leaves ±H (4, 4); the sign is the one that keeps that of a_inf·A for points A (..., 4).
 
     Raises
     ------
@@ -257,17 +209,9 @@ def composed_operator(H_r: Mat4, H_p: Mat4, cbh_a: float, cbh_b: float, cbh_c: f
 def compose_rotations(
     H_hat_r: FloatArray, H_hat_p: FloatArray, theta_r: float, theta_p: float
 ) -> tuple[float, FloatArray]:
-    """Single rotation equal to exp(θ_r Ĥ_r) exp(θ_p Ĥ_p), [RH00] eqs. (24), (25) as corrected.
+    """Angle θ_s in [0, 2π), rad, and operator (4, 4) of the rotation exp(θ_r Ĥ_r) exp(θ_p Ĥ_p).
 
-    Parameters
-    ----------
-    H_hat_r, H_hat_p : (4, 4) operators of rotations about perpendicular axes through one point.
-    theta_r, theta_p : angles, rad.
-
-    Returns
-    -------
-    theta_s : angle in [0, 2π), rad.
-    H_hat_s : (4, 4) operator.
+    For axes that are perpendicular and meet: [RH00] eqs. (24), (25) as corrected.
 
     Raises
     ------
@@ -279,35 +223,3 @@ def compose_rotations(
     if not found:
         raise WorkFailed("two rotations by 0° compose to the identity, which has no axis")
     return theta_s, as_array(H_s)
-
-
-def angles_onto_plane(a: FloatArray, H_hat: FloatArray, A: FloatArray) -> tuple[float, float] | None:
-    """Angles that rotate a point onto a plane, [RH00] eqs. (13)–(15) as corrected.
-
-    Parameters
-    ----------
-    a : (4,) plane.
-    H_hat : (4, 4) revolute operator.
-    A : (4,) point.
-
-    Returns
-    -------
-    θ⁺ and θ⁻ in (−π, π], rad; None where the point never meets the plane.
-    """
-    p_0, p_s, p_c = incidence_coefficients(a, H_hat, A)
-    found, plus, minus = incidence_angles(p_0, p_s, p_c)
-    return (plus, minus) if found else None
-
-
-def incidence_coefficients(a: FloatArray, H_hat: FloatArray, A: FloatArray) -> tuple[float, float, float]:
-    """Coefficients p_0, p_s, p_c of [RH00] eq. (14) for aᵀ H(θ) A.
-
-    Parameters
-    ----------
-    a : (4,) plane.
-    H_hat : (4, 4) revolute operator.
-    A : (4,) point.
-    """
-    first = H_hat @ A
-    second = H_hat @ first
-    return float(a @ (A + second)), float(a @ first), float(-(a @ second))

@@ -115,12 +115,6 @@ def internal(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]
     return cast(Callable[_Params, _Result], dispatcher)
 
 
-def compile_for(function: Any, *arguments: Any) -> None:
-    """Compile a function for the types of arguments, or find it in the cache; nothing is run."""
-    typeof: Any = numba.typeof
-    function.compile(tuple(typeof(argument) for argument in arguments))
-
-
 def allocating(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     """Compile a function that makes arrays of its own, for sweeps that take milliseconds a call."""
     return cast(Callable[_Params, _Result], numba.njit(**{**_OPTIONS, "_nrt": True})(function))

@@ -13,15 +13,15 @@ from projservo_cli.records import FloatArray, IntArray
 # A kernel is one-dimensional when the next pivot stands above round-off by this factor of the first.
 RANK_TOLERANCE = 1e-9
 # A last pivot above this share of the first is no kernel at all: noise leaves a few per cent.
-KERNEL_TOLERANCE = 0.1
+_KERNEL_TOLERANCE = 0.1
 # A last pivot below this is zero to working precision: back-substitution alone gives the kernel.
-EXACT_TOLERANCE = 1e-14
-GAIN_TOLERANCE = 1e-12
-MOST_ITERATIONS = 100
+_EXACT_TOLERANCE = 1e-14
+_GAIN_TOLERANCE = 1e-12
+_MOST_ITERATIONS = 100
 
 
 @inline
-def projected(B: FloatArray, k: int, v: FloatArray, rows: int) -> float:
+def _projected(B: FloatArray, k: int, v: FloatArray, rows: int) -> float:
     """Product of column k with a vector."""
     s0 = s1 = s2 = s3 = 0.0
     for i in range(0, rows, 4):
@@ -33,7 +33,7 @@ def projected(B: FloatArray, k: int, v: FloatArray, rows: int) -> float:
 
 
 @inline
-def paired(B: FloatArray, j: int, k: int, rows: int) -> float:
+def _paired(B: FloatArray, j: int, k: int, rows: int) -> float:
     """Product of two columns."""
     s0 = s1 = s2 = s3 = 0.0
     for i in range(0, rows, 4):
@@ -76,7 +76,7 @@ def orthogonalize(
         pivot[j] = j
         for i in range(m, rows):
             B[j, i] = 0.0
-        norms[j] = paired(B, j, j, rows)
+        norms[j] = _paired(B, j, j, rows)
     if solve:
         for i in range(m, rows):
             rhs[i] = 0.0
@@ -110,13 +110,13 @@ def orthogonalize(
         for i in range(rows):
             B[k, i] *= inverse
         for j in range(k + 1, n):
-            r = paired(B, k, j, rows)
+            r = _paired(B, k, j, rows)
             z[j] = r
             for i in range(rows):
                 B[j, i] -= r * B[k, i]
-            norms[j] = paired(B, j, j, rows)
+            norms[j] = _paired(B, j, j, rows)
         if solve:
-            r = projected(B, k, rhs, rows)
+            r = _projected(B, k, rhs, rows)
             z[k] = r
             for i in range(rows):
                 rhs[i] -= r * B[k, i]
@@ -147,7 +147,7 @@ def kernel_vector(
     False where there is no kernel or more than one dimension of it; x is then zero.
     """
     first, before_last, last = orthogonalize(B, m, n, x, z, pivot, rhs, False)
-    if not before_last >= RANK_TOLERANCE * first or not first > 0.0 or not last <= KERNEL_TOLERANCE * first:
+    if not before_last >= RANK_TOLERANCE * first or not first > 0.0 or not last <= _KERNEL_TOLERANCE * first:
         for j in range(n):
             x[j] = 0.0
         return False
@@ -155,10 +155,10 @@ def kernel_vector(
         z[j] = -B[j, n - 1]
     back_substitute(B, n - 1, z)
     z[n - 1] = 1.0
-    normalize(z, n)
-    if last > EXACT_TOLERANCE * first:
+    _normalize(z, n)
+    if last > _EXACT_TOLERANCE * first:
         gain = 0.0
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(_MOST_ITERATIONS):
             for j in range(n):
                 total = z[j]
                 for i in range(j):
@@ -166,8 +166,8 @@ def kernel_vector(
                 z[j] = total * B[j, j]
             back_substitute(B, n, z)
             previous = gain
-            gain = normalize(z, n)
-            if abs(gain - previous) <= GAIN_TOLERANCE * gain:
+            gain = _normalize(z, n)
+            if abs(gain - previous) <= _GAIN_TOLERANCE * gain:
                 break
     for j in range(n):
         x[pivot[j]] = z[j]
@@ -185,7 +185,7 @@ def back_substitute(B: FloatArray, n: int, z: FloatArray) -> None:
 
 
 @inline
-def normalize(z: FloatArray, n: int) -> float:
+def _normalize(z: FloatArray, n: int) -> float:
     """Scale to unit norm and return the norm it had."""
     size = 0.0
     for j in range(n):

@@ -17,7 +17,7 @@ from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
 
 
 @njit
-def joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
+def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
     """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
     if joint_type == PRISMATIC:
         return translation(H_hat, q)
@@ -30,7 +30,7 @@ def forward(model: Model, q: FloatArray) -> Mat4:
     H = IDENTITY
     for i in range(q.shape[0]):
         amount = float(q[i]) - float(model.q_reference[i])
-        H = mul(H, joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], amount))
+        H = mul(H, _joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], amount))
     return H
 
 
@@ -40,7 +40,7 @@ def backward(model: Model, q: FloatArray) -> Mat4:
     H = IDENTITY
     for i in range(q.shape[0]):
         amount = float(q[i]) - float(model.q_reference[i])
-        H = mul(joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], -amount), H)
+        H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], -amount), H)
     return H
 
 
@@ -69,7 +69,7 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
             continue
         amount = float(q[i]) - float(model.q_reference[i])
         if i == n - 1:
-            H = mul(H, joint_displacement(operator, model.joint_types[i], amount))
+            H = mul(H, _joint_displacement(operator, model.joint_types[i], amount))
         elif model.joint_types[i] == PRISMATIC:
             H = mul(H, translation(operator, amount))
             H_inverse = mul(translation(operator, -amount), H_inverse)
@@ -121,67 +121,28 @@ def row(P: FloatArray, i: int, A: tuple[float, float, float, float]) -> float:
 
 
 def forward_kinematics(model: Model, q: FloatArray) -> FloatArray:
-    """Displacement H_q of the end-effector from the reference, [RH00] eq. (6).
-
-    Parameters
-    ----------
-    model : projective or metric model of n joints.
-    q : (n,) joint readings, rad or m.
-
-    Returns
-    -------
-    (4, 4) displacement.
-    """
+    """Displacement (4, 4) of the end-effector from the reference at joints (n,), rad or m: [RH00] eq. (6)."""
     return as_array(forward(model, np.asarray(q, dtype=np.float64)))
 
 
 def joint_operators(model: Model, q: FloatArray) -> FloatArray:
-    """Joint operators at q, [RH00] eq. (19).
-
-    Parameters
-    ----------
-    model : projective or metric model of n joints.
-    q : (n,) joint readings, rad or m.
-
-    Returns
-    -------
-    (n, 4, 4) operators.
-    """
+    """Joint operators (n, 4, 4) at joints q (n,), rad or m: [RH00] eq. (19)."""
     H_hat = np.empty_like(model.H_hat_0)
     operators_at(model, np.asarray(q, dtype=np.float64), H_hat)
     return H_hat
 
 
 def project(P: FloatArray, M: FloatArray, lens: FloatArray = NO_LENS) -> FloatArray:
-    """Pixels of points in both views, [RH00] eq. (1).
-
-    Parameters
-    ----------
-    P : (2, 3, 4) cameras.
-    M : (..., 4) points.
-    lens : (2, 5) radial distortion of both views.
-
-    Returns
-    -------
-    (2, ..., 2) pixels.
-    """
+    """Pixels (2, ..., 2) of points (..., 4) by cameras (2, 3, 4) and lenses (2, 5), [RH00] eq. (1)."""
     m = np.einsum("vij,...j->v...i", P, M)
     pixels: FloatArray = m[..., :2] / m[..., 2:]
     return through(lens.reshape(len(lens), *(1,) * (m.ndim - 2), 5), pixels)
 
 
 def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArray:
-    """Interaction matrix from joint to image velocities, [RH00] eq. (7), second row corrected.
+    """Interaction matrix (2, m, 2, n), joint to image velocities, px per rad or m: [RH00] eq. (7), corrected.
 
-    Parameters
-    ----------
-    P : (2, 3, 4) cameras.
-    M : (m, 4) points.
-    H_hat : (n, 4, 4) operators at the current joints.
-
-    Returns
-    -------
-    (2, m, 2, n) derivatives of u, v with respect to the joints, px per rad or m.
+    For cameras (2, 3, 4), points (m, 4) and the operators (n, 4, 4) at the current joints.
     """
     J = np.empty((2, M.shape[0], 2, H_hat.shape[0]))
     for view in range(2):

@@ -24,12 +24,12 @@ SETTLED = 1e-9
 Number = TypeVar("Number", float, FloatArray)
 
 
-def swelling(k1: Number, k2: Number, square: Number) -> Number:
+def _swelling(k1: Number, k2: Number, square: Number) -> Number:
     """Factor 1 + k1 ρ² + k2 ρ⁴ of a radius, from its square."""
     return 1.0 + square * (k1 + square * k2)
 
 
-def swelling_rate(k1: Number, k2: Number, square: Number) -> Number:
+def _swelling_rate(k1: Number, k2: Number, square: Number) -> Number:
     """Derivative k1 + 2 k2 ρ² of the factor by the square of the radius."""
     return k1 + 2.0 * (square * k2)
 
@@ -44,7 +44,7 @@ def turning(k1: float, k2: float) -> float:
 
 
 # The same three for the kernels, which call nothing that is not compiled.
-_swelling, _swelling_rate, _turning = njit(swelling), njit(swelling_rate), njit(turning)
+_compiled_factor, _compiled_rate, _compiled_limit = njit(_swelling), njit(_swelling_rate), njit(turning)
 
 
 @merged
@@ -58,20 +58,20 @@ def _from_center(lens: FloatArray, factor: float, u: float, v: float) -> tuple[f
 def _straight_radius(k1: float, k2: float, radius: float) -> float:
     """Radius that bends to another, before the turn: Newton within a bracket; NaN where there is none."""
     low = 0.0
-    limit = _turning(k1, k2)
+    limit = _compiled_limit(k1, k2)
     if limit < math.inf:
         high = math.sqrt(limit)
-        if not radius < high * _swelling(k1, k2, limit):
+        if not radius < high * _compiled_factor(k1, k2, limit):
             return math.nan
     else:
         high = radius
-        while high * _swelling(k1, k2, high * high) < radius:
+        while high * _compiled_factor(k1, k2, high * high) < radius:
             high *= 2.0
     rho = min(radius, high)
     for _ in range(MOST_STEPS):
         square = rho * rho
-        factor = _swelling(k1, k2, square)
-        slope = factor + 2.0 * (square * _swelling_rate(k1, k2, square))
+        factor = _compiled_factor(k1, k2, square)
+        slope = factor + 2.0 * (square * _compiled_rate(k1, k2, square))
         excess = rho * factor - radius
         if excess > 0.0:
             high = rho
@@ -128,9 +128,9 @@ def bend(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     x = (u - float(lens[0])) / float(lens[2])
     y = (v - float(lens[1])) / float(lens[2])
     square = x * x + y * y
-    if not square < _turning(k1, k2):
+    if not square < _compiled_limit(k1, k2):
         return math.nan, math.nan
-    return _from_center(lens, _swelling(k1, k2, square), u, v)
+    return _from_center(lens, _compiled_factor(k1, k2, square), u, v)
 
 
 def _offsets(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -140,27 +140,15 @@ def _offsets(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def bent(lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Bent pixels of straight ones, all at once: the twin of ``bend``, which does not stop at the turn.
-
-    Parameters
-    ----------
-    lens : (..., 5) lenses.
-    pixels : (..., 2) px; leading dimensions are broadcast.
-    """
+    """Bent pixels (..., 2) of straight ones by lenses (..., 5): the twin of ``bend``, past the turn too."""
     _, square = _offsets(lens, pixels)
-    factor = swelling(lens[..., 3], lens[..., 4], square)[..., None]
+    factor = _swelling(lens[..., 3], lens[..., 4], square)[..., None]
     result: FloatArray = lens[..., :2] + factor * (pixels - lens[..., :2])
     return result
 
 
 def straight_views(lens: FloatArray, s: FloatArray) -> FloatArray:
-    """Straight pixels (2, N, 2) of bent ones, all at once; the same without a lens.
-
-    Parameters
-    ----------
-    lens : (2, 5) lenses.
-    s : (2, N, 2) px, NaN where unseen.
-    """
+    """Straight pixels (2, N, 2) of bent ones, NaN where unseen, by lenses (2, 5); the same without a lens."""
     s = np.ascontiguousarray(s, dtype=np.float64)
     if not bends(lens):
         return s
@@ -177,24 +165,18 @@ def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:
 
 
 def through(lens: FloatArray, pixels: FloatArray) -> FloatArray:
-    """What cameras report of straight pixels: bent, NaN beyond the turning point; the same without a lens.
-
-    Parameters are those of ``bent``.
-    """
+    """What cameras report of straight pixels: bent, NaN beyond the turning point; the same without a lens."""
     if not lens[..., FIRST:].any():
         return pixels
     return np.where(within(lens, pixels)[..., None], bent(lens, pixels), np.nan)
 
 
 def bent_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of bent pixels by straight ones (..., 2, 2), and by k1 and k2 (..., 2, 2).
-
-    Parameters are those of ``bent``.
-    """
+    """Derivatives of bent pixels by straight ones (..., 2, 2), and by k1 and k2 (..., 2, 2)."""
     x, square = _offsets(lens, pixels)
     k1, k2 = lens[..., 3], lens[..., 4]
-    rate = 2.0 * swelling_rate(k1, k2, square)
+    rate = 2.0 * _swelling_rate(k1, k2, square)
     by_pixel = rate[..., None, None] * (x[..., :, None] * x[..., None, :])
-    by_pixel = by_pixel + swelling(k1, k2, square)[..., None, None] * np.eye(2)
+    by_pixel = by_pixel + _swelling(k1, k2, square)[..., None, None] * np.eye(2)
     powers = np.stack([square, square**2], axis=-1)
     return by_pixel, (lens[..., 2:3] * x)[..., :, None] * powers[..., None, :]

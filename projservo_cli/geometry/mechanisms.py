@@ -1,7 +1,7 @@
 """Visual mechanisms: one-parameter motions defined by what they leave still, [RH00] section 3.
 
-Every mechanism is the kernel of a stack of operator velocities. The generic functions return
-``Mechanism(q_hat, H_hat)``; the compiled ones write the joint motion into a row of the workspace.
+Every mechanism is the kernel of a stack of operator velocities: a joint motion q̂ (n,), written into an
+array of the caller, and its operator Σ q̂_i Ĥ_i.
 """
 
 import math
@@ -14,7 +14,6 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     apply_transposed,
-    as_vec,
     dual_pencil,
     inner,
     mat,
@@ -23,9 +22,9 @@ from projservo_cli.geometry.algebra import (
     sub,
     vec,
 )
-from projservo_cli.geometry.displacement import as_array
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import (
+    COORDINATES,
     RANK_TOLERANCE,
     back_substitute,
     kernel_vector,
@@ -36,11 +35,8 @@ from projservo_cli.geometry.kinematics import joint_operators, operators_at
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 
 # A kernel vector whose operator is smaller than this share of its terms moves nothing.
-NULL_MOTION = 1e-9
+_NULL_MOTION = 1e-9
 NO_OPERATOR: Mat4 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-
-
-COORDINATES = 6
 
 
 class Span(NamedTuple):
@@ -89,19 +85,6 @@ class Work(NamedTuple):
     xi: FloatArray
 
 
-class Mechanism(NamedTuple):
-    """One-parameter motion of the robot.
-
-    Attributes
-    ----------
-    q_hat : (n,) joint motion.
-    H_hat : (4, 4) operator Σ q̂_i Ĥ_i.
-    """
-
-    q_hat: FloatArray
-    H_hat: FloatArray
-
-
 def workspace(n: int, rows: int, span: Span = OWN) -> Work:
     """Arrays for n joints and matrices of at most ``rows`` rows, with the span of an arm of n ≠ 6."""
     columns = max(n, COORDINATES)
@@ -124,7 +107,7 @@ def workspace(n: int, rows: int, span: Span = OWN) -> Work:
 
 
 @merged
-def put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
+def _put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
     """Write a velocity into four rows of column i."""
     work.B[i, first] = A[0]
     work.B[i, first + 1] = A[1]
@@ -133,13 +116,13 @@ def put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
 
 
 @internal
-def kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
+def _kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
     """Kernel of the eight rows in ``work.B``, compiled once for that number."""
     return kernel_vector(work.B, 8, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
 
 
 @merged
-def operator_of(work: Work, q_hat: FloatArray) -> Mat4:
+def _operator_of(work: Work, q_hat: FloatArray) -> Mat4:
     """Operator Σ q̂_i Ĥ_i of a joint motion."""
     operators = work.basis
     H = multiple(float(q_hat[0]), mat(operators[0]))
@@ -166,11 +149,11 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
     n = q_hat.shape[0]
     for i in range(n):
         operator = mat(operators[i])
-        put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
-        put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
-    if not kernel_of_eight(work, q_hat):
+        _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
+        _put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
+    if not _kernel_of_eight(work, q_hat):
         return False, NO_OPERATOR
-    return moving(work, q_hat)
+    return _moving(work, q_hat)
 
 
 @njit
@@ -180,11 +163,11 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
     n = q_hat.shape[0]
     for i in range(n):
         operator = mat(operators[i])
-        put_rows(work, i, 0, apply(operator, A_1))
-        put_rows(work, i, 4, apply(operator, A_2))
-    if not kernel_of_eight(work, q_hat):
+        _put_rows(work, i, 0, apply(operator, A_1))
+        _put_rows(work, i, 4, apply(operator, A_2))
+    if not _kernel_of_eight(work, q_hat):
         return False, NO_OPERATOR
-    return to_radians(work, q_hat)
+    return _to_radians(work, q_hat)
 
 
 @merged
@@ -194,35 +177,35 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
     n = q_hat.shape[0]
     for i in range(n):
         operator = mat(operators[i])
-        put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
-        put_rows(work, i, 4, apply(operator, A))
-    if not kernel_of_eight(work, q_hat):
+        _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
+        _put_rows(work, i, 4, apply(operator, A))
+    if not _kernel_of_eight(work, q_hat):
         return False, NO_OPERATOR
-    return to_radians(work, q_hat)
+    return _to_radians(work, q_hat)
 
 
 @internal
-def moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
+def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Operator of a kernel vector, refused where it moves nothing.
 
     At a kinematic singularity the kernel is the null motion of the robot: joints move, the face does
     not. Then Σ q̂_i Ĥ_i vanishes against its terms.
     """
-    H = operator_of(work, q_hat)
+    H = _operator_of(work, q_hat)
     operators = work.basis
     terms = 0.0
     for i in range(q_hat.shape[0]):
         operator = mat(operators[i])
         terms += q_hat[i] * q_hat[i] * inner(operator, operator)
-    if not inner(H, H) > NULL_MOTION * NULL_MOTION * terms:
+    if not inner(H, H) > _NULL_MOTION * _NULL_MOTION * terms:
         return False, NO_OPERATOR
     return True, H
 
 
 @internal
-def to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
+def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
-    found, H = moving(work, q_hat)
+    found, H = _moving(work, q_hat)
     if not found:
         return False, NO_OPERATOR
     # Entries with dynamic indices would have to be looked up: the sum is written out.
@@ -238,102 +221,17 @@ def to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     return True, multiple(nu, H)
 
 
-def _mechanism(kind: str, H_hat: FloatArray, first: FloatArray, second: FloatArray) -> Mechanism:
-    """Run one compiled mechanism on plain arrays."""
-    n = len(H_hat)
-    work = workspace(n, 8)
-    work.H_hat[:] = H_hat
-    q_hat = np.zeros(n)
-    compiled = {
-        "translation": translation_mechanism,
-        "rotation": rotation_mechanism,
-        "planar rotation": planar_mechanism,
-    }[kind]
-    found, H = compiled(work, as_vec(first), as_vec(second), q_hat)
-    if not found:
-        raise WorkFailed(
-            f"the robot has no unique {kind} of this kind here: its operators are near a singularity"
-        )
-    return Mechanism(q_hat, as_array(H))
-
-
-def translation_along(H_hat: FloatArray, A_1: FloatArray, A_2: FloatArray) -> Mechanism:
-    """Translation along the line through two points, [RH00] eq. (8).
-
-    Parameters
-    ----------
-    H_hat : (n, 4, 4) operators at the current joints.
-    A_1, A_2 : (4,) points of equal scale a_inf·A.
-
-    Returns
-    -------
-    Mechanism of unit joint norm; only the products with its amplitude have a meaning.
-
-    Raises
-    ------
-    WorkFailed
-        If the motion is not unique.
-    """
-    return _mechanism("translation", H_hat, A_1, A_2 - A_1)
-
-
-def rotation_about(H_hat: FloatArray, A_1: FloatArray, A_2: FloatArray) -> Mechanism:
-    """Revolution around the axis through two points, [RH00] eq. (9).
-
-    Parameters
-    ----------
-    H_hat : (n, 4, 4) operators at the current joints.
-    A_1, A_2 : (4,) points on the axis.
-
-    Returns
-    -------
-    Mechanism per rad; the sense of rotation is arbitrary.
-
-    Raises
-    ------
-    WorkFailed
-        If the motion is not unique.
-    """
-    return _mechanism("rotation", H_hat, A_1, A_2)
-
-
-def rotation_within(H_hat: FloatArray, a: FloatArray, A: FloatArray) -> Mechanism:
-    """Revolution around a point within a plane, [RH00] eq. (10).
-
-    Parameters
-    ----------
-    H_hat : (n, 4, 4) operators at the current joints.
-    a : (4,) plane.
-    A : (4,) point.
-
-    Returns
-    -------
-    Mechanism per rad; the sense of rotation is arbitrary.
-
-    Raises
-    ------
-    WorkFailed
-        If the motion is not unique.
-    """
-    return _mechanism("planar rotation", H_hat, a, A)
-
-
 # Forms that the joints keep up to this share of the largest change are kept.
-INVARIANT = 1e-6
+_INVARIANT = 1e-6
 # Once more with what rounding left of a solution by normal equations.
-PASSES = 2
+_PASSES = 2
 
 
 def span_of(model: Model, A: FloatArray) -> Span:
     """Six operators that span the displacements of the calibrated frame; ``OWN`` for six joints.
 
-    Rotations are about the middle of the points, per rad; a unit of translation moves them about as far
-    as a rad of rotation does.
-
-    Parameters
-    ----------
-    model : calibrated model.
-    A : (m, 4) points, a_inf·A = 1.
+    Rotations are about the middle of the points A (m, 4), a_inf·A = 1, per rad; a unit of translation moves
+    them about as far as a rad of rotation does.
 
     Raises
     ------
@@ -355,14 +253,10 @@ def span_of(model: Model, A: FloatArray) -> Span:
 
 
 def invariant_rotations(actions: FloatArray) -> FloatArray:
-    """Three rotations (3, 3, 3) of the plane at infinity in the metric that all joints keep, per rad.
+    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints keep.
 
-    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L; where few joints leave it open, the
-    one nearest to the identity, which does as well for what these joints can do.
-
-    Parameters
-    ----------
-    actions : (n, 3, 3) of the joint operators on the plane at infinity.
+    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
+    where few joints leave it open, the one nearest to the identity, which does as well for these joints.
 
     Raises
     ------
@@ -373,7 +267,7 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
     changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
     _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T, full_matrices=True)
     sizes = np.r_[sizes, np.zeros(6 - len(sizes))]
-    kept = rows[sizes <= INVARIANT * max(sizes[0], 1.0)]
+    kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
     Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
     if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
         raise WorkFailed(
@@ -425,13 +319,13 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     first, _, last = orthogonalize(work.B, n, COORDINATES, work.norms, work.z, work.pivot, work.rhs, False)
     if not last > RANK_TOLERANCE * first:
         return False
-    for _ in range(PASSES):
-        add_least_norm(work, xi, q_hat)
+    for _ in range(_PASSES):
+        _add_least_norm(work, xi, q_hat)
     return True
 
 
 @merged
-def add_least_norm(work: Work, xi: FloatArray, q_hat: FloatArray) -> None:
+def _add_least_norm(work: Work, xi: FloatArray, q_hat: FloatArray) -> None:
     """Add Jᵀ(J Jᵀ)⁻¹ of what q̂ lacks of ξ, with Jᵀ factorised in ``work.B``."""
     n = q_hat.shape[0]
     z = work.z
@@ -450,7 +344,7 @@ def add_least_norm(work: Work, xi: FloatArray, q_hat: FloatArray) -> None:
             q_hat[i] += work.J[a, i] * z[k]
 
 
-MOST_NEWTON_STEPS = 6
+_MOST_NEWTON_STEPS = 6
 # A Newton step this short, rad or m, is the last: the next would be its square, below round-off.
 SETTLED = 1e-8
 
@@ -486,7 +380,7 @@ def reach(
     m = A.shape[0]
     redundant = work.columns.shape[0] < n
     x = work.xi if redundant else newton
-    for _ in range(MOST_NEWTON_STEPS):
+    for _ in range(_MOST_NEWTON_STEPS):
         H = mul(operators_at(model, q, work.H_hat), H_back)
         for k in range(m):
             reached = apply(H, vec(A[k]))

@@ -88,15 +88,7 @@ def triangulate(
 def fundamental_matrix(P: FloatArray) -> FloatArray:
     """Fundamental matrix F with rightᵀ F left = 0 of a pair of cameras.
 
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., eq. (17.3).
-
-    Parameters
-    ----------
-    P : (2, 3, 4) cameras.
-
-    Returns
-    -------
-    (3, 3) matrix of unit norm.
+    Of unit norm, (3, 3). Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., eq. (17.3).
 
     Raises
     ------
@@ -121,17 +113,7 @@ def _fundamental(cameras: bytes) -> FloatArray:
 
 
 def optical_centers(P: FloatArray, a_inf: FloatArray) -> FloatArray:
-    """Optical centres of both cameras, scaled to a_inf·O = 1.
-
-    Parameters
-    ----------
-    P : (2, 3, 4) cameras.
-    a_inf : (4,) plane at infinity.
-
-    Returns
-    -------
-    (2, 4) points.
-    """
+    """Optical centres (2, 4) of both cameras, scaled to a_inf·O = 1."""
     return _centers(P.tobytes(), a_inf.tobytes()).copy()
 
 
@@ -145,17 +127,7 @@ def _centers(cameras: bytes, plane: bytes) -> FloatArray:
 
 
 def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> FloatArray:
-    """Points of least reprojection error from stereo pixels, scaled to a_inf·M = 1.
-
-    Parameters
-    ----------
-    P : (2, 3, 4) cameras.
-    a_inf : (4,) plane at infinity.
-    s : (2, m, 2) pixels.
-
-    Returns
-    -------
-    (m, 4) points.
+    """Points (m, 4) of least reprojection error from stereo pixels (2, m, 2), scaled to a_inf·M = 1.
 
     Raises
     ------

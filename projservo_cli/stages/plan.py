@@ -9,9 +9,10 @@ from scipy.optimize import least_squares
 from projservo_cli.control.law import State, new_state
 from projservo_cli.geometry.algebra import vec
 from projservo_cli.geometry.displacement import as_array, composed_angle
+from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.geometry.mechanisms import COORDINATES, joint_motion, span_of
+from projservo_cli.geometry.mechanisms import joint_motion, span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
 from projservo_cli.stages.scenario import Scenario, Sight, measured_task, scenario_of, sight_of

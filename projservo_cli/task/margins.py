@@ -21,9 +21,9 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, apply, axpy, dot, mat, put_mat, put_vec, vec
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.geometry.kernels import orthogonalize
+from projservo_cli.geometry.kernels import COORDINATES, orthogonalize
 from projservo_cli.geometry.kinematics import backward, image_velocity, operators_at, project
-from projservo_cli.geometry.mechanisms import COORDINATES, SETTLED, Work, reach, span_of, workspace
+from projservo_cli.geometry.mechanisms import SETTLED, Work, reach, span_of, workspace
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients

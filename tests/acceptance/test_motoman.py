@@ -1,17 +1,44 @@
-"""A real arm, with and without lens: held-out images, geometry, culprits. In full: ``motoman.py``."""
+"""A real arm, with and without lens: held-out images, geometry, outliers.
+
+Arm 2 of a Motoman MA1400 before two fixed cameras: K. Stepanova et al., "Automatic self-contained
+calibration of an industrial dual-arm robot with cameras using self-contact, planar constraints, and
+self-observation", RCIM 73, 2022.
+"""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
 from projservo_cli import cli, store
-from projservo_cli.calibration import residual_statistics
-from tests.acceptance import motoman
+from projservo_cli.calibration import calibrate, residual_statistics
+from projservo_cli.tables import read_table
 from tests.calibration import damage
+
+SIZE = (6000, 4000)
+# What the best fit leaves, px.
+SIGMA = 0.52
+
+
+def fit(observation, seed=0, lens=True):
+    return calibrate(observation, "RRRRRR", source="recorded", image_size=SIZE, seed=seed, lens=lens)
+
+
+def some(observation, rows):
+    """Observation of some of the poses."""
+    values = {name: getattr(observation, name)[rows] for name in ("pose", "q", "images")}
+    return dataclasses.replace(observation, **values)
+
+
+def few(train, seed=0):
+    """Thirty random poses."""
+    return some(train, np.sort(np.random.default_rng(seed).choice(len(train.q), 30, replace=False)))
 
 
 @pytest.fixture(scope="module")
 def tables(shared_data):
-    return motoman.tables(shared_data)
+    """Training and test poses."""
+    return tuple(read_table(shared_data / "motoman" / f"arm2_{part}.csv") for part in ("train", "test"))
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +120,7 @@ def test_axes_stand_as_the_maker_built_them(fitted, lens):
 
 
 def test_thirty_poses_are_enough_from_every_start(tables):
-    values = [held_out(motoman.fit(motoman.few(tables[0], 8), seed), tables) for seed in (0, 1)]
+    values = [held_out(fit(few(tables[0], 8), seed), tables) for seed in (0, 1)]
     assert values[0]["median_px"] <= 1.15
     for name in ("rms_px", "median_px", "p95_px"):
         assert values[1][name] == pytest.approx(values[0][name], abs=1e-3)
@@ -102,12 +129,12 @@ def test_thirty_poses_are_enough_from_every_start(tables):
 @pytest.fixture(scope="module")
 def half(tables):
     """Every other pose, which is quicker."""
-    return motoman.some(tables[0], slice(1, None, 2))
+    return some(tables[0], slice(1, None, 2))
 
 
 def test_shifted_readings_are_listed(tables, half):
-    observation, wrong = damage.shifted(half, 0.15, motoman.SIGMA)
-    calibration = motoman.fit(observation)
+    observation, wrong = damage.shifted(half, 0.15, SIGMA)
+    calibration = fit(observation)
     assert held_out(calibration, tables)["median_px"] <= 0.70
     found = damage.listed(calibration)[0]
     assert len(wrong & found) >= 0.97 * len(wrong)
@@ -116,14 +143,14 @@ def test_shifted_readings_are_listed(tables, half):
 
 def test_exchanged_numbers_are_listed(tables, half):
     observation, wrong = damage.exchanged(half)
-    calibration = motoman.fit(observation)
+    calibration = fit(observation)
     assert held_out(calibration, tables)["median_px"] <= 0.70
     assert damage.listed(calibration)[1] == wrong
 
 
 def test_wrong_joint_readings_are_listed(tables, half):
     observation, wrong = damage.misread(half)
-    calibration = motoman.fit(observation)
+    calibration = fit(observation)
     assert held_out(calibration, tables)["median_px"] <= 0.70
     found = damage.listed(calibration)[2]
     assert found <= wrong

@@ -1,10 +1,5 @@
-"""Statistics of the calibration over many draws, for the tests in small and by hand in full.
+"""Statistics of the calibration over draws of noise, robots and errors."""
 
-``python -m tests.calibration.statistics draws 100`` takes some ten minutes, ``… robots 200`` as long,
-``… shifted 20`` one.
-"""
-
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -22,9 +17,7 @@ from tests.calibration.simulated_robot import Robot, around, random_robot, trial
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 # What is drawn on the noise-free UR5 table: frames, noise in px, share of rows removed.
 CASES = {
-    "within 20 deg, 0.5 px": ("within", 0.5, 0.0),
     "within 20 deg, 1.0 px": ("within", 1.0, 0.0),
-    "4 frames a joint, 0.5 px": ("four", 0.5, 0.0),
     "4 frames a joint, 1.0 px": ("four", 1.0, 0.0),
     "40 % of rows removed, 0.5 px": ("all", 0.5, 0.4),
 }
@@ -74,14 +67,7 @@ def frames(q: FloatArray, reference: FloatArray, which: str) -> BoolArray:
 
 
 def noise_draws(case: str, robot: Robot, count: int, first: int = 0) -> Draws:
-    """Fresh noise on the noise-free table, calibrated from scratch as a recorded one.
-
-    Parameters
-    ----------
-    case : name in ``CASES``.
-    robot : the true UR5.
-    count, first : draws and the seed of the first.
-    """
+    """Fresh noise on the noise-free table of the true UR5, calibrated from scratch as a recorded one."""
     which, sigma, removed = CASES[case]
     table = read_table(SHARED / "ur5" / "trials_0.0px.csv", robot.joint_types)
     validation = read_table(SHARED / "ur5" / "validation.csv", robot.joint_types)
@@ -129,10 +115,6 @@ def random_robots(count: int, first: int = 1000) -> Robots:
 
     Screws are drawn by the rule of ``random_robot``; a robot is rejected where a marker comes nearer
     than 0.3 m to a camera in its trials or the validation poses.
-
-    Parameters
-    ----------
-    count, first : robots to calibrate and the seed of the first.
     """
     found = Robots()
     seed = first
@@ -192,38 +174,3 @@ def shifted_readings(seed: int) -> Found:
         sound,
         len(found - wrong),
     )
-
-
-def main(what: str, count: str) -> None:
-    """Print the statistics of so many draws or robots."""
-    if what == "robots":
-        robots = random_robots(int(count))
-        total = len(robots.ratio) + len(robots.refused)
-        print(f"{robots.good} of {total} good, {len(robots.refused)} refused, {robots.rejected} rejected")
-        print("error ÷ bound:", np.percentile(robots.ratio, [50, 95, 99, 100]).round(3))
-        print(*robots.refused, sep="\n")
-        return
-    if what == "shifted":
-        found = [shifted_readings(seed) for seed in range(int(count))]
-        _, gross, seen, sound, accused = np.sum(found, axis=0)
-        print(f"median px: {min(f.median_px for f in found):.4f} to {max(f.median_px for f in found):.4f}")
-        print(f"{seen:.0f} of {gross:.0f} gross and {accused:.0f} of {sound:.0f} other readings listed")
-        return
-    import json
-
-    from tests.calibration.bound import robot_of
-
-    robot = robot_of(json.loads((SHARED / "ur5" / "truth.json").read_text(encoding="utf-8")))
-    for case in CASES:
-        draws = noise_draws(case, robot, int(count))
-        print(
-            f"{case}: {draws.ratio:.4f} ± {draws.error:.4f}, worst {draws.worst:.2f}, "
-            f"{len(draws.refused)} of {count} refused",
-            *draws.refused,
-            sep="\n  ",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -1,7 +1,5 @@
 """χ², covariance and efficiency against a bound computed here, by complex steps through another model."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
@@ -72,40 +70,6 @@ def test_covariance_is_the_bound_and_the_errors_are_as_it_says(draws):
     assert square.mean() / limit == pytest.approx(1.0, abs=4.0 * bound.relative_error(len(found)))
 
 
-def test_single_predictions_vary_as_stated(draws):
-    robot, held_out, bound, found = draws
-    truth = robot.images(held_out)
-    one = np.sqrt((bound.factor**2).sum(axis=1)).reshape(truth.shape) * SIGMA
-    for calibration in found[:3]:
-        np.testing.assert_allclose(np.sqrt(prediction_variance(calibration, held_out)), one, rtol=0.1)
-    scores = np.array([(predict(c, held_out) - truth) / one for c in found])
-    # Each coordinate by itself is a standard normal over the draws: its mean square over 12 has a
-    # standard deviation of 0.41; over all coordinates the scatter of means shows bias if there is any.
-    assert np.abs(scores.mean(axis=0)).max() * np.sqrt(len(found)) < 5.0
-    assert np.abs(scores).max() < 6.0
-
-
-def test_variance_is_that_of_differences_of_the_prediction(draws):
-    """``prediction_variance`` against central differences of ``predict`` by every entry of P, Ĥ, M."""
-    _, held_out, _, found = draws
-    calibration, q = found[0], held_out[:4]
-    entries = [(name, i) for name in ("P", "H_hat_0", "M") for i in range(getattr(calibration, name).size)]
-    columns = []
-    for name, i in entries:
-        value = getattr(calibration, name)
-        step = 1e-6 * max(np.abs(value).max(), 1e-3)
-        moved = []
-        for sign in (1.0, -1.0):
-            entry = value.copy()
-            entry.ravel()[i] += sign * step
-            moved.append(predict(dataclasses.replace(calibration, **{name: entry}), q))
-        columns.append(((moved[0] - moved[1]) / (2.0 * step)).ravel())
-    J = np.array(columns).T
-    variance = np.einsum("ia,ab,ib->i", J, calibration.covariance, J).reshape(len(q), 2, -1, 2)
-    # Second differences: relative 1e-12, times the conditioning of the frame.
-    np.testing.assert_allclose(prediction_variance(calibration, q), variance, rtol=1e-4)
-
-
 def test_noise_is_estimated_from_the_images_alone():
     rng = np.random.default_rng(8)
     robot = random_robot("RRR", rng)
@@ -120,8 +84,8 @@ def test_noise_is_estimated_from_the_images_alone():
 
 
 @pytest.mark.volume
-@pytest.mark.parametrize(("name", "count"), [("ur5", 8), ("stanford", 4)])
-def test_an_arm_of_another_lab_is_known_to_the_cramer_rao_bound(shared_data, reference_truth, name, count):
+def test_an_arm_of_another_lab_is_known_to_the_cramer_rao_bound(shared_data, reference_truth):
+    name, count = "stanford", 4
     robot = robot_of(reference_truth(name))
     table = read_table(shared_data / name / "trials_0.0px.csv", robot.joint_types)
     validation = read_table(shared_data / name / "validation.csv", robot.joint_types)

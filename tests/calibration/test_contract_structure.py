@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.geometry.kinematics import forward_kinematics, project
+from projservo_cli.geometry.kinematics import forward_kinematics
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 # Operators are assembled from twists and a frame change: a few hundred roundings, no more.
 EXACT = 1e-12
 
 
-@pytest.fixture(scope="module", params=["RRRRRR", "RRPRPR", "PRRPR"])
+@pytest.fixture(scope="module", params=["RRRRRR", "RRPRPR"])
 def case(request):
     rng = np.random.default_rng(11)
     robot = random_robot(request.param, rng)
@@ -136,13 +136,6 @@ def test_cameras_are_finite_and_see_all_points_before_them(case):
         assert (np.einsum("vj,mj->vm", calibration.P[:, 2], M) > 0.0).all()
 
 
-def test_predictions_are_those_of_the_kernels(case):
-    _, _, q, calibration = case
-    model = calibration.model()
-    seen = np.array([project(model.P, calibration.M @ forward_kinematics(model, row).T) for row in q])
-    np.testing.assert_allclose(predict(calibration, q), seen, rtol=1e-12, atol=1e-9)
-
-
 def test_a_point_behind_a_camera_has_no_image(case):
     robot, _, q, calibration = case
     turned = calibration.P.copy()
@@ -153,16 +146,6 @@ def test_a_point_behind_a_camera_has_no_image(case):
     assert np.isnan(other[:, 1]).all()
     assert np.isfinite(one).all()
     assert robot.depths(q).min() > 0.0
-
-
-def test_excitation_and_reference_are_those_of_the_table(case):
-    robot, observation, _, calibration = case
-    np.testing.assert_allclose(calibration.q_reference, robot.q_reference, atol=1e-15)
-    np.testing.assert_allclose(calibration.excitation, np.ptp(observation.q, axis=0), rtol=1e-14)
-    assert not calibration.weak.any()
-    assert calibration.merged_poses == len(observation.pose)
-    assert calibration.merged_markers == len(observation.marker)
-    assert calibration.joint_types == robot.joint_types
 
 
 def test_the_closed_form_finds_the_same_operators_without_noise():

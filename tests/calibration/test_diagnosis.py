@@ -75,11 +75,11 @@ def test_a_joint_that_stands_still_while_its_readings_move(types, joint, motions
     assert "its readings" in message
 
 
-@pytest.mark.parametrize("spoiled", ["shuffled", "geared", "types exchanged"])
+@pytest.mark.parametrize("spoiled", ["shuffled", "geared"])
 def test_what_no_single_joint_explains_names_none(spoiled):
     robot = robot_of("RPRP")
     q = poses(robot, "all at once")
-    readings, types = q.copy(), "PRRP" if spoiled == "types exchanged" else "RPRP"
+    readings, types = q.copy(), "RPRP"
     if spoiled == "shuffled":
         readings = np.random.default_rng(0).permutation(q)
     if spoiled == "geared":

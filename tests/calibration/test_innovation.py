@@ -1,5 +1,7 @@
 """The test of images in the loop: its distribution, its false alarms, what it finds and whom it blames."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
@@ -90,6 +92,26 @@ def test_single_slips_and_unseen_markers_are_no_disturbance(arm):
     s[3::7] = np.nan
     s[4::7, 1] = np.nan
     assert first_alarm(Innovation(calibration, SIGMA, 2000), q, s) == (None, "")
+
+
+def test_the_verdict_does_not_depend_on_the_unit_of_pixels(arm):
+    """A fixed least noise would hide a bump in images measured in other units than pixels."""
+    robot, calibration = arm
+    q, s = walk(robot, 50, np.random.default_rng(7))
+    s[30:, 0] += (2.0, -1.5)
+    unit = 1e-3
+    observation = robot.observe(trials(robot), SIGMA, np.random.default_rng(4))
+    small = calibrate(
+        dataclasses.replace(observation, images=unit * observation.images),
+        "RRRRRR",
+        source="recorded",
+        sigma_px=unit * SIGMA,
+    )
+    k, said = first_alarm(Innovation(calibration, SIGMA, 2000), q, s)
+    other, same = first_alarm(Innovation(small, unit * SIGMA, 2000), q, unit * s)
+    assert k == other
+    assert "left camera" in said
+    assert "left camera" in same
 
 
 def test_a_bump_is_found_that_the_calibration_alone_would_hide(arm):

@@ -104,10 +104,9 @@ def test_a_marker_whose_readings_are_all_wrong_costs_that_marker_alone(lost):
 
 @pytest.mark.volume
 def test_shifted_readings_of_another_lab_are_listed(shared_data):
-    """Three of the twenty seeds that ``python -m tests.calibration.statistics shifted 20`` looks at."""
-    found = [shifted_readings(seed) for seed in range(3)]
+    found = [shifted_readings(seed) for seed in range(2)]
     assert max(each.median_px for each in found) <= 0.19
     _, gross, seen, sound, accused = np.sum(found, axis=0)
-    assert gross > 200
+    assert gross > 130
     assert seen >= 0.97 * gross
     assert accused <= 0.01 * sound

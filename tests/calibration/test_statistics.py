@@ -5,7 +5,6 @@ import pytest
 from tests.calibration.bound import robot_of
 from tests.calibration.statistics import CASES, noise_draws, random_robots
 
-# In full by hand: 100 draws a case, 200 robots.
 DRAWS, ROBOTS = 4, 5
 
 

@@ -88,27 +88,6 @@ def test_what_is_promised_is_what_the_covariance_with_the_poses_says(robot, few,
     assert before / after > 3.0
 
 
-@pytest.mark.volume
-def test_suggested_poses_do_better_than_random_ones(robot, few, suggested):
-    rng = np.random.default_rng(9)
-    targets = visible(robot, around(robot, 150, rng))
-    truth = robot.images(targets)
-    chosen = np.vstack([few, [one.q for one in suggested]])
-
-    def quality(q, seed):
-        found = calibrated(robot, q, seed)
-        return np.mean((predict(found, targets) - truth) ** 2), prediction_variance(found, targets).mean()
-
-    best = np.array([quality(chosen, seed) for seed in range(4)])
-    chance = []
-    for seed in range(4):
-        random = visible(robot, around(robot, 60, rng))[:COUNT]
-        chance.append(quality(np.vstack([few, random]), seed))
-    actual, stated = best.mean(axis=0) / np.mean(chance, axis=0)
-    assert stated < 0.85
-    assert actual < 1.0
-
-
 def test_the_choice_does_not_depend_on_the_frame_nor_on_the_unit_of_pixels(robot, few, suggested):
     observation = observed(robot, few, 0)
     scaled = dataclasses.replace(observation, images=3.0 * observation.images + 50.0)
