@@ -15,7 +15,7 @@ from projservo_cli.report.material import CLASSICAL, VIEWS, title
 
 FRAMES = 60
 FRAME_MS, LAST_MS = 80, 2000
-MOST_COLUMNS = 4
+_MOST_COLUMNS = 4
 SEEN, HIDDEN = style.GREEN, style.ORANGE
 _PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
 _BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
@@ -27,7 +27,7 @@ def shown(traces: Mapping[str, Trace]) -> list[str]:
     """Names of the runs beside one another: the first direct law and the classical ones that were run."""
     direct = [name for name in traces if name in BODY_LAWS]
     found = [*direct[:1], *(name for name in traces if name in CLASSICAL)]
-    return (found if len(found) > 1 else list(traces))[:MOST_COLUMNS]
+    return (found if len(found) > 1 else list(traces))[:_MOST_COLUMNS]
 
 
 def times(traces: Sequence[Trace]) -> FloatArray:

@@ -20,35 +20,35 @@ from projservo_cli.robots.truth import Robot
 from projservo_cli.task.face import center_of
 
 MOST_INSTANTS = 60
-DOTS = 9  # on the planned path
-DIGITS = 4  # of coordinates in m: a tenth of a millimetre
-HEIGHT = 640  # px of the scene
-EYE = 1.75  # distance of the eye, in sizes of the scene
-LOWER = 0.15  # that it looks below the middle, where the names of the axes are
-PAD = 0.03  # around all that is shown, as a share of it
-FRAME_MS = 80
-TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
+_DOTS = 9  # on the planned path
+_DIGITS = 4  # of coordinates in m: a tenth of a millimetre
+_HEIGHT = 640  # px of the scene
+_EYE = 1.75  # distance of the eye, in sizes of the scene
+_LOWER = 0.15  # that it looks below the middle, where the names of the axes are
+_PAD = 0.03  # around all that is shown, as a share of it
+_FRAME_MS = 80
+_TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
 # What is wider than high needs more distance where the page is narrow.
-NEARER = """
+_NEARER = """
 const plot = document.getElementById("{plot_id}");
 const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
 const {x, y, z} = plot.layout.scene.camera.eye;
 Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
 """
-CAMERAS = (style.BLUE, style.ORANGE)
-SEEN, HIDDEN = style.SKY, style.VERMILION
-KEY = (
+_CAMERAS = (style.BLUE, style.ORANGE)
+_SEEN, _HIDDEN = style.SKY, style.VERMILION
+_KEY = (
     ("robot, face at the start", style.BLACK),
-    ("face", SEEN),
-    ("face, hidden from a camera", HIDDEN),
+    ("face", _SEEN),
+    ("face, hidden from a camera", _HIDDEN),
     ("markers", style.GREY),
-    ("left camera", CAMERAS[0]),
-    ("right camera", CAMERAS[1]),
+    ("left camera", _CAMERAS[0]),
+    ("right camera", _CAMERAS[1]),
     ("goal, planned path of the centre", style.PURPLE),
     ("driven path of the centre", style.GREEN),
 )
-AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
-PLAYING = AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
+_AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
+_PLAYING = _AT_ONCE | {"frame": {"duration": _FRAME_MS, "redraw": True}, "fromcurrent": True}
 
 
 class Driven(NamedTuple):
@@ -156,11 +156,11 @@ def write_view(path: Path, motion: Motion, *, name: str, known: str) -> None:
         full_html=False,
         include_plotlyjs=True,
         auto_play=False,
-        config={"displaylogo": False, "responsive": True, "modeBarButtons": [TOOLS]},
+        config={"displaylogo": False, "responsive": True, "modeBarButtons": [_TOOLS]},
         div_id="scene",
-        post_script=NEARER,
+        post_script=_NEARER,
     )
-    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=KEY)
+    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=_KEY)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
@@ -187,7 +187,7 @@ def _figure(motion: Motion) -> Any:
     playing = {"type": "buttons", "direction": "left", "showactive": False}
     playing["buttons"] = chosen[0]["updatemenus[1].buttons"]
     layout = {
-        "height": HEIGHT,
+        "height": _HEIGHT,
         "margin": {"l": 10, "r": 10, "t": 60, "b": 10},
         "showlegend": False,  # the page has a key that leaves the scene its room
         "font": {"family": "system-ui, DejaVu Sans, sans-serif", "size": 13, "color": style.BLACK},
@@ -212,8 +212,8 @@ def _scene(motion: Motion, run: Driven) -> dict[str, Any]:
         name: axis | {"title": {"text": f"{name[0]} (m)"}, "range": reach}
         for name, reach in _extent(motion, run).items()
     }
-    eye = {"x": EYE * np.cos(azimuth), "y": EYE * np.sin(azimuth), "z": 0.5 * EYE}
-    camera = {"eye": eye, "center": {"x": 0.0, "y": 0.0, "z": -LOWER}}
+    eye = {"x": _EYE * np.cos(azimuth), "y": _EYE * np.sin(azimuth), "z": 0.5 * _EYE}
+    camera = {"eye": eye, "center": {"x": 0.0, "y": 0.0, "z": -_LOWER}}
     return {**axes, "aspectmode": "data", "camera": camera}
 
 
@@ -223,8 +223,8 @@ def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
     points += [] if motion.goal is None else [motion.goal]
     shown = np.concatenate([some.reshape(-1, 3) for some in points])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    pad = PAD * float((high - low).max())
-    ranges = np.round(np.stack([low - pad, high + pad], axis=1), DIGITS)
+    pad = _PAD * float((high - low).max())
+    ranges = np.round(np.stack([low - pad, high + pad], axis=1), _DIGITS)
     return {f"{name}axis": reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
 
 
@@ -235,7 +235,7 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
         views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
         label = f"{seconds:.2f} s" + (f", hidden from {views}" if views else "")
         label += f", {run.verdict}" if frame == own[-1] else ""
-        steps.append({"label": label, "method": "animate", "args": [[frame], AT_ONCE], "value": frame})
+        steps.append({"label": label, "method": "animate", "args": [[frame], _AT_ONCE], "value": frame})
     return {
         "steps": steps,
         "active": 0,
@@ -249,13 +249,13 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
 
 def _play(own: list[str]) -> list[dict[str, Any]]:
     return [
-        {"label": "▶ play", "method": "animate", "args": [own, PLAYING]},
-        {"label": "❚❚ pause", "method": "animate", "args": [[None], AT_ONCE]},
+        {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
+        {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
     ]
 
 
 def _still(go: Any, motion: Motion) -> Iterator[Any]:
-    for pyramid, name, color in zip(motion.cameras, VIEWS, CAMERAS, strict=True):
+    for pyramid, name, color in zip(motion.cameras, VIEWS, _CAMERAS, strict=True):
         apex, corners = pyramid[:1], style.closed(pyramid[1:])
         edges = np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
         yield _line(go, edges, f"{name} camera", color, width=3)
@@ -263,7 +263,7 @@ def _still(go: Any, motion: Motion) -> Iterator[Any]:
     if motion.goal is not None:
         yield _line(go, style.closed(motion.goal), "face at the goal", style.PURPLE, width=4)
     if len(motion.planned):
-        dots = np.linspace(0, len(motion.planned) - 1, min(DOTS, len(motion.planned))).astype(int)
+        dots = np.linspace(0, len(motion.planned) - 1, min(_DOTS, len(motion.planned))).astype(int)
         yield _points(go, motion.planned[dots], "planned path", style.PURPLE)
 
 
@@ -277,7 +277,7 @@ def _moving(go: Any, run: Driven, k: int) -> tuple[Any, Any, Any]:
         i=(0 * fan).tolist(),
         j=fan.tolist(),
         k=(fan + 1).tolist(),
-        color=HIDDEN if run.hidden[k].any() else SEEN,
+        color=_HIDDEN if run.hidden[k].any() else _SEEN,
         flatshading=True,
         name="face",
         hoverinfo="name",
@@ -296,4 +296,4 @@ def _points(go: Any, points: FloatArray, name: str, color: str) -> Any:
 
 
 def _places(points: FloatArray) -> dict[str, list[float]]:
-    return {name: np.round(points[:, i], DIGITS).tolist() for i, name in enumerate("xyz")}
+    return {name: np.round(points[:, i], _DIGITS).tolist() for i, name in enumerate("xyz")}

@@ -149,7 +149,7 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
         assert ("pose of the goal is unknown" in spec.lacking(material)) == spec.goal
     monkeypatch.setattr(report, "FIGURES", (SPECS["fig03_scene"], SPECS["fig12_joints"]))
     assert len(report.draw_all(material, tmp_path, ("svg",), [])) == 2
-    rows = [claim.row() for claim in claims_of(material, None)]
+    rows = [claim._asdict() for claim in claims_of(material, None)]
     json.dumps(rows, allow_nan=False)
     assert not any("drift" in row["claim"] or "nan" in row["measured"] for row in rows)
     record = report.record_of(material.studies, None, figures=(), left_out=(), claims=tuple(rows))
