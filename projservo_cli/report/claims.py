@@ -46,7 +46,7 @@ class Claim(NamedTuple):
     holds: bool | None
 
 
-def listed(values: FloatArray) -> str:
+def _listed(values: FloatArray) -> str:
     """Numbers as a list in words, three digits each, large ones whole."""
     return ", ".join(f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in np.atleast_1d(values))
 
@@ -91,7 +91,7 @@ def _control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     yield from _image_error(calibrated, factor)
 
 
-def decay_ranges(material: Material, trace: Trace) -> dict[str, tuple[float, float, int]]:
+def _decay_ranges(material: Material, trace: Trace) -> dict[str, tuple[float, float, int]]:
     """Least and largest factor a step, and their number, of the centre's distance and of θ_s.
 
     Counted are the steps 20 after the last speed-limited one, down to 0.1 mm and 0.05°.
@@ -113,7 +113,7 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[Cla
         fitted_rate(center_distance(material, trace), first, LEAST_DISTANCE, trace.period),
         fitted_rate(trace.theta_s, first, float(LEAST_ANGLE), trace.period),
     ]
-    ranges = decay_ranges(material, trace)
+    ranges = _decay_ranges(material, trace)
     gains = _gains(studies, law)
     expected = {"distance": 1 - gains[0] * trace.period, "theta_s": 1 - gains[1] * trace.period}
     off = [
@@ -206,14 +206,14 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
         yield Claim(
             f"{TITLES[law]}: the drift falls with the gain",
             "section 6, Fig. 8",
-            f"{listed(free)} mm at gains {gains} per step; calibrated {listed(drift[i, 1, 0])} mm",
+            f"{_listed(free)} mm at gains {gains} per step; calibrated {_listed(drift[i, 1, 0])} mm",
             "strictly, with true operators and no limit",
             bool((np.diff(free[np.argsort(studies.gains)]) > 0).all()),
         )
         yield Claim(
             f"{TITLES[law]}: the drift falls with a limit of {studies.step_limit_deg:g}° per step",
             "section 6, Fig. 8",
-            f"{listed(limited)} mm at the same gains; calibrated {listed(drift[i, 1, 1])} mm",
+            f"{_listed(limited)} mm at the same gains; calibrated {_listed(drift[i, 1, 1])} mm",
             f"nowhere larger than without the limit by more than {_SAMPLING:.1%}, "
             "smaller at the highest gain",
             bool((limited <= free * (1 + _SAMPLING)).all() and limited[0] < free[0]),
@@ -246,7 +246,7 @@ def _rate(studies: Studies, revolute: BoolArray) -> Iterator[Claim]:
         yield Claim(
             f"{TITLES[law]}: the drift is typical of low control rates",
             "section 7",
-            f"{listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
+            f"{_listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
             f"drift ∝ period^{order:.2f}; a joint turns by up to {turn:.0f}° in a step of the longest period",
             "falls strictly with the period, true operators and no limit",
             bool((np.diff(values[np.argsort(periods)]) > 0).all()),
@@ -291,7 +291,7 @@ def composition_claim(lambdas: FloatArray, distance: FloatArray) -> Claim:
     return Claim(
         "exp(λτ Ĥ_t) exp(λθ Ĥ_s) = exp(λτ Ĥ_t + λθ Ĥ_s)",
         "eq. (22), section 5.2",
-        f"the centre differs by {listed(1e3 * distance)} mm at λ = {shares}{order}",
+        f"the centre differs by {_listed(1e3 * distance)} mm at λ = {shares}{order}",
         "equal to round-off; to first order only where the difference is ∝ λ²",
         bool((distance <= _EQUAL_M).all()),
     )
