@@ -350,7 +350,7 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[Claim]:
         f"{TITLES[law]}: stands still in a local minimum before it converges",
         "section 6, Fig. 4",
         f"{measured}; {trace.verdict}",
-        f"the error falls < 1 % in {window} steps, verdict converged",
+        f"image error falls < 1 % in {window} steps, verdict converged",
         stretch is not None and trace.verdict == "converged",
     )
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -227,37 +227,19 @@ SECTIONS = ("calibration", "plan", "control")
 _MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
 
 
-@dataclass(frozen=True)
-class _Picture:
-    """One figure.
+class _Picture(NamedTuple):
+    """One figure, and the (label, path) of its files; no drawing where there is no file a page can show."""
 
-    Attributes
-    ----------
-    anchor : its name within the page.
-    number : as in the names of its files.
-    caption, paper : what it shows, and which figure and section of the paper it follows.
-    drawing : the figure itself; None where there is no file that a page can show.
-    links : (label, path) of its files and of the numbers behind it.
-    """
-
-    anchor: str
-    number: str
+    anchor: str  # its name within the page
+    number: str  # as in the names of its files
     caption: str
-    paper: str
+    paper: str  # the figure and section of the paper that it follows
     drawing: Markup | None
     links: tuple[tuple[str, str], ...]
 
 
 def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -> dict[str, list[_Picture]]:
-    """Figures by section, in their order.
-
-    Parameters
-    ----------
-    directory : of the run.
-    files : those the report wrote, relative to it.
-    folder : of the run as seen from the page, empty or ending in a slash.
-    prefix : of all names within the page.
-    """
+    """Figures by section, of the files that the report wrote; ``prefix`` is of all names within the page."""
     found: dict[str, list[_Picture]] = {section: [] for section in SECTIONS}
     for spec in FIGURES:
         kinds = [kind for kind in FORMATS if _file(spec, kind) in files]
@@ -326,16 +308,9 @@ _VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotli
 class _View:
     """One run as the page shows it; what it lacks is empty or None.
 
-    Attributes
-    ----------
-    name : of its configuration.
-    folder : of the run, relative to the page.
-    config : settings, and ``configuration`` the same as YAML with all defaults.
-    made : (property, value) of what the run was made with.
-    calibration, plan, laws, claims, left_out : plain values of each stage, with what only the page tells.
-    drift : table of the report; None where there is none.
-    pictures : the figures by section.
-    extras : (label, path) of what lies beside the page.
+    Stages are told by their plain values and what only the page tells; ``folder`` is that of the run,
+    relative to the page, ``made`` (property, value) of what made it, ``extras`` (label, path) of what lies
+    beside the page.
     """
 
     name: str
@@ -355,14 +330,7 @@ class _View:
 
 
 def _view(run: Run, *, folder: str = "", prefix: str = "") -> _View:
-    """What the page shows of a run.
-
-    Parameters
-    ----------
-    run : the run; its figures are read from its folder.
-    folder : of the run as seen from the page, empty or ending in a slash.
-    prefix : of all names within the page, where it shows several runs.
-    """
+    """What the page shows of a run in a ``folder``; ``prefix`` sets its names off from those of others."""
     config = load_config(run.path, text=run.configuration)
     stages = {name.split("/")[0] for name in run.results}
     found = {stage: stage_object(stage, run, config, list(run.traces)) for stage in stages}
