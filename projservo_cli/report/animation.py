@@ -15,7 +15,7 @@ from projservo_cli.report.material import CLASSICAL, VIEWS, title
 
 FRAMES = 60
 FRAME_MS, LAST_MS = 80, 2000
-MOST_COLUMNS = 4
+_MOST_COLUMNS = 4
 SEEN, HIDDEN = style.GREEN, style.ORANGE
 _PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
 _BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
@@ -27,7 +27,7 @@ def shown(traces: Mapping[str, Trace]) -> list[str]:
     """Names of the runs beside one another: the first direct law and the classical ones that were run."""
     direct = [name for name in traces if name in BODY_LAWS]
     found = [*direct[:1], *(name for name in traces if name in CLASSICAL)]
-    return (found if len(found) > 1 else list(traces))[:MOST_COLUMNS]
+    return (found if len(found) > 1 else list(traces))[:_MOST_COLUMNS]
 
 
 def times(traces: Sequence[Trace]) -> FloatArray:
@@ -41,12 +41,8 @@ def frames(
 ) -> Iterator[npt.NDArray[np.uint8]]:
     """Draw one frame after another; yields the pixels (height, width, 3) of each.
 
-    Parameters
-    ----------
-    traces : the runs, a column each.
-    order : (m,) markers around the face.
-    size : (2,) of the images, px.
-    at : (f,) time of each frame, s.
+    Columns are the ``traces``, ``order`` (m,) are the markers around the face, ``size`` (2,) is that of the
+    images, px, and ``at`` (f,) the time of each frame, s.
     """
     every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
     near = near_pixels(np.concatenate(every), size)
@@ -64,12 +60,9 @@ def frames(
             style.face(panel, trace.s_star[view, order], style.GOAL)
             style.frame_pixels(panel, near)
             panels.append(_Panel(panel, trace.s[:, view, order], trace.self_occluded[:, view]))
-    handles = [
-        style.line_handle("start", **style.START),
-        style.line_handle("goal", **style.GOAL),
-        style.line_handle("path of a marker", **_PATH),
-        style.line_handle("face hidden from this camera", **_BEHIND),
-    ]
+    looks = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
+    looks["face hidden from this camera"] = _BEHIND
+    handles = [style.line_handle(label, **look) for label, look in looks.items()]
     style.legend_below(figure, handles, 4 if len(traces) > 2 else 2)
     clock = figure.suptitle("time 00.00 s", fontsize=9)
     style.arrange(figure)
@@ -121,17 +114,8 @@ def write_animation(
 ) -> None:
     """Write the animation of runs that moved as GIF.
 
-    Parameters
-    ----------
-    path : of the file.
-    traces, order : the runs, of which some are shown; markers around the face.
-    size : of the images, px; where it is not known, what reaches around all that was seen.
-    progress : told how many frames are drawn.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
+    ``order`` are the markers around the face, ``size`` is that of the images in px; where it is not known,
+    the animation shows what reaches around all that was seen.
     """
     from PIL import Image
 

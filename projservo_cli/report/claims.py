@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,17 +33,10 @@ from projservo_cli.report.material import (
 )
 
 
-@dataclass(frozen=True)
-class Claim:
-    """One claim of the paper and its measure.
+class Claim(NamedTuple):
+    """One claim of the paper, where it stands, its measure in words, when it holds, and whether it does.
 
-    Attributes
-    ----------
-    claim : what is claimed.
-    source : where in the paper.
-    measured : the number, in words.
-    criterion : when the claim holds.
-    holds : whether it does; None where it could not be measured.
+    ``holds`` is None where it could not be measured.
     """
 
     claim: str
@@ -53,34 +45,24 @@ class Claim:
     criterion: str
     holds: bool | None
 
-    def row(self) -> dict[str, Any]:
-        """Plain values for the run file and for JSON."""
-        return {
-            "claim": self.claim,
-            "source": self.source,
-            "measured": self.measured,
-            "criterion": self.criterion,
-            "holds": self.holds,
-        }
 
-
-def listed(values: FloatArray) -> str:
+def _listed(values: FloatArray) -> str:
     """Numbers as a list in words, three digits each, large ones whole."""
     return ", ".join(f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in np.atleast_1d(values))
 
 
 # A curve follows an exponential where each step's factor is within this share of 1 - gain·period.
-FACTOR_TOLERANCE = 0.01
-LEAST_STEPS = 10  # settled steps needed to say so
-MODEL_TOLERANCE_DEG = 1e-6
-START_TOLERANCE_DEG = 0.5
+_FACTOR_TOLERANCE = 0.01
+_LEAST_STEPS = 10  # settled steps needed to say so
+_MODEL_TOLERANCE_DEG = 1e-6
+_START_TOLERANCE_DEG = 0.5
 # A coordinate rises, or leaves the exponential, by more than this, px.
-VISIBLE_PX = 1.0
+_VISIBLE_PX = 1.0
 # τ agrees with the true distance within this, % of the start.
-SCALE_TOLERANCE = 2.0
+_SCALE_TOLERANCE = 2.0
 
 
-def control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
+def _control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     """Claims of section 6 about Figs. 9 to 11."""
     for law in DIRECT:
         yield from _exponential(material, studies, law)
@@ -92,8 +74,8 @@ def control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
         "Projective and Euclidean models give the same θ_r and θ_p",
         "section 6, Fig. 10",
         f"largest difference {same:.2g}° with true operators, {also:.2g}° with calibrated ones",
-        f"at most {MODEL_TOLERANCE_DEG:g}° with true operators",
-        same <= MODEL_TOLERANCE_DEG,
+        f"at most {_MODEL_TOLERANCE_DEG:g}° with true operators",
+        same <= _MODEL_TOLERANCE_DEG,
     )
     yield from _scale(material, calibrated)
     trace = studies.own[DIRECT[1], "calibrated", False]
@@ -102,14 +84,14 @@ def control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
         "θ_s starts at the overall rotation of the task, 180° in the paper",
         "section 6, Fig. 9",
         f"{start:.3f}°; true rotation " + ("unknown" if math.isnan(task) else f"{task:.3f}°"),
-        f"within {START_TOLERANCE_DEG:g}° of the true rotation",
-        None if math.isnan(task) else abs(start - task) <= START_TOLERANCE_DEG,
+        f"within {_START_TOLERANCE_DEG:g}° of the true rotation",
+        None if math.isnan(task) else abs(start - task) <= _START_TOLERANCE_DEG,
     )
     factor = 1.0 - studies.gains_of_laws.gain_t * calibrated.period
     yield from _image_error(calibrated, factor)
 
 
-def decay_ranges(material: Material, trace: Trace) -> dict[str, tuple[float, float, int]]:
+def _decay_ranges(material: Material, trace: Trace) -> dict[str, tuple[float, float, int]]:
     """Least and largest factor a step, and their number, of the centre's distance and of θ_s.
 
     Counted are the steps 20 after the last speed-limited one, down to 0.1 mm and 0.05°.
@@ -131,14 +113,14 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[Cla
         fitted_rate(center_distance(material, trace), first, LEAST_DISTANCE, trace.period),
         fitted_rate(trace.theta_s, first, float(LEAST_ANGLE), trace.period),
     ]
-    ranges = decay_ranges(material, trace)
+    ranges = _decay_ranges(material, trace)
     gains = _gains(studies, law)
     expected = {"distance": 1 - gains[0] * trace.period, "theta_s": 1 - gains[1] * trace.period}
     off = [
         max(abs(low / expected[name] - 1), abs(high / expected[name] - 1))
         for name, (low, high, _) in ranges.items()
     ]
-    enough = len(ranges) == 2 and min(count for _, _, count in ranges.values()) >= LEAST_STEPS
+    enough = len(ranges) == 2 and min(count for _, _, count in ranges.values()) >= _LEAST_STEPS
     measured = (
         "too few settled steps"
         if not enough
@@ -152,8 +134,8 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[Cla
         f"{TITLES[law]}: the control errors decay exponentially",
         "section 6, Figs. 9 and 10",
         measured,
-        f"factor of every settled step within {FACTOR_TOLERANCE:.0%} of 1 - gain·period",
-        max(off) <= FACTOR_TOLERANCE if enough else None,
+        f"factor of every settled step within {_FACTOR_TOLERANCE:.0%} of 1 - gain·period",
+        max(off) <= _FACTOR_TOLERANCE if enough else None,
     )
 
 
@@ -182,8 +164,8 @@ def _scale(material: Material, trace: Trace) -> Iterator[Claim]:
         "section 6, Fig. 10",
         f"largest difference {off:.3g} % of the start with the unit-norm kernel of (8), {affine:.2g} % "
         "with the scale fixed through a_inf",
-        f"at most {SCALE_TOLERANCE:g} % with the scale fixed",
-        affine <= SCALE_TOLERANCE,
+        f"at most {_SCALE_TOLERANCE:g} % with the scale fixed",
+        affine <= _SCALE_TOLERANCE,
     )
 
 
@@ -194,26 +176,26 @@ def _image_error(trace: Trace, factor: float) -> Iterator[Claim]:
         "The image error does not decay exponentially",
         "section 6, Fig. 11",
         f"a marker coordinate is up to {off.max():.0f} px away from an exponential decay",
-        f"more than {VISIBLE_PX:g} px (directTHREE, no limit)",
-        bool(off.max() > VISIBLE_PX),
+        f"more than {_VISIBLE_PX:g} px (directTHREE, no limit)",
+        bool(off.max() > _VISIBLE_PX),
     )
-    rising = int((rise > VISIBLE_PX).sum())
+    rising = int((rise > _VISIBLE_PX).sum())
     yield Claim(
         "The image error does not even decay monotonically",
         "section 6, Fig. 11",
         f"{rising} of {rise.size} marker coordinates rise again, by up to {rise.max():.0f} px",
-        f"one by more than {VISIBLE_PX:g} px (directTHREE, no limit)",
+        f"one by more than {_VISIBLE_PX:g} px (directTHREE, no limit)",
         rising > 0,
     )
 
 
 # Both sides of (22) agree where the centre is moved to within this of the same place, m.
-EQUAL_M = 1e-9
+_EQUAL_M = 1e-9
 # A limit that bends the first step alone moves the phase at which the largest deviation is sampled.
-SAMPLING = 1e-3
+_SAMPLING = 1e-3
 
 
-def drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
+def _drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     """Claims of sections 5.2, 6 and 7 about drift; none where the goal pose is unknown."""
     drift = drift_tables(studies)[0]
     if not np.isfinite(drift).all():
@@ -224,16 +206,17 @@ def drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
         yield Claim(
             f"{TITLES[law]}: the drift falls with the gain",
             "section 6, Fig. 8",
-            f"{listed(free)} mm at gains {gains} per step; calibrated {listed(drift[i, 1, 0])} mm",
+            f"{_listed(free)} mm at gains {gains} per step; calibrated {_listed(drift[i, 1, 0])} mm",
             "strictly, with true operators and no limit",
             bool((np.diff(free[np.argsort(studies.gains)]) > 0).all()),
         )
         yield Claim(
             f"{TITLES[law]}: the drift falls with a limit of {studies.step_limit_deg:g}° per step",
             "section 6, Fig. 8",
-            f"{listed(limited)} mm at the same gains; calibrated {listed(drift[i, 1, 1])} mm",
-            f"nowhere larger than without the limit by more than {SAMPLING:.1%}, smaller at the highest gain",
-            bool((limited <= free * (1 + SAMPLING)).all() and limited[0] < free[0]),
+            f"{_listed(limited)} mm at the same gains; calibrated {_listed(drift[i, 1, 1])} mm",
+            f"nowhere larger than without the limit by more than {_SAMPLING:.1%}, "
+            "smaller at the highest gain",
+            bool((limited <= free * (1 + _SAMPLING)).all() and limited[0] < free[0]),
         )
     own = [float(studies.own[law, "true", False].center_deviation_mm or 0.0) for law in DIRECT]
     yield Claim(
@@ -263,7 +246,7 @@ def _rate(studies: Studies, revolute: BoolArray) -> Iterator[Claim]:
         yield Claim(
             f"{TITLES[law]}: the drift is typical of low control rates",
             "section 7",
-            f"{listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
+            f"{_listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
             f"drift ∝ period^{order:.2f}; a joint turns by up to {turn:.0f}° in a step of the longest period",
             "falls strictly with the period, true operators and no limit",
             bool((np.diff(values[np.argsort(periods)]) > 0).all()),
@@ -308,19 +291,19 @@ def composition_claim(lambdas: FloatArray, distance: FloatArray) -> Claim:
     return Claim(
         "exp(λτ Ĥ_t) exp(λθ Ĥ_s) = exp(λτ Ĥ_t + λθ Ĥ_s)",
         "eq. (22), section 5.2",
-        f"the centre differs by {listed(1e3 * distance)} mm at λ = {shares}{order}",
+        f"the centre differs by {_listed(1e3 * distance)} mm at λ = {shares}{order}",
         "equal to round-off; to first order only where the difference is ∝ λ²",
-        bool((distance <= EQUAL_M).all()),
+        bool((distance <= _EQUAL_M).all()),
     )
 
 
 # What counts as "very small" in an image, as a share of its diagonal.
-SMALL_SHARE = 0.01
+_SMALL_SHARE = 0.01
 # The centre moves horizontally where its ordinate varies by less than this share of its abscissa.
-LEVEL_SHARE = 0.02
+_LEVEL_SHARE = 0.02
 
 
-def classical(material: Material) -> Iterator[Claim]:
+def _classical(material: Material) -> Iterator[Claim]:
     """Claims of section 6 about the classical laws that were run."""
     trace = material.traces.get("blockwise")
     if trace is not None:
@@ -367,12 +350,12 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[Claim]:
         f"{TITLES[law]}: stands still in a local minimum before it converges",
         "section 6, Fig. 4",
         f"{measured}; {trace.verdict}",
-        f"the error falls < 1 % in {window} steps, verdict converged",
+        f"image error falls < 1 % in {window} steps, verdict converged",
         stretch is not None and trace.verdict == "converged",
     )
 
 
-def planned(material: Material) -> Iterator[Claim]:
+def _planned(material: Material) -> Iterator[Claim]:
     """Claims of sections 4.3 and 6 about the planned motion."""
     plan = material.plan
     miss = float(np.linalg.norm(plan.s[-1] - plan.s_star, axis=-1).max())
@@ -385,7 +368,7 @@ def planned(material: Material) -> Iterator[Claim]:
     )
 
 
-def direct(material: Material) -> Iterator[Claim]:
+def _direct(material: Material) -> Iterator[Claim]:
     """Claims of sections 4.2 and 6 about what the cameras see under direct control."""
     traces = {law: material.traces[law] for law in DIRECT if law in material.traces}
     if traces:
@@ -408,8 +391,8 @@ def direct(material: Material) -> Iterator[Claim]:
             "The image paths of directTHREE and directTWO differ very little",
             "section 6, Fig. 7",
             f"largest distance between both paths {gap:.1f} px",
-            f"at most {SMALL_SHARE:.0%} of the image diagonal, {SMALL_SHARE * diagonal:.1f} px",
-            gap <= SMALL_SHARE * diagonal,
+            f"at most {_SMALL_SHARE:.0%} of the image diagonal, {_SMALL_SHARE * diagonal:.1f} px",
+            gap <= _SMALL_SHARE * diagonal,
         )
     if DIRECT[0] in traces:
         yield _level(material, traces[DIRECT[0]])
@@ -423,12 +406,9 @@ def _level(material: Material, trace: Trace) -> Claim:
         "section 6, Fig. 11",
         f"ordinate varies by {variation[0]:.1f} and {variation[1]:.1f} px while the abscissa travels "
         f"{travel[0]:.0f} and {travel[1]:.0f} px (left, right)",
-        f"variation at most {LEVEL_SHARE:.0%} of the travel",
-        bool((variation <= LEVEL_SHARE * travel).all()),
+        f"variation at most {_LEVEL_SHARE:.0%} of the travel",
+        bool((variation <= _LEVEL_SHARE * travel).all()),
     )
-
-
-__all__ = ["Claim", "claims_of"]
 
 
 def claims_of(material: Material, eq22: tuple[FloatArray, FloatArray] | None) -> list[Claim]:
@@ -440,9 +420,9 @@ def claims_of(material: Material, eq22: tuple[FloatArray, FloatArray] | None) ->
     eq22 : shares λ, and the distances of the centre between both sides of (22), m; None where they
         could not be computed.
     """
-    found = [*classical(material), *planned(material), *direct(material)]
+    found = [*_classical(material), *_planned(material), *_direct(material)]
     if material.studies is not None:
-        found += [*drift_claims(material, material.studies), *control_claims(material, material.studies)]
+        found += [*_drift_claims(material, material.studies), *_control_claims(material, material.studies)]
     if eq22 is not None:
         found.append(composition_claim(*eq22))
     return found

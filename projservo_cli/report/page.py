@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -227,38 +227,20 @@ SECTIONS = ("calibration", "plan", "control")
 _MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
 
 
-@dataclass(frozen=True)
-class Picture:
-    """One figure.
+class _Picture(NamedTuple):
+    """One figure, and the (label, path) of its files; no drawing where there is no file a page can show."""
 
-    Attributes
-    ----------
-    anchor : its name within the page.
-    number : as in the names of its files.
-    caption, paper : what it shows, and which figure and section of the paper it follows.
-    drawing : the figure itself; None where there is no file that a page can show.
-    links : (label, path) of its files and of the numbers behind it.
-    """
-
-    anchor: str
-    number: str
+    anchor: str  # its name within the page
+    number: str  # as in the names of its files
     caption: str
-    paper: str
+    paper: str  # the figure and section of the paper that it follows
     drawing: Markup | None
     links: tuple[tuple[str, str], ...]
 
 
-def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -> dict[str, list[Picture]]:
-    """Figures by section, in their order.
-
-    Parameters
-    ----------
-    directory : of the run.
-    files : those the report wrote, relative to it.
-    folder : of the run as seen from the page, empty or ending in a slash.
-    prefix : of all names within the page.
-    """
-    found: dict[str, list[Picture]] = {section: [] for section in SECTIONS}
+def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -> dict[str, list[_Picture]]:
+    """Figures by section, of the files that the report wrote; ``prefix`` is of all names within the page."""
+    found: dict[str, list[_Picture]] = {section: [] for section in SECTIONS}
     for spec in FIGURES:
         kinds = [kind for kind in FORMATS if _file(spec, kind) in files]
         if kinds:
@@ -276,7 +258,7 @@ def _section(spec: FigureSpec) -> str:
     return "control" if spec.laws or spec.studies or spec.modes else "plan"
 
 
-def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> Picture:
+def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> _Picture:
     drawing = None
     for kind in ("svg", "png"):
         content = _content(directory, _file(spec, kind)) if kind in kinds and drawing is None else None
@@ -286,7 +268,7 @@ def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, p
     if (directory / _file(spec, "csv")).is_file():
         links.insert(0, ("numbers (CSV)", folder + _file(spec, "csv")))
     digits = "".join(c for c in spec.name.partition("_")[0] if c.isdigit())
-    return Picture(
+    return _Picture(
         f"{prefix}{spec.name}", str(int(digits or 0)), spec.title, spec.paper, drawing, tuple(links)
     )
 
@@ -323,19 +305,12 @@ _VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotli
 
 
 @dataclass(frozen=True)
-class View:
+class _View:
     """One run as the page shows it; what it lacks is empty or None.
 
-    Attributes
-    ----------
-    name : of its configuration.
-    folder : of the run, relative to the page.
-    config : settings, and ``configuration`` the same as YAML with all defaults.
-    made : (property, value) of what the run was made with.
-    calibration, plan, laws, claims, left_out : plain values of each stage, with what only the page tells.
-    drift : table of the report; None where there is none.
-    pictures : the figures by section.
-    extras : (label, path) of what lies beside the page.
+    Stages are told by their plain values and what only the page tells; ``folder`` is that of the run,
+    relative to the page, ``made`` (property, value) of what made it, ``extras`` (label, path) of what lies
+    beside the page.
     """
 
     name: str
@@ -350,23 +325,16 @@ class View:
     drift: dict[str, Any] | None = None
     left_out: dict[str, list[str]] = field(default_factory=dict)
     reported: bool = False
-    pictures: dict[str, list[Picture]] = field(default_factory=lambda: {name: [] for name in SECTIONS})
+    pictures: dict[str, list[_Picture]] = field(default_factory=lambda: {name: [] for name in SECTIONS})
     extras: tuple[tuple[str, str], ...] = ()
 
 
-def _view(run: Run, *, folder: str = "", prefix: str = "") -> View:
-    """What the page shows of a run.
-
-    Parameters
-    ----------
-    run : the run; its figures are read from its folder.
-    folder : of the run as seen from the page, empty or ending in a slash.
-    prefix : of all names within the page, where it shows several runs.
-    """
+def _view(run: Run, *, folder: str = "", prefix: str = "") -> _View:
+    """What the page shows of a run in a ``folder``; ``prefix`` sets its names off from those of others."""
     config = load_config(run.path, text=run.configuration)
     stages = {name.split("/")[0] for name in run.results}
     found = {stage: stage_object(stage, run, config, list(run.traces)) for stage in stages}
-    shown = View(
+    shown = _View(
         config.name,
         folder,
         config,
@@ -502,7 +470,7 @@ def _drift(report: Report) -> dict[str, Any] | None:
     }
 
 
-def _differences(views: list[View]) -> list[tuple[str, list[str]]]:
+def _differences(views: list[_View]) -> list[tuple[str, list[str]]]:
     """Settings in which runs differ: the key, and what each run has; empty where it lacks the key."""
     flat = [dict(_leaves("", view.config.model_dump(mode="json", exclude_none=True))) for view in views]
     keys = dict.fromkeys(key for settings in flat for key in settings)
@@ -521,9 +489,9 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, str]]:
         yield path, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def _picture_rows(views: list[View]) -> dict[str, list[list[Picture | None]]]:
+def _picture_rows(views: list[_View]) -> dict[str, list[list[_Picture | None]]]:
     """Figures by section, a row for each, an entry for each run; None where a run lacks it."""
-    rows: dict[str, list[list[Picture | None]]] = {}
+    rows: dict[str, list[list[_Picture | None]]] = {}
     for section in SECTIONS:
         numbered = [{picture.number: picture for picture in view.pictures[section]} for view in views]
         names = sorted({number for own in numbered for number in own}, key=int)
@@ -531,7 +499,7 @@ def _picture_rows(views: list[View]) -> dict[str, list[list[Picture | None]]]:
     return rows
 
 
-def _claim_rows(views: list[View]) -> list[dict[str, Any]]:
+def _claim_rows(views: list[_View]) -> list[dict[str, Any]]:
     """Claims of all runs: what is claimed, where, when it holds, and what each run measured."""
     rows: dict[tuple[str, str, str], dict[str, Any]] = {}
     for v, view in enumerate(views):
@@ -593,7 +561,7 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
     _write(path, named)
 
 
-def _write(path: Path, views: list[View]) -> None:
+def _write(path: Path, views: list[_View]) -> None:
     text = template("page.html").render(
         views=views, claims=_claim_rows(views), differences=_differences(views), pictures=_picture_rows(views)
     )

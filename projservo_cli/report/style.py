@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
-PNG_DPI = 200
+_PNG_DPI = 200
 Look = dict[str, Any]
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMAGE = "image"  # label of axes that show pixels
 
 # M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
@@ -55,7 +55,7 @@ CURVES: tuple[tuple[str, Any, str], ...] = (
 START: Look = {"color": BLACK, "linewidth": 1.4}
 GOAL: Look = {"color": BLUE, "linestyle": (0, (5, 1.5))}
 
-RC: Any = {
+_RC: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 8.0,
     "axes.titlesize": 8.5,
@@ -83,7 +83,7 @@ RC: Any = {
     "image.cmap": "cividis",
     "savefig.facecolor": "white",
 }
-METADATA: dict[str, dict[str, Any]] = {
+_METADATA: dict[str, dict[str, Any]] = {
     "svg": {"Date": None, "Creator": "projservo"},
     "pdf": {"CreationDate": None, "ModDate": None, "Creator": "projservo", "Producer": "matplotlib"},
     "png": {"Software": "projservo"},
@@ -95,7 +95,7 @@ def styled() -> Iterator[None]:
     """Draw and save in the style of the figures."""
     import matplotlib
 
-    with matplotlib.rc_context(RC):
+    with matplotlib.rc_context(_RC):
         yield
 
 
@@ -150,7 +150,7 @@ def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
     made = {}
     for kind in formats:
         file = io.BytesIO()
-        figure.savefig(file, format=kind, dpi=PNG_DPI, metadata=METADATA[kind])
+        figure.savefig(file, format=kind, dpi=_PNG_DPI, metadata=_METADATA[kind])
         made[kind] = clips_by_content(file.getvalue()) if kind == "svg" else file.getvalue()
     return made
 
@@ -230,7 +230,7 @@ def log_scale(axes: "Axes") -> None:
 def _power(value: float, position: int | None = None) -> str:
     del position
     exponent = round(float(np.log10(value))) if value > 0 else 0
-    return "10" + str(exponent).translate(SUPERSCRIPTS)
+    return "10" + str(exponent).translate(_SUPERSCRIPTS)
 
 
 def signed(value: float, decimals: int = 1) -> str:

@@ -20,51 +20,51 @@ from projservo_cli.robots.truth import Robot
 from projservo_cli.task.face import center_of
 
 MOST_INSTANTS = 60
-DOTS = 9  # on the planned path
-DIGITS = 4  # of coordinates in m: a tenth of a millimetre
-HEIGHT = 640  # px of the scene
-EYE = 1.75  # distance of the eye, in sizes of the scene
-LOWER = 0.15  # that it looks below the middle, where the names of the axes are
-PAD = 0.03  # around all that is shown, as a share of it
-FRAME_MS = 80
-TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
+_DOTS = 9  # on the planned path
+_DIGITS = 4  # of coordinates in m: a tenth of a millimetre
+_HEIGHT = 640  # px of the scene
+_EYE = 1.75  # distance of the eye, in sizes of the scene
+_LOWER = 0.15  # that it looks below the middle, where the names of the axes are
+_PAD = 0.03  # around all that is shown, as a share of it
+_FRAME_MS = 80
+_TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
 # What is wider than high needs more distance where the page is narrow.
-NEARER = """
+_NEARER = """
 const plot = document.getElementById("{plot_id}");
 const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
 const {x, y, z} = plot.layout.scene.camera.eye;
 Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
 """
-CAMERAS = (style.BLUE, style.ORANGE)
-SEEN, HIDDEN = style.SKY, style.VERMILION
-KEY = (
+_CAMERAS = (style.BLUE, style.ORANGE)
+_SEEN, _HIDDEN = style.SKY, style.VERMILION
+_KEY = (
     ("robot, face at the start", style.BLACK),
-    ("face", SEEN),
-    ("face, hidden from a camera", HIDDEN),
+    ("face", _SEEN),
+    ("face, hidden from a camera", _HIDDEN),
     ("markers", style.GREY),
-    ("left camera", CAMERAS[0]),
-    ("right camera", CAMERAS[1]),
+    ("left camera", _CAMERAS[0]),
+    ("right camera", _CAMERAS[1]),
     ("goal, planned path of the centre", style.PURPLE),
     ("driven path of the centre", style.GREEN),
 )
-AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
-PLAYING = AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
+_AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
+_PLAYING = _AT_ONCE | {"frame": {"duration": _FRAME_MS, "redraw": True}, "fromcurrent": True}
 
 
 class Driven(NamedTuple):
-    """One run at the k instants shown, in m: polylines of the robot, faces in cyclic order, all markers."""
+    """One run at the k instants shown, in m."""
 
     verdict: str
     seconds: FloatArray  # (k,)
-    robot: FloatArray  # (k, j, 3)
-    face: FloatArray  # (k, m, 3)
-    markers: FloatArray  # (k, p, 3)
     hidden: BoolArray  # (k, 2) whether the face is hidden from each camera
     path: FloatArray  # (t, 3) centre of the face at every instant of the run
+    robot: FloatArray  # (k, j, 3) from its base to the tool
+    face: FloatArray  # (k, m, 3) in cyclic order
+    markers: FloatArray  # (k, p, 3)
 
 
 class Motion(NamedTuple):
-    """What stands still in the view, in m, and the runs by name."""
+    """What stands still in the view, in m in the frame of the robot's base, and the runs by name."""
 
     cameras: FloatArray  # (2, 5, 3) optical centre and image corners of both viewing pyramids
     start: FloatArray  # (m, 3) corners of the face
@@ -76,15 +76,7 @@ class Motion(NamedTuple):
 def motion(
     robot: Robot, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
 ) -> Motion:
-    """Place everything in the frame of the robot's base.
-
-    Parameters
-    ----------
-    robot, plant : the true robot, rig and face.
-    markers : (p, 4) all markers at the robot's reference, m.
-    plan : the plan.
-    traces : the runs, each with a step at least; their joints move the robot.
-    """
+    """What the view shows of runs with a step at least; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
     start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
     goals = [trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all()]
@@ -97,8 +89,7 @@ def motion(
 def instants(q: FloatArray) -> IntArray:
     """At most ``MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
 
-    They are spread evenly half over the time and half over the way of the joints, so that neither the
-    beginning of a long run nor its end is passed over.
+    They are spread half over the time, half over the way of the joints: no end of a run is passed over.
     """
     if len(q) <= MOST_INSTANTS:
         return np.arange(len(q))
@@ -111,16 +102,15 @@ def instants(q: FloatArray) -> IntArray:
 
 def _driven(robot: Robot, plant: Plant, markers: FloatArray, trace: Trace) -> Driven:
     shown = instants(trace.q)
-    places, face, every = [], [], []
+    places = []
     for q in trace.q[shown]:
         H = forward_kinematics(plant.model, q)
-        tool = (H @ robot.base_tool)[:3, 3]
-        places.append(skeleton(joint_operators(plant.model, q), robot.joint_types, tool))
-        face.append((plant.M[plant.order] @ H.T)[:, :3])
-        every.append((markers @ H.T)[:, :3])
-    verdict, seconds = f"{trace.verdict}, {trace.steps} steps", trace.period * shown.astype(np.float64)
-    moved = np.stack(places), np.stack(face), np.stack(every)
-    return Driven(verdict, seconds, *moved, trace.self_occluded[shown], _centers(plant, trace.q))
+        polyline = skeleton(joint_operators(plant.model, q), robot.joint_types, (H @ robot.base_tool)[:3, 3])
+        places.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
+    moved = (np.stack(kind) for kind in zip(*places, strict=True))
+    seconds, path = trace.period * shown.astype(np.float64), _centers(plant, trace.q)
+    verdict = f"{trace.verdict}, {trace.steps} steps"
+    return Driven(verdict, seconds, trace.self_occluded[shown], path, *moved)
 
 
 def _centers(plant: Plant, q: FloatArray) -> FloatArray:
@@ -130,13 +120,7 @@ def _centers(plant: Plant, q: FloatArray) -> FloatArray:
 
 
 def plotly() -> Any:
-    """The library that draws the view.
-
-    Raises
-    ------
-    InputError
-        If it is not installed.
-    """
+    """The library that draws the view; an InputError says how to get it."""
     try:
         import plotly.graph_objects
     except ImportError as error:
@@ -145,22 +129,16 @@ def plotly() -> Any:
 
 
 def write_view(path: Path, motion: Motion, *, name: str, known: str) -> None:
-    """Write the view of a run of a name beside its report; ``known`` says where the picture comes from.
-
-    Raises
-    ------
-    InputError
-        If plotly is not installed or the file cannot be written.
-    """
+    """Write the view of a run of a name beside its report; ``known`` says where the picture comes from."""
     scene = _figure(motion).to_html(
         full_html=False,
         include_plotlyjs=True,
         auto_play=False,
-        config={"displaylogo": False, "responsive": True, "modeBarButtons": [TOOLS]},
+        config={"displaylogo": False, "responsive": True, "modeBarButtons": [_TOOLS]},
         div_id="scene",
-        post_script=NEARER,
+        post_script=_NEARER,
     )
-    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=KEY)
+    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=_KEY)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
@@ -169,7 +147,8 @@ def _figure(motion: Motion) -> Any:
     """The view as a figure of plotly: what stands still, then four traces a run, and a frame an instant."""
     go = plotly()
     still = [*_still(go, motion)]
-    traces, frames, buttons, chosen = [*still], [], [], []
+    traces, frames, reach = [*still], [], {}
+    menu: list[Any] = []
     for number, (name, run) in enumerate(motion.runs.items()):
         moving = [_moving(go, run, k) for k in range(len(run.seconds))]
         own = [f"{name}/{k}" for k in range(len(moving))]
@@ -180,41 +159,40 @@ def _figure(motion: Motion) -> Any:
             traces.append(trace)
         shown = [True] * len(still) + [k // 4 == number for k in range(4 * len(motion.runs))]
         changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": _play(own)}
-        changed |= {f"scene.{axis}.range": reach for axis, reach in _extent(motion, run).items()}
-        buttons.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
-        chosen.append(changed)
+        reach[name] = _extent(motion, run)
+        changed |= {f"scene.{axis}axis.range": limits for axis, limits in reach[name].items()}
+        menu.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
+    first = menu[0]["args"][1]
     left = {"x": 0.0, "xanchor": "left"}
-    playing = {"type": "buttons", "direction": "left", "showactive": False}
-    playing["buttons"] = chosen[0]["updatemenus[1].buttons"]
+    playing: dict[str, Any] = {"type": "buttons", "direction": "left", "showactive": False}
+    playing["buttons"] = first["updatemenus[1].buttons"]
     layout = {
-        "height": HEIGHT,
+        "height": _HEIGHT,
         "margin": {"l": 10, "r": 10, "t": 60, "b": 10},
         "showlegend": False,  # the page has a key that leaves the scene its room
         "font": {"family": "system-ui, DejaVu Sans, sans-serif", "size": 13, "color": style.BLACK},
         "paper_bgcolor": "#ffffff",
         "uirevision": "kept",  # the view stays as it was turned
-        "scene": _scene(motion, next(iter(motion.runs.values()))),
-        "sliders": chosen[0]["sliders"],
+        "scene": _scene(motion, next(iter(reach.values()))),
+        "sliders": first["sliders"],
         "updatemenus": [
-            left | {"y": 1.0, "yanchor": "bottom", "pad": {"b": 8}, "buttons": buttons},
+            left | {"y": 1.0, "yanchor": "bottom", "pad": {"b": 8}, "buttons": menu},
             left | {"y": 0.0, "yanchor": "top", "pad": {"t": 8}} | playing,
         ],
     }
     return go.Figure(traces, layout, frames)
 
 
-def _scene(motion: Motion, run: Driven) -> dict[str, Any]:
+def _scene(motion: Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
     """Axes of equal scales, seen from beside the way from the face to the cameras."""
     axis: dict[str, Any] = {"backgroundcolor": "#ffffff", "gridcolor": style.PALE, "showbackground": False}
     towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
     azimuth = float(np.arctan2(towards[1], towards[0])) - np.radians(58.0)
-    axes = {
-        name: axis | {"title": {"text": f"{name[0]} (m)"}, "range": reach}
-        for name, reach in _extent(motion, run).items()
-    }
-    eye = {"x": EYE * np.cos(azimuth), "y": EYE * np.sin(azimuth), "z": 0.5 * EYE}
-    camera = {"eye": eye, "center": {"x": 0.0, "y": 0.0, "z": -LOWER}}
-    return {**axes, "aspectmode": "data", "camera": camera}
+    eye = {"x": _EYE * np.cos(azimuth), "y": _EYE * np.sin(azimuth), "z": 0.5 * _EYE}
+    scene: dict[str, Any] = {"aspectmode": "data", "camera": {"eye": eye, "center": {"z": -_LOWER}}}
+    for name, limits in reach.items():
+        scene[f"{name}axis"] = axis | {"title": {"text": f"{name} (m)"}, "range": limits}
+    return scene
 
 
 def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
@@ -223,9 +201,9 @@ def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
     points += [] if motion.goal is None else [motion.goal]
     shown = np.concatenate([some.reshape(-1, 3) for some in points])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    pad = PAD * float((high - low).max())
-    ranges = np.round(np.stack([low - pad, high + pad], axis=1), DIGITS)
-    return {f"{name}axis": reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
+    pad = _PAD * float((high - low).max())
+    ranges = np.round(np.stack([low - pad, high + pad], axis=1), _DIGITS)
+    return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
 
 
 def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
@@ -235,7 +213,7 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
         views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
         label = f"{seconds:.2f} s" + (f", hidden from {views}" if views else "")
         label += f", {run.verdict}" if frame == own[-1] else ""
-        steps.append({"label": label, "method": "animate", "args": [[frame], AT_ONCE], "value": frame})
+        steps.append({"label": label, "method": "animate", "args": [[frame], _AT_ONCE], "value": frame})
     return {
         "steps": steps,
         "active": 0,
@@ -249,13 +227,13 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
 
 def _play(own: list[str]) -> list[dict[str, Any]]:
     return [
-        {"label": "▶ play", "method": "animate", "args": [own, PLAYING]},
-        {"label": "❚❚ pause", "method": "animate", "args": [[None], AT_ONCE]},
+        {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
+        {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
     ]
 
 
 def _still(go: Any, motion: Motion) -> Iterator[Any]:
-    for pyramid, name, color in zip(motion.cameras, VIEWS, CAMERAS, strict=True):
+    for pyramid, name, color in zip(motion.cameras, VIEWS, _CAMERAS, strict=True):
         apex, corners = pyramid[:1], style.closed(pyramid[1:])
         edges = np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
         yield _line(go, edges, f"{name} camera", color, width=3)
@@ -263,8 +241,8 @@ def _still(go: Any, motion: Motion) -> Iterator[Any]:
     if motion.goal is not None:
         yield _line(go, style.closed(motion.goal), "face at the goal", style.PURPLE, width=4)
     if len(motion.planned):
-        dots = np.linspace(0, len(motion.planned) - 1, min(DOTS, len(motion.planned))).astype(int)
-        yield _points(go, motion.planned[dots], "planned path", style.PURPLE)
+        dots = np.linspace(0, len(motion.planned) - 1, min(_DOTS, len(motion.planned))).astype(int)
+        yield _line(go, motion.planned[dots], "planned path", style.PURPLE)
 
 
 def _moving(go: Any, run: Driven, k: int) -> tuple[Any, Any, Any]:
@@ -277,23 +255,21 @@ def _moving(go: Any, run: Driven, k: int) -> tuple[Any, Any, Any]:
         i=(0 * fan).tolist(),
         j=fan.tolist(),
         k=(fan + 1).tolist(),
-        color=HIDDEN if run.hidden[k].any() else SEEN,
+        color=_HIDDEN if run.hidden[k].any() else _SEEN,
         flatshading=True,
         name="face",
         hoverinfo="name",
     )
-    return robot, face, _points(go, run.markers[k], "markers", style.GREY)
+    return robot, face, _line(go, run.markers[k], "markers", style.GREY)
 
 
-def _line(go: Any, points: FloatArray, name: str, color: str, **look: Any) -> Any:
-    line = {"color": color} | look
-    return go.Scatter3d(**_places(points), mode="lines", line=line, name=name, hoverinfo="name")
-
-
-def _points(go: Any, points: FloatArray, name: str, color: str) -> Any:
-    marker = {"size": 3, "color": color}
-    return go.Scatter3d(**_places(points), mode="markers", marker=marker, name=name, hoverinfo="name")
+def _line(go: Any, points: FloatArray, name: str, color: str, width: float | None = None) -> Any:
+    """A line of a width, or points where there is none."""
+    look = {"mode": "markers", "marker": {"size": 3, "color": color}}
+    if width is not None:
+        look = {"mode": "lines", "line": {"color": color, "width": width}}
+    return go.Scatter3d(**_places(points), **look, name=name, hoverinfo="name")
 
 
 def _places(points: FloatArray) -> dict[str, list[float]]:
-    return {name: np.round(points[:, i], DIGITS).tolist() for i, name in enumerate("xyz")}
+    return {name: np.round(points[:, i], _DIGITS).tolist() for i, name in enumerate("xyz")}

@@ -73,7 +73,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
         bench = comparison_of(config, run.calibration, run.plan)
         material = material_of(run, bench, left_out, progress)
         studies, eq22 = material.studies, composition(bench, config, left_out)
-        claims = [claim.row() for claim in claims_of(material, eq22)]
+        claims = [claim._asdict() for claim in claims_of(material, eq22)]
     figures = draw_all(material, directory, config.report.formats, left_out, progress)
     told = {"figures": tuple(figures), "left_out": tuple(left_out), "claims": tuple(claims)}
     report = record_of(studies, eq22, **told)
@@ -220,9 +220,8 @@ def require(config: "Config", wanted: Sequence[str]) -> None:
         If plotly is not installed, the robot is not known in metres, or there is no task.
     """
     if config.task is None:
-        raise InputError(
-            f"--{wanted[0]}: shows runs of laws, which need a task: set task.start and task.goal"
-        )
+        text = "shows runs of laws, which need a task: set task.start and task.goal"
+        raise InputError(f"--{wanted[0]}: {text}")
     if "view" in wanted:
         plotly()
         _metric(config)
@@ -240,37 +239,21 @@ def _metric(config: "Config") -> Truth:
 
 
 def view(run: "Run", progress: Progress = silent) -> Path:
-    """Write the 3D view of a run into its folder.
-
-    Raises
-    ------
-    InputError
-        If plotly is not installed, the robot is not known in metres, or the file cannot be written.
-    WorkFailed
-        If no run of a law has a step to show.
-    """
+    """Write the 3D view of a run into its folder; a WorkFailed says that no run has a step to show."""
     config = load_config(run.path, text=run.configuration)
     truth, traces = _metric(config), _moved(run)
     plant = plant_of(config, truth, run.plan.q_start)
     joints = "simulated joints" if config.plant.use is None else "joints that the robot itself reported"
     known = f"Robot, rig and face as the configuration describes them, moved by the {joints}."
-    progress("view", 0, 1)
     path = run.path.parent / VIEW_FILE
+    progress("view", 0, 1)
     write_view(path, motion(truth.robot, plant, truth.M, run.plan, traces), name=config.name, known=known)
     progress("view", 1, 1)
     return path
 
 
 def animation(run: "Run", progress: Progress = silent) -> Path:
-    """Write the film of both camera images into the folder of a run, as GIF.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    WorkFailed
-        If no run of a law has a step to show.
-    """
+    """Write the film of both camera images into the folder of a run, as GIF; fails as ``view`` does."""
     path, traces = run.path.parent / ANIMATION_FILE, _moved(run)
     config = load_config(run.path, text=run.configuration)
     given = config.rig if config.rig is not None else config.data

@@ -145,7 +145,7 @@ def test_a_residual_and_the_error_of_its_prediction_make_up_the_noise():
 @pytest.mark.parametrize("size", [1e-9, 0.03, 0.5, 4.0])
 def test_arrows_are_magnified_by_a_round_factor_to_a_visible_length(extent, size):
     factor = calibration.magnification(np.array([size, -size]), extent)
-    length = factor * size * np.sqrt(2.0) / (calibration.ARROW * extent)
+    length = factor * size * np.sqrt(2.0) / (0.04 * extent)
     assert 0.4 - 1e-9 <= length <= 1.0 + 1e-9  # the steps 1, 2, 5 are at most 2.5 apart
     assert round(factor / 10.0 ** np.floor(np.log10(factor) + 1e-9), 9) in (1.0, 2.0, 5.0)
 

@@ -83,7 +83,7 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
     assert SPECS["fig04_classical"].data(given)["plateau_stacked"].tolist() == [10, 29]
     (claim,) = [claim for claim in claims_of(given, None) if "local minimum" in claim.claim]
     assert claim.measured.startswith("19 steps from step 10 at 30 px")
-    assert claim.criterion.startswith("the error falls < 1 % in 5 steps")
+    assert claim.criterion.startswith("image error falls < 1 % in 5 steps")
 
 
 def test_way_along_a_line_and_distance_from_it():

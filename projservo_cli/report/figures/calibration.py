@@ -14,32 +14,32 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-RIGHT, BOTH = 1, 2
+_RIGHT, _BOTH = 1, 2
 # Length of an arrow of the rms residual, as a share of the extent of what was seen.
-ARROW = 0.04
+_ARROW = 0.04
 # Shares of χ² between which the residuals of a pose are expected.
-BAND = (0.025, 0.975)
-BINS = 40
-RESIDUAL: style.Look = {"color": style.BLUE}
-WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
-LEFT_OUT: style.Look = {
+_BAND = (0.025, 0.975)
+_BINS = 40
+_RESIDUAL: style.Look = {"color": style.BLUE}
+_WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
+_LEFT_OUT: style.Look = {
     "color": style.VERMILION,
     "marker": "x",
     "linestyle": "none",
     "markersize": 4,
     "markeredgewidth": 0.9,
 }
-MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
+_MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
 
 
 def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
-    seen, renamed = by_marker(calibration, observation)
+    seen, renamed = _by_marker(calibration, observation)
     read: BoolArray = np.asarray(np.isfinite(seen).all(axis=-1))
     lost = renamed | ~np.isfinite(predicted).all(axis=-1)
-    out: BoolArray = np.logical_or(left_out(calibration, observation), lost)
+    out: BoolArray = np.logical_or(_left_out(calibration, observation), lost)
     used: BoolArray = np.logical_and(read, ~out)
     residual = seen - predicted
     result: Data = {
@@ -55,7 +55,7 @@ def _data(fit: Fit) -> Data:
         **(
             by_pose(used, residual, prediction_variance(calibration, observation.q))
             if fit.held_out is None
-            else by_pose_held_out(fit.held_out)
+            else _by_pose_held_out(fit.held_out)
         ),
     }
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
@@ -69,7 +69,7 @@ def _data(fit: Fit) -> Data:
     return result
 
 
-def by_marker(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
+def _by_marker(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
     """Pixels (K, 2, m, 2) of the calibrated markers, and which of them were read under another number."""
     column = {int(number): j for j, number in enumerate(observation.marker)}
     seen = observation.images[:, :, [column[int(number)] for number in calibration.marker]]
@@ -80,11 +80,11 @@ def by_marker(calibration: Calibration, observation: Observation) -> tuple[Float
     return seen, renamed
 
 
-def left_out(calibration: Calibration, observation: Observation) -> BoolArray:
+def _left_out(calibration: Calibration, observation: Observation) -> BoolArray:
     """Readings (K, 2, m) that the fit did not use: outliers, and poses whose joints are in doubt."""
     out = np.zeros((len(observation.pose), 2, len(calibration.marker)), dtype=np.bool_)
     for pose, number, view in calibration.outlier:
-        views = np.array([view != RIGHT, view in (RIGHT, BOTH)])
+        views = np.array([view != _RIGHT, view in (_RIGHT, _BOTH)])
         rows = observation.pose == pose
         out |= rows[:, None, None] & views[:, None] & (calibration.marker == number)
     out[np.isin(observation.pose, calibration.suspect[:, 0])] = True
@@ -118,7 +118,7 @@ def by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data
     }
 
 
-def by_pose_held_out(held_out: CrossValidation) -> Data:
+def _by_pose_held_out(held_out: CrossValidation) -> Data:
     """Predicted and actual error of each pose from fits that have not seen it, as of ``by_pose``.
 
     The predicted one has the noise of the held-out reading in it.
@@ -169,7 +169,7 @@ def magnification(residual: FloatArray, extent: float) -> float:
     rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
     if rms == 0.0:
         return 1.0
-    wanted = ARROW * extent / rms
+    wanted = _ARROW * extent / rms
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(max(step * power for step in (1.0, 2.0, 5.0) if step * power <= wanted * (1.0 + 1e-12)))
 
@@ -197,12 +197,12 @@ def _draw(data: Data, figure: "Figure") -> None:
     _excitation(panels[2, 0], data)
     _spectrum(panels[2, 1], data)
     handles: list[Any] = [
-        style.line_handle(f"residual, {data['factor']:,g} times", **RESIDUAL),
-        style.line_handle("reading left out", **LEFT_OUT),
-        style.line_handle("noise model", **MODEL),
+        style.line_handle(f"residual, {data['factor']:,g} times", **_RESIDUAL),
+        style.line_handle("reading left out", **_LEFT_OUT),
+        style.line_handle("noise model", **_MODEL),
         style.line_handle("residual of a pose", color=style.BLUE, marker="o", linestyle="none"),
         style.line_handle("95 % of poses in the model", color=style.PALE, linewidth=6),
-        Patch(label="weak joint", **WEAK),
+        Patch(label="weak joint", **_WEAK),
     ]
     style.legend_below(figure, handles, 3)
 
@@ -220,9 +220,9 @@ def _arrows(axes: "Axes", data: Data, view: str) -> None:
         headwidth=4.0,
         headlength=5.0,
         headaxislength=4.0,
-        **RESIDUAL,
+        **_RESIDUAL,
     )
-    axes.plot(*out.T, **LEFT_OUT)
+    axes.plot(*out.T, **_LEFT_OUT)
     style.image_axes(axes, f"{view}: {len(seen)} readings, {len(out)} left out")
     style.frame_pixels(axes, np.concatenate([seen, tips, out]))
 
@@ -233,13 +233,13 @@ def _histogram(axes: "Axes", data: Data) -> None:
     widest = max(4.0 * sigma, float(np.abs(residual).max(initial=0.0)))
     axes.hist(
         residual,
-        bins=np.linspace(-widest, widest, BINS + 1).tolist(),
+        bins=np.linspace(-widest, widest, _BINS + 1).tolist(),
         density=bool(residual.size),
         color=style.SKY,
         linewidth=0,
     )
     x = np.linspace(-widest, widest, 401)
-    axes.plot(x, np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)), **MODEL)
+    axes.plot(x, np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)), **_MODEL)
     axes.set_title(f"noise model {sigma:.3g} px, χ²/dof {float(data['chi2_per_dof']):.3g}")
     axes.set_xlabel("residual (px)")
     axes.set_ylabel("density (1/px)")
@@ -259,9 +259,9 @@ def _poses(axes: "Axes", data: Data) -> None:
     x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
     expected = x if held_out else expected_residual(x, sigma)
     coordinates = float(np.median(data["pose_coordinates"])) if predicted.size else 1.0
-    low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(BAND)) / coordinates)
+    low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(_BAND)) / coordinates)
     axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)
-    axes.plot(x, expected, **MODEL)
+    axes.plot(x, expected, **_MODEL)
     axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
@@ -280,7 +280,7 @@ def _excitation(axes: "Axes", data: Data) -> None:
         (prismatic, other, 1.0, "m", style.SKY),
     ):
         for i in np.flatnonzero(chosen):
-            look = WEAK if weak[i] else {"color": color}
+            look = _WEAK if weak[i] else {"color": color}
             kind.bar(i, scale * data["excitation"][i], width=0.6, **look)
         if chosen.any():
             kind.set_ylabel(f"range ({unit})")

@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # Share of the largest deviation of the best run below which nothing is drawn.
-LEAST_SHARE = 0.05
-PATH_POINTS = 400
+_LEAST_SHARE = 0.05
+_PATH_POINTS = 400
 # Runs with a longer joint step, rad or m, wind the arm up: their path is drawn at the instants only.
-WHIRL = np.pi
+_WHIRL = np.pi
 # Modes whose largest distances differ by more than this are shown on a logarithmic scale, down to a share
 # of the least of them.
-WIDE, LEAST_OF_MODES = 10.0, 0.02
+_WIDE, _LEAST_OF_MODES = 10.0, 0.02
 
 
 def drift_tables(studies: Studies | None) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -62,10 +62,10 @@ def _data(material: Material) -> Data:
         cases = [(gain, False) for gain in studies.gains] + [(max(studies.gains), True)]
         for i, (gain, limited) in enumerate(cases):
             trace = studies.sweep[law, "calibrated", limited, gain]
-            whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > WHIRL
+            whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > _WHIRL
             points = trace.center if whirls else center_path(material, trace)
             way, off = along_line(points, trace.center[0], material.goal_center(trace))
-            used = np.unique(np.linspace(0, len(points) - 1, PATH_POINTS).round().astype(int))
+            used = np.unique(np.linspace(0, len(points) - 1, _PATH_POINTS).round().astype(int))
             result[f"whirls_{law}_{i}"] = np.array(whirls)
             result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([way, off], axis=1)[used]
     return result
@@ -89,7 +89,7 @@ def _draw(data: Data, figure: "Figure") -> None:
     gains = data["gain"]
     for row, law in enumerate(DIRECT):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
-        least = max(LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
+        least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
         for i, path in enumerate(paths):
             way, off = path.T
             axes[row, 0].plot(way, np.maximum(off, least), **_path_look(i, len(gains)))
@@ -206,6 +206,6 @@ def _draw_modes(data: Data, figure: "Figure") -> None:
 def _log_where_wide(axes: "Axes", values: list[Any]) -> None:
     """Logarithmic scale where the runs differ much at their largest."""
     most = [float(np.max(value)) for value in values]
-    if min(most) > 0.0 and max(most) > WIDE * min(most):
+    if min(most) > 0.0 and max(most) > _WIDE * min(most):
         style.log_scale(axes)
-        axes.set_ylim(bottom=LEAST_OF_MODES * min(most))
+        axes.set_ylim(bottom=_LEAST_OF_MODES * min(most))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # What is drawn of an error on a logarithmic scale: five decades below its start.
-DECADES = 1e-5
+_DECADES = 1e-5
 
 
 def _data_two(material: Material) -> Data:
@@ -84,7 +84,7 @@ def _draw_two(data: Data, figure: "Figure") -> None:
 
 def _log(axes: "Axes", start: float) -> None:
     style.log_scale(axes)
-    axes.set_ylim(max(start, 1e-3) * DECADES, max(start, 1e-3) * 3.0)
+    axes.set_ylim(max(start, 1e-3) * _DECADES, max(start, 1e-3) * 3.0)
 
 
 def _data_three(material: Material) -> Data:

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 # How far outside an image, as a share of its size, a path is still drawn.
-OUTSIDE = 0.15
-BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
-PANEL_WIDTH = 2.9  # inches, of one of two panels beside one another
+_OUTSIDE = 0.15
+_BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
+_PANEL_WIDTH = 2.9  # inches, of one of two panels beside one another
 
 
 def _data_classical(material: Material) -> Data:
@@ -68,7 +68,7 @@ def _draw_classical(data: Data, figure: "Figure") -> None:
         np.concatenate([data[f"s_{law}"].reshape(-1, 2), data[f"s_star_{law}"].reshape(-1, 2)])
         for law in laws
     ]
-    heights = [PANEL_WIDTH * style.aspect(near_pixels(pixels, data["image_size"])) for pixels in shown]
+    heights = [_PANEL_WIDTH * style.aspect(near_pixels(pixels, data["image_size"])) for pixels in shown]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
     axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
     for row, law in enumerate(laws):
@@ -86,7 +86,7 @@ def _draw_classical(data: Data, figure: "Figure") -> None:
     handles = _classical_handles()
     handles += [style.line_handle("end of the run", color=style.BLACK, marker="x", linestyle="none")]
     every = near_pixels(np.concatenate(shown), data["image_size"]) / data["image_size"]
-    if (np.abs(every - 0.5) > 0.5 - BORDER_SHOWN).any():
+    if (np.abs(every - 0.5) > 0.5 - _BORDER_SHOWN).any():
         handles += [style.line_handle("border of the image", color=style.GREY, linewidth=0.8)]
     style.legend_below(figure, handles, 4)
 
@@ -115,7 +115,7 @@ def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
 def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
     """Pixels (k, 2) that were measured, none farther outside the image than is drawn."""
     seen = pixels[np.isfinite(pixels).all(axis=1)]
-    return np.clip(seen, -OUTSIDE * size, (1.0 + OUTSIDE) * size)
+    return np.clip(seen, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)
 
 
 def _classical_handles() -> list[object]:
@@ -148,7 +148,7 @@ def _data_direct(material: Material) -> Data:
 def _draw_direct(data: Data, figure: "Figure") -> None:
     """Both laws over one another, one panel a camera."""
     every = np.concatenate([data[f"s_{law}"].reshape(-1, 2) for law in DIRECT])
-    figure.set_figheight(PANEL_WIDTH * style.aspect(every) + 1.05)
+    figure.set_figheight(_PANEL_WIDTH * style.aspect(every) + 1.05)
     axes = figure.subplots(1, 2)
     looks = (
         {"color": style.BLACK, "linewidth": 1.1},

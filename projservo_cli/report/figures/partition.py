@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ARC_POINTS = 61
+_ARC_POINTS = 61
 
 
 def _data(material: Material) -> Data:
@@ -26,7 +26,7 @@ def _data(material: Material) -> Data:
     """
     plan = material.plan
     order = cyclic_order(plan.A)
-    share = np.linspace(0.0, 1.0, ARC_POINTS)
+    share = np.linspace(0.0, 1.0, _ARC_POINTS)
     H_r = [exp_rotation(plan.H_hat[1], x * plan.theta_r) for x in share]
     H_p = [exp_rotation(plan.H_hat[2], x * plan.theta_p) for x in share]
     axis = _axis(plan.H_hat[1], plan.A_c, plan.A)
@@ -62,10 +62,10 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
     return np.stack([A_c - 1.4 * reach / size * longest, A_c + 1.4 * reach / size * longest])
 
 
-SHIFTED: style.Look = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
-TURNED: style.Look = {"color": style.GREEN, "linestyle": (0, (5, 1.5, 1, 1.5))}
-PATH: style.Look = {"color": style.GREY, "linewidth": 0.7}
-AXIS: style.Look = {"color": style.BLACK, "linewidth": 0.8, "linestyle": (0, (8, 3, 1, 3))}
+_SHIFTED: style.Look = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
+_TURNED: style.Look = {"color": style.GREEN, "linestyle": (0, (5, 1.5, 1, 1.5))}
+_PATH: style.Look = {"color": style.GREY, "linewidth": 0.7}
+_AXIS: style.Look = {"color": style.BLACK, "linewidth": 0.8, "linestyle": (0, (8, 3, 1, 3))}
 
 
 @registered(
@@ -86,33 +86,33 @@ def _draw(data: Data, figure: "Figure") -> None:
     handles = [
         style.line_handle("start $A$", **style.START),
         style.line_handle("goal $A_*$", **style.GOAL),
-        style.line_handle("goal less translation $A_t$", **SHIFTED),
-        style.line_handle("less rotation onto the plane $A_r$", **TURNED),
-        style.line_handle("paths of the markers", **PATH),
-        style.line_handle(r"axis of $\hat H_r$", **AXIS),
+        style.line_handle("goal less translation $A_t$", **_SHIFTED),
+        style.line_handle("less rotation onto the plane $A_r$", **_TURNED),
+        style.line_handle("paths of the markers", **_PATH),
+        style.line_handle(r"axis of $\hat H_r$", **_AXIS),
     ]
     style.legend_below(figure, handles, 3)
 
 
 def _translation(axes: "Axes", data: Data) -> None:
     for k in range(len(data["A"])):
-        axes.plot(*np.stack([data["A_t"][k], data["A_star"][k]]).T, **PATH)
+        axes.plot(*np.stack([data["A_t"][k], data["A_star"][k]]).T, **_PATH)
     arrow = {"arrowstyle": "->", "linewidth": 0.9}
     axes.annotate("", data["center"][1], data["center"][0], arrowprops=arrow)
     style.face(axes, data["A"], style.START, fill=True)
-    style.face(axes, data["A_t"], SHIFTED)
+    style.face(axes, data["A_t"], _SHIFTED)
     style.face(axes, data["A_star"], style.GOAL)
     style.frame_pixels(axes, np.concatenate([data["A"], data["A_t"], data["A_star"]]))
     style.image_axes(axes, "translation of the centre")
 
 
 def _onto_plane(axes: "Axes", data: Data) -> None:
-    axes.plot(*data["axis"].T, **AXIS)
+    axes.plot(*data["axis"].T, **_AXIS)
     for k in range(len(data["A"])):
-        axes.plot(*data["onto_plane"][:, k].T, **PATH)
+        axes.plot(*data["onto_plane"][:, k].T, **_PATH)
     style.face(axes, data["A"], style.START, fill=True)
-    style.face(axes, data["A_r"], TURNED)
-    style.face(axes, data["A_t"], SHIFTED)
+    style.face(axes, data["A_r"], _TURNED)
+    style.face(axes, data["A_t"], _SHIFTED)
     around = [data["onto_plane"].reshape(-1, 2), data["axis"], data["A"], data["A_t"]]
     style.frame_pixels(axes, np.concatenate(around))
     style.image_axes(axes, rf"onto plane, $\theta_r$ = {style.signed(data['angles_deg'][0])}°")
@@ -120,8 +120,8 @@ def _onto_plane(axes: "Axes", data: Data) -> None:
 
 def _within_plane(axes: "Axes", data: Data) -> None:
     for k in range(len(data["A"])):
-        axes.plot(*data["within_plane"][:, k].T, **PATH)
+        axes.plot(*data["within_plane"][:, k].T, **_PATH)
     style.face(axes, data["A"], style.START, fill=True)
-    style.face(axes, data["A_r"], TURNED)
+    style.face(axes, data["A_r"], _TURNED)
     style.frame_pixels(axes, np.concatenate([data["within_plane"].reshape(-1, 2), data["A_r"]]))
     style.image_axes(axes, rf"within plane, $\theta_p$ = {style.signed(data['angles_deg'][1])}°")

@@ -14,22 +14,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NODES = 81
-TURNS = 41  # shares μ_p tried at each μ_t, μ_r
-TICKS = 11  # points at equal steps of σ on the path
-WIDE = 4.0  # margins beyond are drawn in powers of ten
+_NODES = 81
+_TURNS = 41  # shares μ_p tried at each μ_t, μ_r
+_TICKS = 11  # points at equal steps of σ on the path
+_WIDE = 4.0  # margins beyond are drawn in powers of ten
 LABEL = 0.05  # room that the number on a contour needs, in shares
 
-SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider shows beneath
+_SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider shows beneath
     r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
     r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
     r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
 }
-REGIONS: dict[str, style.Look] = {  # hatched, so that they differ in grey too
+_REGIONS: dict[str, style.Look] = {  # hatched, so that they differ in grey too
     "margin": {"facecolor": style.GREY, "hatch": ""},
     "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
 }
-MARGINS: dict[str, style.Look] = {
+_MARGINS: dict[str, style.Look] = {
     "visibility": {"color": style.BLUE, "linestyle": "-"},
     "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
     "joints": {"color": style.GREEN, "linestyle": (0, (4, 1, 1, 1))},
@@ -40,7 +40,7 @@ MARGINS: dict[str, style.Look] = {
 def _data(material: Material) -> Data:
     """Margins of both cameras over the unit square, the border distance at the best μ_p, and the path."""
     plan = material.plan
-    mu = np.linspace(0.0, 1.0, NODES)
+    mu = np.linspace(0.0, 1.0, _NODES)
     O = plan.optical_center
     moved = O[:, None] - mu[:, None] * plan.tau * (O @ plan.H_hat[0].T)[:, None]
     planes = np.array([exp_rotation(plan.H_hat[1], -share * plan.theta_r).T @ plan.a for share in mu])
@@ -49,7 +49,7 @@ def _data(material: Material) -> Data:
     return {
         "share": mu,
         "margin": margin,
-        "border_px": border_distance(material, mu),
+        "border_px": _border_distance(material, mu),
         "sigma": plan.sigma,
         "mu": plan.mu,
         "along": np.stack(
@@ -65,7 +65,7 @@ def _data(material: Material) -> Data:
     }
 
 
-def border_distance(material: Material, mu: FloatArray) -> FloatArray:
+def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     """Least distance of a marker from the border of each image, px, where μ_p is best for both.
 
     Parameters
@@ -77,7 +77,7 @@ def border_distance(material: Material, mu: FloatArray) -> FloatArray:
     (2, k, k) distances over μ_t and μ_r, negative outside.
     """
     plan, P, lens = material.plan, material.calibrated.P, material.calibrated.lens
-    turns = np.linspace(0.0, 1.0, TURNS)
+    turns = np.linspace(0.0, 1.0, _TURNS)
     within = np.array([exp_rotation(plan.H_hat[2], share * plan.theta_p) for share in turns])
     onto = np.array([exp_rotation(plan.H_hat[1], share * plan.theta_r) for share in mu])
     M = np.einsum("rij,pmj->rpmi", onto, plan.A @ np.swapaxes(within, 1, 2))
@@ -113,11 +113,11 @@ def _draw(data: Data, figure: "Figure") -> None:
         _region(r"outside this image at every $\mu_p$", "border_px"),
         style.line_handle(r"path, at tenths of $\sigma$", color=style.VERMILION, marker="o"),
     ]
-    handles += _lines(axes[1, 0], data["sigma"], data["mu"], SHARES)
+    handles += _lines(axes[1, 0], data["sigma"], data["mu"], _SHARES)
     axes[1, 0].set_ylabel(r"share $\mu$ (1)")
-    handles += _lines(axes[1, 1], data["sigma"], data["along"], MARGINS)
+    handles += _lines(axes[1, 1], data["sigma"], data["along"], _MARGINS)
     axes[1, 1].axhline(0.0, color=style.BLACK, linewidth=0.6)
-    if np.nanmax(data["along"]) > WIDE:  # conditioning may grow a hundredfold
+    if np.nanmax(data["along"]) > _WIDE:  # conditioning may grow a hundredfold
         axes[1, 1].set_yscale("symlog", linthresh=1.0)
         axes[1, 1].yaxis.set_major_formatter("{x:g}")
     axes[1, 1].set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
@@ -128,12 +128,12 @@ def _draw(data: Data, figure: "Figure") -> None:
 def _region(label: str, name: str) -> Any:
     from matplotlib.patches import Patch
 
-    return Patch(label=label, alpha=0.6, edgecolor=style.BLACK, linewidth=0.0, **REGIONS[name])
+    return Patch(label=label, alpha=0.6, edgecolor=style.BLACK, linewidth=0.0, **_REGIONS[name])
 
 
 def _map(axes: "Axes", data: Data, view: int) -> None:
     share = data["share"]
-    for name, look in REGIONS.items():
+    for name, look in _REGIONS.items():
         finite = np.maximum(data[name][view], -1e6)
         if finite.min() < 0.0:
             color, hatch = look["facecolor"], look["hatch"]
@@ -151,7 +151,7 @@ def _map(axes: "Axes", data: Data, view: int) -> None:
     t, r = data["mu"][:, 0], data["mu"][:, 1]
     axes.plot([0.0, 1.0], [0.0, 1.0], color=style.BLACK, linewidth=0.5)
     axes.plot(t, r, color=style.VERMILION, linewidth=1.6)
-    tenths = np.linspace(0.0, 1.0, TICKS)
+    tenths = np.linspace(0.0, 1.0, _TICKS)
     sigma = data["sigma"]
     axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), "o", color=style.VERMILION)
     axes.set_xlim(-0.02, 1.02)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 # The steep profile has the translation done at this share of the path.
 STEEP = 0.35
-FACES = 9
+_FACES = 9
 
 
 def _data_linear(material: Material) -> Data:
@@ -116,7 +116,7 @@ def _draw(data: Data, figure: "Figure") -> None:
     faces, sigma = data["faces"], data["sigma"]
     for k in range(faces.shape[1]):
         image.plot(*faces[:, k].T, color=style.GREY, linewidth=0.6)
-    shown = np.unique(np.linspace(0, len(sigma) - 1, FACES).round().astype(int))
+    shown = np.unique(np.linspace(0, len(sigma) - 1, _FACES).round().astype(int))
     for j in shown:
         color = colormaps["cividis"](0.82 * sigma[j])
         ends = j in (shown[0], shown[-1])

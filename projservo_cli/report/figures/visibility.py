@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ARC_POINTS = 181
+_ARC_POINTS = 181
 
 
 def _data(material: Material) -> Data:
@@ -27,8 +27,8 @@ def _data(material: Material) -> Data:
     order = cyclic_order(plan.A)
     O = plan.optical_center
     start = O @ plan.a
-    arcs = np.stack([np.linspace(0.0, sense, ARC_POINTS) for sense in plan.sense])
-    images = np.empty((2, ARC_POINTS, 2, len(plan.A), 2))
+    arcs = np.stack([np.linspace(0.0, sense, _ARC_POINTS) for sense in plan.sense])
+    images = np.empty((2, _ARC_POINTS, 2, len(plan.A), 2))
     for i, arc in enumerate(arcs):
         for j, theta in enumerate(arc):
             H = exp_rotation(plan.H_hat[1], theta)
@@ -55,7 +55,7 @@ def _margins(a: FloatArray, H_hat: FloatArray, O: FloatArray, theta: FloatArray)
     return np.array(values).reshape(*theta.shape, 2)
 
 
-SENSES: tuple[style.Look, ...] = (
+_SENSES: tuple[style.Look, ...] = (
     {"color": style.BLUE, "linestyle": "-"},
     {"color": style.VERMILION, "linestyle": (0, (5, 1.5))},
 )
@@ -83,7 +83,7 @@ def _draw(data: Data, figure: "Figure") -> None:
         style.line_handle("face at the start", **style.START),
         *(
             style.line_handle(rf"sense $\theta_r$ = {style.signed(angle)}°", **look)
-            for angle, look in zip(senses, SENSES, strict=True)
+            for angle, look in zip(senses, _SENSES, strict=True)
         ),
         style.line_handle("hidden from this camera", color=style.GREY, linewidth=4, alpha=0.5),
         style.line_handle(
@@ -96,7 +96,7 @@ def _draw(data: Data, figure: "Figure") -> None:
 
 def _images(axes: "Axes", data: Data, view: int) -> None:
     images = data["images"][:, :, view]
-    for i, look in enumerate(SENSES):
+    for i, look in enumerate(_SENSES):
         seen = data["theta_margin"][i, :, view] > 0
         for k in range(images.shape[2]):
             path = images[i, :, k]
@@ -109,7 +109,7 @@ def _images(axes: "Axes", data: Data, view: int) -> None:
 
 
 def _angle(axes: "Axes", data: Data, view: int) -> None:
-    for i, look in enumerate(SENSES):
+    for i, look in enumerate(_SENSES):
         theta, margin = data["theta_deg"][i], data["theta_margin"][i, :, view]
         axes.plot(theta, np.where(margin > 0, np.nan, margin), color=style.GREY, linewidth=4, alpha=0.5)
         axes.plot(theta, margin, **look)
