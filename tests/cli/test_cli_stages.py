@@ -221,7 +221,7 @@ def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
     assert calibrate["merged_poses"] == 3
     names = [(joint["name"], joint["type"]) for joint in calibrate["joints"]]
     assert names == [("q1", "R"), ("elbow", "R")]
-    assert set(calibrate["joints"][0]) == {"name", "type", "excitation", "weak"}
+    assert set(calibrate["joints"][0]) >= {"name", "type", "excitation", "weak"}
     assert set(value["servo"]["laws"][0]) >= LAW_KEYS
     assert value["servo"]["laws"][0]["position_error_mm"] is None
     assert set(projservo("plan", "-o", "out", "--json").json) >= {"run", "feasible", "reason", "theta_s_deg"}
