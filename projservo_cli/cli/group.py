@@ -73,7 +73,7 @@ class Projservo(click.Group):
             if not ctx.resilient_parsing:  # that is completion, which offers nothing then
                 raise
             ctx.obj, arguments = [], []
-        used = {flag for name in ctx.obj for one in self.commands[name].get_params(ctx) for flag in one.opts}
+        used = {_flag(param) for name in ctx.obj for param in self.commands[name].get_params(ctx)}
         unused = [flag for flag in flags if flag not in used]
         if unused and not ctx.resilient_parsing:
             raise click.UsageError(f"{', '.join(unused)}: not used by {' '.join(ctx.obj)}")
@@ -114,7 +114,7 @@ class Projservo(click.Group):
         ]
         while rest:
             _, left, read = every.make_parser(ctx).parse_args(list(rest))
-            flags += [param.opts[-1] for param in read]
+            flags += map(_flag, read)
             taken += rest[: len(rest) - len(left)]
             if taken[-1:] == ["--"]:
                 return [*words, *left], taken[:-1], flags
@@ -155,6 +155,11 @@ main = Projservo(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
 )
 click.version_option(__version__, message="projservo %(version)s")(main)
+
+
+def _flag(option: click.Parameter) -> str:
+    """The long form of an option; click gives those of help in no order."""
+    return max(option.opts, key=len)
 
 
 def run(arguments: Sequence[str]) -> int:
