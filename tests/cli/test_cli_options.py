@@ -88,13 +88,6 @@ def test_help_imports_neither_numbers_nor_files():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_command_is_one_of_click(capsys):
-    with pytest.raises(SystemExit) as left:
-        main(["calibrat"])
-    assert left.value.code == 2
-    assert "did you mean calibrate?" in capsys.readouterr().err
-
-
 def complete(line, monkeypatch, capsys):
     """What bash is offered after a line."""
     words = shlex.split(line)
@@ -156,6 +149,9 @@ USAGE = {
     "no kind of export": (["export", "out", "--to", "xls"], "--to"),
     "export of nothing": (["export"], "'RUN'"),
     "one run to compare": (["compare", "out"], "two runs"),
+    "no page": (["compare", "out", "out", "-o", "both"], "both.html"),
+    "no such run": (["compare", "out", "nowhere"], "out/run.h5: there is no run file"),
+    "no yaml": (["init", "mine.json"], "mine.yaml"),
     "two files": (["init", "a.yaml", "b.yaml"], "unexpected extra argument"),
     "cross-validation of a plan": (["plan", "--cross-validate", "3"], "--cross-validate: not used by plan"),
     "start of a plan": (["plan", "--init", "f.json"], "--init: not used by plan"),

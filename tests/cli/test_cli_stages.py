@@ -125,38 +125,32 @@ def test_force_makes_the_named_stages_anew_and_drops_what_hung_on_them(projservo
 
 
 def test_a_table_that_changes_outdates_and_one_that_moved_away_does_not(projservo, stages, tmp_path):
-    assert projservo("calibrate", "--data", "t.csv", "-o", "out").code == 0
-    table = tmp_path / "t.csv"
-    table.rename(tmp_path / "u.csv")
-    assert projservo("calibrate", "-o", "out").code == 0
-    assert projservo("calibrate", "-o", "out", "--data", "u.csv").code == 0
-    assert stages.made == ["calibrate"]
-    moved = tmp_path / "u.csv"
-    moved.write_text(moved.read_text().replace("0,0,0.1,0.2,1,", "0,0,0.1,0.2,9,"))
-    assert projservo("calibrate", "-o", "out").code == 0
-    assert stages.made == ["calibrate"] * 2
-    assert projservo("calibrate", "-o", "out", "--data", "none.csv").code == 2
-
-
-def test_recorded_options_are_stored_with_the_run(projservo, stages, tmp_path):
-    answer = projservo("calibrate", "--data", "t.csv", "--joints", "rp", "--noise-px", "2e-1", "--json")
+    given = ("--joints", "rp", "--noise-px", "2e-1", "--json")
+    answer = projservo("calibrate", "--data", "t.csv", *given)
     assert answer.json["run"] == str(tmp_path / "results/t/run.h5")
     assert [joint["type"] for joint in answer.json["joints"]] == ["R", "P"]
     stored = load("results/t").configuration
     assert "joints: RP" in stored
     assert "noise_px: 0.2" in stored
+    moved = (tmp_path / "t.csv").rename(tmp_path / "u.csv")
+    assert projservo("calibrate", "-o", "results/t").code == 0
+    assert projservo("calibrate", "-o", "results/t", "--data", "u.csv").code == 0
+    assert stages.made == ["calibrate"]
+    moved.write_text(moved.read_text().replace("0,0,0.1,0.2,1,", "0,0,0.1,0.2,9,"))
+    assert projservo("calibrate", "-o", "results/t").code == 0
+    assert stages.made == ["calibrate"] * 2
+    assert projservo("calibrate", "-o", "results/t", "--data", "none.csv").code == 2
 
 
 def test_a_recorded_calibration_is_not_replaced_by_a_simulated_one(projservo, stages):
+    simulated = ("calibrate", "-c", "tiny.yaml", "-o", "out")
     projservo("calibrate", "--data", "t.csv", "-o", "out")
-    answer = projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+    answer = projservo(*simulated)
     assert answer.code == 2
     assert "recorded data" in answer.err
-    assert load("out").calibration.source == "recorded"
-    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "--force").code == 0
-    assert load("out").calibration.source == "simulated"
-    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "--data", "t.csv").code == 0
-    assert load("out").calibration.source == "recorded"
+    for given, source in (([], "recorded"), (["--force"], "simulated"), (["--data", "t.csv"], "recorded")):
+        assert projservo(*simulated, *given).code == (0 if given else 2)
+        assert load("out").calibration.source == source
 
 
 def test_laws_are_those_asked_for_in_their_order_and_others_stay(projservo, reported):
@@ -227,27 +221,21 @@ def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
     assert set(projservo("plan", "-o", "out", "--json").json) >= {"run", "feasible", "reason", "theta_s_deg"}
 
 
-def test_a_refused_calibration_is_an_object_with_exit_code_1(projservo, stages, refused):
-    stages.fails["calibrate"] = refused
-    answer = projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "--json")
-    assert answer.code == 1
-    assert set(answer.json) >= CALIBRATE_KEYS
-    assert (answer.json["usable"], answer.json["reason"]) == (False, str(refused))
-    assert answer.err.splitlines()[-1] == f"projservo: calibrate: {refused}"
-    chain = projservo("calibrate", "plan", "servo", "-c", "tiny.yaml", "-o", "out", "--json")
-    assert chain.code == 1
-    assert chain.json["calibrate"]["usable"] is False
-    assert chain.json["servo"]["laws"] == []
-    assert projservo("servo", "-c", "tiny.yaml", "-o", "out", "--json").json["failed"] == "calibrate"
-
-
-def test_a_failing_law_keeps_what_was_done(projservo, stages, refused):
+def test_what_fails_is_an_object_with_exit_code_1(projservo, stages, refused):
     stages.fails["stacked"] = refused
     answer = projservo("plan", "servo", "-c", "tiny.yaml", "-o", "out", "--json")
     assert answer.code == 1
-    assert answer.json["plan"]["feasible"] is True
+    assert answer.json["plan"]["feasible"] is True  # what was done is kept
     assert [trace["law"] for trace in answer.json["servo"]["laws"]] == ["direct_three"]
     assert answer.json["servo"]["failed"] == "servo/stacked"
+    stages.fails["calibrate"] = refused
+    chain = projservo("calibrate", "plan", "servo", "-c", "tiny.yaml", "-o", "new", "--json")
+    assert chain.code == 1
+    assert set(chain.json["calibrate"]) >= CALIBRATE_KEYS
+    assert (chain.json["calibrate"]["usable"], chain.json["calibrate"]["reason"]) == (False, str(refused))
+    assert chain.json["servo"]["laws"] == []
+    assert chain.json["servo"]["failed"] == "calibrate"
+    assert chain.err.splitlines()[-1] == f"projservo: calibrate: {refused}"
 
 
 def test_a_law_that_must_converge_decides_the_exit_code(projservo, stages):

@@ -119,13 +119,3 @@ def test_what_another_process_made_meanwhile_is_kept(projservo, stages, tmp_path
     projservo("servo", "--law", "direct_three", "-c", "tiny.yaml", "-o", "out")
     assert stages.made == ["calibrate", "plan", "stacked", "direct_three"]
     assert list(load("out").traces) == ["stacked", "direct_three"]
-
-
-@pytest.mark.parametrize(
-    "value", ["a" + ".b" * 5000 + "=1", "task.start.joints." + "9" * 6000 + "=1", "x=\udc80"]
-)
-def test_overrides_of_any_length_end_in_one_line(projservo, stages, value):
-    answer = projservo("calibrate", "-c", "tiny.yaml", "--set", value)
-    assert answer.code == 2
-    assert len(answer.err.splitlines()) == 1
-    assert len(answer.err) < 7000

@@ -8,7 +8,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.config.schema import json_schema
@@ -57,22 +56,6 @@ def test_an_export_holds_every_array_and_says_what_it_is(projservo, reported, tm
     assert projservo("export", "out", "--force").code == 0
     assert projservo("export", "out", "-o", "there", "-q").out == ""
     assert (tmp_path / "there/fields.csv").read_bytes() == (folder / "fields.csv").read_bytes()
-
-
-REFUSED = {
-    "no page": (["compare", "out", "out", "-o", "both"], "both.html"),
-    "no such run": (["compare", "out", "nowhere"], "nowhere/run.h5: there is no run file"),
-    "no yaml": (["init", "mine.json"], "mine.yaml"),
-}
-
-
-@pytest.mark.parametrize("case", REFUSED)
-def test_refused_in_one_line(projservo, reported, case):
-    arguments, message = REFUSED[case]
-    answer = projservo(*arguments)
-    assert (answer.code, answer.out) == (2, "")
-    assert message in answer.err
-    assert answer.err.count("\n") == 1
 
 
 class Texts(HTMLParser):
