@@ -1,5 +1,7 @@
 """Fixtures every test may use, and the rule for tests that need the compiler."""
 
+import contextlib
+import io
 import json
 import os
 from pathlib import Path
@@ -48,3 +50,18 @@ def reference_truth(shared_data):
 def rng():
     """Random numbers that are the same in every run."""
     return np.random.default_rng(20000626)
+
+
+@pytest.fixture(scope="session")
+def first_chain(tmp_path_factory):
+    """Folder of the first chain of README, made once and to be copied; with what it printed in told.txt."""
+    from projservo_cli import cli
+
+    folder = tmp_path_factory.mktemp("first")
+    told = io.StringIO()
+    with contextlib.redirect_stdout(told), contextlib.redirect_stderr(told):
+        stages = ["calibrate", "plan", "servo", "report"]
+        code = cli.run([*stages, "-c", str(ROOT / "configs" / "paper.yaml"), "-o", str(folder)])
+    assert code == 0, told.getvalue()
+    (folder / "told.txt").write_text(told.getvalue(), encoding="utf-8")
+    return folder

@@ -1,6 +1,7 @@
 """References written by the code they describe: directives that take no arguments."""
 
 import dataclasses
+import inspect
 import types
 import typing
 from collections.abc import Iterator
@@ -14,8 +15,7 @@ from sphinx.util.docutils import SphinxDirective
 from extensions import keys
 from extensions.tables import table, text
 from projservo_cli import records
-from projservo_cli.cli.commands import COMMANDS, allowed
-from projservo_cli.cli.options import OPTIONS
+from projservo_cli.cli import main
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.equations import REGISTER
 from projservo_cli.sweep.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
@@ -62,24 +62,25 @@ def plain(hint: Any) -> str:
 
 def commands() -> Iterator[str]:
     """The commands, with what each takes."""
-    for name, command in COMMANDS.items():
-        words = " ".join([name, *command.arguments])
-        yield from ("", f"(command-{name})=", f"## projservo {name}", "", text(command.summary), "")
-        yield from ("```text", f"projservo {words} [OPTIONS]", "```", "")
-        for paragraph in command.about.split("\n\n"):
-            yield from (text(paragraph), "")
-        yield from ("For example:", "", "```text", command.example, "```", "")
-        own = [key for key in OPTIONS if key in allowed([name])]
-        yield from options([command.variants.get(key, OPTIONS[key]) for key in own])
-
-
-def options(found: list[Any]) -> Iterator[str]:
-    """A definition list of options of click."""
-    context = click.Context(click.Command("projservo"))
-    for option in found:
-        record = option.get_help_record(context)
-        if record is not None:
-            yield from (f"`{record[0]}`", f": {text(record[1])}", "")
+    for name, command in main.commands.items():
+        with click.Context(main, info_name="projservo") as group:
+            context = click.Context(command, group, info_name=name)
+        summary, *paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
+        yield from ("", f"(command-{name})=", f"## projservo {name}", "", text(summary), "")
+        yield from ("```text", command.get_usage(context).removeprefix("Usage: "), "```", "")
+        for paragraph in paragraphs:
+            yield from (text(" ".join(paragraph.split())), "")
+        yield from (
+            "For example:",
+            "",
+            "```text",
+            (command.epilog or "").removeprefix("Example: "),
+            "```",
+            "",
+        )
+        for option in command.params:
+            if (record := option.get_help_record(context)) is not None:
+                yield from (f"`{record[0]}`", f": {text(record[1])}", "")
 
 
 def equations() -> Iterator[str]:

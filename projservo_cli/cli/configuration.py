@@ -1,6 +1,7 @@
 """Which configuration and which run file a call is about."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +10,16 @@ from projservo_cli.files import require_inside
 from projservo_cli.records import InputError
 from projservo_cli.store import Run, load, run_path
 
-SHIPPED = "paper.yaml"
-RESULTS = Path("results")
+_RESULTS = Path("results")
+_TEXTS = (  # options whose value is text, not YAML, and their keys
+    ("data", "data", "table"),
+    ("joints", "data", "joints"),
+    ("joint_unit", "data", "joint_unit"),
+    ("init", "calibration", "init"),
+)
 
 
-def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
+def resolve(options: Mapping[str, Any]) -> tuple[Config, Run]:
     """The configuration with all overrides, and the run as stored so far.
 
     Raises
@@ -22,9 +28,9 @@ def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
         When either cannot be read or makes no sense.
     """
     overrides = given_overrides(options)
-    if options["origin"] is not None:
+    if options.get("origin") is not None:
         return _from_sweep(options["origin"], options, overrides)
-    stored = stored_run(options["output"]) if options["output"] else None
+    stored = _stored(options["output"]) if options["output"] else None
     if options["config"]:
         config = load_config(options["config"], overrides)
     elif stored is not None and stored.configuration:
@@ -32,12 +38,12 @@ def resolve(options: dict[str, Any]) -> tuple[Config, Run]:
     elif options["data"]:
         config = load_config(None, overrides)
     else:
-        config = load_config(shipped(SHIPPED), overrides)
+        config = load_config(shipped(), overrides)
     target = _target(options, config)
-    return config, stored or stored_run(target) or Run(target)
+    return config, stored or _stored(target) or Run(target)
 
 
-def _from_sweep(origin: str, options: dict[str, Any], overrides: list[Override]) -> tuple[Config, Run]:
+def _from_sweep(origin: str, options: Mapping[str, Any], overrides: list[Override]) -> tuple[Config, Run]:
     """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
     if options["config"]:
         raise InputError("-c and --from: the configuration is that of the sweep; leave -c out")
@@ -47,28 +53,28 @@ def _from_sweep(origin: str, options: dict[str, Any], overrides: list[Override])
     if overrides:
         config = load_config(config.name, overrides, text=to_yaml(config))
     target = _target(options, config)
-    run = stored_run(target) or Run(target)
+    run = _stored(target) or Run(target)
     stored = run.results.get("calibrate")
     if calibration is not None and (stored is None or stored.key != calibration.key):
         run = Run(target, run.configuration, {"calibrate": calibration})
     return config, run
 
 
-def _target(options: dict[str, Any], config: Config) -> Path:
+def _target(options: Mapping[str, Any], config: Config) -> Path:
     """The run file: where the user says, else in the folder of the configuration's name."""
     if options["output"]:
         return run_path(options["output"])
-    folder = RESULTS / config.name
-    require_inside(folder, RESULTS)
+    folder = _RESULTS / config.name
+    require_inside(folder, _RESULTS)
     return run_path(folder)
 
 
-def stored_run(target: str | Path) -> Run | None:
+def _stored(target: str | Path) -> Run | None:
     """The run in a folder or file; None where there is none yet."""
     return load(target) if run_path(target).exists() else None
 
 
-def shipped(name: str) -> Path:
+def shipped(name: str = "paper.yaml") -> Path:
     """A configuration that comes with projservo, in a checkout as in an installed package.
 
     Raises
@@ -83,36 +89,28 @@ def shipped(name: str) -> Path:
     raise InputError(f"{name}: this installation lacks it; give a configuration with -c")
 
 
-def given_overrides(options: dict[str, Any]) -> list[Override]:
-    """Options that stand for values of the configuration, then ``--set``, then ``--speed-scale``."""
+def given_overrides(options: Mapping[str, Any]) -> list[Override]:
+    """Options that stand for keys of the configuration, then ``--set``, then ``--speed-scale``."""
     found = []
-    if options["data"] is not None:
-        table = os.path.abspath(options["data"])
-        found.append(Override(f"--data {options['data']}", ("data", "table"), table))
-    if options["joints"] is not None:
-        found.append(Override(f"--joints {options['joints']}", ("data", "joints"), options["joints"]))
-    if options["joint_unit"] is not None:
-        unit = options["joint_unit"]
-        found.append(Override(f"--joint-unit {unit}", ("data", "joint_unit"), unit))
-    if options["noise_px"] is not None:
-        found.append(
-            Override.parse(f"data.noise_px={options['noise_px']}", f"--noise-px {options['noise_px']}")
-        )
-    if options["cross_validate"] is not None:
-        folds = options["cross_validate"]
-        found.append(Override.parse(f"calibration.cross_validate={folds}", f"--cross-validate {folds}"))
-    if options["init"] is not None:
-        path = os.path.abspath(options["init"])
-        found.append(Override(f"--init {options['init']}", ("calibration", "init"), path))
-    if options["lens"]:
+    for name, *key in _TEXTS:
+        if (given := options.get(name)) is not None:
+            value = os.path.abspath(given) if name in ("data", "init") else given
+            found.append(Override(f"{_flag(name)} {given}", tuple(key), value))
+    for name, where in (("noise_px", "data.noise_px"), ("cross_validate", "calibration.cross_validate")):
+        if (given := options.get(name)) is not None:
+            found.append(Override.parse(f"{where}={given}", f"{_flag(name)} {given}"))
+    if options.get("lens"):
         found.append(Override("--lens", ("calibration", "lens"), True))
-    if options["image_size"] is not None:
+    if options.get("image_size") is not None:
         found.append(_image_size(options["image_size"]))
     found += map(Override.parse, options["sets"])
-    if options["speed_scale"] is not None:  # after --set plant=…, which would else make a robot faster again
-        scale = options["speed_scale"]
+    if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
         found.append(Override.parse(f"plant.speed_scale={scale}", f"--speed-scale {scale}"))
     return found
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _image_size(text: str) -> Override:

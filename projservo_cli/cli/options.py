@@ -1,192 +1,143 @@
-"""Options of all commands, and text in lines."""
+"""Options that several commands take, as decorators."""
 
-import re
-import textwrap
+import contextlib
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import click
 
-_UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
-LEFT_OUT = {"--suggest": "5"}  # what an option means whose value is left out
+from projservo_cli.cli.output import Console
+
+_Function = Callable[..., Any]
+_Decorator = Callable[[_Function], _Function]
+
+PATH = click.Path(path_type=Path)
+
+override = click.option(
+    "--set",
+    "sets",
+    metavar="A.B=V",
+    multiple=True,
+    help="Override a value of the configuration; V is YAML. Repeatable.",
+)
+joint_unit = click.option(
+    "--joint-unit",
+    type=click.Choice(["deg", "rad"]),
+    help="Unit of the table's revolute joints. Default: rad.",
+)
+dry_run = click.option("-n", "--dry-run", is_flag=True, help="Say what would be done, do nothing.")
+speed_scale = click.option(
+    "--speed-scale", metavar="S", help="Scale every command by S, above 0 and at most 1."
+)
 
 
-def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Laws for the completion of a shell."""
+def configuration(help: str, **settings: Any) -> _Decorator:
+    """``-c``."""
+    return click.option("-c", "--config", metavar="FILE", type=click.Path(), help=help, **settings)
+
+
+def output(metavar: str, help: str, **settings: Any) -> _Decorator:
+    """``-o``, a path."""
+    return click.option("-o", "--output", metavar=metavar, type=PATH, help=help, **settings)
+
+
+def force(help: str) -> _Decorator:
+    """``--force``."""
+    return click.option("--force", is_flag=True, help=help)
+
+
+def threads(help: str) -> _Decorator:
+    """``-j``."""
+    return click.option("-j", "--threads", metavar="N", type=click.IntRange(1, 256), help=help)
+
+
+def _with_terminal(context: click.Context, parameter: click.Parameter, value: bool) -> bool:
+    """Refuse ``--confirm`` where nobody can answer."""
     del context, parameter
-    from projservo_cli.records import LAWS
-
-    return [law for law in LAWS if law.startswith(incomplete)]
-
-
-OPTIONS: dict[str, click.Option] = {
-    option.name or "": option
-    for option in (
-        click.Option(
-            ["-c", "--config"],
-            metavar="FILE",
-            type=click.Path(),
-            help="Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml.",
-        ),
-        click.Option(
-            ["sets", "--set"],
-            metavar="A.B=V",
-            multiple=True,
-            help="Override a value of the configuration; V is YAML. Repeatable.",
-        ),
-        click.Option(
-            ["-o", "--output"],
-            metavar="DIR",
-            type=click.Path(),
-            help="Folder of the run, or its run.h5. Default: results/<configuration name>.",
-        ),
-        click.Option(
-            ["--data"],
-            metavar="TABLE",
-            type=click.Path(),
-            help="Observation table (CSV): calibrate from it, or validate with it.",
-        ),
-        click.Option(
-            ["--joints"],
-            metavar="RRPRRR",
-            help="Type of each joint of the table, R or P. Default: all R.",
-        ),
-        click.Option(
-            ["--joint-unit"],
-            type=click.Choice(["deg", "rad"]),
-            help="Unit of the table's revolute joints. Default: rad; of validate that of the run.",
-        ),
-        click.Option(
-            ["--noise-px"], metavar="S", help="Pixel noise of the table, per coordinate. Default: estimated."
-        ),
-        click.Option(
-            ["--cross-validate"],
-            metavar="K",
-            help="On calibrate: predict the poses in K parts, each from a fit to the others.",
-        ),
-        click.Option(
-            ["--init"],
-            metavar="FILE",
-            type=click.Path(),
-            help="On calibrate: try this robot and rig (JSON: screws, cameras, markers) first as a start.",
-        ),
-        click.Option(
-            ["--suggest"],
-            metavar="[N]",
-            type=click.IntRange(1, 100),
-            help="On calibrate: suggest N further poses to record, the most telling first; 5 without N.",
-        ),
-        click.Option(
-            ["--lens"],
-            is_flag=True,
-            help="Estimate radial lens distortion, two coefficients a camera. Default: none.",
-        ),
-        click.Option(
-            ["--image-size"],
-            metavar="WxH",
-            help="Size of the table's images, px. Default: that of rig, else from where markers were seen.",
-        ),
-        click.Option(
-            ["--motions"],
-            metavar="CSV",
-            type=click.Path(),
-            help="On record: further poses after the trial motions, a row each of q1 ... qN.",
-        ),
-        click.Option(
-            ["--joints-csv"],
-            metavar="CSV",
-            type=click.Path(),
-            help="On detect: joint readings q1 ... qN, a row a pose, perhaps with pose or left and right.",
-        ),
-        click.Option(
-            ["--dictionary"],
-            metavar="NAME",
-            default="4X4_50",
-            show_default=True,
-            help="On detect: the tags, such as 4X4_50, ARUCO_ORIGINAL, APRILTAG_36H11.",
-        ),
-        click.Option(
-            ["--points"],
-            type=click.Choice(["corners", "centers"]),
-            default="corners",
-            show_default=True,
-            help="On detect: four markers a tag, or one.",
-        ),
-        click.Option(
-            ["laws", "--law"],
-            metavar="NAME",
-            multiple=True,
-            shell_complete=_laws,
-            help="On servo: this law, or law of yours (module:Class), instead of control.laws. Repeatable.",
-        ),
-        click.Option(
-            ["--speed-scale"],
-            metavar="S",
-            help="On servo and record: scale every command by S, above 0 and at most 1.",
-        ),
-        click.Option(
-            ["--confirm"],
-            is_flag=True,
-            help="On servo and record: ask on the terminal before the first motion.",
-        ),
-        click.Option(
-            ["origin", "--from"],
-            metavar="SWEEP:INDEX",
-            help="On servo: the run of that number of a sweep, made anew as a run of its own.",
-        ),
-        click.Option(
-            ["--view"],
-            is_flag=True,
-            help="On report: a 3D view of robot, rig and paths with a time slider, view.html.",
-        ),
-        click.Option(
-            ["--animation"],
-            is_flag=True,
-            help="On report: both camera images under several laws over time, animation.gif.",
-        ),
-        click.Option(
-            ["--scheduler"],
-            metavar="ADDRESS",
-            help="On sweep: the Dask scheduler whose workers do the work, such as tcp://host:8786.",
-        ),
-        click.Option(
-            ["--to"],
-            type=click.Choice(["csv"]),
-            default="csv",
-            help="On export: the kind of file, of which there is one.",
-        ),
-        click.Option(["--force"], is_flag=True, help="Make the named stages even where they are up to date."),
-        click.Option(["-n", "--dry-run"], is_flag=True, help="Say what would be done, do nothing."),
-        click.Option(
-            ["-j", "--threads"],
-            metavar="N",
-            type=click.IntRange(1, 256),
-            help="Threads. Default: all processors.",
-        ),
-        click.Option(["--json"], is_flag=True, help="Print one JSON object on standard output."),
-        click.Option(
-            ["-q", "--quiet"], is_flag=True, help="Print nothing but errors and what --json prints."
-        ),
-        click.Option(["-v", "--verbose"], is_flag=True, help="Say more; show tracebacks."),
-        click.Option(["--version"], is_flag=True, help="Print the version and exit."),
-        click.Option(["-h", "--help"], is_flag=True, help="Print this help and exit."),
-    )
-}
+    if value and not sys.stdin.isatty():
+        raise click.UsageError(
+            "--confirm: standard input is no terminal, so nobody can be asked; leave it out"
+        )
+    return value
 
 
-def wrapped(text: str, indent: str = "") -> str:
-    """Text in lines of at most 80 columns; words longer than that stay whole."""
-    return textwrap.fill(
-        text,
-        80,
-        initial_indent=indent,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+confirm = click.option(
+    "--confirm", is_flag=True, callback=_with_terminal, help="Ask on the terminal before the first motion."
+)
 
 
-def visible(text: str) -> str:
-    """Text whose control characters and changes of direction are written out, line ends apart.
+def told(function: _Function) -> _Function:
+    """Give a command its console, made of ``--json``, ``-q`` and ``-v``, which all commands take.
 
-    Texts come from files of others too; a terminal that is sent them must not obey them.
+    What a robot or a law of a user prints meanwhile goes to standard error: it is not what was asked for.
     """
-    return _UNSEEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+    @click.option("--json", "as_json", is_flag=True, help="Print one JSON object on standard output.")
+    @click.option("-q", "--quiet", is_flag=True, help="Print nothing but errors and what --json prints.")
+    @click.option("-v", "--verbose", is_flag=True, help="Say more; show tracebacks.")
+    @functools.wraps(function)
+    def command(*arguments: Any, as_json: bool, quiet: bool, verbose: bool, **values: Any) -> Any:
+        console = Console(quiet=quiet, verbose=verbose, as_json=as_json)
+        with console, contextlib.redirect_stdout(sys.stderr):
+            return function(console, *arguments, **values)
+
+    return command
+
+
+_OF_STAGES = (
+    configuration("Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml."),
+    override,
+    click.option(
+        "-o",
+        "--output",
+        metavar="DIR",
+        type=click.Path(),
+        help="Folder of the run, or its run.h5. Default: results/<configuration name>.",
+    ),
+    click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
+    click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
+    joint_unit,
+    click.option("--noise-px", metavar="S", help="Pixel noise of the table. Default: estimated."),
+    click.option("--lens", is_flag=True, help="Estimate radial lens distortion, two coefficients a camera."),
+    click.option(
+        "--image-size",
+        metavar="WxH",
+        help="Size of the table's images, px. Default: that of rig, else from where markers were seen.",
+    ),
+    force("Make the named stages even where they are up to date."),
+    dry_run,
+    threads("Threads. Default: all processors."),
+    told,
+    click.pass_obj,  # the names of the stages of the call
+)
+
+
+def of_stages(function: _Function) -> _Function:
+    """Give a stage the options of all stages, its console, and the names of the stages of the call."""
+    for decorate in reversed(_OF_STAGES):
+        function = decorate(function)
+    return function
+
+
+def require_new(path: Path, *, force: bool) -> None:
+    """Refuse to replace unasked what is there.
+
+    Raises
+    ------
+    InputError
+        Where it exists and ``--force`` was not given.
+    """
+    from projservo_cli.records import InputError
+
+    if path.exists() and not force:
+        raise InputError(f"{path}: exists already; choose another, or replace it with --force")
+
+
+def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
+    """The run that is named, as an argument or with ``-o``; None where none is."""
+    if run is not None and output is not None:
+        raise click.UsageError(f"{command} takes one run, as an argument or with -o")
+    return run or output

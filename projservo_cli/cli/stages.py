@@ -1,238 +1,428 @@
-"""The stages: what is to be done, doing it, and saying what came out."""
+"""The stages and their chain: what is to be done, doing it, and saying what came out."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import click
 
-from projservo_cli.cli.foreign import confirm, law_names, require_asked, require_named, require_terminal
-from projservo_cli.cli.output import Console, print_json
-from projservo_cli.records import WorkFailed, name_of
+from projservo_cli.cli import options as option
+from projservo_cli.cli.group import FAILED, main
+from projservo_cli.cli.output import Console
 
-FIGURES = "figures"  # folder of a run in which a killed report may have left something
+_FIGURES = "figures"  # folder of a run in which a killed report may have left something
+_EXTRAS = ("view", "animation")
+
+
+def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Laws for the completion of a shell."""
+    del context, parameter
+    from projservo_cli.records import LAWS
+
+    return [law for law in LAWS if law.startswith(incomplete)]
+
+
+@main.stage(
+    "calibrate", epilog="Example: projservo calibrate --data trials.csv --joints RRPRRR -o results/mine"
+)
+@click.option(
+    "--cross-validate", metavar="K", help="Predict the poses in K parts, each from a fit to the others."
+)
+@click.option(
+    "--init",
+    metavar="FILE",
+    type=click.Path(),
+    help="Try this robot and rig (JSON: screws, cameras, markers) first as a start.",
+)
+@click.option(
+    "--suggest",
+    metavar="[N]",
+    type=click.IntRange(1, 100),
+    help="Suggest N further poses to record, the most telling first; 5 without N.",
+)
+@option.of_stages
+def calibrate_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+    """Learn the projective kinematics from trial motions.
+
+    Estimates both cameras and all joint operators from images alone, simulated from the configuration or
+    recorded in an observation table (--data).
+
+    --cross-validate and --init become part of the configuration of the run. --suggest works on the
+    calibration as it is and writes suggestions.csv into the folder of the run, for record --motions.
+    """
+    return _make(console, stages, options)
+
+
+@main.stage("plan", epilog="Example: projservo plan -c configs/ur5.yaml --set trajectory.profile=exponential")
+@option.of_stages
+def plan_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+    """Plan the task as a translation and two rotations.
+
+    Partitions the task by the start and goal images and lays a path on which both cameras keep seeing the
+    face. Calibrates first where needed.
+    """
+    return _make(console, stages, options)
+
+
+@main.stage("servo", epilog="Example: projservo servo -o results/ur5 --law direct_two --law stacked")
+@click.option(
+    "--law",
+    "laws",
+    metavar="NAME",
+    multiple=True,
+    shell_complete=_laws,
+    help="This law, or law of yours (module:Class), instead of control.laws. Repeatable.",
+)
+@option.speed_scale
+@option.confirm
+@click.option(
+    "--from",
+    "origin",
+    metavar="SWEEP:INDEX",
+    help="The run of that number of a sweep, made anew as a run of its own.",
+)
+@option.of_stages
+def servo_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+    """Run the control laws in closed loop.
+
+    Runs each law of control.laws (or of --law) to its verdict. Calibrates and plans first where needed. Exit
+    code 1 when a law of control.must_converge does not converge.
+
+    With --set plant=module:Class (or plant in the configuration) a robot of yours takes the place of the
+    simulated one. It is driven to the start of the task and from there by each law, and stopped on every way
+    out.
+    """
+    return _make(console, stages, options)
+
+
+@main.stage(
+    "report",
+    epilog="Example: projservo calibrate plan servo report -c configs/ur5.yaml -o results/ur5 --view",
+)
+@click.argument("sweep", metavar="[SWEEP]", required=False, type=option.PATH)
+@click.option("--view", is_flag=True, help="A 3D view of robot, rig and paths with a time slider, view.html.")
+@click.option(
+    "--animation", is_flag=True, help="Both camera images under several laws over time, animation.gif."
+)
+@option.of_stages
+def report_run(stages: Sequence[str], console: Console, *, sweep: Path | None, **options: Any) -> int:
+    """Draw the figures and check the paper's claims.
+
+    Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; and
+    report.html, one page that tells it all and needs no other file. Makes every stage before it where needed.
+
+    --view adds view.html, a 3D view of robot, rig, face and paths with a time slider, which needs no network;
+    it needs pip install 'projservo[view]' and a robot described in metres. --animation adds animation.gif,
+    what both cameras see under the direct and the classical laws. The page links to both; a report that is up
+    to date is not made again for them.
+
+    projservo report SWEEP, with the folder of a sweep, writes its statistics and figures instead: success
+    with intervals, final errors, laws compared on the same tasks.
+    """
+    if sweep is not None:
+        from projservo_cli.cli.sweep_command import tell_report
+
+        return tell_report(console, sweep, options)
+    return _make(console, stages, options)
 
 
 @dataclass
-class _Call:
+class _Chain:
     """One call of stages: what was asked for and what became of it."""
 
-    names: list[str]
+    console: Console
+    names: Sequence[str]
+    options: Mapping[str, Any]
     laws: tuple[str, ...]
     config: Any
     run: Any
     steps: Sequence[Any]
-    console: Console
-    reason: str = ""
     failed: str = ""
+    reason: str = ""
     laws_done: tuple[str, ...] = ()
-    suggested: dict[str, Any] = field(default_factory=dict)
-    extras: dict[str, Any] = field(default_factory=dict)
+    beside: dict[str, dict[str, Any]] = field(default_factory=dict)  # further values of a stage's object
+
+    def lacks(self, stage: str) -> bool:
+        """Whether a stage was not completed by the call."""
+        order = [step.stage for step in self.steps]
+        return bool(self.failed) and order.index(stage) >= order.index(self.failed.split("/")[0])
 
 
-def run(names: list[str], rest: list[str], options: dict[str, Any]) -> int:
+def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> int:
     """Make the named stages and what they lack; the exit code."""
-    del rest  # stages take no arguments
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
-    require_terminal(options)
-    given = law_names(options["laws"])
-    from projservo_cli.cli.extras import wanted_of
     from projservo_cli.config import to_yaml
     from projservo_cli.files import tidy, working_in
 
-    console = Console(quiet=options["quiet"], verbose=options["verbose"])
-    call = _asked(names, given, options, console)
+    chain = _asked(console, names, options)
     if options["dry_run"]:
-        return _dry(call, as_json=options["json"])
-    nothing = not any(step.why for step in call.steps) and call.run.configuration == to_yaml(call.config)
-    if nothing and not wanted_of(options):
-        tidy(call.run.path.parent, FIGURES)
-        return _done(call, options)
-    with working_in(call.run.path.parent, FIGURES):
+        return _tell_dry(chain)
+    folder = chain.run.path.parent
+    up_to_date = chain.run.configuration == to_yaml(chain.config) and not any(s.why for s in chain.steps)
+    if up_to_date and not _extras(options):
+        tidy(folder, _FIGURES)
+        return _work(chain)
+    with working_in(folder, _FIGURES):
         # Anew, since another process may have written the run until now.
-        return _done(_asked(names, given, options, console), options)
+        return _work(_asked(console, names, options))
 
 
-def _done(call: _Call, options: dict[str, Any]) -> int:
-    """Make what has to be made, and tell what came out; the exit code."""
-    from projservo_cli.cli.extras import made_extras, wanted_of
-    from projservo_cli.cli.words import suggested
-
-    try:
-        _say_compilation(call)
-        _work(call, options)
-        if options["suggest"] is not None and not _lacking(call, "calibrate"):
-            call.suggested = suggested(call.config, call.run, options["suggest"])
-        if (wanted := wanted_of(options)) and not _lacking(call, "report"):
-            call.extras = made_extras(call.config, call.run, call.laws, wanted, call.console)
-    finally:
-        call.console.finish()
-    return _tell(call, as_json=options["json"])
-
-
-def _asked(names: list[str], given: Sequence[str], options: dict[str, Any], console: Console) -> _Call:
+def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> _Chain:
     """What is to be done, by the configuration and what the run holds; refused where it must not be."""
     from projservo_cli.cli.configuration import resolve
-    from projservo_cli.cli.extras import require
-    from projservo_cli.cli.words import require_covariance
     from projservo_cli.files import require_writable
     from projservo_cli.stages.chain import steps_for
 
+    given = _law_names(options.get("laws", ()))
     config, stored = resolve(options)
-    if options["suggest"] is not None:
-        require_covariance(config)
-    require(config, options)
+    if options.get("suggest") is not None and config.calibration.method != "refined":
+        raise click.UsageError(
+            f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
+            "use --set calibration.method=refined"
+        )
+    if wanted := _extras(options):
+        from projservo_cli.stages.report import require
+
+        require(config, wanted)
     steps = steps_for(config, stored, names, laws=given, force=options["force"])
-    laws = tuple(step.law for step in steps if step.law)
+    chain = _Chain(console, names, options, tuple(s.law for s in steps if s.law), config, stored, steps)
     if not options["dry_run"]:
-        require_named(config, steps, names)
-        require_asked(options, config, steps)
+        _require_named(chain)
         if any(step.why for step in steps):
             require_writable(stored.path)
-    return _Call(names, laws, config, stored, steps, console)
+    return chain
 
 
-def _dry(call: _Call, *, as_json: bool) -> int:
-    if as_json:
-        steps = [
-            {"stage": step.stage, "law": step.law or None, "why": step.why or None} for step in call.steps
-        ]
-        print_json({"run": call.run.path.resolve(), "dry_run": True, "steps": steps})
-    for step in () if as_json else call.steps:
-        call.console.show(f"{step.name}: {f'would be made ({step.why})' if step.why else 'up to date'}")
+def _extras(options: Mapping[str, Any]) -> list[str]:
+    """What a report is to have beside its page."""
+    return [name for name in _EXTRAS if options.get(name)]
+
+
+def _law_names(names: Sequence[str]) -> tuple[str, ...]:
+    """The laws of ``--law``, each once, registered names as the classes they stand for."""
+    from projservo_cli.records import LAWS
+    from projservo_cli.robots import plugins
+
+    found = {name: name if name in LAWS else plugins.target_of("law", name) for name in names}
+    for name, target in found.items():
+        if target is None:
+            valid = ", ".join((*LAWS, *plugins.registered("law")))
+            raise click.UsageError(f"--law {name}: no such law; laws: {valid}, or module:Class")
+    return tuple(dict.fromkeys(target for target in found.values() if target is not None))
+
+
+def _require_named(chain: _Chain) -> None:
+    """Refuse to move a robot that no stage asks for, or to start code that only a stored run names.
+
+    A run file may come from anybody: what is stored in it is shown and compared, never imported. Classes
+    that are named are imported, so that what cannot be found is known before any work.
+    """
+    from projservo_cli.control import CODES
+    from projservo_cli.records import InputError, law_and_mode
+    from projservo_cli.robots import plugins
+    from projservo_cli.robots.yours import METHODS
+
+    plant = chain.config.plant.use
+    servo = [step for step in chain.steps if step.stage == "servo" and step.why]
+    if servo and plant is not None and "servo" not in chain.names:
+        raise InputError(
+            f"{chain.names[-1]} needs a run of {servo[0].law} ({servo[0].why}), which moves {plant}: "
+            "run projservo servo first"
+        )
+    laws = [law_and_mode(step.law)[0] for step in servo]
+    wanted = {("law", law): f"--law {law}" for law in laws if law not in CODES}
+    if servo and plant is not None:
+        wanted["plant", plant] = f"--set plant={plant}"
+    named = wanted.keys() if chain.options["config"] else _named_by(chain.options)
+    for (kind, target), flag in wanted.items():
+        if (kind, target) not in named:
+            raise InputError(
+                f"{kind} {target} is named by the stored run alone, which starts no code: give the "
+                f"configuration again with -c, or {flag}"
+            )
+    for kind, target in wanted:
+        plugins.find(kind, target, METHODS if kind == "plant" else ("__call__",))
+
+
+def _named_by(options: Mapping[str, Any]) -> set[tuple[str, str | None]]:
+    """Robots and laws that the options name."""
+    from projservo_cli.config import Override
+    from projservo_cli.robots import plugins
+
+    found: set[tuple[str, str | None]] = {("law", name) for name in _law_names(options.get("laws", ()))}
+    for override in map(Override.parse, options["sets"]):
+        kind = {"plant": "plant", "control": "law"}.get(str(override.path[0]))
+        if kind is not None:
+            found |= {(kind, plugins.target_of(kind, text)) for text in _texts(override.value)}
+    return found
+
+
+def _texts(value: Any) -> list[str]:
+    if isinstance(value, str):
+        return [value]
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [text for item in inner for text in _texts(item)]
+
+
+def _tell_dry(chain: _Chain) -> int:
+    steps = [{"stage": step.stage, "law": step.law or None, "why": step.why or None} for step in chain.steps]
+    words = (f"{s.name}: {f'would be made ({s.why})' if s.why else 'up to date'}" for s in chain.steps)
+    chain.console.tell({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
     return 0
 
 
-def _work(call: _Call, options: dict[str, Any]) -> None:
-    """Make what has to be made, stop at the first failure, keep what was made until then."""
-    from projservo_cli.stages.chain import make
+def _work(chain: _Chain) -> int:
+    """Make what has to be made, and tell what came out; the exit code."""
+    _announce(chain)
+    _say_compilation(chain)
+    _make_steps(chain)
+    if (count := chain.options.get("suggest")) is not None and not chain.lacks("calibrate"):
+        chain.beside["calibrate"] = _suggestions(chain, count)
+    if (wanted := _extras(chain.options)) and not chain.lacks("report"):
+        chain.beside["report"] = _made_extras(chain, wanted)
+    from projservo_cli.report.values import failed_object, stage_object
 
-    motion = next((step for step in call.steps if step.law and step.why), None)
-    for done, step in enumerate(call.steps):
-        call.console.progress("results", done, len(call.steps))
-        if not step.why:
-            tell = call.console.say if step.stage in call.names else call.console.detail
-            tell(f"{step.name}: up to date")
+    values = {}
+    for name in chain.names:
+        if chain.lacks(name):
+            values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
         else:
-            needed = "" if step.stage in call.names else f", needed by {call.names[-1]}"
-            if step is motion:
-                confirm(options, call.config, "servo", call.console)
-            call.console.say(f"{step.name}: making it ({step.why}{needed})")
-            try:
-                call.run, dropped = make(step, call.config, call.run, call.laws, call.console.progress)
-            except WorkFailed as error:
-                call.failed, call.reason = step.name, " ".join(str(error).split())
-                return
-            if dropped:
-                call.console.say(f"{', '.join(dropped)}: dropped, made from what was replaced")
-        if step.law:
-            call.laws_done += (step.law,)
-            trace = call.run.traces[step.law]
-            if trace.verdict == "failed":  # nor is what failed driven by the next law
-                call.failed, call.reason = step.name, trace.reason
-                return
-    _keep_configuration(call)
+            values[name] = stage_object(name, chain.run, chain.config, chain.laws)
+            values[name] |= chain.beside.get(name, {})
+    chain.console.tell(values if len(values) > 1 else values[chain.names[0]], _words(chain, values))
+    findings = list(_findings(chain))
+    for text, _ in findings:
+        click.echo(f"projservo: {text}", err=True)
+    return FAILED if any(fatal for _, fatal in findings) else 0
 
 
-def _keep_configuration(call: _Call) -> None:
-    """Overrides are part of the stored configuration, also where nothing had to be made."""
+def _announce(chain: _Chain) -> None:
+    """Say in one line for each reason what will be made, and what is up to date."""
+    reasons: dict[str, list[str]] = {}
+    for step in chain.steps:
+        needed = "" if step.stage in chain.names else f", needed by {chain.names[-1]}"
+        if step.why or not needed:
+            reasons.setdefault(step.why and step.why + needed, []).append(step.name)
+    for why, found in reasons.items():
+        chain.console.say(f"{', '.join(found)}: {f'making ({why})' if why else 'up to date'}")
+
+
+def _make_steps(chain: _Chain) -> None:
+    """Make what has to be made, stop at the first failure, keep what was made until then."""
     from projservo_cli.config import to_yaml
+    from projservo_cli.records import WorkFailed
+    from projservo_cli.stages.chain import make
     from projservo_cli.store import save
 
-    text = to_yaml(call.config)
-    if call.run.configuration != text:
-        call.run = replace(call.run, configuration=text)
-        save(call.run)
+    console = chain.console
+    motion = next((step for step in chain.steps if step.law and step.why), None)
+    for done, step in enumerate(chain.steps):
+        console.progress("results", done, len(chain.steps))
+        if step is motion and chain.options.get("confirm"):
+            console.confirm("servo", chain.config.plant)
+        if step.why:
+            console.detail(f"{step.name}: making it")
+            try:
+                chain.run, dropped = make(step, chain.config, chain.run, chain.laws, console.progress)
+            except WorkFailed as error:
+                chain.failed, chain.reason = step.name, " ".join(str(error).split())
+                return
+            if dropped:
+                console.say(f"{', '.join(dropped)}: dropped, made from what was replaced")
+        if step.law:
+            chain.laws_done += (step.law,)
+            trace = chain.run.traces[step.law]
+            if trace.verdict == "failed":  # nor is what failed driven by the next law
+                chain.failed, chain.reason = step.name, trace.reason
+                return
+    text = to_yaml(chain.config)
+    if chain.run.configuration != text:  # overrides are stored also where nothing had to be made
+        chain.run = replace(chain.run, configuration=text)
+        save(chain.run)
 
 
-def _say_compilation(call: _Call) -> None:
+def _say_compilation(chain: _Chain) -> None:
     """The first run on a machine is slower by the time of compilation; say so."""
-    if not any(step.why for step in call.steps) or os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
+    if not any(step.why for step in chain.steps) or os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
         return
     from projservo_cli.geometry.jit import CACHE_FOLDER
 
     if CACHE_FOLDER is None:
-        call.console.say("compiling kernels (in every run: no cache folder can be written)")
+        chain.console.say("compiling kernels (in every run: no cache folder can be written)")
     elif not any(CACHE_FOLDER.rglob("*.nbi")):
-        call.console.say("compiling kernels, once")
+        chain.console.say("compiling kernels, once")
 
 
-def _tell(call: _Call, *, as_json: bool) -> int:
+def _suggestions(chain: _Chain, count: int) -> dict[str, Any]:
+    """Further poses for the calibration, as JSON values; the list of them is written beside the run."""
+    from projservo_cli.records import WorkFailed
+    from projservo_cli.stages.calibrate import suggested, write_suggestions
+
+    calibration, config = chain.run.calibration, chain.config
+    try:
+        found = suggested(config, chain.run.observation, calibration, count)
+    except WorkFailed as error:
+        return {"suggestions": [], "suggestions_reason": str(error)}
+    path = chain.run.path.parent / "suggestions.csv"
+    unit = config.data.joint_unit if config.data is not None else None
+    write_suggestions(found, path, [letter == "P" for letter in calibration.joint_types], unit)
+    keys = ("q", "from_pose", "delta", "variance_before", "variance_after")
+    return {
+        "suggestions": [{key: getattr(one, key) for key in keys} for one in found],
+        "suggestions_file": path.resolve(),
+        "suggestions_unit": unit or "rad",
+        "suggestions_limited": config.robot is not None,
+    }
+
+
+def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
+    """Write what is wanted, and the page anew, which links to it; the paths by name."""
+    from projservo_cli.report.page import write_page
+    from projservo_cli.stages import report as reporting
+    from projservo_cli.stages.chain import reported
+
+    told = reported(chain.config, chain.run, chain.laws)
+    makers = {"view": reporting.view, "animation": reporting.animation}
+    made = {}
+    for name in wanted:
+        chain.console.detail(f"report: making the {name}")
+        made[name] = makers[name](told, chain.console.progress).resolve()
+    write_page(replace(told, results={**told.results, "report": chain.run.results["report"]}))
+    return made
+
+
+def _words(chain: _Chain, values: Mapping[str, dict[str, Any]]) -> Iterator[str]:
     from projservo_cli.cli.words import summary
-    from projservo_cli.report.values import failed_object, stage_object
 
-    values = {}
-    for name in call.names:
-        if _lacking(call, name):
-            values[name] = failed_object(name, call.run, call.reason, call.failed, call.laws_done)
-        else:
-            values[name] = stage_object(name, call.run, call.config, call.laws)
-            values[name] |= {"calibrate": call.suggested, "report": call.extras}.get(name, {})
-    if as_json:
-        print_json(values if len(call.names) > 1 else values[call.names[0]])
-    else:
-        for name, value in values.items():
-            call.console.show(summary(name, value))
-        if call.run.results:
-            call.console.show(f"run: {call.run.path}")
-    return _verdict(call)
+    for name, value in values.items():
+        yield from summary(name, value, detailed=chain.console.verbose)
+    if chain.run.results:
+        yield f"run: {chain.run.path}"
 
 
-def _lacking(call: _Call, name: str) -> bool:
-    """Whether a stage was not completed by the call."""
-    if not call.failed:
-        return False
-    order = [step.stage for step in call.steps]
-    return order.index(name) >= order.index(call.failed.split("/")[0])
+def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
+    """What is not as it was asked for, and whether that ends the call with exit code 1."""
+    from projservo_cli.records import name_of
 
-
-def _verdict(call: _Call) -> int:
-    """Exit code 1 when a stage failed or what it made is not what was asked for.
-
-    That is a calibration that is not usable, a plan that keeps not all its constraints, or a law that
-    must converge and did not.
-    """
-    if call.failed:
-        click.echo(f"projservo: {call.failed}: {call.reason}", err=True)
-        return 1
-    missed_calibration = _unusable(call)
-    if call.suggested.get("suggestions") == []:
-        click.echo(f"projservo: calibrate: {call.suggested['suggestions_reason']}", err=True)
-        missed_calibration = True
-    must = call.config.control.must_converge
-    ends = [call.run.traces[law] for law in call.laws_done]
-    missed = [
-        trace
-        for trace in ends
-        if trace.verdict == "disturbed" or (trace.law in must and trace.verdict != "converged")
-    ]
-    for trace in missed:
-        reason = f": {trace.reason}" if trace.reason else ""
-        must_converge = " must converge, but" if trace.law in must else ""
-        click.echo(
-            f"projservo: {name_of(trace.law, trace.mode)}{must_converge} ended in {trace.verdict}{reason}",
-            err=True,
-        )
-    infeasible = _infeasible(call)
-    return 1 if missed or missed_calibration or infeasible else 0
-
-
-def _infeasible(call: _Call) -> bool:
-    """Say that no motion keeps the constraints asked for; True where the call was to plan one."""
-    if "plan" not in call.run.results or call.run.plan.profile != "constrained":
-        return False
-    plan = call.run.plan
-    if not plan.feasible:
-        click.echo(f"projservo: plan: {plan.reason}", err=True)
-    return not plan.feasible and "plan" in call.names
-
-
-def _unusable(call: _Call) -> bool:
-    """Say that a calibration cannot support control; True where the call was to make it usable."""
-    if "calibrate" not in call.run.results or call.run.calibration.usable:
-        return False
-    reason = " ".join(call.run.calibration.reason.split())
-    click.echo(f"projservo: calibrate: the calibration is not usable: {reason}", err=True)
-    return "calibrate" in call.names
+    if chain.failed:
+        yield f"{chain.failed}: {chain.reason}", True
+        return
+    results = chain.run.results
+    if "calibrate" in results and not chain.run.calibration.usable:
+        reason = " ".join(chain.run.calibration.reason.split())
+        yield f"calibrate: the calibration is not usable: {reason}", "calibrate" in chain.names
+    if (beside := chain.beside.get("calibrate", {})).get("suggestions") == []:
+        yield f"calibrate: {beside['suggestions_reason']}", True
+    must = chain.config.control.must_converge
+    for trace in (chain.run.traces[law] for law in chain.laws_done):
+        missed = trace.law in must and trace.verdict != "converged"
+        if missed or trace.verdict == "disturbed":
+            reason = f": {trace.reason}" if trace.reason else ""
+            but = " must converge, but" if trace.law in must else ""
+            yield f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason}", True
+    # Other profiles are those of the paper, of which the margins are only measured.
+    if "plan" in results and chain.run.plan.profile == "constrained" and not chain.run.plan.feasible:
+        yield f"plan: {chain.run.plan.reason}", "plan" in chain.names

@@ -1,6 +1,8 @@
 """The command line called in this process, with stages that only pretend to work."""
 
+import importlib
 import json
+import shutil
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
@@ -8,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from projservo_cli import cli, files
+from projservo_cli import calibration, cli, files
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed, law_and_mode
 from projservo_cli.stages import chain
 from projservo_cli.tables import read_table
@@ -47,15 +49,8 @@ class Stages:
     gone: bool = False
 
     def module(self, stage: str) -> Any:
-        depends = {
-            "calibrate": ("seed", "robot", "rig", "markers", "noise.calibration_px", "calibration", "data"),
-            "plan": ("task", "trajectory"),
-            "servo": ("seed", "control", "stop"),
-            "report": ("report",),
-        }
-        return SimpleNamespace(
-            DEPENDS_ON=depends[stage], run=getattr(self, stage), missing=lambda run: self.gone
-        )
+        depends = importlib.import_module(f"projservo_cli.stages.{stage}").DEPENDS_ON
+        return SimpleNamespace(DEPENDS_ON=depends, run=getattr(self, stage), missing=lambda run: self.gone)
 
     def _make(self, name: str) -> None:
         if name in self.fails:
@@ -97,7 +92,8 @@ class Stages:
         self.reported.append((list(run.traces), run.configuration))
         claim = {"claim": "c", "source": "s", "measured": "3 mm", "criterion": "< 4 mm", "holds": True}
         left_out = {"what": "fig_9", "reason": "no run"}
-        return fake(Report, 9, figures=("figures/fig_1.svg",), claims=(claim,), left_out=(left_out,))
+        claims = (claim, {**claim, "claim": "it is large", "measured": "1 mm", "holds": False})
+        return fake(Report, 9, figures=("figures/fig_1.svg",), claims=claims, left_out=(left_out,))
 
 
 @dataclass
@@ -114,19 +110,57 @@ class Answer:
         return json.loads(self.out, parse_constant=refuse)
 
 
-@pytest.fixture
-def stages(monkeypatch, tmp_path):
+def pretend(patch, folder):
+    """Pretended stages, in a folder with a configuration and a table."""
     pretended = Stages()
-    monkeypatch.setattr(chain, "stage_module", pretended.module)
-    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")
-    (tmp_path / "t.csv").write_text(TABLE, encoding="utf-8")
+    patch.setattr(chain, "stage_module", pretended.module)
+    patch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
+    patch.chdir(folder)
+    (folder / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")
+    (folder / "t.csv").write_text(TABLE, encoding="utf-8")
     return pretended
 
 
 @pytest.fixture
+def stages(monkeypatch, tmp_path):
+    return pretend(monkeypatch, tmp_path)
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory):
+    """The folder of a run through all pretended stages."""
+    folder = tmp_path_factory.mktemp("once")
+    with pytest.MonkeyPatch.context() as patch:
+        pretend(patch, folder)
+        assert cli.run(["report", "-c", "tiny.yaml", "-o", "out", "-q"]) == 0
+    return folder / "out"
+
+
+@pytest.fixture
+def reported(stages, made_once, tmp_path):
+    """The pretended stages, and such a run in out."""
+    shutil.copytree(made_once, tmp_path / "out")
+    return stages
+
+
+@pytest.fixture
+def statistics(monkeypatch):
+    """What every validation is made to find."""
+    value = {
+        "count": 2,
+        "rms_px": 0.5,
+        "median_px": 0.25,
+        "p95_px": float("nan"),
+        "skipped": {"unknown_marker": 1, "behind_camera": 0, "missing": 3},
+    }
+    monkeypatch.setattr(calibration, "residual_statistics", lambda *_: value)
+    return value
+
+
+@pytest.fixture
 def projservo(capsys):
+    """Function that calls the command line in this process."""
+
     def call(*arguments: Any) -> Answer:
         capsys.readouterr()
         code = cli.run([str(argument) for argument in arguments])

@@ -2,32 +2,17 @@
 
 import pytest
 
-CONFIGURATIONS = {
+CONFIGURATIONS = {  # more in tests/config
     "unknown key": ("nmae: x\n", "nmae: unknown key; did you mean name?"),
-    "wrong type": ("seed: one\n", "seed: must be a whole number, not 'one'"),
-    "boolean for a number": ("noise: {calibration_px: true}\n", "must be a number, not true"),
     "not a number": ("noise: {calibration_px: .nan}\n", "must be a finite number"),
-    "infinite": ("control: {gain_t: .inf}\n", "must be a finite number"),
-    "gain too high": ("control: {gain_t: 25}\n", "gain · period_s is 1"),
-    "wrong unit": ("calibration: {amplitude_rad: 0.5}\n", "unknown key; did you mean amplitude_deg?"),
-    "law unknown": ("control: {laws: [direct_too]}\n", "did you mean direct_two?"),
     "duplicate key": ("seed: 1\nseed: 2\n", ":2:1: seed: the key stands here a second time"),
     "no yaml": ("name: {\n", "not valid YAML"),
     "empty": ("", "is empty"),
-    "a list": ("- 1\n", "expected keys and values"),
     "no robot": ("name: x\n", "robot: is missing"),
-    "two goals": (
-        "task: {start: {joints: [1], unit: rad}, goal: {turn_deg: 1, joints: {joints: [1], unit: rad}}}\n",
-        "task.goal: give exactly one of",
-    ),
-    "a text for a list": ("control: {laws: stacked}\n", "control.laws: must be a list"),
 }
-TABLES = {
+TABLES = {  # more in tests/store
     "empty": ("", "the table is empty"),
-    "header only": ("pose,marker,q1,u_left,v_left,u_right,v_right\n", "no rows"),
     "truncated": ("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,1,2,3,4,5\n1,0,1,2", ":3: 4 cells"),
-    "malformed": ("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,one,2,3,4,5\n", ":2: q1 is 'one'"),
-    "no pixels": ("pose,marker,q1\n0,0,1\n", "lacks the column(s) u_left"),
     "other separator": ("pose;marker;q1\n0;0;1\n", "semicolons"),
 }
 
@@ -62,14 +47,8 @@ RECORDED, SIMULATED = ["--data", "t.csv"], ["-c", "tiny.yaml"]
 OPTIONS = {
     "no such configuration": (["-c", "none.yaml"], "none.yaml: cannot be read"),
     "no such table": (["--data", "none.csv"], "none.csv: cannot be read"),
-    "a folder for a table": (["--data", "."], "cannot be read"),
-    "joints too few": ([*RECORDED, "--joints", "R"], "2 joint columns q1…q2, but joints 'R' has 1 letters"),
     "joints of other letters": ([*RECORDED, "--joints", "RX"], "--joints RX: data.joints: 'RX' must be"),
-    "noise of text": ([*RECORDED, "--noise-px", "abc"], "--noise-px abc: data.noise_px: must be a number"),
-    "no noise": ([*RECORDED, "--noise-px", "0"], "--noise-px 0: data.noise_px: must be greater than 0"),
-    "noise not a number": ([*RECORDED, "--noise-px", ".nan"], "must be a finite number"),
     "joints without a table": ([*SIMULATED, "--joints", "RR"], "--joints RR: data.table: is missing"),
-    "override without value": ([*SIMULATED, "--set", "seed"], "--set seed: expected KEY=VALUE"),
     "override of nothing": ([*SIMULATED, "--set", "sed=1"], "--set sed=1: sed: unknown key; did you mean"),
     "a file for a folder": ([*SIMULATED, "-o", "t.csv/out"], "t.csv/out"),
     "a table for a run": ([*SIMULATED, "-o", "t.csv"], "not a run file"),
@@ -88,14 +67,12 @@ def test_several_errors_are_several_lines(projservo, stages):
     assert answer.err.count("\n") == 2
 
 
-@pytest.mark.parametrize("command", ["show", "validate"])
-def test_runs_that_are_none(projservo, stages, tmp_path, command):
-    data = ["--data", "t.csv"] if command == "validate" else []
-    refuse(projservo(command, "nowhere", *data), "there is no run file")
-    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
+def test_runs_that_are_none(projservo, reported, tmp_path):
     whole = (tmp_path / "out/run.h5").read_bytes()
     (tmp_path / "out/run.h5").write_bytes(whole[: len(whole) // 2])
-    refuse(projservo(command, "out", *data), "cut short")
+    for words in (["show"], ["validate", "--data", "t.csv"]):
+        refuse(projservo(*words, "nowhere"), "there is no run file")
+        refuse(projservo(*words, "out"), "cut short")
     refuse(projservo("calibrate", "-c", "tiny.yaml", "-o", "out"), "cut short")
 
 

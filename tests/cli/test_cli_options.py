@@ -1,46 +1,36 @@
 """Words and options in every order, help, version, and what is refused as usage."""
 
 import itertools
+import shlex
 import subprocess
 import sys
 
+import click
 import pytest
 
 from projservo_cli import __version__
 from projservo_cli.cli import main
-from projservo_cli.cli.commands import COMMANDS
 
 PIECES = [("servo",), ("plan",), ("-c", "tiny.yaml"), ("-o", "out"), ("--json",)]
 
 
-@pytest.mark.parametrize(
-    "pieces", list(itertools.permutations(PIECES)), ids=lambda pieces: " ".join(itertools.chain(*pieces))
-)
-def test_options_stand_anywhere_in_a_chain(projservo, stages, pieces):
-    answer = projservo(*itertools.chain(*pieces), "--law", "stacked", "-n")
-    assert answer.code == 0
-    assert [step["stage"] for step in answer.json["steps"]] == ["calibrate", "plan", "servo"]
-    assert answer.json["run"].endswith("/out/run.h5")
+def test_options_stand_anywhere_in_a_chain(projservo, stages):
+    for pieces in itertools.permutations(PIECES):
+        answer = projservo(*itertools.chain(*pieces), "--law", "stacked", "-n")
+        assert answer.code == 0, pieces
+        assert [step["stage"] for step in answer.json["steps"]] == ["calibrate", "plan", "servo"]
+        assert answer.json["run"].endswith("/out/run.h5")
     assert stages.made == []
 
 
-@pytest.mark.parametrize("order", list(itertools.permutations(["out", "--data=t.csv", "--json"])))
-@pytest.mark.parametrize("first", [0, 1, 2, 3])
-def test_options_stand_anywhere_around_arguments(projservo, stages, monkeypatch, order, first):
-    import projservo_cli.calibration
-
-    monkeypatch.setattr(
-        projservo_cli.calibration,
-        "residual_statistics",
-        lambda calibration, observation: {"count": len(observation.pose), "median_px": 0.1, "skipped": {}},
-        raising=False,
-    )
-    assert projservo("calibrate", "-c", "tiny.yaml", "-o", "out", "-q").code == 0
-    words = list(order)
-    words.insert(min(first, words.index("out")), "validate")
-    answer = projservo(*words)
-    assert answer.code == 0, answer.err
-    assert answer.json["count"] == 2
+def test_options_stand_anywhere_around_arguments(projservo, reported, statistics):
+    for order in itertools.permutations(["validate", "out", "--data=t.csv", "--json"]):
+        if order.index("validate") < order.index("out"):
+            answer = projservo(*order)
+            assert answer.code == 0, answer.err
+            assert answer.json["count"] == 2
+    assert projservo("--json", "validate", "-qo", "out", "--data", "t.csv").json["count"] == 2
+    assert projservo("--json", "--data", "t.csv", "validate", "--", "out").json["count"] == 2
 
 
 def test_stages_run_in_their_order_each_once(projservo, stages):
@@ -49,23 +39,43 @@ def test_stages_run_in_their_order_each_once(projservo, stages):
     assert stages.made == ["calibrate", "plan", "direct_three", "stacked"]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-@pytest.mark.parametrize("flag", ["-h", "--help"])
-def test_every_command_has_help_within_80_columns(projservo, name, flag):
-    for words in ([name, flag], [flag, name]):
-        answer = projservo(*words)
-        assert answer.code == 0
-        assert answer.out.startswith(f"Usage: projservo {name}")
-        assert "-h, --help" in answer.out
-        assert ("--law" in answer.out) == (name == "servo")
-        assert max(map(len, answer.out.splitlines())) <= 80
+@pytest.mark.parametrize("name", main.commands)
+def test_help_has_an_example_that_the_command_line_takes(projservo, name):
+    answer = projservo(name, "--help")
+    assert answer == projservo("-h", name)
+    assert answer.code == 0
+    assert answer.out.startswith(f"Usage: projservo {name}")
+    assert ("--law" in answer.out) == (name == "servo")
+    assert max(map(len, answer.out.splitlines())) <= 80
+    told = " ".join(answer.out.partition("Example: ")[2].split())
+    program, *words = shlex.split(told)
+    assert program == "projservo"
+    assert name in words
+    # What it says is taken, up to files that are not here.
+    with main.make_context("projservo", words) as context:
+        assert name in context.obj
+        _, command, rest = main.resolve_command(context, [*context.obj[:1], *context.args])
+        command.make_context(name, rest, parent=context)
+
+
+def test_a_flag_takes_a_value_in_all_commands_or_in_none():
+    takes = {}
+    for command in main.commands.values():
+        for option in command.params:
+            if isinstance(option, click.Option):
+                assert takes.setdefault(option.opts[-1], option.is_flag) == option.is_flag
 
 
 def test_help_names_all_commands_and_version_is_printed(projservo):
     text = projservo("--help").out
-    assert all(f"  {name} " in text for name in COMMANDS)
+    assert all(f"  {name} " in text for name in main.commands)
+    assert max(map(len, text.splitlines())) <= 80
     assert projservo().out == text
-    assert projservo("--version").out == f"projservo {__version__}\n"
+    for words in (["--version"], ["servo", "--version"], ["--version", "show", "x"]):
+        assert projservo(*words).out == f"projservo {__version__}\n"
+    both = projservo("servo", "calibrate", "-h").out
+    assert "--law" in both
+    assert "--suggest" in both
 
 
 def test_help_imports_neither_numbers_nor_files():
@@ -78,11 +88,34 @@ def test_help_imports_neither_numbers_nor_files():
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_command_is_one_of_click(capsys):
-    with pytest.raises(SystemExit) as left:
-        main(["calibrat"])
-    assert left.value.code == 2
-    assert "did you mean calibrate?" in capsys.readouterr().err
+def complete(line, monkeypatch, capsys):
+    """What bash is offered after a line."""
+    words = shlex.split(line)
+    count = len(words) if line.endswith(" ") else len(words) - 1
+    monkeypatch.setenv("_PROJSERVO_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(count))
+    with pytest.raises(SystemExit):
+        main()
+    return capsys.readouterr().out.split()
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("projservo cal", ["plain,calibrate"]),
+        ("projservo calibrate re", ["plain,report"]),
+        ("projservo -q calibrate plan -o x s", ["plain,servo"]),
+        ("projservo servo --law st", ["plain,stacked"]),
+        ("projservo export out --to c", ["plain,csv"]),
+        ("projservo validate --dat", ["plain,--data"]),
+        ("projservo show res", ["file,res"]),
+        ("projservo plan -c x", ["file,x"]),
+        ("projservo nonsense x", []),
+    ],
+)
+def test_a_shell_completes_commands_stages_laws_and_files(line, offered, monkeypatch, capsys):
+    assert complete(line, monkeypatch, capsys) == offered
 
 
 USAGE = {
@@ -96,22 +129,34 @@ USAGE = {
     "data of equations": (["equations", "--data", "t.csv"], "--data: not used by equations"),
     "unknown law": (["servo", "--law", "direct_four"], "laws: direct_three, direct_two, stacked"),
     "stage and other": (["calibrate", "validate"], "validate stands alone"),
-    "other and stage": (["equations", "calibrate"], "takes no argument"),
-    "two runs to show": (["show", "a", "b"], "takes 1 argument"),
+    "other and stage": (["equations", "calibrate"], "unexpected extra argument (calibrate)"),
+    "two runs to show": (["show", "a", "b"], "unexpected extra argument (b)"),
     "run twice": (["show", "a", "-o", "b"], "one run"),
     "validate without run": (["validate", "--data", "t.csv"], "needs a run"),
-    "validate without data": (["validate", "out"], "--data TABLE"),
+    "validate without data": (["validate", "out"], "'--data'"),
     "threads": (["servo", "-j", "0"], "-j"),
     "unit": (["calibrate", "--data", "t.csv", "--joint-unit", "grad"], "--joint-unit"),
     "image size without height": (["calibrate", "--data", "t.csv", "--image-size", "1280"], "1280x1024"),
     "lens of show": (["show", "--lens"], "--lens: not used by show"),
-    "record without table": (["record", "-c", "tiny.yaml"], "--output TABLE"),
+    "record without table": (["record", "-c", "tiny.yaml"], "'--output'"),
     "unit of no motions": (["record", "-o", "u.csv", "--joint-unit", "deg"], "--motions"),
     "motions of calibrate": (["calibrate", "--motions", "m.csv"], "--motions: not used by calibrate"),
-    "one folder of images": (["detect", "left", "-o", "u.csv"], "two folders"),
-    "three folders of images": (["detect", "a", "b", "c"], "takes 2 arguments"),
-    "images without joints": (["detect", "a", "b", "-o", "u.csv"], "--joints-csv CSV"),
-    "images without table": (["detect", "a", "b", "--joints-csv", "q.csv"], "--output TABLE"),
+    "one folder of images": (["detect", "left", "-o", "u.csv"], "'RIGHT'"),
+    "three folders of images": (["detect", *"abc", "-o", "t.csv", "--joints-csv", "q"], "extra argument (c)"),
+    "images without joints": (["detect", "a", "b", "-o", "u.csv"], "'--joints-csv'"),
+    "images without table": (["detect", "a", "b", "--joints-csv", "q.csv"], "'--output'"),
+    "validation of a plan": (["plan", "x", "--data", "y"], "no command 'x'"),
+    "no kind of export": (["export", "out", "--to", "xls"], "--to"),
+    "export of nothing": (["export"], "'RUN'"),
+    "one run to compare": (["compare", "out"], "two runs"),
+    "no page": (["compare", "out", "out", "-o", "both"], "both.html"),
+    "no such run": (["compare", "out", "nowhere"], "out/run.h5: there is no run file"),
+    "no yaml": (["init", "mine.json"], "mine.yaml"),
+    "two files": (["init", "a.yaml", "b.yaml"], "unexpected extra argument"),
+    "cross-validation of a plan": (["plan", "--cross-validate", "3"], "--cross-validate: not used by plan"),
+    "start of a plan": (["plan", "--init", "f.json"], "--init: not used by plan"),
+    "sweep of nothing": (["sweep"], "'--config'"),
+    "confirmed by nobody": (["servo", "--confirm"], "no terminal"),
     "unknown points": (["detect", "a", "b", "--points", "edges"], "--points"),
 }
 

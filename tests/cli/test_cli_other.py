@@ -14,41 +14,19 @@ from projservo_cli.store import load
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def statistics(monkeypatch):
-    value = {
-        "count": 2,
-        "rms_px": 0.5,
-        "median_px": 0.25,
-        "p95_px": float("nan"),
-        "skipped": {"unknown_marker": 1, "behind_camera": 0, "missing": 3},
-    }
-    monkeypatch.setattr(projservo_cli.calibration, "residual_statistics", lambda *_: value, raising=False)
-    return value
-
-
-@pytest.mark.parametrize("run", [["out"], ["out/run.h5"], ["-o", "out"], ["-o", "out/run.h5"]])
-def test_validate_prints_the_statistics_of_a_table(projservo, stages, statistics, tmp_path, run):
-    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
-    answer = projservo("validate", *run, "--data", "t.csv", "--json")
-    assert answer.json == {"run": str(tmp_path / "out/run.h5"), **statistics, "p95_px": None}
-    text = projservo("validate", *run, "--data", "t.csv").out
-    told = " ".join(text.split())
+def test_validate_prints_the_statistics_of_a_table(projservo, reported, statistics, tmp_path):
+    for run in (["out"], ["out/run.h5"], ["-o", "out"], ["-o", "out/run.h5"]):
+        answer = projservo("validate", *run, "--data", "t.csv", "--json")
+        assert answer.json == {"run": str(tmp_path / "out/run.h5"), **statistics, "p95_px": None}
+    answer = projservo("validate", "out", "--data", "t.csv")
+    told = " ".join(answer.out.split())
     assert "2 marker-view pairs; skipped: 1 unknown marker, 0 behind camera, 3 missing" in told
-    assert "median 0.25" in text
-
-
-def test_validate_asks_about_another_robot_where_nothing_fits(projservo, stages, statistics, tmp_path):
-    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
-    assert "same robot" not in projservo("validate", "out", "--data", "t.csv").err
+    assert "median 0.25" in told
+    assert "same robot" not in answer.err
     statistics["median_px"] = 375.0
     answer = projservo("validate", "out", "--data", "t.csv", "--json")
     assert "are these the\nsame robot" in answer.err
     assert answer.json["median_px"] == 375.0
-
-
-def test_validate_wants_as_many_joints_as_the_calibration_has(projservo, stages, statistics, tmp_path):
-    projservo("calibrate", "-c", "tiny.yaml", "-o", "out")
     (tmp_path / "one.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n0,0,1,2,3,4,5\n")
     answer = projservo("validate", "out", "--data", "one.csv")
     assert answer.code == 2
@@ -77,8 +55,10 @@ def test_validate_takes_the_unit_of_the_run_unless_told(projservo, stages, monke
     assert same == [[0.1, 20], [0.1, 30]]
 
 
-def test_show_tells_what_a_run_holds(projservo, stages, tmp_path):
-    projservo("report", "-c", "tiny.yaml", "-o", "results/paper")
+def test_show_tells_what_a_run_holds(projservo, reported, tmp_path):
+    (tmp_path / "out").rename(tmp_path / "paper")
+    (tmp_path / "results").mkdir()
+    (tmp_path / "paper").rename(tmp_path / "results/paper")
     value = projservo("show", "--json").json  # the default of -o
     assert value["run"] == str(tmp_path / "results/paper/run.h5")
     assert value["configuration"]["name"] == "tiny"

@@ -1,21 +1,22 @@
-"""The real stages through the command line: reference tables, refusals, runs that repeat."""
+"""The real stages through the command line: refusals, runs that repeat, options, what is read afterwards."""
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from projservo_cli import store
-from projservo_cli.tables import read_table, write_table
+from projservo_cli import cli, store
+from tests.conftest import ROOT
 
-PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
-
-# limits on the median and the 95th percentile of the held-out distance, px
-TABLES = {
-    "ur5/trials_0.5px": ([], 0.17, 0.6),
-    "stanford/trials_0.5px": (["--joints", "RRPRRR"], 0.18, 0.5),
-}
+CONFIGS = ROOT / "configs"
+PAPER = ("-c", CONFIGS / "paper.yaml")
+FEW = "calibration.frames_per_joint=4"
+ON_A_LINE = (
+    "markers={positions_m: [[-0.08, 0, 0.05], [-0.02, 0, 0.05], [0.03, 0, 0.05], [0.08, 0, 0.05]], "
+    "face: [0, 1, 2]}"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -24,55 +25,16 @@ def elsewhere(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize("name", TABLES)
-def test_a_recorded_table_predicts_images_it_has_not_seen(projservo, shared_data, name):
-    options, median, p95 = TABLES[name]
-    answer = projservo("calibrate", "--data", shared_data / f"{name}.csv", *options, "-o", "out", "--json")
-    assert (answer.code, answer.json["usable"]) == (0, True), answer.err
-    held_out = shared_data / name.split("/")[0] / "validation.csv"
-    value = projservo("validate", "out", "--data", held_out, "--json").json
-    assert value["count"] == 4000  # 200 poses, 10 markers, 2 views
-    assert value["skipped"] == {"unknown_marker": 0, "behind_camera": 0, "missing": 0}
-    assert value["median_px"] <= median
-    assert value["p95_px"] <= p95
-
-
-def test_a_table_in_degrees_gives_the_calibration_of_the_table_in_radians(projservo, shared_data):
-    table = shared_data / "stanford" / "trials_0.5px.csv"
-    radians = read_table(table)
-    revolute = np.array([1, 1, 0, 1, 1, 1], dtype=bool)
-    q = np.where(revolute, np.degrees(radians.q), radians.q)
-    write_table(dataclasses.replace(radians, q=q), "deg.csv")
-    options = ["--joints", "RRPRRR", "-q"]
-    refused = projservo("calibrate", "--data", "deg.csv", *options, "-o", "deg")
-    assert refused.code == 2
-    assert "look like degrees; give --joint-unit deg" in refused.err
-    assert projservo("calibrate", "--data", table, *options, "-o", "rad").code == 0
-    assert projservo("calibrate", "--data", "deg.csv", *options, "--joint-unit", "deg", "-o", "deg").code == 0
-    value, expected = (
-        projservo("validate", run, "--data", held_out, "--json").json
-        for run in ("deg", "rad")
-        for held_out in ["deg.csv" if run == "deg" else table]
-    )
-    # readings differ by the rounding of degrees, 1e-16; the optimum is found to 1e-6 px
-    assert value["rms_px"] == pytest.approx(expected["rms_px"], abs=1e-6)
-
-
-ON_A_LINE = (
-    "markers={positions_m: [[-0.08, 0, 0.05], [-0.02, 0, 0.05], [0.03, 0, 0.05], [0.08, 0, 0.05]], "
-    "face: [0, 1, 2]}"
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("calibration.amplitude_deg=0", "joint 1"),
+        ("calibration.frames_per_joint=0", "pose"),
+        (ON_A_LINE, "line"),
+    ],
 )
-UNSUPPORTED = {
-    "no amplitude": (["--set", "calibration.amplitude_deg=0"], "joint 1"),
-    "no trials": (["--set", "calibration.frames_per_joint=0"], "pose"),
-    "markers on a line": (["--set", ON_A_LINE], "line"),
-}
-
-
-@pytest.mark.parametrize("case", UNSUPPORTED)
-def test_data_that_support_no_calibration(projservo, case):
-    options, message = UNSUPPORTED[case]
-    answer = projservo("calibrate", "-c", PAPER, *options, "-o", "out", "-q", "--json")
+def test_data_that_support_no_calibration(projservo, given, message):
+    answer = projservo("calibrate", *PAPER, "--set", given, "-o", "out", "-q", "--json")
     assert answer.code == 1
     assert (answer.json["usable"], answer.json["failed"]) == (False, "calibrate")
     assert message in answer.json["reason"]
@@ -82,7 +44,7 @@ def test_data_that_support_no_calibration(projservo, case):
 
 def test_a_goal_that_cannot_be_reached(projservo):
     goal = "task.goal={joints: {joints: [500, 0, 0, 0, 0, 0], unit: deg}}"
-    answer = projservo("plan", "-c", PAPER, "--set", goal, "-o", "out", "-q")
+    answer = projservo("plan", *PAPER, "--set", goal, "--set", FEW, "-o", "out", "-q")
     assert answer.code == 1
     assert "joint 1" in answer.err
     assert answer.err.count("\n") == 1
@@ -97,6 +59,88 @@ def test_a_recorded_run_says_which_key_a_stage_lacks(projservo, shared_data):
     assert list(store.load("out").results) == ["calibrate"]
 
 
+@pytest.fixture(scope="module")
+def held_out(tmp_path_factory):
+    """A run with cross-validation, made once."""
+    folder = tmp_path_factory.mktemp("run")
+    assert (
+        cli.run([str(a) for a in ("--cross-validate", 3, *PAPER, "--set", FEW, "calibrate", "-o", folder)])
+        == 0
+    )
+    return folder
+
+
+def test_held_out_errors_are_in_json_and_words(projservo, held_out):
+    value = projservo("calibrate", "-o", held_out, "--json").json["cross_validation"]
+    assert (value["folds"], value["unit"], value["failed"]) == (3, "poses", [])
+    assert value["rms_px"] == pytest.approx(value["predicted_rms_px"], rel=0.15)
+    assert value["median_px"] < value["rms_px"] < value["p95_px"]
+    words = projservo("calibrate", "-o", held_out).out
+    assert f"held out, 3 parts of poses: rms {value['rms_px']:.3g} px" in words
+    for parts, why in ((3, None), (4, "outdated")):  # they are part of the configuration
+        dry = projservo("calibrate", "-o", held_out, "-n", "--json", "--cross-validate", parts).json
+        assert dry["steps"][0]["why"] == why
+
+
+def test_a_number_left_out_takes_no_other_word_for_it(projservo, held_out):
+    for words, count in ((["--suggest", "calibrate"], 5), (["--suggest", "2", "calibrate"], 2)):
+        answer = projservo(*words, "-o", held_out, "--json")
+        assert answer.code == 0, answer.err
+        assert len(answer.json["suggestions"]) == count
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--cross-validate", "1"], "--cross-validate 1: calibration.cross_validate"),
+        (["--cross-validate", "26"], "there are 25 poses; choose 2 to 25 parts"),
+        (["--cross-validate", "3", "--set", "calibration.method=closed_form"], "the method refined"),
+        (["--suggest", "--set", "calibration.method=closed_form"], "no covariance to judge poses by"),
+        (["--init", "none.json"], "none.json: cannot be read"),
+        (["--init", "bad.json"], "bad.json:1:1: not JSON"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(projservo, options, message):
+    Path("bad.json").write_text("no")
+    answer = projservo("calibrate", *PAPER, "--set", FEW, "-o", "run", *options)
+    assert answer.code == 2
+    assert message in answer.err.splitlines()[-1]
+    assert not list(Path().rglob("*.h5"))
+
+
+def test_a_start_is_tried_and_named_where_it_was_none(projservo, reference_truth):
+    truth = reference_truth("ur5")
+    Path("ur5.json").write_text(json.dumps(truth))
+    config = ("-c", CONFIGS / "ur5.yaml", "--set", FEW)
+    good = projservo("calibrate", *config, "--init", "ur5.json", "-o", "one", "--json")
+    assert good.code == 0
+    assert not any("ur5.json" in text for text in good.json["advice"])
+    # The file is known by what it says: elsewhere it is the same, changed it is another.
+    Path("there").mkdir()
+    Path("ur5.json").rename("there/ur5.json")
+    moved = ("calibrate", "-o", "one", "--init", "there/ur5.json", "--dry-run", "--json")
+    assert projservo(*moved).json["steps"][0]["why"] is None
+    truth["T_base_tool_at_reference"][0][3] = 2.0  # between the cameras, partly behind them
+    Path("there/ur5.json").write_text(json.dumps(truth))
+    assert projservo(*moved).json["steps"][0]["why"] == "outdated"
+    wrong = projservo("calibrate", *config, "--init", "there/ur5.json", "-o", "two", "--json")
+    assert wrong.code == 0
+    assert "was no start" in wrong.json["advice"][-1]
+    assert wrong.json["rms_px"] == pytest.approx(good.json["rms_px"], rel=1e-6)
+
+
+@pytest.mark.volume
+def test_what_the_first_chain_prints_is_read_in_ten_seconds(first_chain):
+    told = (first_chain / "told.txt").read_text(encoding="utf-8")
+    assert len(told.splitlines()) <= 45
+    assert len(told.split()) <= 350
+    assert max(len(line) for line in told.splitlines() if str(first_chain) not in line) <= 80
+    for law in ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"):
+        assert sum(line.split()[:1] == [law] for line in told.splitlines()) == 1
+    assert f"page: {first_chain / 'report.html'}" in told
+    assert " claims hold" in told
+
+
 def arrays(run):
     """Every array of a run by the name of its place."""
     return {
@@ -109,37 +153,28 @@ def arrays(run):
 
 
 @pytest.mark.volume
-def test_the_same_seed_makes_identical_arrays_and_running_again_changes_nothing(projservo):
-    for folder in ("one", "two"):
-        answer = projservo("servo", "-c", PAPER, "--law", "direct_three", "-o", folder, "--json")
-        assert answer.code == 0, answer.err
+def test_the_same_seed_makes_identical_arrays_and_running_again_changes_nothing(projservo, first_chain):
+    answer = projservo("servo", *PAPER, "--law", "direct_three", "-o", "one", "--json")
     (trace,) = answer.json["laws"]
-    assert trace["verdict"] == "converged"
-    one, two = (arrays(store.load(folder)) for folder in ("one", "two"))
-    assert one.keys() == two.keys()
+    assert (answer.code, trace["verdict"]) == (0, "converged")
+    one, first = arrays(store.load("one")), arrays(store.load(first_chain))
     assert any(name.startswith("servo/direct_three") for name in one)
     for name, value in one.items():
-        np.testing.assert_array_equal(value, two[name], err_msg=name)
+        np.testing.assert_array_equal(value, first[name], err_msg=name)
     before = Path("one/run.h5").read_bytes()
     again = projservo("calibrate", "plan", "servo", "--law", "direct_three", "-o", "one", "--json")
-    assert again.code == 0
     assert again.json["servo"]["laws"] == [trace]
     assert Path("one/run.h5").read_bytes() == before
-    other = projservo("calibrate", "-c", PAPER, "-o", "three", "--set", "seed=2", "-q")
-    assert other.code == 0
-    assert not np.array_equal(store.load("three").observation.images, store.load("one").observation.images)
+    assert projservo("calibrate", *PAPER, "-o", "two", "--set", "seed=2", "-q").code == 0
+    assert not np.array_equal(store.load("two").observation.images, store.load("one").observation.images)
 
 
 @pytest.mark.volume
-def test_xarray_opens_a_whole_run_with_names_and_units(projservo):
+def test_xarray_opens_a_whole_run_with_names_and_units(first_chain):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("h5netcdf")
-    assert projservo("servo", "-c", PAPER, "--law", "direct_two", "-o", "out", "-q").code == 0
-    with xarray.open_datatree("out/run.h5", engine="h5netcdf") as tree:
-        assert set(tree.groups) == {
-            *("/", "/calibrate", "/calibrate/observation", "/calibrate/calibration"),
-            *("/plan", "/servo", "/servo/direct_two"),
-        }
+    with xarray.open_datatree(first_chain / "run.h5", engine="h5netcdf") as tree:
+        assert {"/calibrate/observation", "/calibrate/calibration", "/plan", "/report"} < set(tree.groups)
         for node in tree.subtree:
             for name, data in node.data_vars.items():
                 assert data.attrs["units"], name

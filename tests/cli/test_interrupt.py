@@ -18,8 +18,8 @@ def work(arguments):
     Ended()
     time.sleep(60)
 
-cli._dispatch = work
-cli.main()
+cli.main.invoke = work
+cli.main(["doctor"])
 """
 
 

@@ -92,7 +92,7 @@ def check_commands(folder, names, read):
     found = json.loads(read())
     later = {"cross_validation", "suggestions"}  # only where they are asked for
     assert told["calibrate"] - {"name", "type", "excitation", "weak"} - later <= set(found["calibrate"])
-    assert {"name", "type", "excitation", "weak"} == set(found["calibrate"]["joints"][0])
+    assert {"name", "type", "excitation", "weak"} <= set(found["calibrate"]["joints"][0])
     assert told["plan"] - {"least", "mu"} <= set(found["plan"])
     assert {"least", "mu"} == set(found["plan"]["margins"]["joints"])
     assert cli.run(["record", "-c", "configs/ur5.yaml", "--output", "trials.csv"]) == 0

@@ -7,7 +7,7 @@ import re
 import pytest
 
 from projservo_cli import records
-from projservo_cli.cli.commands import COMMANDS
+from projservo_cli.cli import main
 from projservo_cli.config import Config
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.equations import REGISTER
@@ -71,7 +71,7 @@ def test_every_field_of_every_record_has_a_row():
 
 def test_every_command_and_equation_is_there():
     commands = "\n".join(reference.commands())
-    assert re.findall(r"^## projservo ([\w-]+)$", commands, flags=re.MULTILINE) == list(COMMANDS)
+    assert re.findall(r"^## projservo ([\w-]+)$", commands, flags=re.MULTILINE) == list(main.commands)
     assert len(cells(reference.equations())) == 2 + len(REGISTER)
 
 

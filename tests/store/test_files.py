@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
 from projservo_cli.cli.export import write_csv
+
 from projservo_cli.files import inside, replacing, require_inside, require_writable, working_in
 from projservo_cli.records import InputError
 from projservo_cli.report.page import write_comparison

@@ -94,14 +94,6 @@ def _run(arguments: tuple[str, ...], out: Path, err: Path) -> None:
 
 def prepare() -> None:
     """Import once what calls import, rather than in every one of them."""
-    modules = (
-        "cli.stages",
-        "cli.configuration",
-        "cli.foreign",
-        "cli.export",
-        "cli.show",
-        "store.run_file",
-        "report.page",
-    )
+    modules = ("cli.configuration", "cli.words", "store.run_file", "report.page", "sweep.report", "tables")
     for name in (*modules, *(f"stages.{stage}" for stage in STAGES)):
         importlib.import_module(f"projservo_cli.{name}")

@@ -1,0 +1,239 @@
+"""Observation tables on the command line: ``record``, ``detect`` and ``validate``."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from projservo_cli.cli import options as option
+from projservo_cli.cli.group import main
+from projservo_cli.cli.output import Console, wrapped
+
+# Predictions so many times the noise away come from another robot, or from other units.
+_FAR = 20.0
+
+
+@main.command("record", epilog="Example: projservo record -c configs/stanford.yaml --output trials.csv")
+@option.configuration("Configuration (YAML). Default: paper.yaml.")
+@option.override
+@option.output("TABLE", "Observation table to write (CSV).", required=True)
+@click.option(
+    "--motions",
+    metavar="CSV",
+    type=option.PATH,
+    help="Further poses after the trial motions, a row each, with columns q1 ... qN.",
+)
+@option.joint_unit
+@option.speed_scale
+@option.confirm
+@option.force("Begin anew, whatever stands in the table.")
+@option.dry_run
+@option.told
+def record_table(
+    console: Console,
+    *,
+    config: str | None,
+    output: Path,
+    motions: Path | None,
+    joint_unit: str | None,
+    confirm: bool,
+    force: bool,
+    dry_run: bool,
+    **options: Any,
+) -> None:
+    """Drive the robot through trial motions and write a table.
+
+    Drives the robot of a configuration, simulated or yours, through its trial motions (and --motions, whose
+    readings --joint-unit is about), in steps that the joint-speed limit allows, and writes what both cameras
+    see into an observation table for calibrate --data.
+
+    The table grows as the robot goes. After an interruption the same command continues it; a table of another
+    configuration is refused, unless --force begins anew.
+    """
+    if joint_unit is not None and motions is None:
+        raise click.UsageError("--joint-unit is that of --motions, which is not given")
+    from projservo_cli.cli.configuration import given_overrides, shipped
+    from projservo_cli.config import load_config
+    from projservo_cli.files import working_in
+    from projservo_cli.stages.record import prepare, record
+    from projservo_cli.tables import read_joints
+
+    settings = load_config(config or shipped(), given_overrides(options))
+    poses = None
+    if motions is not None:
+        types = settings.robot.joint_types if settings.robot is not None else None
+        poses = read_joints(motions, types, joint_unit)
+    recording = prepare(settings, output, motions=poses, force=force)
+    if dry_run:
+        _tell_recording(console, recording)
+        return
+    with working_in(output.parent, name=f".{output.name}.lock"):
+        recording = prepare(settings, output, motions=poses, force=force)
+        if recording.pending and confirm:
+            console.confirm("record", settings.plant)
+        if recording.found and recording.pending:
+            console.say(f"{output}: continued after {recording.found} of {len(recording.targets)} poses")
+        try:
+            record(settings, recording, progress=console.progress)
+        except KeyboardInterrupt:
+            done = f"{len(recording.q)} of {len(recording.targets)}"
+            console.say(f"{output}: {done} poses; run again to continue")
+            raise
+        _tell_recording(console, recording)
+
+
+def _tell_recording(console: Console, recording: Any) -> None:
+    value = {
+        "table": recording.path.resolve(),
+        "poses": len(recording.targets),
+        "recorded": len(recording.q) - recording.found,
+        "found": recording.found,
+        "pending": len(recording.pending),
+        "markers": len(recording.marker),
+        "unseen": recording.unseen,
+        "commands": recording.commands,
+    }
+    words = (
+        "record: {recorded} poses recorded, {found} there before, {pending} to be recorded; "
+        "{markers} markers",
+        "  unseen: {unseen} marker-view pairs; {commands} commands sent",
+    )
+    console.tell(value, [*(text.format_map(value) for text in words), f"table: {recording.path}"])
+
+
+@main.command(
+    epilog="Example: projservo detect images/left images/right --joints-csv q.csv --output tags.csv"
+)
+@click.argument("left")
+@click.argument("right")
+@option.output("TABLE", "Observation table to write (CSV).", required=True)
+@click.option(
+    "--joints-csv",
+    metavar="CSV",
+    type=click.Path(),
+    required=True,
+    help="Joint readings, a row a pose: columns q1 ... qN, perhaps pose or left, right.",
+)
+@click.option(
+    "--dictionary",
+    metavar="NAME",
+    default="4X4_50",
+    show_default=True,
+    help="The tags, such as 4X4_50, ARUCO_ORIGINAL, APRILTAG_36H11.",
+)
+@click.option(
+    "--points",
+    type=click.Choice(["corners", "centers"]),
+    default="corners",
+    show_default=True,
+    help="Four markers a tag, or one.",
+)
+@option.force("Replace the table if there is one.")
+@option.told
+def detect(
+    console: Console,
+    *,
+    left: str,
+    right: str,
+    output: Path,
+    joints_csv: str,
+    dictionary: str,
+    points: str,
+    force: bool,
+) -> None:
+    """Find ArUco or AprilTag markers in images and write a table.
+
+    Finds tags in the images of two folders (or quoted patterns such as 'left/*.png'), with corners to a
+    fraction of a pixel, and writes an observation table for calibrate --data. Needs OpenCV: pip install
+    'projservo[detect]'.
+
+    The list of joint readings (--joints-csv) says which images belong together. With columns left and right,
+    these are the names of the two images. With a column pose, images are those whose name ends in that
+    number. With neither, both folders are taken in the order of their names, one image a row; image_2 comes
+    before image_10.
+
+    With --points corners, corner k of tag t is marker 4 t + k, in the order of the dictionary: top left, top
+    right, bottom right, bottom left. With --points centers, tag t is marker t, at the crossing of its
+    diagonals. Readings are copied as they are: say --joint-unit deg on calibrate where they are degrees.
+    """
+    import numpy as np
+
+    from projservo_cli.detection import observe, pair_images
+    from projservo_cli.detection.tags import TagFinder
+    from projservo_cli.tables import read_joints, write_table
+
+    option.require_new(output, force=force)
+    finder = TagFinder(dictionary)
+    joints = read_joints(joints_csv, joint_unit="as is")
+    pairs = pair_images(left, right, joints, joints_csv)
+    observation, found = observe(pairs, joints.q, finder, points, console.progress)
+    write_table(observation, output)
+    in_left, in_right = np.moveaxis(np.isfinite(observation.images[..., 0]), 1, 0)
+    value = {
+        "table": output.resolve(),
+        "poses": len(observation.pose),
+        "tags": found.tags,
+        "markers": len(observation.marker),
+        "both": int((in_left & in_right).sum()),
+        "left_only": int((in_left & ~in_right).sum()),
+        "right_only": int((~in_left & in_right).sum()),
+        "unseen": int((~in_left & ~in_right).sum()),
+        "ambiguous": found.ambiguous,
+        "unrefined": found.unrefined,
+        "empty_images": found.empty,
+    }
+    words = (
+        f"detect: {{poses}} poses, {len(found.tags)} tags, {{markers}} markers",
+        "  markers seen by both cameras {both}, left only {left_only}, right only {right_only}, "
+        "by none {unseen}",
+        "  left out: {ambiguous} tags twice in an image, {unrefined} points without clean edges; "
+        "images without a tag: {empty_images}",
+    )
+    console.tell(value, [*(text.format_map(value) for text in words), f"table: {output}"])
+
+
+@main.command(epilog="Example: projservo validate results/mine --data validation.csv")
+@click.argument("run", required=False, type=option.PATH)
+@option.output("DIR", "The run, instead of an argument.")
+@click.option("--data", metavar="TABLE", type=option.PATH, required=True, help="Observation table (CSV).")
+@click.option(
+    "--joint-unit",
+    type=click.Choice(["deg", "rad"]),
+    help="Unit of the table's revolute joints. Default: that of the run.",
+)
+@option.told
+def validate(
+    console: Console, *, run: Path | None, output: Path | None, data: Path, joint_unit: str | None
+) -> None:
+    """Predict held-out images with a calibration.
+
+    Compares the pixels of an observation table (--data) with those the calibration of a run predicts at the
+    table's joint readings.
+    """
+    target = option.one_run("validate", run, output)
+    if target is None:
+        raise click.UsageError("validate needs a run: projservo validate RUN --data TABLE")
+    from projservo_cli.calibration import residual_statistics
+    from projservo_cli.config import load_config
+    from projservo_cli.store import load
+    from projservo_cli.tables import read_table
+
+    found = load(target)
+    calibration = found.calibration
+    if joint_unit is None:
+        config = load_config(found.path, text=found.results["calibrate"].configuration)
+        joint_unit = config.data.joint_unit if config.data is not None else None
+    observation = read_table(data, calibration.joint_types, joint_unit)
+    value = {"run": found.path.resolve(), **residual_statistics(calibration, observation)}
+    if value["count"] and value["median_px"] > _FAR * calibration.sigma_px:
+        console.say(
+            f"validate: the median is {value['median_px'] / calibration.sigma_px:.3g} times the noise of "
+            "the calibration: are these the same robot, rig and markers, with joints in the same units?"
+        )
+    skipped = ", ".join(f"{count} {why.replace('_', ' ')}" for why, count in value["skipped"].items())
+    words = [wrapped(f"validate: {value['count']} marker-view pairs; skipped: {skipped}")]
+    if value["count"]:
+        words.append(
+            "  residual px: rms {rms_px:.4g}, median {median_px:.4g}, p95 {p95_px:.4g}".format_map(value)
+        )
+    console.tell(value, words)

@@ -1,0 +1,230 @@
+"""The command ``projservo``: one group whose stages chain, and what becomes of errors: exit codes."""
+
+import _thread
+import difflib
+import inspect
+import io
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+import click
+from click.shell_completion import CompletionItem, shell_complete
+
+from projservo_cli.cli.output import visible
+from projservo_cli.version import __version__
+
+DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
+_COMPLETE = "_PROJSERVO_COMPLETE"
+_LEFT_OUT = {"--suggest": "5"}  # what an option means whose number is left out
+
+
+class _Stage(click.Command):
+    """A command after whose name other stages may follow."""
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Further stages, and options."""
+        named, group = ctx.obj, ctx.find_root().command
+        stages = group.stages if isinstance(group, Projservo) else []
+        further = [name for name in stages if name.startswith(incomplete) and name not in named]
+        return [*map(CompletionItem, further), *super().shell_complete(ctx, incomplete)]
+
+
+class Projservo(click.Group):
+    """A group whose stages chain, and in which options stand anywhere and hold for the whole call.
+
+    ``context.obj`` are the names of the commands that are called: of one, or of the stages of a chain,
+    which are called as one command that takes the options of them all.
+    """
+
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        super().__init__(*arguments, **settings)
+        self.stages: list[str] = []
+
+    def stage(self, name: str, **settings: Any) -> Callable[[Callable[..., Any]], click.Command]:
+        """Decorate like ``command`` one that chains with other stages, in the order of their definition."""
+        self.stages.append(name)
+        return self.command(name, cls=_Stage, options_metavar="[STAGE ...] [OPTIONS]", **settings)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of their definition."""
+        return list(self.commands)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Stages, then the others."""
+        others = [name for name in self.commands if name not in self.stages]
+        for title, names in (("Stages", self.stages), ("Other commands", others)):
+            with formatter.section(title):
+                formatter.write_dl([(name, self.commands[name].get_short_help_str(80)) for name in names])
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Sort words from options, so that the name of the command comes first and its arguments last."""
+        words, options, flags = self._sorted(ctx, args or ["--help"])
+        for flag in ("--version", *([] if words else ["--help"])):
+            if flag in flags:
+                return super().parse_args(ctx, [flag])
+        try:
+            ctx.obj, arguments = self._named(words)
+        except click.UsageError:
+            if not ctx.resilient_parsing:  # that is completion, which offers nothing then
+                raise
+            ctx.obj, arguments = [], []
+        used = {_flag(param) for name in ctx.obj for param in self.commands[name].get_params(ctx)}
+        unused = [flag for flag in flags if flag not in used]
+        if unused and not ctx.resilient_parsing:
+            raise click.UsageError(f"{', '.join(unused)}: not used by {' '.join(ctx.obj)}")
+        return super().parse_args(ctx, [*ctx.obj[:1], *options, *(["--", *arguments] if arguments else [])])
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """One command, or a chain of stages as one."""
+        name, command, rest = super().resolve_command(ctx, args)
+        if len(ctx.obj) > 1 and command is not None:
+            parts = [self.commands[stage] for stage in ctx.obj]
+            name = " ".join(ctx.obj)
+            command = _Stage(
+                name,
+                callback=command.callback,
+                params=list({option.name: option for part in parts for option in part.params}.values()),
+                help="\n\n".join(inspect.cleandoc(part.help or "") for part in parts),
+                epilog="\n\n".join(part.epilog or "" for part in parts),
+                options_metavar=command.options_metavar,
+            )
+        return name, command, rest
+
+    def _sorted(self, ctx: click.Context, args: list[str]) -> tuple[list[str], list[str], list[str]]:
+        """Words; options with their values; and the flags of these options.
+
+        The parser of click, stopping at each word, tells them apart.
+        """
+        params = [*self.params, *(param for command in self.commands.values() for param in command.params)]
+        options = {param.name: param for param in params if isinstance(param, click.Option)}
+        every = click.Command(None, params=[*options.values()])
+        words: list[str] = []
+        taken: list[str] = []
+        flags: list[str] = []
+        rest = [
+            f"{word}={_LEFT_OUT[word]}" if word in _LEFT_OUT and not following.isdecimal() else word
+            for word, following in zip(args, [*args[1:], ""], strict=True)
+        ]
+        while rest:
+            _, left, read = every.make_parser(ctx).parse_args(list(rest))
+            flags += map(_flag, read)
+            taken += rest[: len(rest) - len(left)]
+            if taken[-1:] == ["--"]:
+                return [*words, *left], taken[:-1], flags
+            words += left[:1]
+            rest = left[1:]
+        return words, taken, flags
+
+    def _named(self, words: Sequence[str]) -> tuple[list[str], list[str]]:
+        """The stages, each once and in their order, or one other command; and its arguments."""
+        if not words:
+            raise click.UsageError(f"no command; one of {', '.join(self.commands)}")
+        first, *rest = words
+        if first in self.commands and first not in self.stages:
+            return [first], rest
+        if first == "report" and len(rest) == 1 and rest[0] not in self.commands:  # of a sweep, not of a run
+            return [first], rest
+        for word in words:
+            if word not in self.commands:
+                close = difflib.get_close_matches(word, self.commands, n=1)
+                hint = f"did you mean {close[0]}? " if close else ""
+                raise click.UsageError(f"no command {word!r}; {hint}commands: {', '.join(self.commands)}")
+            if word not in self.stages:
+                raise click.UsageError(f"{word} stands alone; it does not chain with {first}")
+        return [name for name in self.stages if name in words], []
+
+    def main(self, args: Sequence[str] | None = None, *_: Any, **__: Any) -> NoReturn:
+        """Run the command line, or answer a shell that completes it, and leave with the exit code."""
+        if _COMPLETE in os.environ:
+            sys.exit(shell_complete(self, {}, "projservo", _COMPLETE, os.environ[_COMPLETE]))
+        sys.unraisablehook = _interrupt_anew
+        sys.exit(run(sys.argv[1:] if args is None else args))
+
+
+main = Projservo(
+    "projservo",
+    help="Uncalibrated stereo visual servoing in projective space. The stages calibrate, plan, servo and "
+    "report chain in one call; each first makes what it lacks. Options may stand anywhere.",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
+)
+click.version_option(__version__, message="projservo %(version)s")(main)
+
+
+def _flag(option: click.Parameter) -> str:
+    """The long form of an option; click gives those of help in no order."""
+    return max(option.opts, key=len)
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command line.
+
+    Returns
+    -------
+    The exit code: 0 done, 1 the work failed, 2 what was given makes no sense, 130 interrupted.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without Greek letters is no reason to fail
+            stream.reconfigure(errors="replace")
+    try:
+        with main.make_context("projservo", list(arguments)) as context:
+            code: int | None = main.invoke(context)
+        sys.stdout.flush()
+        return code or DONE
+    except click.exceptions.Exit as end:  # after help and version
+        return end.exit_code
+    except click.UsageError as error:
+        return _complain(error.format_message(), MALFORMED)
+    except KeyboardInterrupt:
+        return _complain("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+    except Exception as error:
+        return _failure(error, verbose="-v" in arguments or "--verbose" in arguments)
+
+
+def _failure(error: Exception, *, verbose: bool) -> int:
+    from projservo_cli.records import InputError, WorkFailed
+
+    if isinstance(error, InputError):
+        return _complain(str(error), MALFORMED)
+    if isinstance(error, WorkFailed):
+        return _complain(str(error), FAILED)
+    if verbose:
+        traceback.print_exception(error)
+    what = " ".join(str(error).split())
+    return _complain(
+        f"internal error, {type(error).__name__}: {what} (-v shows where; please report it)", FAILED
+    )
+
+
+def _complain(text: str, code: int) -> int:
+    """One line a finding, so that a message can be searched for and clicked on."""
+    for line in text.splitlines():
+        click.echo(f"projservo: {visible(line)}", err=True)
+    return code
+
+
+def _interrupt_anew(lost: "sys.UnraisableHookArgs") -> None:
+    """Interrupt a moment later where Ctrl-C came amid what cannot raise, such as the end of an object."""
+    if not issubclass(lost.exc_type, KeyboardInterrupt):
+        sys.__unraisablehook__(lost)
+        return
+    timer = threading.Timer(0.01, _interrupt)
+    timer.daemon = True
+    timer.start()
+
+
+def _interrupt() -> None:
+    """Interrupt the main thread, from another one, and wherever there are signals also what it waits for."""
+    if os.name == "posix":
+        os.kill(os.getpid(), signal.SIGINT)
+    else:
+        _thread.interrupt_main()

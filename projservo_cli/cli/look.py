@@ -1,0 +1,182 @@
+"""Looking at what there is: ``show``, ``compare``, ``export`` and ``equations``."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from projservo_cli.cli import options as option
+from projservo_cli.cli.group import main
+from projservo_cli.cli.output import Console, wrapped
+
+
+@main.command(epilog="Example: projservo show results/ur5 --json")
+@click.argument("run", required=False, type=option.PATH)
+@option.output("DIR", "The run, instead of an argument.")
+@option.told
+def show(console: Console, *, run: Path | None, output: Path | None) -> None:
+    """Show what a run holds and how it was made.
+
+    Lists the results in a run, by default of results/paper, and what they were made with; -v with every
+    claim, and the configuration.
+    """
+    target = option.one_run("show", run, output) or Path("results", "paper")
+    from projservo_cli.cli.words import summary
+    from projservo_cli.config import load_config
+    from projservo_cli.report.values import stage_object
+    from projservo_cli.store import SERVO, load
+
+    found = load(target)
+    config = load_config(found.path, text=found.configuration)
+    laws = list(found.traces)
+    stages = list(dict.fromkeys(name.split("/")[0] for name in found.results))
+    values = {stage: stage_object(stage, found, config, laws) for stage in stages}
+
+    def words() -> Iterator[str]:
+        yield f"run: {found.path}"
+        yield wrapped(f"configuration: {config.name}, {'recorded' if config.recorded else 'simulated'}")
+        for stage, value in values.items():
+            yield from summary(stage, value, detailed=console.verbose)
+            result = found.results[stage if stage in found.results else SERVO + laws[-1]]
+            yield wrapped(_made(result.provenance), "  ")
+        if console.verbose:
+            yield found.configuration.rstrip()
+
+    made = {name: {"key": result.key, **result.provenance} for name, result in found.results.items()}
+    settings = config.model_dump(mode="json")
+    value = {"run": found.path.resolve(), "configuration": settings, "made": made, **values}
+    console.tell(value, words())
+
+
+def _made(provenance: Any) -> str:
+    told = {name: str(value or "") for name, value in provenance.items()}
+    commit = told.get("git_commit", "")[:10]
+    source = f" at {commit}{' with changes' if told.get('git_dirty') else ''}" if commit else ""
+    versions = ", ".join(f"{name} {told.get(name, '?')}" for name in ("python", "numpy", "numba"))
+    return (
+        f"made {told.get('date', '?')} on {told.get('host', '?')} "
+        f"with projservo {told.get('projservo', '?')}{source}, {versions}"
+    )
+
+
+@main.command(epilog="Example: projservo compare results/paper results/ur5 -o both.html")
+@click.argument("runs", nargs=-1, required=True, type=option.PATH, metavar="RUN RUN ...")
+@option.output("PAGE", "Page to write.", default="compare.html", show_default=True)
+@option.force("Replace the page if there is one.")
+@option.told
+def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bool) -> None:
+    """Show runs side by side on one page.
+
+    Writes one page like report.html with the differences of the configurations, and calibrations, plans,
+    laws, claims and figures beside each other.
+    """
+    if len(runs) < 2:
+        raise click.UsageError("compare needs two runs or more: projservo compare RUN RUN")
+    from projservo_cli.records import InputError
+    from projservo_cli.report.page import write_comparison
+    from projservo_cli.store import load
+
+    if output.suffix != ".html":
+        raise InputError(f"{output}: name a page to write, such as {output.name or 'runs'}.html")
+    option.require_new(output, force=force)
+    found = [load(target) for target in runs]
+    write_comparison(found, output)
+    value = {"page": output.resolve(), "runs": [run.path.resolve() for run in found]}
+    console.tell(value, [f"compare: {len(runs)} runs: {output}"])
+
+
+@main.command(epilog="Example: projservo export results/ur5 --to csv")
+@click.argument("run", type=option.PATH)
+@option.output("DIR", "Folder to write. Default: csv beside run.h5.")
+@click.option(
+    "--to", type=click.Choice(["csv"]), default="csv", help="The kind of file, of which there is one."
+)
+@option.force("Replace what is there.")
+@option.told
+def export(console: Console, *, run: Path, output: Path | None, to: str, force: bool) -> None:
+    """Write all arrays of a run as CSV tables.
+
+    Writes a folder with a table for each result, a column for each index of an array, and fields.csv, which
+    says what every array is, in which unit.
+    """
+    del to
+    from projservo_cli.store import load
+
+    found = load(run)
+    folder = output or found.path.parent / "csv"
+    option.require_new(folder, force=force)
+    files = list(_write_tables(found, folder))
+    value = {"run": found.path.resolve(), "files": [file.resolve() for file in files]}
+    console.tell(value, [f"export: {len(files)} files: {folder}"])
+
+
+def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
+    """A table that says what every field is, and one for each record."""
+    import csv
+    import io
+    import json
+    import re
+
+    import numpy as np
+
+    from projservo_cli.files import replacing
+    from projservo_cli.tables import to_csv
+
+    def scalar(value: Any) -> str:
+        if isinstance(value, str):
+            return value
+        return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+
+    stream = io.StringIO()
+    about = csv.writer(stream, lineterminator="\n")
+    about.writerow(["file", "field", "dimensions", "unit", "about", "value"])
+    records = {(n, label): r for n, result in run.results.items() for label, r in result.records.items()}
+    tables: dict[str, str] = {}
+    for (name, label), record in records.items():
+        place = f"{name}/{label}" if label else name
+        file = re.sub(r"\W", "_", place, flags=re.ASCII) + ".csv"  # a name that a file can have anywhere
+        arrays = {}
+        for field in dataclasses.fields(record):
+            if (value := getattr(record, field.name)) is None:
+                continue
+            dims = field.metadata.get("dims")
+            if dims is not None:
+                arrays[field.name] = np.asarray(value)
+            told = scalar(value) if dims is None else ""
+            about.writerow(
+                [
+                    file,
+                    field.name,
+                    " ".join(dims or ()),
+                    field.metadata["units"],
+                    field.metadata["about"],
+                    told,
+                ]
+            )
+        tables[file] = to_csv(arrays, down=0)
+    for file, text in ({"fields.csv": stream.getvalue()} | tables).items():
+        with replacing(folder / file) as temporary:
+            temporary.write_bytes(text.encode())
+        yield folder / file
+
+
+@main.command(epilog="Example: projservo equations --json")
+@option.told
+def equations(console: Console) -> None:
+    """List the equations of the paper and the code of each.
+
+    Prints number, title, function, test and erratum of every equation.
+    """
+    from projservo_cli.equations import REGISTER
+
+    def words() -> Iterator[str]:
+        for entry in REGISTER:
+            yield wrapped(f"({entry.number}) {entry.title}")
+            yield from (f"    {function}" for function in entry.functions)
+            yield from (f"    tested by {test}" for test in entry.tests)
+            if entry.erratum:
+                yield wrapped(f"erratum: {entry.erratum}", "    ")
+
+    console.tell({"equations": [dataclasses.asdict(entry) for entry in REGISTER]}, words())

@@ -1,0 +1,187 @@
+"""A machine and how to begin on it: ``init``, ``schema``, ``doctor`` and ``bench``."""
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from projservo_cli.cli import options as option
+from projservo_cli.cli.group import FAILED, main
+from projservo_cli.cli.output import Console, wrapped
+from projservo_cli.version import __version__
+
+_STARTER, _SCHEMA = "projservo.yaml", "projservo.schema.json"  # as the first line of the starter names it
+_MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu", "cpu_count", "date", "jit")
+
+
+@main.command(epilog="Example: projservo init mine.yaml")
+@click.argument("file", default=_STARTER, type=option.PATH)
+@option.force("Replace the file if there is one.")
+@option.told
+def init(console: Console, *, file: Path, force: bool) -> None:
+    """Write a commented configuration to start from.
+
+    Writes a configuration that runs as it is, with a comment on every key, and beside it the schema by which
+    editors complete and check it.
+    """
+    from projservo_cli.config.schema import json_schema, schema_text, starter
+    from projservo_cli.records import InputError
+
+    path = file / _STARTER if file.is_dir() else file
+    if path.suffix not in (".yaml", ".yml"):
+        raise InputError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
+    option.require_new(path, force=force)
+    described = path.with_name(_SCHEMA)
+    _write(path, starter())
+    _write(described, schema_text(json_schema()))
+    words = (
+        f"init: {path}, with {described} for editors",
+        f"next: projservo calibrate plan servo report -c {path}",
+    )
+    console.tell({"configuration": path.resolve(), "schema": described.resolve()}, words)
+
+
+@main.command("schema", epilog="Example: projservo schema -o schema.json")
+@click.argument("what", required=False, metavar="[sweep]", type=click.Choice(["sweep"]))
+@option.output("FILE", "File to write. Default: standard output.")
+@option.told
+def print_schema(console: Console, *, what: str | None, output: Path | None) -> None:
+    """Print the JSON Schema of the configuration.
+
+    Editors that speak YAML complete and check a configuration whose first line names the schema: #
+    yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.
+    """
+    from projservo_cli.config.schema import json_schema, schema_text, sweep_schema
+
+    schema = sweep_schema() if what else json_schema()
+    if output is None:
+        console.as_json = True
+        console.tell(schema, ())
+    else:
+        _write(output, schema_text(schema))
+
+
+def _write(path: Path, text: str) -> None:
+    from projservo_cli.files import replacing
+
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@main.command(epilog="Example: projservo doctor --json")
+@option.told
+def doctor(console: Console) -> int:
+    """Say what is installed and where things go.
+
+    Lists versions, extras, whether the kernels are compiled, and the folder of results. Exit code 1 when
+    something is missing that every run needs.
+    """
+    packages, extras = _requirements()
+    missing = [name for name, version in packages.items() if version is None]
+    folder = Path("results").absolute()
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    writable = there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    value: dict[str, Any] = {
+        "projservo": __version__,
+        "package": Path(__file__).resolve().parents[1],
+        "python": ".".join(map(str, sys.version_info[:3])),
+        "interpreter": sys.executable,
+        "processors": os.cpu_count(),
+        "packages": packages,
+        "missing": missing,
+        "extras": {name: sorted(lacking) for name, lacking in extras.items()},
+        "kernels": None if missing else _kernels(),
+        "results": {"folder": folder, "writable": writable},
+    }
+    console.tell(value, map(wrapped, _found(value)))
+    return FAILED if missing or not writable else 0
+
+
+def _requirements() -> tuple[dict[str, str | None], dict[str, list[str]]]:
+    """Versions of the packages every run needs, None where one is missing; and what each extra lacks."""
+    import importlib.metadata
+    import re
+
+    try:
+        needed = importlib.metadata.requires("projservo") or []
+    except importlib.metadata.PackageNotFoundError:  # run from sources that were never installed
+        needed = []
+    packages: dict[str, str | None] = {}
+    extras: dict[str, list[str]] = {}
+    for text in needed:
+        (name,) = re.findall(r"^[\w.-]+", text)
+        extra = re.search(r"extra\s*==\s*['\"]([\w.-]+)['\"]", text)
+        try:
+            version = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            version = None
+        if extra is None:
+            packages[name] = version
+        else:
+            extras.setdefault(extra[1], []).extend([name] if version is None else [])
+    return packages, extras
+
+
+def _kernels() -> dict[str, Any]:
+    from projservo_cli.geometry.jit import CACHE_FOLDER, COMPILED
+
+    count = 0 if CACHE_FOLDER is None else sum(1 for _ in CACHE_FOLDER.rglob("*.nbi"))
+    return {"jit": COMPILED, "cache": CACHE_FOLDER, "compiled": count}
+
+
+def _found(value: dict[str, Any]) -> Iterator[str]:
+    yield f"projservo {value['projservo']} in {value['package']}"
+    yield f"python {value['python']} at {value['interpreter']}, {value['processors']} processors"
+    versions = [f"{name} {version or 'MISSING'}" for name, version in value["packages"].items()]
+    yield f"packages: {', '.join(versions) or 'unknown: projservo is not installed, only run'}"
+    for name, lacking in value["extras"].items():
+        lacks = f"lacks {', '.join(lacking)}: pip install 'projservo[{name}]'"
+        yield f"extra {name}: {lacks if lacking else 'installed'}"
+    kernels, results = value["kernels"], value["results"]
+    if kernels is None:
+        told = "unknown, packages are missing"
+    elif not kernels["jit"]:
+        told = "not compiled at all: NUMBA_DISABLE_JIT is set"
+    elif kernels["cache"] is None:
+        told = "compiled anew in every run: no folder can be written; set PROJSERVO_CACHE_DIR"
+    elif not kernels["compiled"]:
+        told = f"to be compiled by the first run, once, into {kernels['cache']}"
+    else:
+        told = f"{kernels['compiled']} compiled, in {kernels['cache']}"
+    yield f"kernels: {told}"
+    yield f"results: {results['folder']}{'' if results['writable'] else ', which CANNOT be written to'}"
+
+
+@main.command(epilog="Example: projservo bench --json")
+@option.configuration("Configuration (YAML) with a simulated task. Default: paper.yaml.")
+@option.override
+@option.told
+def bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> None:
+    """Measure the speed of a control step and of a run.
+
+    Times a step of every law in 256 states of a noisy run, a call from Python and a traced run of 150 steps,
+    in turn with one numpy.linalg.svd of an 8x6 matrix.
+    """
+    from projservo_cli import provenance
+    from projservo_cli.cli.configuration import shipped
+    from projservo_cli.config import load_config
+    from projservo_cli.stages.bench import Case, measure
+
+    console.say("compiling kernels where they are not in the cache, then measuring: half a minute")
+    settings = load_config(config or shipped(), sets)
+    result = measure(Case(settings))
+    collected = provenance.collect(seed=settings.seed)
+    machine = {name: collected[name] for name in _MACHINE}
+    console.tell({**result, "machine": machine}, _timed(result, machine))
+
+
+def _timed(result: dict[str, Any], machine: dict[str, Any]) -> Iterator[str]:
+    yield f"{'':32}   least µs  median µs   quartiles µs      of one SVD"
+    for name, times in result["times_us"].items():
+        spread = f"{times['lower']:.2f} to {times['upper']:.2f}"
+        numbers = f"{times['least']:10.2f} {times['median']:10.2f}   {spread:16}"
+        yield f"{name:32} {numbers} {times['over_svd']:10.3f}"
+    yield "{cpu}, {system}, numpy {numpy}, numba {numba}".format_map(machine)
