@@ -174,7 +174,7 @@ def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -
     """What is to be done, by the configuration and what the run holds; refused where it must not be."""
     from projservo_cli.cli.configuration import resolve
     from projservo_cli.files import require_writable
-    from projservo_cli.stages.chain import steps_for
+    from projservo_cli.stages.steps import steps_for
 
     given = _law_names(options.get("laws", ()))
     config, stored = resolve(options)

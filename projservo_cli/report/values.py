@@ -10,6 +10,7 @@ from projservo_cli.records import Calibration
 from projservo_cli.store import Run
 
 PAGE_FILE, VIEW_FILE, ANIMATION_FILE = "report.html", "view.html", "animation.gif"
+CLAIMS_FILE = "claims.json"
 NEAREST = ("visibility", "border_px", "joints", "condition")  # smallest along the planned motion
 LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
 _COUNTS = ("merged_poses", "merged_markers")

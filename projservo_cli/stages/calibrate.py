@@ -18,8 +18,6 @@ from projservo_cli.stages.world import Truth, image_size_of, joints_of, referenc
 if TYPE_CHECKING:
     from projservo_cli.config import Config
 
-DEPENDS_ON = ("seed", "robot", "rig", "markers", "noise.calibration_px", "calibration", "data", "task.start")
-
 
 def trial_motions(config: "Config") -> FloatArray:
     """Joint readings (k, n) of the reference and of every single-joint trial, rad or m.

@@ -1,59 +1,15 @@
-"""What is up to date, what has to be made first, and making it.
+"""Making the results of stages, one after the other, each from those before it."""
 
-Every result carries a key: a hash of the configuration its stage depends on and of the key of the
-stage before it. Keys follow from the configuration alone, so what is to be done is known before
-anything is done.
-"""
-
-import hashlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from projservo_cli import provenance
-from projservo_cli.config import Config, digest, to_yaml
-from projservo_cli.records import InputError, names_of
+from projservo_cli.config import Config, to_yaml
 from projservo_cli.stages import Progress
+from projservo_cli.stages.steps import STAGES, Step
 from projservo_cli.stages.world import has_task
 from projservo_cli.store import SERVO, Result, Run, save
-
-STAGES = ("calibrate", "plan", "servo", "report")
-# Where a file lies does not matter, only what it says. Which laws are run, in which modes, and which of
-# them must converge, changes the run of none of them.
-NOT_HASHED: dict[str, tuple[str, ...]] = {
-    "calibrate": ("data.table", "calibration.init"),
-    "plan": ("data.table",),
-    "servo": ("data.table", "control.laws", "control.mode", "control.must_converge"),
-    "report": ("data.table",),
-}
-
-EXPECTED = {"table": "a table", "init": "JSON with screws, cameras and markers"}
-
-
-@dataclass(frozen=True)
-class Step:
-    """One result that is needed.
-
-    Attributes
-    ----------
-    stage : name of the stage.
-    law : name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty.
-    key : what the key of the result will be.
-    why : why it has to be made; empty where the stored one is up to date.
-    inputs : files read and their hashes.
-    """
-
-    stage: str
-    law: str
-    key: str
-    why: str
-    inputs: dict[str, str]
-
-    @property
-    def name(self) -> str:
-        """Name of the result in the run file."""
-        return f"{SERVO}{self.law}" if self.law else self.stage
 
 
 def stage_module(stage: str) -> Any:
@@ -73,108 +29,6 @@ def stage_module(stage: str) -> Any:
     from projservo_cli.stages import report
 
     return report
-
-
-def steps_for(
-    config: Config, run: Run, named: Sequence[str], *, laws: Sequence[str] = (), force: bool = False
-) -> list[Step]:
-    """All results that the named stages consist of or need, in the order of making.
-
-    Parameters
-    ----------
-    config : Config
-    run : Run
-        What is stored so far; possibly nothing.
-    named : sequence of str
-        Stages the user asked for.
-    laws : sequence of str
-        Laws instead of ``control.laws``.
-    force : bool
-        Make the named stages even where they are up to date.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be read, a law has none of the modes of ``control.mode``, or a recorded
-        calibration would be replaced by a simulated one without ``force``.
-    """
-    last = max(named, key=STAGES.index)
-    stages = STAGES[: STAGES.index(last) + 1]
-    if not has_task(config) and set(named) <= {"calibrate", "report"}:
-        stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
-    steps: list[Step] = []
-    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, stages):
-        step = Step(stage, law, key, "", inputs)
-        remade = any(before.why for before in steps if before.stage != stage)
-        steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
-    if steps[0].why and not force:
-        _keep_recorded(config, run)
-    return steps
-
-
-def _keys(
-    config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
-) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, run, key and input hashes of every result of the stages, each key made from those before."""
-    inputs = _file_hashes(config, run)
-    before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
-    for stage in stages:
-        keys = []
-        for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
-            extra = {"before": before, "law": law}
-            keys.append(digest(config, _depends_on(stage), without=NOT_HASHED[stage], extra=extra))
-            yield stage, law, keys[-1], inputs if stage == "calibrate" else {}
-        before = [*keys]
-
-
-def _depends_on(stage: str) -> tuple[str, ...]:
-    keys: tuple[str, ...] = stage_module(stage).DEPENDS_ON
-    return keys
-
-
-def _file_hashes(config: Config, run: Run) -> dict[str, str]:
-    """Hashes of the files that are read; the stored one where that very file is gone since."""
-    files = {"table": config.data.table if config.data is not None else None, "init": config.calibration.init}
-    stored = run.results["calibrate"].inputs if "calibrate" in run.results else {}
-    found: dict[str, str] = {}
-    for name, given in files.items():
-        if given is None:
-            continue
-        path, digested = Path(given), f"{name}_sha256"
-        if not path.exists() and stored.get(name) == given:
-            found |= {name: given, digested: stored[digested]}
-            continue
-        try:
-            found |= {name: given, digested: hashlib.sha256(path.read_bytes()).hexdigest()}
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be read: {error.strerror or error}; expected {EXPECTED[name]}"
-            ) from error
-    return found
-
-
-def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
-    stored = run.results.get(step.name)
-    if stored is None:
-        return "none yet"
-    if stored.key != step.key:
-        return "outdated"
-    if step.law and stored.records[""].verdict == "failed":
-        return "failed before"
-    if remade:
-        return "what it is made from is made anew"
-    if step.stage == "report" and stage_module("report").missing(run):
-        return "a file of it is missing"
-    return "asked for by --force" if forced else ""
-
-
-def _keep_recorded(config: Config, run: Run) -> None:
-    if config.recorded or "calibrate" not in run.results or run.calibration.source != "recorded":
-        return
-    raise InputError(
-        f"{run.path}: its calibration comes from recorded data and would be replaced by a simulated one; "
-        "choose another folder with -o, give the table with --data, or use --force"
-    )
 
 
 def make(

@@ -15,7 +15,7 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import joint_motion, span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
-from projservo_cli.stages.scenario import Scenario, Sight, measured_task, scenario_of, sight_of
+from projservo_cli.stages.scenario import Scenario, Sense, Sight, measured_task, scenario_of, sight_of
 from projservo_cli.stages.world import center_index, face_numbers, image_size_of, joints_of
 from projservo_cli.task.face import Task, center_of, face_plane, require_found
 from projservo_cli.task.margins import (
@@ -310,22 +310,6 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         )
 
 
-DEPENDS_ON = (
-    "seed",
-    "robot",
-    "rig",
-    "markers",
-    "noise.servo_px",
-    "noise.shown_frames",
-    "task",
-    "trajectory",
-    "control.observation",
-    "plant.use",
-    "control.joint_speed_limit_deg_s",
-    "control.prismatic_speed_limit_m_s",
-)
-
-
 def run(config: "Config", calibration: Calibration) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
@@ -486,23 +470,6 @@ def _in_sight(profile: str, found: Along) -> tuple[bool, str]:
         f"the profile {profile} turns the face away from a camera ({', '.join(lost)}): "
         "choose another trajectory.profile"
     )
-
-
-class Sense(NamedTuple):
-    """All of a plan that a law needs that plans anew in each step: which way to turn.
-
-    Attributes
-    ----------
-    motions : (2, n) joint motions of the rotations r and p in the sense they are planned.
-    task : measured as the plan is; None where the whole plan was made.
-    """
-
-    motions: FloatArray
-    task: Task | None
-
-    def rotation_sense(self) -> FloatArray:
-        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
-        return self.motions
 
 
 def rotation_sense(scenario: Scenario) -> Sense:

@@ -21,7 +21,7 @@ from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.drift import drift_rows, drift_tables
 from projservo_cli.report.material import DIRECT, Fit, Material, Studies
 from projservo_cli.report.page import write_page
-from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
+from projservo_cli.report.values import ANIMATION_FILE, CLAIMS_FILE, VIEW_FILE
 from projservo_cli.report.view import motion, plotly, write_view
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import plant_of
@@ -44,9 +44,7 @@ if TYPE_CHECKING:
     from projservo_cli.store import Run
 
 # The page shows which laws had to converge, which changes the run of none of them.
-DEPENDS_ON = ("report", "control.must_converge")
 FOLDER = "figures"
-CLAIMS_FILE = "claims.json"
 _NUMBERS = "csv"  # what is drawn, beside each figure
 _Eq22 = tuple[FloatArray, FloatArray]
 
@@ -83,12 +81,6 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     made = Result("", run.configuration, provenance.collect(seed=config.seed), {}, {"": report})
     write_page(replace(run, results={**run.results, "report": made}))
     return report
-
-
-def missing(run: "Run") -> bool:
-    """Whether a file that the stored report wrote is not there any more."""
-    figures = run.results["report"].records[""].figures
-    return not all((run.path.parent / name).is_file() for name in (*figures, CLAIMS_FILE, PAGE_FILE))
 
 
 def material_of(

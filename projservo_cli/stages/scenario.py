@@ -222,6 +222,23 @@ def true_ends(truth: Truth | None, goal_pose: FloatArray | None) -> Ends:
     return Ends(base_tool, goal_pose, goal_pose @ np.linalg.solve(base_tool, middle))
 
 
+class Sense(NamedTuple):
+    """All of a plan that a law needs that plans anew in each step: which way to turn.
+
+    Attributes
+    ----------
+    motions : (2, n) joint motions of the rotations r and p in the sense they are planned.
+    task : measured as the plan is; None where the whole plan was made.
+    """
+
+    motions: FloatArray
+    task: Task | None
+
+    def rotation_sense(self) -> FloatArray:
+        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
+        return self.motions
+
+
 class Sight(NamedTuple):
     """A body to measure with: its calibration, and its pixels (2, b, 2) at the start and at the goal."""
 

@@ -33,28 +33,12 @@ from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant
 from projservo_cli.robots.yours import DrivenRobot, at_rest_after
 from projservo_cli.stages import own_robot
-from projservo_cli.stages.plan import Sense
-from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.scenario import Scenario, Sense, scenario_of
 from projservo_cli.stages.trace import Run, trace_of
 from projservo_cli.task.following import followed
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
-
-DEPENDS_ON = (
-    "seed",
-    "robot",
-    "rig",
-    "markers",
-    "noise.servo_px",
-    "noise.shown_frames",
-    "task",
-    "trajectory.delta",
-    "control",
-    "plant",
-    "disturbance",
-    "stop",
-)
 
 
 def run(

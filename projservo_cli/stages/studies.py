@@ -19,8 +19,8 @@ from projservo_cli.geometry.displacement import (
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.plan import Profile, Sense, Shown, plan_task
-from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
+from projservo_cli.stages.plan import Profile, Shown, plan_task
+from projservo_cli.stages.scenario import Scenario, Sense, idealized, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.trace import trace_of
 from projservo_cli.stages.world import Truth, truth_of

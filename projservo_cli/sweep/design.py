@@ -17,8 +17,7 @@ from projservo_cli.config.models import Goal, Task
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.records import FloatArray, InputError, IntArray, law_and_mode, names_of
-from projservo_cli.stages.calibrate import DEPENDS_ON as CALIBRATION_DEPENDS_ON
-from projservo_cli.stages.chain import NOT_HASHED
+from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
 
 
 def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
@@ -233,7 +232,7 @@ class Design:
     def calibration_key(self, cell: int, calibration: int) -> str:
         """Hash of all a calibration depends on; cells that share it share the calibration."""
         config = self.calibrated(cell, calibration).model_copy(update={"seed": 0})
-        return digest(config, CALIBRATION_DEPENDS_ON, without=NOT_HASHED["calibrate"])
+        return digest(config, DEPENDS_ON["calibrate"], without=NOT_HASHED["calibrate"])
 
     def calibrations(self) -> Iterator[tuple[str, Config]]:
         """Key of each calibration that is needed, each once, and a configuration that needs it."""
@@ -334,4 +333,4 @@ def name_of_run(config: Config) -> str:
 
 def _for_calibration(key: str) -> bool:
     """Whether the calibration depends on a key of the configuration."""
-    return any(f"{key}.".startswith(f"{part}.") for part in CALIBRATION_DEPENDS_ON)
+    return any(f"{key}.".startswith(f"{part}.") for part in DEPENDS_ON["calibrate"])

@@ -16,7 +16,7 @@ from projservo_cli import provenance
 from projservo_cli.config import Config
 from projservo_cli.files import replacing
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.chain import steps_for
+from projservo_cli.stages.steps import steps_for
 from projservo_cli.store import TABLE, Result, Run, SweepTable, assemble, load
 from projservo_cli.sweep.design import Design, from_recipe
 from projservo_cli.sweep.engine import versions

@@ -28,7 +28,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.truth import METRIC_A_INF
 from projservo_cli.stages import calibrate
-from projservo_cli.stages.chain import steps_for
+from projservo_cli.stages.steps import steps_for
 from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.store import Result, Run, load, save
 from projservo_cli.sweep.design import TASKS, Design, TaskSet

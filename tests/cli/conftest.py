@@ -1,6 +1,5 @@
 """The command line called in this process, with stages that only pretend to work."""
 
-import importlib
 import json
 import shutil
 from dataclasses import dataclass, field
@@ -12,7 +11,7 @@ import pytest
 
 from projservo_cli import calibration, cli, files
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed, law_and_mode
-from projservo_cli.stages import chain
+from projservo_cli.stages import chain, steps
 from projservo_cli.tables import read_table
 from tests.fake_records import fake
 
@@ -49,8 +48,7 @@ class Stages:
     gone: bool = False
 
     def module(self, stage: str) -> Any:
-        depends = importlib.import_module(f"projservo_cli.stages.{stage}").DEPENDS_ON
-        return SimpleNamespace(DEPENDS_ON=depends, run=getattr(self, stage), missing=lambda run: self.gone)
+        return SimpleNamespace(run=getattr(self, stage))
 
     def _make(self, name: str) -> None:
         if name in self.fails:
@@ -114,6 +112,7 @@ def pretend(patch, folder):
     """Pretended stages, in a folder with a configuration and a table."""
     pretended = Stages()
     patch.setattr(chain, "stage_module", pretended.module)
+    patch.setattr(steps, "missing", lambda run: pretended.gone)
     patch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
     patch.chdir(folder)
     (folder / "tiny.yaml").write_text(CONFIGURATION, encoding="utf-8")

@@ -16,8 +16,7 @@ from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import REPLAN, law_and_mode
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.plan import Sense
-from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.stages.scenario import Sense, scenario_of
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 from tests.known import driven

@@ -10,8 +10,7 @@ from projservo_cli.records import LAWS, METRIC_LAWS, Calibration, following_mode
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
 from projservo_cli.stages import calibrate, studies
-from projservo_cli.stages.plan import Sense
-from projservo_cli.stages.scenario import idealized
+from projservo_cli.stages.scenario import Sense, idealized
 from tests.fake_records import fake
 from tests.known import configured, driven, known_scenario, planned
 

@@ -11,6 +11,7 @@ from projservo_cli.report import style
 from projservo_cli.report.figures import calibration
 from projservo_cli.report.material import Fit
 from projservo_cli.stages import calibrate, chain
+from projservo_cli.stages.steps import steps_for
 from projservo_cli.store import Result, Run
 from tests.fake_records import fake
 from tests.figures.cases import SPECS, case
@@ -210,9 +211,9 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
     config = load_config(None, [f"data.table={table}", "report.formats=[svg]"])
     material = case()[2]
     run = Run(tmp_path / "run.h5")
-    steps = chain.steps_for(config, run, ["report"])
+    steps = steps_for(config, run, ["report"])
     assert [step.stage for step in steps] == ["calibrate", "report"]
-    assert "plan" in [step.stage for step in chain.steps_for(config, run, ["plan", "report"])]
+    assert "plan" in [step.stage for step in steps_for(config, run, ["plan", "report"])]
     records = {"calibration": material.calibration, "observation": material.observation}
     run = dataclasses.replace(run, results={"calibrate": Result(steps[0].key, "", {}, {}, records)})
     made, _ = chain.make(steps[1], config, run, (), lambda *_: None)

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from projservo_cli.stages.plan import Sense
+from projservo_cli.stages.scenario import Sense
 from tests.known import configured, driven, known_scenario, planned, shown
 
 

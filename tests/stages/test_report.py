@@ -9,7 +9,7 @@ from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.claims import claims_of, composition_claim
 from projservo_cli.report.figures.drift import drift_tables
 from projservo_cli.report.material import DIRECT
-from projservo_cli.stages import chain, report, studies
+from projservo_cli.stages import report, steps, studies
 from projservo_cli.store import Result, Run, load, save
 from tests.figures.cases import GAINS, PERIODS_S, SHORT, SPECS, case
 from tests.known import configured
@@ -188,8 +188,8 @@ def test_a_failed_comparison_of_eq_22_is_named(monkeypatch):
 
 def test_which_laws_must_converge_outdates_the_page_that_says_so_and_no_run(tmp_path):
     def keys(*overrides):
-        steps = chain.steps_for(configured("paper", *overrides), Run(tmp_path / "run.h5"), ["report"])
-        return {step.name: step.key for step in steps}
+        found = steps.steps_for(configured("paper", *overrides), Run(tmp_path / "run.h5"), ["report"])
+        return {step.name: step.key for step in found}
 
     before, after = keys(), keys("control.must_converge=[exact]")
     assert {name for name in before if before[name] != after[name]} == {"report"}

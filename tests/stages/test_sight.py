@@ -14,8 +14,7 @@ from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.plan import Sense
-from projservo_cli.stages.scenario import StartAndGoal, Watched, scenario_of
+from projservo_cli.stages.scenario import Sense, StartAndGoal, Watched, scenario_of
 from tests.known import driven
 from tests.stages.cases import Case, case
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from projservo_cli import cli
-from projservo_cli.stages.chain import STAGES
+from projservo_cli.stages.steps import STAGES
 
 TRACEBACK = "Traceback (most recent call last)"
 
