@@ -19,6 +19,8 @@ from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.records import FloatArray, InputError, IntArray, law_and_mode, names_of
 from projservo_cli.stages.calibrate import DEPENDS_ON as CALIBRATION_DEPENDS_ON
 from projservo_cli.stages.chain import NOT_HASHED
+from projservo_cli.stages.world import truth_of
+from projservo_cli.sweep.tasks import STRATA, random_tasks
 
 
 def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
@@ -90,13 +92,6 @@ class Axis(NamedTuple):
     name: str
     keys: tuple[str, ...]
     values: tuple[Any, ...]
-
-
-class TaskSet(NamedTuple):
-    """Random tasks of a base: joints (k, n) at start and goal, rad or m."""
-
-    q_start: FloatArray
-    q_goal: FloatArray
 
 
 class Numbers(NamedTuple):
@@ -244,13 +239,24 @@ class Design:
                 seen.add(key)
                 yield key, self.calibrated(*place)
 
-    def config(self, run: int, tasks: Mapping[int, TaskSet]) -> Config:
-        """Configuration of a run.
+    @lru_cache(maxsize=64)  # noqa: B019 - a process has one design
+    def tasks(self, base: int) -> tuple[FloatArray, FloatArray]:
+        """Random tasks of a base: joints (k, n) at start and goal, rad or m, a stratum after the other."""
+        config = self.cell(base * (self.cells // len(self.bases)))
+        assert config.task is not None
+        assert config.robot is not None
+        assert self.sweep.tasks is not None
+        count = self.sweep.tasks.random
+        q_front = np.array(config.task.start.values(config.robot.joint_types))
+        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
+        tasks = random_tasks(truth_of(config), q_front, count, rng)
+        quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]  # they come sorted by stratum
+        first = np.cumsum([0, *quota[:-1]])
+        order = [first[i] + k for k in range(max(quota)) for i in range(STRATA) if k < quota[i]]
+        return tasks.q_start[order], tasks.q_goal[order]
 
-        Parameters
-        ----------
-        run : its number.
-        tasks : random tasks of each base, by number, where the sweep has any.
+    def config(self, run: int) -> Config:
+        """Configuration of a run.
 
         Raises
         ------
@@ -267,7 +273,7 @@ class Design:
             assert config.task is not None
             start, goal = (
                 JointVector(joints=tuple(q[at.task].tolist()), unit="rad")
-                for q in tasks[self.base_of(at.cell)]
+                for q in self.tasks(self.base_of(at.cell))
             )
             offset = config.task.start_offset  # stays
             update["task"] = Task(start=start, start_offset=offset, goal=Goal(joints=goal))

@@ -15,7 +15,7 @@ from projservo_cli.records import Plan, WorkFailed
 from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.preparation import random_tasks
+from projservo_cli.sweep.tasks import random_tasks
 from tests.conftest import ROOT
 from tests.planning.oracle import TrueTask
 

@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.records import InputError
 from projservo_cli.stages.plan import Profile, demands_of, plan_task
-from projservo_cli.sweep.preparation import STRATA, random_tasks
+from projservo_cli.sweep.tasks import STRATA, random_tasks
 from projservo_cli.task.planning import turning_sense
 from tests.planning.cases import constrained, reaching_of
 from tests.planning.oracle import TrueTask

@@ -1,37 +1,15 @@
-"""What many runs of a sweep share and what takes long to make: random tasks and calibrations."""
+"""Random reaching tasks within sight of both cameras, as many in each sixth of half a turn."""
 
-import dataclasses
 import math
-import zipfile
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
-from projservo_cli import provenance
 from projservo_cli.calibration.prediction import displacements, image_points, moved_points
-from projservo_cli.config import Config, to_yaml
-from projservo_cli.files import replacing
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.records import (
-    PRISMATIC,
-    Calibration,
-    CrossValidation,
-    FloatArray,
-    InputError,
-    IntArray,
-    Observation,
-    WorkFailed,
-)
+from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.truth import METRIC_A_INF
-from projservo_cli.stages import calibrate
-from projservo_cli.stages.chain import steps_for
-from projservo_cli.stages.world import Truth, truth_of
-from projservo_cli.store import Result, Run, load, save
-from projservo_cli.sweep.design import TASKS, Design, TaskSet
+from projservo_cli.stages.world import Truth
 
 RANGE = 0.9
 LEAST_COSINE = math.cos(math.radians(75.0))
@@ -149,112 +127,3 @@ def _accepted(truth: Truth, poses: FloatArray, front: float, rejected: dict[str,
     rejected["turned away"] += int((before & ~turned).sum())
     rejected["outside an image"] += int((before & turned & ~inside).sum())
     return np.flatnonzero(before & turned & inside)
-
-
-REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
-
-
-class Calibrated(NamedTuple):
-    """What became of the calibration of a key: records, or why there are none."""
-
-    key: str
-    config: Config
-    records: tuple[Observation, Calibration, CrossValidation | None] | None
-    reason: str = ""
-
-
-def calibrate_one(wanted: tuple[str, Config]) -> Calibrated:
-    """Make the calibration of a key, on one thread like all that must be the same to the bit."""
-    with threadpool_limits(1):
-        try:
-            return Calibrated(*wanted, calibrate.run(wanted[1]))
-        except WorkFailed as error:
-            return Calibrated(*wanted, None, str(error))
-
-
-def tasks_of(design: Design, folder: Path, say: Callable[[str], None]) -> dict[int, TaskSet]:
-    """Random tasks of every base, drawn once and kept in files.
-
-    Raises
-    ------
-    InputError, WorkFailed
-        If there are no such tasks.
-    """
-    if design.sweep.tasks is None:
-        return {}
-    found = {}
-    for number, (name, _) in enumerate(design.bases):
-        path = folder / f"tasks_{name}.npz"
-        if not path.exists():
-            say(f"drawing {design.sweep.tasks.random} random tasks of {name}")
-            tasks = drawn_tasks(design, number, design.sweep.tasks.random)
-            with replacing(path) as temporary, open(temporary, "wb") as file:
-                np.savez(file, **tasks._asdict())
-        found[number] = read_tasks(path)
-    return found
-
-
-def drawn_tasks(design: Design, base: int, count: int) -> TaskSet:
-    """Random tasks of a base, one of each stratum of their angles after the other."""
-    config = design.cell(base * (design.cells // len(design.bases)))
-    assert config.task is not None
-    assert config.robot is not None
-    q_front = np.array(config.task.start.values(config.robot.joint_types))
-    rng = np.random.default_rng(np.random.SeedSequence(design.sweep.seed, spawn_key=(TASKS,)))
-    tasks = random_tasks(truth_of(config), q_front, count, rng)
-    quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]  # they come sorted by stratum
-    first = np.cumsum([0, *quota[:-1]])
-    order = [first[i] + k for k in range(max(quota)) for i in range(STRATA) if k < quota[i]]
-    return TaskSet(tasks.q_start[order], tasks.q_goal[order])
-
-
-def read_tasks(path: Path) -> TaskSet:
-    """Random tasks of a file.
-
-    Raises
-    ------
-    InputError
-        If it is damaged.
-    """
-    try:
-        with np.load(path) as file:
-            return TaskSet(file["q_start"], file["q_goal"])
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path}: damaged; delete it and run the sweep again") from error
-
-
-def missing_calibrations(design: Design, folder: Path) -> Iterator[tuple[str, Config]]:
-    """Calibrations that are needed and not yet stored: their keys, and configurations that need them."""
-    for key, config in design.calibrations():
-        path = calibration_path(folder, key)
-        if not path.exists() and not path.with_suffix(REFUSED).exists():
-            yield key, config
-
-
-def calibration_path(folder: Path, key: str) -> Path:
-    """The run file that holds a calibration."""
-    return folder / "calibrations" / f"{key[:20]}.h5"
-
-
-def keep_calibration(folder: Path, made: Calibrated) -> None:
-    """Store a calibration as a run file of its own, or why there is none."""
-    path = calibration_path(folder, made.key)
-    if made.records is None:
-        with replacing(path.with_suffix(REFUSED)) as temporary:
-            temporary.write_text(made.reason + "\n", encoding="utf-8")
-        return
-    names = ("observation", "calibration", "cross_validation")
-    records = {name: one for name, one in zip(names, made.records, strict=True) if one is not None}
-    (step,) = steps_for(made.config, Run(path), ["calibrate"])
-    origin = provenance.collect(seed=made.config.seed)
-    text = to_yaml(made.config)
-    save(Run(path, text, {"calibrate": Result(step.key, text, origin, step.inputs, records)}))
-
-
-def calibrations_of(design: Design, folder: Path) -> dict[str, Calibration | None]:
-    """Calibrations by their key, None where one was refused; without covariance, which no run needs."""
-    found: dict[str, Calibration | None] = {}
-    for key, _ in design.calibrations():
-        path, none = calibration_path(folder, key), np.zeros((0, 0))
-        found[key] = dataclasses.replace(load(path).calibration, covariance=none) if path.exists() else None
-    return found
