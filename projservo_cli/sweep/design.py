@@ -24,13 +24,7 @@ from projservo_cli.sweep.tasks import STRATA, random_tasks
 
 
 def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
-    """A configuration with other values.
-
-    Raises
-    ------
-    InputError
-        If a value is not one that its key takes; ``what`` it is of.
-    """
+    """A configuration with other values, or an InputError that calls them by what they are of."""
     resolved = config.model_dump(mode="json")
     changes = [_override(what, key, value) for key, value in values.items()]
     try:
@@ -152,13 +146,7 @@ class Design:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def numbers(self, run: int) -> Numbers:
-        """Where a run stands.
-
-        Raises
-        ------
-        InputError
-            If there is no such run.
-        """
+        """Where a run stands; an InputError where there is none."""
         if not 0 <= run < self.total:
             raise InputError(f"run {run}: the sweep {self.sweep.name} has runs 0 to {self.total - 1}")
         return Numbers(run, *(int(number[0]) for number in self.placed(np.array([run])).values()))
@@ -185,13 +173,7 @@ class Design:
 
     @lru_cache(maxsize=1024)  # noqa: B019 - a process has one design
     def cell(self, cell: int) -> Config:
-        """Configuration of a cell before anything is drawn.
-
-        Raises
-        ------
-        InputError
-            If a value of the grid is not one that its key takes, or a simulated task is missing.
-        """
+        """Configuration of a cell before anything is drawn."""
         name, text = self.bases[self.base_of(cell)]
         values = self.values(cell)
         changes = [
@@ -256,13 +238,7 @@ class Design:
         return tasks.q_start[order], tasks.q_goal[order]
 
     def config(self, run: int) -> Config:
-        """Configuration of a run.
-
-        Raises
-        ------
-        InputError
-            If a drawn value is not one that its key takes.
-        """
+        """Configuration of a run."""
         at = self.numbers(run)
         config = self.calibrated(at.cell, at.calibration)
         drawn = self._drawn(VALUES, at.draw)
@@ -296,13 +272,7 @@ class Design:
 
 
 def read_design(sweep: SweepConfig) -> Design:
-    """Read the bases of a sweep and check every cell.
-
-    Raises
-    ------
-    InputError
-        If a base cannot be read, or a cell is no configuration of a simulated task.
-    """
+    """Read the bases of a sweep and check every cell, before any run is made."""
     changes = [_override("set", key, value) for key, value in sweep.set.items()]
     bases = tuple((Path(base).stem, to_yaml(load_config(base, changes))) for base in sweep.base)
     design = Design(sweep, bases)
@@ -322,13 +292,7 @@ def from_recipe(recipe: Mapping[str, Any]) -> Design:
 
 
 def name_of_run(config: Config) -> str:
-    """Name of the only run of a configuration: its law, with the mode where it follows the plan.
-
-    Raises
-    ------
-    InputError
-        If it has several, or none.
-    """
+    """Name of the only run of a configuration: its law, with the mode where it follows the plan."""
     names = names_of(config.control.laws, config.control.mode)
     if len(names) != 1:
         raise InputError(

@@ -93,7 +93,7 @@ def _make(
         keys = {design.calibration_key(*pair) for pair in pairs}
         return Part(design, first, last, {key: calibrations[key] for key in keys})
 
-    threads = shares_settings(design)
+    threads = _shares_settings(design)
     chunk = status.chunk or design.sweep.chunk
     if not chunk:
         chunk = min(SHARED if threads else OWN, math.ceil(design.total / (PARTS * engine.workers)))
@@ -111,7 +111,7 @@ def _make(
             progress("runs", done, left)
 
 
-def shares_settings(design: Design) -> bool:
+def _shares_settings(design: Design) -> bool:
     """Whether all runs are compiled ones, of which many differ in nothing but their images."""
     tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
     settings = math.lcm(design.sweep.calibrations, tasks)

@@ -8,7 +8,7 @@ when it is complete they are removed. Calibrations stay, to make any run anew.
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,20 +27,12 @@ from projservo_cli.sweep.runs import columns_of
 REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
 
 
-@dataclass(frozen=True)
-class Status:
-    """How far a sweep is.
-
-    Attributes
-    ----------
-    done, total : runs that are stored, and in all.
-    chunk : runs of a part; 0 before it began.
-    complete : whether nothing is left to do: all runs are in the table, and the parts are removed.
-    """
+class Status(NamedTuple):
+    """How far a sweep is: runs that are stored, and in all; ``complete`` when its parts are gone too."""
 
     done: int
     total: int
-    chunk: int
+    chunk: int  # runs of a part; 0 before it began
     complete: bool = False
 
 
@@ -128,13 +120,7 @@ class Folder:
         return found
 
     def design(self) -> Design:
-        """The design of the sweep that the folder holds.
-
-        Raises
-        ------
-        InputError
-            If there is no sweep.
-        """
+        """The design of the sweep that the folder holds."""
         return from_recipe(self._read()["recipe"])
 
     def begin(self, design: Design, chunk: int) -> None:

@@ -36,16 +36,6 @@ class RandomTasks:
     drawn: int
     rejected: dict[str, int]
 
-    def words(self) -> str:
-        """Rejection rate and reasons."""
-        vectors = {reason: count for reason, count in self.rejected.items() if reason != "stratum full"}
-        rate = sum(vectors.values()) / self.drawn
-        reasons = ", ".join(f"{reason} {count / self.drawn:.1%}" for reason, count in vectors.items())
-        return (
-            f"{len(self.angle)} tasks from {self.drawn} joint vectors, {rate:.2%} of them rejected "
-            f"({reasons}); {self.rejected['stratum full']} pairs rejected as their stratum was full"
-        )
-
 
 def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator) -> RandomTasks:
     """Draw tasks.
@@ -56,13 +46,6 @@ def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.G
     q_front : (n,) joints at which the cameras see the front of the face, rad or m.
     count : tasks wanted.
     rng : seeded.
-
-    Raises
-    ------
-    InputError
-        If a joint has no limits to draw within.
-    WorkFailed
-        If too few joint vectors show the face to both cameras.
     """
     robot = truth.robot
     middle, half = 0.5 * (robot.lower + robot.upper), 0.5 * RANGE * (robot.upper - robot.lower)

@@ -160,11 +160,10 @@ def test_the_sense_of_the_turn_is_the_one_a_grid_search_finds(arm):
 @pytest.mark.parametrize("arm", ["paper", "ur5"])
 def test_random_tasks_stay_in_sight_wherever_a_grid_search_finds_a_way(arm):
     """A small part of ``python -m tests.planning.study ARM 500``."""
-    found, tasks = study(arm, 12, seed=7)
+    found, _ = study(arm, 12, seed=7)
     assert [o for o in found.missed if not o.near] == []
     assert sum(o.oracle for o in found.outcomes) >= 10
     assert any(o.feasible for o in found.outcomes)
-    assert "rejected" in tasks.words()
 
 
 def test_random_tasks_are_what_they_say():
