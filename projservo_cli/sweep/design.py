@@ -18,16 +18,12 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.records import FloatArray, InputError, IntArray, law_and_mode, names_of
 from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
+from projservo_cli.stages.world import truth_of
+from projservo_cli.sweep.tasks import STRATA, random_tasks
 
 
 def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
-    """A configuration with other values.
-
-    Raises
-    ------
-    InputError
-        If a value is not one that its key takes; ``what`` it is of.
-    """
+    """A configuration with other values, or an InputError that calls them by what they are of."""
     resolved = config.model_dump(mode="json")
     changes = [_override(what, key, value) for key, value in values.items()]
     try:
@@ -91,13 +87,6 @@ class Axis(NamedTuple):
     values: tuple[Any, ...]
 
 
-class TaskSet(NamedTuple):
-    """Random tasks of a base: joints (k, n) at start and goal, rad or m."""
-
-    q_start: FloatArray
-    q_goal: FloatArray
-
-
 class Numbers(NamedTuple):
     """Where run number ``run`` stands: its cell, its number in the cell, and those of what it shares."""
 
@@ -156,13 +145,7 @@ class Design:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def numbers(self, run: int) -> Numbers:
-        """Where a run stands.
-
-        Raises
-        ------
-        InputError
-            If there is no such run.
-        """
+        """Where a run stands; an InputError where there is none."""
         if not 0 <= run < self.total:
             raise InputError(f"run {run}: the sweep {self.sweep.name} has runs 0 to {self.total - 1}")
         return Numbers(run, *(int(number[0]) for number in self.placed(np.array([run])).values()))
@@ -189,13 +172,7 @@ class Design:
 
     @lru_cache(maxsize=1024)  # noqa: B019 - a process has one design
     def cell(self, cell: int) -> Config:
-        """Configuration of a cell before anything is drawn.
-
-        Raises
-        ------
-        InputError
-            If a value of the grid is not one that its key takes, or a simulated task is missing.
-        """
+        """Configuration of a cell before anything is drawn."""
         name, text = self.bases[self.base_of(cell)]
         values = self.values(cell)
         changes = [
@@ -243,19 +220,24 @@ class Design:
                 seen.add(key)
                 yield key, self.calibrated(*place)
 
-    def config(self, run: int, tasks: Mapping[int, TaskSet]) -> Config:
-        """Configuration of a run.
+    @lru_cache(maxsize=64)  # noqa: B019 - a process has one design
+    def tasks(self, base: int) -> tuple[FloatArray, FloatArray]:
+        """Random tasks of a base: joints (k, n) at start and goal, rad or m, a stratum after the other."""
+        config = self.cell(base * (self.cells // len(self.bases)))
+        assert config.task is not None
+        assert config.robot is not None
+        assert self.sweep.tasks is not None
+        count = self.sweep.tasks.random
+        q_front = np.array(config.task.start.values(config.robot.joint_types))
+        rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
+        tasks = random_tasks(truth_of(config), q_front, count, rng)
+        quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]  # they come sorted by stratum
+        first = np.cumsum([0, *quota[:-1]])
+        order = [first[i] + k for k in range(max(quota)) for i in range(STRATA) if k < quota[i]]
+        return tasks.q_start[order], tasks.q_goal[order]
 
-        Parameters
-        ----------
-        run : its number.
-        tasks : random tasks of each base, by number, where the sweep has any.
-
-        Raises
-        ------
-        InputError
-            If a drawn value is not one that its key takes.
-        """
+    def config(self, run: int) -> Config:
+        """Configuration of a run."""
         at = self.numbers(run)
         config = self.calibrated(at.cell, at.calibration)
         drawn = self._drawn(VALUES, at.draw)
@@ -266,7 +248,7 @@ class Design:
             assert config.task is not None
             start, goal = (
                 JointVector(joints=tuple(q[at.task].tolist()), unit="rad")
-                for q in tasks[self.base_of(at.cell)]
+                for q in self.tasks(self.base_of(at.cell))
             )
             offset = config.task.start_offset  # stays
             update["task"] = Task(start=start, start_offset=offset, goal=Goal(joints=goal))
@@ -289,13 +271,7 @@ class Design:
 
 
 def read_design(sweep: SweepConfig) -> Design:
-    """Read the bases of a sweep and check every cell.
-
-    Raises
-    ------
-    InputError
-        If a base cannot be read, or a cell is no configuration of a simulated task.
-    """
+    """Read the bases of a sweep and check every cell, before any run is made."""
     changes = [_override("set", key, value) for key, value in sweep.set.items()]
     bases = tuple((Path(base).stem, to_yaml(load_config(base, changes))) for base in sweep.base)
     design = Design(sweep, bases)
@@ -315,13 +291,7 @@ def from_recipe(recipe: Mapping[str, Any]) -> Design:
 
 
 def name_of_run(config: Config) -> str:
-    """Name of the only run of a configuration: its law, with the mode where it follows the plan.
-
-    Raises
-    ------
-    InputError
-        If it has several, or none.
-    """
+    """Name of the only run of a configuration: its law, with the mode where it follows the plan."""
     names = names_of(config.control.laws, config.control.mode)
     if len(names) != 1:
         raise InputError(

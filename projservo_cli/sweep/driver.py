@@ -2,20 +2,20 @@
 
 import math
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
-from functools import partial
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
+from projservo_cli.config import Config
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.stages import Progress
+from projservo_cli.records import WorkFailed
+from projservo_cli.stages import Progress, calibrate
 from projservo_cli.store import write_part
-from projservo_cli.sweep import preparation
-from projservo_cli.sweep.design import Design, TaskSet, name_of_run
+from projservo_cli.sweep.design import Design, name_of_run
 from projservo_cli.sweep.engine import Engine
-from projservo_cli.sweep.folder import Folder, Status
-from projservo_cli.sweep.preparation import calibrate_one
+from projservo_cli.sweep.folder import Calibrated, Folder, Status
 from projservo_cli.sweep.runs import Part, compiled_by, run_part
 
 PARTS = 4  # of each worker at least
@@ -75,24 +75,25 @@ def _make(
     progress: Progress,
     say: Callable[[str], None],
 ) -> None:
-    """Tasks, calibrations and parts that are missing."""
-    tasks = preparation.tasks_of(design, folder.path, say)
-    _compile_once(design, tasks, engine, say)
-    wanted = list(preparation.missing_calibrations(design, folder.path))
+    """Calibrations and parts that are missing."""
+    for base in range(len(design.bases) if design.sweep.tasks else 0):
+        design.tasks(base)  # or say that there are none, before anything else is made
+    _compile_once(design, engine, say)
+    wanted = folder.missing_calibrations(design)
     most = 1 + len(wanted) // CALIBRATIONS
     with closing(engine.completed(calibrate_one, wanted, most=most)) as calibrated:
         for count, one in enumerate(calibrated):
-            preparation.keep_calibration(folder.path, one)
+            folder.keep_calibration(one)
             progress("calibrations", count + 1, len(wanted))
-    calibrations = preparation.calibrations_of(design, folder.path)
+    calibrations = folder.calibrations(design)
 
     def part(first: int, last: int) -> Part:
         cell, draw = np.divmod(np.arange(first, last), design.sweep.runs)
         pairs = set(zip(cell.tolist(), (draw % design.sweep.calibrations).tolist(), strict=True))
         keys = {design.calibration_key(*pair) for pair in pairs}
-        return Part(design, first, last, {key: calibrations[key] for key in keys}, tasks)
+        return Part(design, first, last, {key: calibrations[key] for key in keys})
 
-    threads = shares_settings(design)
+    threads = _shares_settings(design)
     chunk = status.chunk or design.sweep.chunk
     if not chunk:
         chunk = min(SHARED if threads else OWN, math.ceil(design.total / (PARTS * engine.workers)))
@@ -110,7 +111,7 @@ def _make(
             progress("runs", done, left)
 
 
-def shares_settings(design: Design) -> bool:
+def _shares_settings(design: Design) -> bool:
     """Whether all runs are compiled ones, of which many differ in nothing but their images."""
     tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
     settings = math.lcm(design.sweep.calibrations, tasks)
@@ -119,9 +120,16 @@ def shares_settings(design: Design) -> bool:
     return all(compiled_by(design, design.cell(cell)) for cell in range(design.cells))
 
 
-def _compile_once(
-    design: Design, tasks: Mapping[int, TaskSet], engine: Engine, say: Callable[[str], None]
-) -> None:
+def calibrate_one(wanted: tuple[str, Config]) -> Calibrated:
+    """Make the calibration of a key, on one thread like all that must be the same to the bit."""
+    with threadpool_limits(1):
+        try:
+            return Calibrated(*wanted, calibrate.run(wanted[1]))
+        except WorkFailed as error:
+            return Calibrated(*wanted, None, str(error))
+
+
+def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
     """Fill an empty cache by one process, where several would each compile the same.
 
     That process ends here: the compiler keeps hundreds of megabytes.
@@ -130,11 +138,11 @@ def _compile_once(
     if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
         return
     say("compiling kernels, once, before the processes start")
-    with closing(engine.completed(partial(_first_runs, tasks), [design])) as made:
+    with closing(engine.completed(_first_runs, [design])) as made:
         list(made)
 
 
-def _first_runs(tasks: Mapping[int, TaskSet], design: Design) -> None:
+def _first_runs(design: Design) -> None:
     """One calibration and a run of each law with it, for the kernels they leave."""
     records = calibrate_one((design.calibration_key(0, 0), design.calibrated(0, 0))).records
     calibration = None if records is None else records[1]
@@ -142,4 +150,4 @@ def _first_runs(tasks: Mapping[int, TaskSet], design: Design) -> None:
     by_law = {name_of_run(design.cell(cell)): cell for cell in reversed(cells)}
     for cell in by_law.values():
         run = cell * design.sweep.runs
-        run_part(Part(design, run, run + 1, {design.calibration_key(cell, 0): calibration}, tasks))
+        run_part(Part(design, run, run + 1, {design.calibration_key(cell, 0): calibration}))

@@ -39,15 +39,10 @@ DECISIVE = ("projservo", "python", "numpy", "scipy", "numba", "jit")  # for the 
 
 
 class Engine:
-    """So many workers of this machine; a single one is this process.
-
-    Attributes
-    ----------
-    losses : what futures raise whose worker was lost.
-    """
+    """So many workers of this machine; a single one is this process."""
 
     here = True
-    losses: tuple[type[Exception], ...] = (BrokenExecutor, CancelledError, OSError)
+    losses: tuple[type[Exception], ...] = (BrokenExecutor, CancelledError, OSError)  # of workers
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
@@ -68,13 +63,6 @@ class Engine:
         ----------
         most : workers that the jobs are worth.
         threads : whether they seldom wait for each other; the memory is that of one process then.
-
-        Raises
-        ------
-        WorkFailed
-            If workers are lost again and again, or the cluster is.
-        InputError
-            What a job raises.
         """
         workers = min(self.workers, most or self.workers)
         if self.here and workers == 1:
@@ -146,29 +134,18 @@ class Engine:
 
 def _follow_the_parent() -> None:
     """Leave interrupts to the parent, and end when it is gone, however it ended."""
+    parent: Any = multiprocessing.parent_process()
+
+    def end() -> None:
+        parent.join()
+        os._exit(1)
+
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(multiprocessing.parent_process(),), daemon=True).start()
-
-
-def _end_with(process: Any) -> None:
-    process.join()
-    os._exit(1)
+    threading.Thread(target=end, daemon=True).start()
 
 
 class Cluster(Engine):
-    """Workers of a Dask scheduler, which makes anew what they lose when they die.
-
-    Parameters
-    ----------
-    address : of the scheduler, such as tcp://host:8786.
-
-    Raises
-    ------
-    WorkFailed
-        If the scheduler does not answer or has no workers.
-    InputError
-        If the package of the cluster is missing here, or ours there, or versions differ.
-    """
+    """Workers of the Dask scheduler at an address such as tcp://host:8786; it makes up for lost ones."""
 
     here = False
 

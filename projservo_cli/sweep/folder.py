@@ -2,43 +2,47 @@
 
 A manifest says what all else is of. While a sweep runs there is a file for each part; a part that is there
 is done, so after any end the same command goes on with the others. The table is assembled from them, and
-when it is complete they are removed. Calibrations and random tasks stay, to make any run anew.
+when it is complete they are removed. Calibrations stay, to make any run anew.
 """
 
 import json
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from projservo_cli import provenance
-from projservo_cli.config import Config
+from projservo_cli.config import Config, to_yaml
 from projservo_cli.files import replacing
-from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages.steps import steps_for
-from projservo_cli.store import TABLE, Result, Run, SweepTable, assemble, load
+from projservo_cli.store import TABLE, Result, Run, SweepTable, assemble, load, save
 from projservo_cli.sweep.design import Design, from_recipe
 from projservo_cli.sweep.engine import versions
-from projservo_cli.sweep.preparation import REFUSED, calibration_path, read_tasks
 from projservo_cli.sweep.runs import columns_of
 
+REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
 
-@dataclass(frozen=True)
-class Status:
-    """How far a sweep is.
 
-    Attributes
-    ----------
-    done, total : runs that are stored, and in all.
-    chunk : runs of a part; 0 before it began.
-    complete : whether nothing is left to do: all runs are in the table, and the parts are removed.
-    """
+class Status(NamedTuple):
+    """How far a sweep is: runs that are stored, and in all; ``complete`` when its parts are gone too."""
 
     done: int
     total: int
-    chunk: int
+    chunk: int  # runs of a part; 0 before it began
     complete: bool = False
+
+
+class Calibrated(NamedTuple):
+    """What became of the calibration of a key: records, or why there are none."""
+
+    key: str
+    config: Config
+    records: tuple[Observation, Calibration, CrossValidation | None] | None
+    reason: str = ""
 
 
 class Folder:
@@ -116,13 +120,7 @@ class Folder:
         return found
 
     def design(self) -> Design:
-        """The design of the sweep that the folder holds.
-
-        Raises
-        ------
-        InputError
-            If there is no sweep.
-        """
+        """The design of the sweep that the folder holds."""
         return from_recipe(self._read()["recipe"])
 
     def begin(self, design: Design, chunk: int) -> None:
@@ -134,9 +132,9 @@ class Folder:
 
     def clear(self) -> None:
         """Remove what a sweep of another configuration left."""
-        for path in (self.parts, self.path / "calibrations"):
-            shutil.rmtree(path, ignore_errors=True)
-        for path in (self.table, self.manifest, *self.path.glob("tasks_*.npz")):
+        for folder in (self.parts, self.path / "calibrations"):
+            shutil.rmtree(folder, ignore_errors=True)
+        for path in (self.table, self.manifest):
             path.unlink(missing_ok=True)
 
     def assemble(self, design: Design) -> None:
@@ -153,6 +151,41 @@ class Folder:
         }
         headings = [(column.name, column.dtype, column.units, column.about) for column in columns]
         assemble(self.table, self.stored(), headings, attributes)
+
+    def calibration(self, key: str) -> Path:
+        """The run file that holds a calibration, or beside which a file says why there is none."""
+        return self.path / "calibrations" / f"{key[:20]}.h5"
+
+    def missing_calibrations(self, design: Design) -> list[tuple[str, Config]]:
+        """Calibrations that are needed and not yet stored: their keys, and configurations that need them."""
+        return [
+            (key, config)
+            for key, config in design.calibrations()
+            if not any(self.calibration(key).with_suffix(kind).exists() for kind in (".h5", REFUSED))
+        ]
+
+    def keep_calibration(self, made: Calibrated) -> None:
+        """Store a calibration as a run file of its own, or why there is none."""
+        path = self.calibration(made.key)
+        if made.records is None:
+            with replacing(path.with_suffix(REFUSED)) as temporary:
+                temporary.write_text(made.reason + "\n", encoding="utf-8")
+            return
+        names = ("observation", "calibration", "cross_validation")
+        records = {name: one for name, one in zip(names, made.records, strict=True) if one is not None}
+        (step,) = steps_for(made.config, Run(path), ["calibrate"])
+        origin = provenance.collect(seed=made.config.seed)
+        text = to_yaml(made.config)
+        save(Run(path, text, {"calibrate": Result(step.key, text, origin, step.inputs, records)}))
+
+    def calibrations(self, design: Design) -> dict[str, Calibration | None]:
+        """Calibrations by their key, None where one was refused; without covariance, which no run needs."""
+        none = np.zeros((0, 0))
+        paths = {key: self.calibration(key) for key, _ in design.calibrations()}
+        return {
+            key: replace(load(path).calibration, covariance=none) if path.exists() else None
+            for key, path in paths.items()
+        }
 
 
 def run_of(target: str) -> tuple[Config, Result | None]:
@@ -179,12 +212,8 @@ def run_of(target: str) -> tuple[Config, Result | None]:
     folder = Folder(sweep)
     design = folder.design()
     at = design.numbers(int(index))
-    base = design.base_of(at.cell)
-    tasks = {}
-    if design.sweep.tasks is not None:
-        tasks[base] = read_tasks(folder.path / f"tasks_{design.bases[base][0]}.npz")
-    config = design.config(at.run, tasks).model_copy(update={"name": f"{design.sweep.name}-{at.run}"})
-    path = calibration_path(folder.path, design.calibration_key(at.cell, at.calibration))
+    config = design.config(at.run).model_copy(update={"name": f"{design.sweep.name}-{at.run}"})
+    path = folder.calibration(design.calibration_key(at.cell, at.calibration))
     refused = path.with_suffix(REFUSED)
     if refused.exists():
         raise WorkFailed(f"run {at.run}: {refused.read_text(encoding='utf-8').strip()}")

@@ -41,11 +41,6 @@ def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[
     Returns
     -------
     The statistics, and the files.
-
-    Raises
-    ------
-    InputError
-        If there is no sweep, none of its runs is done, or a file cannot be written.
     """
     if folder.stored():
         folder.assemble(folder.design())

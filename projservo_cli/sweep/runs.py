@@ -22,7 +22,7 @@ from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, recorded, sense_is_enough
 from projservo_cli.stages.trace import deviation_between_samples_mm, summary_of
-from projservo_cli.sweep.design import RUNS, Design, TaskSet, name_of_run, seed_of
+from projservo_cli.sweep.design import RUNS, Design, name_of_run, seed_of
 from projservo_cli.task.body import NO_BODY
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
@@ -114,14 +114,12 @@ class Part:
     Attributes
     ----------
     calibrations : by their key; None where there could be none.
-    tasks : random tasks of the bases, by the number of the base.
     """
 
     design: Design
     first: int
     last: int
     calibrations: Mapping[str, Calibration | None]
-    tasks: Mapping[int, TaskSet]
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,12 +155,12 @@ def run_part(part: Part) -> Made:
                 _put(table, rows, {"verdict": NOT_CALIBRATED, "usable": 0})
                 continue
             _put(table, rows, {"usable": int(calibration.usable)})
-            config = design.config(at.run, part.tasks)
+            config = design.config(at.run)
             if compiled_by(design, config):
                 _put(table, rows, _measured(config, calibration, table["seed"][rows]))
                 these = np.array([run for run in these if run in wanted], dtype=np.int64)
             for run in these.tolist():
-                row, trace = _run(design, run, part, calibration, keep=run in wanted)
+                row, trace = _run(design, run, calibration, keep=run in wanted)
                 _put(table, np.array([run - part.first]), row)
                 if trace is not None:
                     traces[run] = trace
@@ -305,10 +303,10 @@ def _interned(design: Design) -> Design:
 
 
 def _run(
-    design: Design, run: int, part: Part, calibration: Calibration, *, keep: bool
+    design: Design, run: int, calibration: Calibration, *, keep: bool
 ) -> tuple[dict[str, Any], Trace | None]:
     """What is measured of one run, by column, and its trace where it is kept."""
-    config = design.config(run, part.tasks)
+    config = design.config(run)
     name = name_of_run(config)
     try:
         scenario = scenario_of(config, calibration)

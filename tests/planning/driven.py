@@ -19,7 +19,7 @@ from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.preparation import STRATA, random_tasks
+from projservo_cli.sweep.tasks import STRATA, random_tasks
 from tests.conftest import ROOT
 from tests.planning.arm import arm_of, feasible
 from tests.planning.oracle import TrueTask

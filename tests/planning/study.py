@@ -15,7 +15,7 @@ from projservo_cli.records import Plan, WorkFailed
 from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.preparation import random_tasks
+from projservo_cli.sweep.tasks import random_tasks
 from tests.conftest import ROOT
 from tests.planning.oracle import TrueTask
 
@@ -130,6 +130,6 @@ def study(arm, count, seed=1):
 
 if __name__ == "__main__":
     found, drawn = study(sys.argv[1], int(sys.argv[2]), *map(int, sys.argv[3:]))
-    print(drawn.words())
+    print(f"{len(drawn.angle)} tasks from {drawn.drawn} joint vectors; rejected: {drawn.rejected}")
     for line in found.words():
         print(line)

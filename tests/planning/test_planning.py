@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.records import InputError
 from projservo_cli.stages.plan import Profile, demands_of, plan_task
-from projservo_cli.sweep.preparation import STRATA, random_tasks
+from projservo_cli.sweep.tasks import STRATA, random_tasks
 from projservo_cli.task.planning import turning_sense
 from tests.planning.cases import constrained, reaching_of
 from tests.planning.oracle import TrueTask
@@ -160,11 +160,10 @@ def test_the_sense_of_the_turn_is_the_one_a_grid_search_finds(arm):
 @pytest.mark.parametrize("arm", ["paper", "ur5"])
 def test_random_tasks_stay_in_sight_wherever_a_grid_search_finds_a_way(arm):
     """A small part of ``python -m tests.planning.study ARM 500``."""
-    found, tasks = study(arm, 12, seed=7)
+    found, _ = study(arm, 12, seed=7)
     assert [o for o in found.missed if not o.near] == []
     assert sum(o.oracle for o in found.outcomes) >= 10
     assert any(o.feasible for o in found.outcomes)
-    assert "rejected" in tasks.words()
 
 
 def test_random_tasks_are_what_they_say():

@@ -30,16 +30,6 @@ def make(found, path, workers=1, progress=lambda *_: None, **options):
     return run(found, Folder(path), Engine(workers), progress, lambda _: None, **options)
 
 
-def interrupt_after(runs):
-    """Ctrl-C when so many runs are stored."""
-
-    def progress(what, done, total):
-        if what == "runs" and done >= runs:
-            raise KeyboardInterrupt
-
-    return progress
-
-
 def columns(path):
     """All columns of the table in a folder."""
     table = SweepTable(Folder(path).table)

@@ -11,20 +11,21 @@ from pathlib import Path
 from projservo_cli.store import SweepTable
 from tests.conftest import ROOT
 
-RUNS = 24  # a law, made two at a time: seconds of work, on a busy machine long after its first parts are seen
+# Runs of a law and of a part: seconds of work, on a busy machine long after the first parts are seen.
+RUNS, CHUNK = 96, 8
 SWEEP = """\
 base: {base}
 runs: {runs}
-chunk: 2
+chunk: {chunk}
 calibrations: 2
 set:
   stop.max_steps: 60
   noise.servo_px: 0.3
   calibration.frames_per_joint: 6
-  trajectory.profile: constrained
 grid: {{law: [direct_two, stacked]}}
 random: {{control.gain_t: {{uniform: [1, 3]}}}}
 traces: [1, {runs}]
+between_samples: true
 """
 COMMAND = "from projservo_cli.cli import main; main()"
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
@@ -33,7 +34,9 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"
 def written(folder):
     """A small sweep as a configuration file."""
     path = folder / "small.yaml"
-    path.write_text(SWEEP.format(base=ROOT / "configs" / "ur5.yaml", runs=RUNS), encoding="utf-8")
+    path.write_text(
+        SWEEP.format(base=ROOT / "configs" / "ur5.yaml", runs=RUNS, chunk=CHUNK), encoding="utf-8"
+    )
     return path
 
 

@@ -10,6 +10,7 @@ import pytest
 from projservo_cli.records import WorkFailed
 from projservo_cli.sweep import engine
 from tests.sweep.processes import (
+    CHUNK,
     ENVIRONMENT,
     RUNS,
     differences,
@@ -87,10 +88,10 @@ def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(clu
     assert "the connection to the scheduler is lost; what was stored until then is kept" in err
     assert "Traceback" not in err, err
     stored = len(parts(out))
-    assert 8 <= stored < RUNS
+    assert 8 <= stored < 2 * RUNS / CHUNK
     code, _, err = finish(start(config, out, "--scheduler", cluster().address))
     assert code == 0, err
-    assert f"{2 * stored} of {2 * RUNS} runs are stored already" in err
+    assert f"{CHUNK * stored} of {2 * RUNS} runs are stored already" in err
     assert not differences(out, reference)
 
 

@@ -10,7 +10,6 @@ from projservo_cli.config.sweep import Distribution, load_sweep
 from projservo_cli.records import InputError
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.design import from_recipe, read_design, sample
-from projservo_cli.sweep.preparation import drawn_tasks
 from tests.conftest import ROOT
 from tests.sweep.cases import design
 
@@ -46,8 +45,8 @@ def test_a_run_depends_on_its_number_alone_and_cells_share_their_draws():
         },
     }
     first, second = design(**values), design(**values)
-    configs = [first.config(run, {}) for run in range(first.total)]
-    backwards = [second.config(run, {}) for run in reversed(range(second.total))]
+    configs = [first.config(run) for run in range(first.total)]
+    backwards = [second.config(run) for run in reversed(range(second.total))]
     assert configs == backwards[::-1]
     assert len({config.seed for config in configs}) == 6
     for draw in range(6):
@@ -69,7 +68,7 @@ def test_a_design_is_made_again_from_its_recipe_and_its_key_tells_what_matters()
     found = design()
     again = from_recipe(found.recipe)
     assert again.key == found.key
-    assert again.config(5, {}) == found.config(5, {})
+    assert again.config(5) == found.config(5)
     assert design(chunk=2, name="other").key == found.key
     assert len({design(**other).key for other in ({}, {"seed": 1}, {"runs": 5}, {"traces": [1]})}) == 4
 
@@ -92,11 +91,10 @@ def test_distributions_keep_to_their_bounds_and_moments():
 
 def test_random_tasks_come_one_of_each_stratum_in_turn():
     found = design(tasks={"random": 8})
-    tasks = drawn_tasks(found, 0, 8)
     robot = truth_of(found.cell(0)).robot
     strata = []
     for run in range(8):
-        config = found.config(run, {0: tasks})
+        config = found.config(run)
         start, goal = (np.array(q.joints) for q in (config.task.start, config.task.goal.joints))
         R = robot.pose(start)[:3, :3].T @ robot.pose(goal)[:3, :3]
         strata.append(int(6 * math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) / math.pi))

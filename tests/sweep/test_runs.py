@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.sweep.design import name_of_run
-from projservo_cli.sweep.preparation import calibrate_one, drawn_tasks
+from projservo_cli.sweep.driver import calibrate_one
 from projservo_cli.sweep.runs import Part, run_part
 from tests.sweep.cases import design
 
@@ -48,10 +48,9 @@ SAME = (
 
 def part_of(found, first=0, last=None):
     """A part with all it needs."""
-    tasks = {} if found.sweep.tasks is None else {0: drawn_tasks(found, 0, found.sweep.tasks.random)}
     made = [calibrate_one(wanted) for wanted in found.calibrations()]
     calibrations = {one.key: one.records and one.records[1] for one in made}
-    return Part(found, first, found.total if last is None else last, calibrations, tasks)
+    return Part(found, first, found.total if last is None else last, calibrations)
 
 
 @pytest.mark.volume
@@ -61,7 +60,7 @@ def test_every_run_redone_by_the_stages_is_its_row(name):
     part = part_of(found)
     made, calibrations = run_part(part), {}
     for i in range(found.total):
-        config = found.config(i, part.tasks)
+        config = found.config(i)
         at = found.numbers(i)
         key = found.calibration_key(at.cell, at.calibration)
         if key not in calibrations:
@@ -88,8 +87,7 @@ def test_parts_do_not_depend_on_how_runs_are_divided():
     part = part_of(found)
     whole = run_part(part)
     pieces = [
-        run_part(Part(found, first, first + 1, part.calibrations, part.tasks))
-        for first in reversed(range(found.total))
+        run_part(Part(found, first, first + 1, part.calibrations)) for first in reversed(range(found.total))
     ][::-1]
     for column, values in whole.columns.items():
         assert np.concatenate([piece.columns[column] for piece in pieces]).tobytes() == values.tobytes()
