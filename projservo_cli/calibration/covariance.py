@@ -96,7 +96,7 @@ def covariance_factor(problem: Problem, scene: Scene, used: BoolArray, result: P
     """
     factor = _output_derivative(problem, scene, result) @ spread_factor(problem, scene, used)
     free = np.zeros((len(factor), 18))
-    free[: result.P.size + result.H_hat_0.size + result.M.size] = output_gauge(result)
+    free[: result.P.size + result.H_hat_0.size + result.M.size] = _output_gauge(result)
     return np.asarray(factor - free @ (free.T @ factor))
 
 
@@ -124,7 +124,7 @@ def _output_derivative(problem: Problem, scene: Scene, result: ProjectiveScene) 
     return J
 
 
-def output_gauge(result: ProjectiveScene) -> FloatArray:
+def _output_gauge(result: ProjectiveScene) -> FloatArray:
     """Orthonormal directions (24 + 16 n + 4 m, 18) that change no image: of the frame and of both cameras."""
     directions = []
     for k in range(16):
@@ -146,7 +146,7 @@ def marker_factor(result: ProjectiveScene, factor: FloatArray) -> FloatArray:
     for j in range(m):
         scales[first + 4 * j : first + 4 * (j + 1), j] = result.M[j]
     # One of the directions is a sum of others: all markers scaled at once.
-    U, s, _ = np.linalg.svd(np.hstack([output_gauge(result), scales]), full_matrices=False)
+    U, s, _ = np.linalg.svd(np.hstack([_output_gauge(result), scales]), full_matrices=False)
     free = U[:, s > _OPEN_DIRECTION * s[0]]
     factor = factor[: first + 4 * m]
     return (factor - free @ (free.T @ factor))[first:]

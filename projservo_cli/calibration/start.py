@@ -54,10 +54,10 @@ def merged(guess: Guess, readings: Readings) -> Alignment:
     points, seen = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
     where = readings.pose_of[both], readings.marker_of[both]
     points[where], seen[where] = guess.points, True
-    return merge(points, seen)
+    return _merge(points, seen)
 
 
-def merge(points: FloatArray, seen: BoolArray) -> Alignment:
+def _merge(points: FloatArray, seen: BoolArray) -> Alignment:
     """Grow the body from the fullest pose until nothing is added, from points (K, m, 3) where seen (K, m)."""
     K = len(seen)
     points = np.where(seen[..., None], points, 0.0)
@@ -144,7 +144,7 @@ _CONTRADICTION = 5.5
 _WIDTH = 0.05
 
 
-def rotation_axes(
+def _rotation_axes(
     alignment: Alignment,
     q: FloatArray,
     prismatic: BoolArray,
@@ -286,7 +286,7 @@ _RIDGE = 0.03
 _LEAST_SCALE = 1e-3
 
 
-def place(w: FloatArray, guess: Guess, readings: Readings, q: FloatArray) -> Scene:
+def _place(w: FloatArray, guess: Guess, readings: Readings, q: FloatArray) -> Scene:
     """Axis points, directions of translation and markers, linear in the points once all axes are known.
 
     A point of marker j at pose k is R̄_n X_j + Σ R̄_{i−1} ((I − R_i) p_i, or q_i v_i if prismatic):
@@ -368,8 +368,8 @@ def placed(
     steps: int = _TURNS,
 ) -> Iterator[Scene]:
     """Scenes of a guessed metric frame, one for each set of axes that explains its rotations."""
-    for w in rotation_axes(alignment, problem.q, readings.prismatic, rng, keep, steps):
-        scene = place(w, guess, readings, problem.q)
+    for w in _rotation_axes(alignment, problem.q, readings.prismatic, rng, keep, steps):
+        scene = _place(w, guess, readings, problem.q)
         if np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all():
             yield scene
 

@@ -1,32 +1,39 @@
-"""The start: rotations, the marker body, axes and places in a metric frame."""
+"""The start: the marker body from partial views, axes and places in a metric frame."""
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration import start
+from projservo_cli.calibration.adjustment import prepare
 from projservo_cli.calibration.epipolar import Guess
 from projservo_cli.calibration.readings import gather
+from projservo_cli.calibration.start import merged, placed
+from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 
+def guessed(points):
+    return Guess(np.zeros((2, 3, 4)), points, 0.0, 1.0)
+
+
 def cloud(seen_share, wrong_share, rng):
-    """Poses of one body with some sightings missing and some wrong."""
+    """Poses of one body with some sightings missing and some wrong: body, rotations, guess, readings."""
     true = rng.uniform(-0.1, 0.1, (8, 3))
     R = Rotation.random(30, random_state=1).as_matrix()
-    t = rng.uniform(-1.0, 1.0, (30, 3))
-    points = true @ np.swapaxes(R, 1, 2) + t[:, None]
+    points = true @ np.swapaxes(R, 1, 2) + rng.uniform(-1.0, 1.0, (30, 1, 3))
     seen = rng.random((30, 8)) < seen_share
     wrong = rng.random((30, 8)) < wrong_share
     points[wrong] += rng.uniform(-0.5, 0.5, (int(wrong.sum()), 3))
-    return true, R, t, points, seen
+    images = np.where(seen[:, None, :, None], np.zeros((30, 2, 8, 2)), np.nan)
+    readings = gather(Observation(np.arange(30), np.arange(8), np.zeros((30, 1)), images), "R")
+    return true, R, guessed(points[readings.pose_of, readings.marker_of]), readings
 
 
 @pytest.mark.parametrize(("seen_share", "wrong_share"), [(1.0, 0.0), (0.6, 0.0), (0.9, 0.08)])
 def test_body_is_merged_from_partial_views(seen_share, wrong_share):
-    true, R, _, points, seen = cloud(seen_share, wrong_share, np.random.default_rng(2))
-    found = start.merge(points, seen)
+    true, R, guess, readings = cloud(seen_share, wrong_share, np.random.default_rng(2))
+    found = merged(guess, readings)
     assert np.isfinite(found.body).all()
     assert found.merged.sum() >= 0.9 * len(R)
     # The body is the true one up to a rigid motion: distances agree.
@@ -43,14 +50,12 @@ def test_screws_are_recovered_from_exact_points(types, poses):
     robot = random_robot(types, np.random.default_rng(5))
     q = poses(robot)
     readings = gather(robot.observe(q, 0.0, np.random.default_rng(0)), types)
-    dq = readings.q - robot.q_reference
     true = np.array([_moved(robot, row) for row in q])
-    points = true[readings.pose_of, readings.marker_of]
-    alignment = start.merge(true, np.ones(true.shape[:2], dtype=bool))
-    candidates = start.rotation_axes(alignment, dq, readings.prismatic, np.random.default_rng(1), 3)
-    best = min(np.abs(_screws(w, points, readings, dq) - robot.twists).max() for w in candidates)
+    guess = guessed(true[readings.pose_of, readings.marker_of])
+    problem = prepare(readings, robot.q_reference)
+    scenes = placed(problem, readings, guess, merged(guess, readings), np.random.default_rng(1))
     # The ridge pulls axes towards the body by at most its square over the number of equations.
-    assert best < 5e-3
+    assert min(np.abs(scene.H_hat - robot.twists).max() for scene in scenes) < 5e-3
 
 
 def _moved(robot, row):
@@ -58,7 +63,3 @@ def _moved(robot, row):
     for twist, amount in zip(robot.twists, row - robot.q_reference, strict=True):
         T = T @ expm(twist * amount)
     return (T @ robot.markers.T).T[:, :3]
-
-
-def _screws(w, points, readings, dq):
-    return start.place(w, Guess(np.zeros((2, 3, 4)), points, 0.0, 1.0), readings, dq).H_hat

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.control import CODES
 from projservo_cli.control.law import reset
-from projservo_cli.geometry.algebra import as_vec
+from projservo_cli.geometry.algebra import vec
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import RUNNING
 from projservo_cli.loop.summary import path_along, path_deviation
@@ -262,7 +262,7 @@ def test_deviation_from_the_line():
     A_c = sc.plant.M.mean(axis=0)
     start, goal = (poe(sc.model, q) @ A_c for q in (sc.q_start, sc.q_goal))
     between = path_deviation(sc.plant, run.log, run.steps, GAINS.period, start, goal, 10)
-    length, at_samples = path_along(sc.plant, run.log, run.steps, as_vec(start), as_vec(goal))
+    length, at_samples = path_along(sc.plant, run.log, run.steps, vec(start), vec(goal))
     way = (goal - start)[:3] / np.linalg.norm((goal - start)[:3])
 
     def distance(q):
@@ -280,7 +280,7 @@ def test_deviation_of_a_task_without_translation_is_the_distance_from_the_start(
     sc = scene()
     run = Run(sc, "direct_three", bounds=limits(max_steps=10))
     start = np.append(run.center[0], 1.0)
-    _, at_samples = path_along(sc.plant, run.log, run.steps, as_vec(start), as_vec(start))
+    _, at_samples = path_along(sc.plant, run.log, run.steps, vec(start), vec(start))
     assert at_samples == pytest.approx(np.linalg.norm(run.center - run.center[0], axis=1).max(), abs=1e-12)
 
 
