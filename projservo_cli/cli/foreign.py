@@ -7,12 +7,14 @@ from typing import Any
 import click
 
 from projservo_cli.cli.output import Console
-from projservo_cli.records import LAWS, InputError, law_and_mode
+from projservo_cli.records import InputError, law_and_mode
 from projservo_cli.robots import plugins
 
 
 def law_names(names: Sequence[str]) -> tuple[str, ...]:
     """The laws of ``--law``, each once, registered names as the classes they stand for."""
+    from projservo_cli.control import LAWS
+
     found = {name: name if name in LAWS else plugins.target_of("law", name) for name in names}
     for name, target in found.items():
         if target is None:

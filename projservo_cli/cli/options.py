@@ -12,7 +12,8 @@ LEFT_OUT = {"--suggest": "5"}  # what an option means whose value is left out
 def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
     """Laws for the completion of a shell."""
     del context, parameter
-    from projservo_cli.records import LAWS
+
+    from projservo_cli.control import LAWS
 
     return [law for law in LAWS if law.startswith(incomplete)]
 

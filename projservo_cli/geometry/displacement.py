@@ -279,35 +279,3 @@ def compose_rotations(
     if not found:
         raise WorkFailed("two rotations by 0° compose to the identity, which has no axis")
     return theta_s, as_array(H_s)
-
-
-def angles_onto_plane(a: FloatArray, H_hat: FloatArray, A: FloatArray) -> tuple[float, float] | None:
-    """Angles that rotate a point onto a plane, [RH00] eqs. (13)–(15) as corrected.
-
-    Parameters
-    ----------
-    a : (4,) plane.
-    H_hat : (4, 4) revolute operator.
-    A : (4,) point.
-
-    Returns
-    -------
-    θ⁺ and θ⁻ in (−π, π], rad; None where the point never meets the plane.
-    """
-    p_0, p_s, p_c = incidence_coefficients(a, H_hat, A)
-    found, plus, minus = incidence_angles(p_0, p_s, p_c)
-    return (plus, minus) if found else None
-
-
-def incidence_coefficients(a: FloatArray, H_hat: FloatArray, A: FloatArray) -> tuple[float, float, float]:
-    """Coefficients p_0, p_s, p_c of [RH00] eq. (14) for aᵀ H(θ) A.
-
-    Parameters
-    ----------
-    a : (4,) plane.
-    H_hat : (4, 4) revolute operator.
-    A : (4,) point.
-    """
-    first = H_hat @ A
-    second = H_hat @ first
-    return float(a @ (A + second)), float(a @ first), float(-(a @ second))

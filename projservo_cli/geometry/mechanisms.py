@@ -1,7 +1,7 @@
 """Visual mechanisms: one-parameter motions defined by what they leave still, [RH00] section 3.
 
-Every mechanism is the kernel of a stack of operator velocities. The generic functions return
-``Mechanism(q_hat, H_hat)``; the compiled ones write the joint motion into a row of the workspace.
+Every mechanism is the kernel of a stack of operator velocities: the joint motion q̂ is written to an
+array, its operator Σ q̂_i Ĥ_i returned.
 """
 
 import math
@@ -14,7 +14,6 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     apply_transposed,
-    as_vec,
     dual_pencil,
     inner,
     mat,
@@ -23,7 +22,6 @@ from projservo_cli.geometry.algebra import (
     sub,
     vec,
 )
-from projservo_cli.geometry.displacement import as_array
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import (
     RANK_TOLERANCE,
@@ -87,19 +85,6 @@ class Work(NamedTuple):
     J: FloatArray
     norms: FloatArray
     xi: FloatArray
-
-
-class Mechanism(NamedTuple):
-    """One-parameter motion of the robot.
-
-    Attributes
-    ----------
-    q_hat : (n,) joint motion.
-    H_hat : (4, 4) operator Σ q̂_i Ĥ_i.
-    """
-
-    q_hat: FloatArray
-    H_hat: FloatArray
 
 
 def workspace(n: int, rows: int, span: Span = OWN) -> Work:
@@ -236,86 +221,6 @@ def to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     for i in range(q_hat.shape[0]):
         q_hat[i] *= nu
     return True, multiple(nu, H)
-
-
-def _mechanism(kind: str, H_hat: FloatArray, first: FloatArray, second: FloatArray) -> Mechanism:
-    """Run one compiled mechanism on plain arrays."""
-    n = len(H_hat)
-    work = workspace(n, 8)
-    work.H_hat[:] = H_hat
-    q_hat = np.zeros(n)
-    compiled = {
-        "translation": translation_mechanism,
-        "rotation": rotation_mechanism,
-        "planar rotation": planar_mechanism,
-    }[kind]
-    found, H = compiled(work, as_vec(first), as_vec(second), q_hat)
-    if not found:
-        raise WorkFailed(
-            f"the robot has no unique {kind} of this kind here: its operators are near a singularity"
-        )
-    return Mechanism(q_hat, as_array(H))
-
-
-def translation_along(H_hat: FloatArray, A_1: FloatArray, A_2: FloatArray) -> Mechanism:
-    """Translation along the line through two points, [RH00] eq. (8).
-
-    Parameters
-    ----------
-    H_hat : (n, 4, 4) operators at the current joints.
-    A_1, A_2 : (4,) points of equal scale a_inf·A.
-
-    Returns
-    -------
-    Mechanism of unit joint norm; only the products with its amplitude have a meaning.
-
-    Raises
-    ------
-    WorkFailed
-        If the motion is not unique.
-    """
-    return _mechanism("translation", H_hat, A_1, A_2 - A_1)
-
-
-def rotation_about(H_hat: FloatArray, A_1: FloatArray, A_2: FloatArray) -> Mechanism:
-    """Revolution around the axis through two points, [RH00] eq. (9).
-
-    Parameters
-    ----------
-    H_hat : (n, 4, 4) operators at the current joints.
-    A_1, A_2 : (4,) points on the axis.
-
-    Returns
-    -------
-    Mechanism per rad; the sense of rotation is arbitrary.
-
-    Raises
-    ------
-    WorkFailed
-        If the motion is not unique.
-    """
-    return _mechanism("rotation", H_hat, A_1, A_2)
-
-
-def rotation_within(H_hat: FloatArray, a: FloatArray, A: FloatArray) -> Mechanism:
-    """Revolution around a point within a plane, [RH00] eq. (10).
-
-    Parameters
-    ----------
-    H_hat : (n, 4, 4) operators at the current joints.
-    a : (4,) plane.
-    A : (4,) point.
-
-    Returns
-    -------
-    Mechanism per rad; the sense of rotation is arbitrary.
-
-    Raises
-    ------
-    WorkFailed
-        If the motion is not unique.
-    """
-    return _mechanism("planar rotation", H_hat, a, A)
 
 
 # Forms that the joints keep up to this share of the largest change are kept.

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control import CODES
-from projservo_cli.control.bound import bind, bound_command
+from projservo_cli.control import CODES, LAWS, command
 from projservo_cli.control.law import ERRORS, Gains, State, new_state
+from projservo_cli.geometry.jit import njit
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.compiled import run as run_compiled
-from projservo_cli.loop.repeated import many_steps
-from projservo_cli.loop.step import Limits
-from projservo_cli.records import LAWS, FloatArray, Model
+from projservo_cli.loop.python import bind, bound_command
+from projservo_cli.loop.step import Limits, limit_speed
+from projservo_cli.records import FloatArray, Model
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
 from projservo_cli.stages.world import truth_of
@@ -51,6 +51,16 @@ class Job(NamedTuple):
     q_start: FloatArray
     state: State
     log: Log
+
+
+@njit
+def _many_steps(job: Job) -> float:
+    """Measure, partition, command and limit, once in each recorded state of a run."""
+    total = 0.0
+    for k in range(job.log.s.shape[0]):
+        command(job.code, job.model, job.task, job.gains, job.log.s[k], job.log.q[k], job.state)
+        total += limit_speed(job.state.q_dot, job.limits.speed)
+    return total
 
 
 class Case:
@@ -93,21 +103,21 @@ class Case:
             new_log(n, seen, limits.max_steps, len(ERRORS)),
         )
 
-    def _states(self, task: Task, plant: Plant) -> tuple[FloatArray, FloatArray]:
-        """Pixels and joints of the states that are cycled through."""
+    def _states(self, task: Task, plant: Plant) -> Job:
+        """A run whose log has the states that are cycled through."""
         job = self.job(task, plant, self.limits)
         run_compiled(*job)
-        return job.log.s, job.log.q
+        return job
 
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
-        task, (S, Q) = (self.body_task, self.whole) if body else (self.task, self.points)
-        return many_steps(CODES[law], self.model, task, self.gains, S, Q, self.state, self.limits.speed)
+        job = self.whole if body else self.points
+        return _many_steps(job._replace(code=CODES[law]))
 
     def one_step(self) -> int:
         """One step of direct_three, called from Python."""
-        S, Q = self.points
-        return bound_command(self.bound, S[0], Q[0])
+        log = self.points.log
+        return bound_command(self.bound, log.s[0], log.q[0])
 
     def whole_run(self) -> Job:
         """A run of 150 steps, traced."""
@@ -115,7 +125,7 @@ class Case:
 
     def matrices(self) -> FloatArray:
         """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
-        _, Q = self.points
+        Q = self.points.log.q
         work = workspace(len(self.q_start), 8)
         found = np.empty((STATES, 8, len(self.q_start)))
         for k in range(STATES):

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.control import CODES, blockwise, direct_three, direct_two, euclidean_points, stacked
+from projservo_cli.control import CODES, LAWS, blockwise, direct_three, direct_two, euclidean_points, stacked
 from projservo_cli.control.law import TAU, TAU_AFFINE, THETA_P, THETA_R, THETA_S
-from projservo_cli.records import LAWS
 from tests.samples import frame, operators, pixels, poe, revolute
 from tests.scene import GAINS, STEP, Run, limits, scene
 

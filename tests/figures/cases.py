@@ -6,11 +6,12 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import prediction_derivative
-from projservo_cli.records import LAWS, METRIC_LAWS, Calibration, following_mode, name_of
+from projservo_cli.control import LAWS
+from projservo_cli.records import METRIC_LAWS, Calibration, following_mode, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
 from projservo_cli.stages import calibrate, studies
-from projservo_cli.stages.plan import Pace, Sense
+from projservo_cli.stages.plan import Sense
 from projservo_cli.stages.scenario import idealized
 from tests.fake_records import fake
 from tests.known import configured, driven, known_scenario, planned
@@ -34,7 +35,7 @@ def case(name="paper", steps=SHORT, whole=False):
     scenario = known_scenario(config)
     true = scenario.truth
     model = studies.projective_twin(true.model)
-    plan = planned(scenario, model, samples=21, pace=Pace(duration=3.0))
+    plan = planned(scenario, model, samples=21, duration=3.0)
     sense = Sense(plan.rotation_sense(), None)
     traces = {law: driven(scenario, sense, law, true.model if law in METRIC_LAWS else model) for law in LAWS}
     for law in FOLLOWING:

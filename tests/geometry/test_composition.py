@@ -9,11 +9,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm, logm
 
 from projservo_cli.geometry.displacement import (
-    angles_onto_plane,
     compose_rotations,
     composed_angle,
     incidence_angles,
-    incidence_coefficients,
     wrap,
 )
 from projservo_cli.records import WorkFailed
@@ -65,24 +63,6 @@ def test_no_angle_where_the_plane_is_never_met():
     assert not incidence_angles(0.0, 0.0, 0.0)[0]
     assert not incidence_angles(math.nan, 1.0, 0.0)[0]
     assert incidence_angles(-0.5, 0.3, 0.4)[0]  # it only touches
-    assert angles_onto_plane(np.array([0, 0, 1.0, -5]), revolute([0, 0, 0], [1, 0, 0]), np.ones(4)) is None
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_points_are_turned_onto_the_plane(seed):
-    generator = np.random.default_rng(seed)
-    G = frame(seed)
-    H_hat = G @ revolute(generator.normal(size=3), generator.normal(size=3)) @ np.linalg.inv(G)
-    A, a = generator.normal(size=(2, 4))
-    p_0, p_s, p_c = incidence_coefficients(a, H_hat, A)
-    for theta in (0.3, -2.0):
-        assert p_0 + p_s * math.sin(theta) + p_c * math.cos(theta) == pytest.approx(
-            a @ expm(theta * H_hat) @ A
-        )
-    solutions = angles_onto_plane(a, H_hat, A)
-    assert (solutions is None) == (abs(p_0) > math.hypot(p_s, p_c))
-    for theta in solutions or ():
-        assert abs(a @ expm(theta * H_hat) @ A) < 1e-12
 
 
 def perpendicular_pair(seed):
