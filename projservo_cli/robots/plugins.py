@@ -23,7 +23,7 @@ from projservo_cli.records import InputError, WorkFailed
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
-ALIKE = 0.8
+_ALIKE = 0.8
 TARGET = rf"^{DOTTED}:{DOTTED}$"
 
 
@@ -125,10 +125,10 @@ def _found(where: str, module: str, name: str) -> Any:
 def _require_methods(where: str, found: Any, methods: Sequence[str]) -> None:
     lacking = [name for name in methods if not callable(getattr(found, name, None))]
     if lacking:
+        require_spelt(where, found, lacking)
         raise InputError(
             f"{where}: lacks {', '.join(f'{name}()' for name in lacking)}; needed: {', '.join(methods)}"
         )
-    require_spelt(where, found, methods)
 
 
 def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
@@ -143,7 +143,7 @@ def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
     """
     own = [name for name in dir(found) if not name.startswith("_")]
     for name in own:
-        near = difflib.get_close_matches(name, names, n=1, cutoff=ALIKE)
+        near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
         if near and near[0] not in own:
             raise InputError(f"{where}: has {name}, which nothing looks for; did you mean {near[0]}?")
 

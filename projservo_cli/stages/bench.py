@@ -8,21 +8,20 @@ import itertools
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control import CODES, LAWS, command
-from projservo_cli.control.law import ERRORS, Gains, State, new_state
-from projservo_cli.geometry.jit import njit
+from projservo_cli.control import CODES, LAWS
+from projservo_cli.control.law import ERRORS, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
-from projservo_cli.loop.compiled import Log, new_log
+from projservo_cli.loop.compiled import Job, many_steps, new_log
 from projservo_cli.loop.compiled import run as run_compiled
 from projservo_cli.loop.python import bind, bound_command
-from projservo_cli.loop.step import Limits, limit_speed
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.loop.step import Limits
+from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
 from projservo_cli.stages.world import truth_of
@@ -36,31 +35,6 @@ if TYPE_CHECKING:
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
 BODY = "exact, body"
-
-
-class Job(NamedTuple):
-    """The arguments of one run; ``state`` and ``log`` are its own, the rest may be shared."""
-
-    code: int
-    model: Model
-    task: Task
-    gains: Gains
-    limits: Limits
-    plant: Plant
-    noise: FloatArray
-    q_start: FloatArray
-    state: State
-    log: Log
-
-
-@njit
-def _many_steps(job: Job) -> float:
-    """Measure, partition, command and limit, once in each recorded state of a run."""
-    total = 0.0
-    for k in range(job.log.s.shape[0]):
-        command(job.code, job.model, job.task, job.gains, job.log.s[k], job.log.q[k], job.state)
-        total += limit_speed(job.state.q_dot, job.limits.speed)
-    return total
 
 
 class Case:
@@ -112,7 +86,7 @@ class Case:
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
         job = self.whole if body else self.points
-        return _many_steps(job._replace(code=CODES[law]))
+        return many_steps(job._replace(code=CODES[law]))
 
     def one_step(self) -> int:
         """One step of direct_three, called from Python."""
