@@ -208,10 +208,8 @@ class CrossValidation:
     )
 
 
-LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact")
 METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
 POINT_LAWS = ("stacked", "blockwise", "euclidean_points")  # laws that need the points of the face themselves
-BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)  # laws that can measure with the body
 
 
 def signed(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:
@@ -413,9 +411,7 @@ class Report:
 
 
 __all__ = [
-    "BODY_LAWS",
     "FREE",
-    "LAWS",
     "METRIC_LAWS",
     "NO_LENS",
     "POINT_LAWS",

@@ -1,20 +1,31 @@
-"""Control laws: one file a law, one contract, one if-chain."""
+"""Control laws: one file a law, one contract, one if-chain.
 
-from projservo_cli.control.blockwise import blockwise
-from projservo_cli.control.direct_three import direct_three
-from projservo_cli.control.direct_two import direct_two
-from projservo_cli.control.euclidean_points import euclidean_points
-from projservo_cli.control.exact import exact
-from projservo_cli.control.following import aim, go_on
-from projservo_cli.control.law import LOST, Gains, State
-from projservo_cli.control.stacked import stacked
+Run files and tables know a law by its name, compiled code by the code in its file. A law is added by its
+file and by its lines here.
+"""
+
+from projservo_cli.control import blockwise, direct_three, direct_two, euclidean_points, exact, stacked
+from projservo_cli.control.law import LOST, Gains, State, aim, go_on
 from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.lens import bends, straight
-from projservo_cli.records import LAWS, FloatArray, Model
+from projservo_cli.records import POINT_LAWS, FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.trajectory import following
 
-CODES = {law: code for code, law in enumerate(LAWS)}
+_DIRECT_THREE, _DIRECT_TWO, _STACKED = direct_three.CODE, direct_two.CODE, stacked.CODE
+_BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = blockwise.CODE, euclidean_points.CODE, exact.CODE
+CODES = {
+    "direct_three": _DIRECT_THREE,
+    "direct_two": _DIRECT_TWO,
+    "stacked": _STACKED,
+    "blockwise": _BLOCKWISE,
+    "euclidean_points": _EUCLIDEAN_POINTS,
+    "exact": _EXACT,
+}
+if len(set(CODES.values())) < len(CODES):
+    raise ValueError(f"each law needs a code of its own: {CODES}")
+LAWS = tuple(CODES)
+BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)  # laws that can measure with the body
 
 
 @internal
@@ -41,18 +52,18 @@ def command(
         seen = state.straight
     if following(task.reference):
         aim(task.reference, gains, state)
-    if code == 0:
-        status = direct_three(model, task, gains, seen, q, state)
-    elif code == 1:
-        status = direct_two(model, task, gains, seen, q, state)
-    elif code == 2:
-        status = stacked(model, task, gains, seen, q, state)
-    elif code == 3:
-        status = blockwise(model, task, gains, seen, q, state)
-    elif code == 4:
-        status = euclidean_points(model, task, gains, seen, q, state)
+    if code == _DIRECT_THREE:
+        status = direct_three.direct_three(model, task, gains, seen, q, state)
+    elif code == _DIRECT_TWO:
+        status = direct_two.direct_two(model, task, gains, seen, q, state)
+    elif code == _STACKED:
+        status = stacked.stacked(model, task, gains, seen, q, state)
+    elif code == _BLOCKWISE:
+        status = blockwise.blockwise(model, task, gains, seen, q, state)
+    elif code == _EUCLIDEAN_POINTS:
+        status = euclidean_points.euclidean_points(model, task, gains, seen, q, state)
     else:
-        status = exact(model, task, gains, seen, q, state)
+        status = exact.exact(model, task, gains, seen, q, state)
     if following(task.reference):
-        go_on(task.reference, gains, status, code == 5, state)
+        go_on(task.reference, gains, status, code == _EXACT, state)
     return status

@@ -1,10 +1,11 @@
 """Classical stereo law: the sum of two monocular laws."""
 
-from projservo_cli.control.image_based import pseudo_inverse, put_view
-from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
+from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse, put_view
 from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
+
+CODE = 3
 
 
 @merged

@@ -9,6 +9,8 @@ from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
 
+CODE = 1
+
 
 @merged
 def axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:

@@ -1,11 +1,12 @@
 """Classical stereo law: triangulated Euclidean points, with a metric model."""
 
-from projservo_cli.control.image_based import pseudo_inverse
-from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure
+from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse
 from projservo_cli.geometry.algebra import apply, mat, vec
 from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
+
+CODE = 4
 
 
 @merged

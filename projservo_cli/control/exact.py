@@ -6,9 +6,9 @@ forward kinematics alone, [RH00] eqs. (6), (19); no metric quantity enters.
 """
 
 import math
+from typing import NamedTuple
 
 from projservo_cli.control.direct_two import single_rotation
-from projservo_cli.control.following import speed_share
 from projservo_cli.control.law import (
     MOST_PARTS,
     OK,
@@ -17,6 +17,7 @@ from projservo_cli.control.law import (
     State,
     follow,
     partitioned,
+    speed_share,
     translation_rate,
 )
 from projservo_cli.geometry.algebra import Mat4, mul
@@ -29,6 +30,8 @@ from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.trajectory import following, planned_step
 
+CODE = 5
+
 # A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
 # by about 0.1 mm from the path of a robot of a metre's size.
 PART_STEP = math.radians(2.5)
@@ -38,44 +41,63 @@ HALVINGS = 48
 BRANCH_FACTOR = 2.0
 
 
+class _Step(NamedTuple):
+    """Displacement of one period, which is solved for a joint step in so many equal parts.
+
+    Attributes
+    ----------
+    parts : translation and rotations that are left.
+    H_s : operator Ĥ_s of both rotations.
+    tau, theta : amplitudes of the translation and of that rotation, rad.
+    sense : factor that scales the joint motion q̂_s to the sense of Ĥ_s.
+    ahead : share of a period by which a plan is followed.
+    pieces : how many parts.
+    """
+
+    parts: Parts
+    H_s: Mat4
+    tau: float
+    theta: float
+    sense: float
+    ahead: float
+    pieces: int
+
+
 @merged
-def desired(parts: Parts, H_s: Mat4, tau: float, theta: float, share: float) -> Mat4:
-    """Share of the displacement of one period, exp(share τ Ĥ_t) exp(share θ Ĥ_s)."""
-    return mul(translation(parts.H_t, share * tau), rotation(H_s, mul(H_s, H_s), share * theta))
+def _scaled(step: _Step, share: float, count: int) -> _Step:
+    """A share of the displacement."""
+    tau, theta, ahead = share * step.tau, share * step.theta, share * step.ahead
+    return _Step(step.parts, step.H_s, tau, theta, step.sense, ahead, count)
+
+
+@merged
+def desired(step: _Step, share: float) -> Mat4:
+    """Share of the displacement of one period, exp(share τ Ĥ_t) exp(share θ Ĥ_s), [RH00] eq. (22)."""
+    turn = rotation(step.H_s, mul(step.H_s, step.H_s), share * step.theta)
+    return mul(translation(step.parts.H_t, share * step.tau), turn)
 
 
 @internal
-def first_order(parts: Parts, tau: float, theta: float, sense: float, ahead: float, state: State) -> float:
+def _first_order(step: _Step, state: State) -> float:
     """First-order joint step τ q̂_t + θ q̂_s of one period into ``state.q_dot``; its largest entry.
 
     Where a plan is followed, the joint motion of its next period is added in the share ``ahead``. NaN
     where the joints cannot make it.
     """
     for i in range(state.xi_dot.shape[0]):
-        state.xi_dot[i] = tau * state.q_hat[0, i] + theta * sense * state.q_hat[3, i]
+        state.xi_dot[i] = step.tau * state.q_hat[0, i] + step.theta * step.sense * state.q_hat[3, i]
     if not follow(state):
         return math.nan
     most = 0.0
     for i in range(state.q_dot.shape[0]):
-        state.q_dot[i] += ahead * state.q_ahead[i]
+        state.q_dot[i] += step.ahead * state.q_ahead[i]
         most = max(most, abs(state.q_dot[i]))
     return most
 
 
 @internal
-def continued(
-    model: Model,
-    task: Task,
-    q: FloatArray,
-    parts: Parts,
-    H_s: Mat4,
-    tau: float,
-    theta: float,
-    ahead: float,
-    count: int,
-    state: State,
-) -> bool:
-    """Solve the displacement in ``count`` equal parts, each from the one before, into ``state.path``.
+def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: State) -> bool:
+    """Solve the displacement in equal parts, each from the one before, into ``state.path``.
 
     The first part is predicted by the first-order step in ``state.q_dot``, the others by the part
     before. A part more than twice as long as predicted is on another kinematic branch.
@@ -84,45 +106,32 @@ def continued(
     -------
     False where a part does not settle or leaves the branch.
     """
-    n = q.shape[0]
+    n, count = q.shape[0], step.pieces
     H_back = backward(model, q)
     for i in range(n):
         state.path[0, i] = q[i]
     for j in range(1, count + 1):
         predicted = 0.0
         for i in range(n):
-            step = state.q_dot[i] / count if j == 1 else state.path[j - 1, i] - state.path[j - 2, i]
-            state.path[j, i] = state.path[j - 1, i] + step
-            predicted += step * step
-        goal = desired(parts, H_s, tau, theta, j / count)
+            part = state.q_dot[i] / count if j == 1 else state.path[j - 1, i] - state.path[j - 2, i]
+            state.path[j, i] = state.path[j - 1, i] + part
+            predicted += part * part
+        goal = desired(step, j / count)
         if following(task.reference):
-            goal = mul(planned_step(task.reference, float(state.clock[0]), ahead * j / count), goal)
+            goal = mul(planned_step(task.reference, float(state.clock[0]), step.ahead * j / count), goal)
         if not reach(model, H_back, goal, state.A, state.path[j], state.work, state.newton, SETTLED):
             return False
         taken = 0.0
         for i in range(n):
-            step = state.path[j, i] - state.path[j - 1, i]
-            taken += step * step
+            part = state.path[j, i] - state.path[j - 1, i]
+            taken += part * part
         if taken > BRANCH_FACTOR * BRANCH_FACTOR * predicted + ROUND_OFF * ROUND_OFF:
             return False
     return True
 
 
 @merged
-def up_to_limit(
-    model: Model,
-    task: Task,
-    q: FloatArray,
-    parts: Parts,
-    H_s: Mat4,
-    tau: float,
-    theta: float,
-    sense: float,
-    ahead: float,
-    count: int,
-    gains: Gains,
-    state: State,
-) -> float:
+def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _Step, state: State) -> float:
     """Largest share of a step, to round-off, at which no joint passes its limit; its parts in ``state.path``.
 
     The displacement is shortened along the path by bisection, each time solved for the joints.
@@ -130,38 +139,23 @@ def up_to_limit(
     share = 0.0
     width = 0.5
     for _ in range(HALVINGS):
-        trial = share + width
-        first_order(parts, trial * tau, trial * theta, sense, trial * ahead, state)
-        if continued(model, task, q, parts, H_s, trial * tau, trial * theta, trial * ahead, count, state):
-            joint = blocked_joint(q, state.path[count], gains.lower, gains.upper)
+        trial = _scaled(step, share + width, step.pieces)
+        _first_order(trial, state)
+        if _continued(model, task, q, trial, state):
+            joint = blocked_joint(q, state.path[step.pieces], gains.lower, gains.upper)
             if joint < 0:
-                share = trial
+                share += width
             else:
                 state.blocked[0] = joint
         width *= 0.5
-    first_order(parts, share * tau, share * theta, sense, share * ahead, state)
-    if share == 0.0 or not continued(
-        model, task, q, parts, H_s, share * tau, share * theta, share * ahead, count, state
-    ):
-        for j in range(count + 1):
+    last = _scaled(step, share, step.pieces)
+    _first_order(last, state)
+    if share == 0.0 or not _continued(model, task, q, last, state):
+        for j in range(step.pieces + 1):
             for i in range(q.shape[0]):
                 state.path[j, i] = q[i]
         share = 0.0
     return share
-
-
-@merged
-def first_order_only(
-    parts: Parts, tau: float, theta: float, sense: float, share: float, gains: Gains, state: State
-) -> int:
-    """First-order joint step of a displacement that is already within the joint-speed limit."""
-    first_order(parts, tau, theta, sense, share, state)
-    for i in range(state.q_dot.shape[0]):
-        state.q_dot[i] /= gains.period
-    state.share[0] = share
-    state.parts[0] = 0
-    state.blocked[0] = -1
-    return OK
 
 
 @merged
@@ -186,20 +180,27 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         return SINGULAR
     tau = translation_rate(task, gains, parts, state) * gains.period
     theta = gains.gain_s * theta_s * gains.period
-    if not math.isfinite(first_order(parts, tau, theta, sense, 1.0, state)):
+    whole = _Step(parts, H_s, tau, theta, sense, 1.0, 1)
+    if not math.isfinite(_first_order(whole, state)):
         return SINGULAR
     share = speed_share(state.q_dot, gains.speed, gains.period)
-    tau *= share
-    theta *= share
-    most = first_order(parts, tau, theta, sense, share, state)
+    step = _scaled(whole, share, 1)
+    most = _first_order(step, state)
     count = min(MOST_PARTS, max(1, math.ceil(most / PART_STEP)))
-    while not continued(model, task, q, parts, H_s, tau, theta, share, count, state):
+    step = _scaled(step, 1.0, count)
+    while not _continued(model, task, q, step, state):
         if count == MOST_PARTS:
-            return first_order_only(parts, tau, theta, sense, share, gains, state)
+            # Across a singularity the first-order step is all there is.
+            _first_order(step, state)
+            for i in range(q.shape[0]):
+                state.q_dot[i] /= gains.period
+            state.share[0], state.parts[0], state.blocked[0] = share, 0, -1
+            return OK
         count = min(MOST_PARTS, 2 * count)
+        step = _scaled(step, 1.0, count)
     state.blocked[0] = blocked_joint(q, state.path[count], gains.lower, gains.upper)
     if state.blocked[0] >= 0:
-        share *= up_to_limit(model, task, q, parts, H_s, tau, theta, sense, share, count, gains, state)
+        share *= _up_to_limit(model, task, gains, q, step, state)
     for i in range(q.shape[0]):
         state.q_dot[i] = (state.path[count, i] - q[i]) / gains.period
     state.share[0] = share

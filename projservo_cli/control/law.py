@@ -11,23 +11,24 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, dot, put_vec, sub, vec
+from projservo_cli.geometry.algebra import Mat4, apply, dot, mat, put_vec, sub, vec
 from projservo_cli.geometry.displacement import composed_angle
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.geometry.kinematics import operators_at, row
+from projservo_cli.geometry.kernels import COORDINATES, least_squares
+from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
+from projservo_cli.geometry.lens import straighten
 from projservo_cli.geometry.mechanisms import OWN, Span, Work, joint_motion, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
-from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, carry, fit_body, new_normal
+from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, Until, carry, fit_body, new_normal
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
-from projservo_cli.task.trajectory import following
+from projservo_cli.task.trajectory import Reference, between, following, place, planned
 from projservo_cli.task.visibility import limited_translation
 
 # Whether to fit only the views that the goal showed, and in how many steps; written as values of a loop,
 # for the compiler makes a function anew for each literal argument.
-ATTEMPTS = ((True, MOST_STEPS), (False, MOST_STEPS))
+_ATTEMPTS = ((True, MOST_STEPS), (False, MOST_STEPS))
 
 # Parts a law may split one step into.
 MOST_PARTS = 128
@@ -221,8 +222,9 @@ def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State)
     """
     fit = Fit(False, H, 0.0, 0.0, 0)
     state.face_px[0] = math.nan
-    for shown_only, most_steps in ATTEMPTS:
-        fit = fit_body(model.P, task.body, s, H, shown_only, SETTLED_PX, most_steps, state.normal)
+    for shown_only, most_steps in _ATTEMPTS:
+        until = Until(shown_only, SETTLED_PX, most_steps)
+        fit = fit_body(model.P, task.body, s, H, until, state.normal)
         if fit.found:
             break
     state.fit[0] = fit.before
@@ -311,3 +313,94 @@ def translation_rate(task: Task, gains: Gains, parts: Parts, state: State) -> fl
     if allowed < wanted:
         state.limited[0] += 1.0
     return allowed / gains.period
+
+
+@internal
+def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
+    """Interaction matrix and image error of one view, [RH00] eq. (7), into rows from ``first`` on."""
+    work = state.work
+    operators = work.columns
+    for i in range(operators.shape[0]):
+        operator = mat(operators[i])
+        for k in range(state.A.shape[0]):
+            put_vec(state.A_t[k], apply(operator, vec(state.A[k])))
+            _, _, u_dot, v_dot = image_velocity(model.P[view], state.A[k], state.A_t[k])
+            work.B[i, first + 2 * k] = u_dot
+            work.B[i, first + 2 * k + 1] = v_dot
+    for k in range(state.A.shape[0]):
+        if following(task.reference):
+            u, v = float(state.s_aim[view, k, 0]), float(state.s_aim[view, k, 1])
+        else:
+            target = task.s_star[view, k]
+            u, v = straighten(model.lens[view], float(target[0]), float(target[1]))
+        work.rhs[first + 2 * k] = s[view, k, 0] - u
+        work.rhs[first + 2 * k + 1] = s[view, k, 1] - v
+
+
+@internal
+def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
+    """Joint motion q̂ (n,) of least squares, and of least norm, of the matrix in the workspace.
+
+    The matrix has a column for each of ``Work.columns``: a pseudo-inverse of the
+    product of an image Jacobian of full column rank and of coordinates of full row rank is the product of
+    both pseudo-inverses.
+    """
+    work = state.work
+    if work.columns.shape[0] == q_hat.shape[0]:
+        return least_squares(work.B, rows, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
+    if not least_squares(work.B, rows, work.xi.shape[0], work.xi, work.pivot, work.z, work.rhs):
+        return False
+    return joint_motion(work, work.xi, q_hat)
+
+
+@merged
+def aim(reference: Reference, gains: Gains, state: State) -> None:
+    """Write where the face should be now, where its images should go, and how the joints lead there.
+
+    For the image-based law, whose command is −λ J⁺ (s − s_aim), the planned velocity ṡ is fed forward by
+    aiming ahead: s_aim = s + ṡ/λ.
+    """
+    i, x = place(reference, float(state.clock[0]))
+    j, y = place(reference, float(state.clock[0]) + 1.0)
+    lead = 1.0 / (gains.gain * gains.period)
+    H = planned(reference, float(state.clock[0]))
+    for k in range(state.A_aim.shape[0]):
+        for c in range(4):
+            state.A_aim[k, c] = between(reference.A[:, k, c], i, x)
+        put_vec(state.A_aim[k], apply(H, vec(state.A_aim[k])))
+        for view in range(2):
+            for c in range(2):
+                here = between(reference.s[:, view, k, c], i, x)
+                ahead = between(reference.s_ahead[:, view, k, c], i, x)
+                state.s_aim[view, k, c] = here + lead * ahead
+    for l in range(state.q_ahead.shape[0]):
+        state.q_ahead[l] = between(reference.q[:, l], j, y) - between(reference.q[:, l], i, x)
+
+
+@merged
+def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
+    """Share of the amplitude at which the first-order joint step keeps the joint-speed limit."""
+    share = 1.0
+    for i in range(q_step.shape[0]):
+        size = abs(q_step[i])
+        if size * share > speed[i] * period:
+            share = speed[i] * period / size
+    return share
+
+
+@merged
+def go_on(reference: Reference, gains: Gains, status: int, limited: bool, state: State) -> None:
+    """Advance the plan by as much of a period as the joint-speed limit leaves of the step.
+
+    Parameters
+    ----------
+    limited : whether the law kept the limit itself; it is else applied here.
+    """
+    if status != OK:
+        return
+    if not limited:
+        share = speed_share(state.q_dot, gains.speed, 1.0)
+        for i in range(state.q_dot.shape[0]):
+            state.q_dot[i] *= share
+        state.share[0] = share
+    state.clock[0] += reference.rate * state.share[0]

@@ -241,3 +241,28 @@ def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
     knock(plant.disturbance, k + 1, dq)
     put_mat(log.H[k + 1], pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1]))
     read_joints(plant.disturbance, k + 1, log.q[k + 1], log.read[k], log.read[k + 1])
+
+
+class Job(NamedTuple):
+    """The arguments of ``run``; ``state`` and ``log`` are its own, the rest may be shared."""
+
+    code: int
+    model: Model
+    task: Task
+    gains: Gains
+    limits: Limits
+    plant: Plant
+    noise: FloatArray
+    q_start: FloatArray
+    state: State
+    log: Log
+
+
+@njit
+def many_steps(job: Job) -> float:
+    """Measure, partition, command and limit, once in each state of a log: the cost of steps."""
+    total = 0.0
+    for k in range(job.log.s.shape[0]):
+        command(job.code, job.model, job.task, job.gains, job.log.s[k], job.log.q[k], job.state)
+        total += limit_speed(job.state.q_dot, job.limits.speed)
+    return total

@@ -1,12 +1,15 @@
 """The closed loop in Python: any law on any plant, the same limits, counting and verdicts."""
 
 import math
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
+from numba import types
+from numba.experimental import structref
 
-from projservo_cli.control.bound import bind, bound_command
-from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, new_state
+from projservo_cli.control import command
+from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, State, new_state
+from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.geometry.mechanisms import span_of
 from projservo_cli.loop.compiled import Log, new_log
@@ -31,25 +34,64 @@ from projservo_cli.loop.step import (
     verdict_at,
 )
 from projservo_cli.records import FloatArray, Model, WorkFailed
+from projservo_cli.robots.plugins import require_spelt
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.task.face import Task
 
-LEFT_TO_THE_LOOP = (-1.0,)
-NOT_FITTED = (np.nan, np.nan, np.nan)
-UNKNOWN = (np.nan,)
-FREE = (-1,)
+# Handing some forty arrays over to compiled code takes longer than a control step. They are handed over
+# once and kept in a structure of the compiler; a call then passes the pixels and the joints alone.
+_FIELDS = ("code", "model", "task", "gains", "state")
+
+if TYPE_CHECKING or not COMPILED:
+
+    class Bound(NamedTuple):
+        """What a law works on."""
+
+        code: int
+        model: Model
+        task: Task
+        gains: Gains
+        state: State
+
+else:
+
+    @structref.register
+    class BoundType(types.StructRef):
+        """The compiler's type of what a law works on."""
+
+    class Bound(structref.StructRefProxy):
+        """What a law works on, held by compiled code."""
+
+    structref.define_proxy(Bound, BoundType, _FIELDS)
+
+
+@allocating
+def bind(code: int, model: Model, task: Task, gains: Gains, state: State) -> Any:
+    """What the law of a code works on; changes of its arrays are seen, here and there."""
+    return Bound(code, model, task, gains, state)
+
+
+@allocating
+def bound_command(bound: Any, s: FloatArray, q: FloatArray) -> int:
+    """One command of the bound law, as of ``command``: the status, the rest is written to the state."""
+    return command(bound.code, bound.model, bound.task, bound.gains, s, q, bound.state)
+
+
+# What a law may have beside, and what holds where it has not: the share of the amplitude that its own
+# joint-speed limit left, negative where the limit is up to the loop; what fitting a body left, and the image
+# error (px) of the face by which the run is judged; the joint at whose limit it ended a step, or −1; joints
+# (parts + 1, n) between the parts in which it wants a step sent.
+OPTIONAL: dict[str, tuple[float, ...]] = {
+    "share": (-1.0,),
+    "fit": (math.nan, math.nan, math.nan),
+    "face_px": (math.nan,),
+    "blocked": (-1,),
+    "path": (),
+}
 
 
 class LoopLaw(Protocol):
-    """What the Python loop asks of a law.
-
-    A law that keeps the joint-speed limit itself has an attribute ``share`` (1,), the share of the
-    amplitude its limit left; the limit is else up to the loop. One that fits a body has an attribute
-    ``fit`` (3,), which the log keeps, and ``face_px`` (1,), the image error of the face by which the run
-    is judged. One that ends a step at the limit of a joint has an attribute ``blocked`` (1,), that joint
-    or −1. One that wants its step sent in parts has an attribute ``path``
-    (parts + 1, n), the joints between them.
-    """
+    """What the Python loop asks of a law; it may also have those of ``OPTIONAL``."""
 
     errors: FloatArray
 
@@ -153,79 +195,96 @@ def run(
 
     Raises
     ------
+    InputError
+        If the law has an attribute that is a misspelt one of ``OPTIONAL``.
     WorkFailed
         If the plant or the law fails before the first instant is complete.
     """
-    reached = [0]
     try:
+        require_spelt(f"law {type(law).__name__}", law, ("errors", *OPTIONAL))
         log = new_log(len(plant.joints()), plant.markers, limits.max_steps, len(ERRORS))
+        made = _Run(law, plant, s_star, limits, log)
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
-        try:
-            verdict, steps = _run(law, plant, s_star, period, limits, scale, log, reached)
-        except WorkFailed as error:
-            steps = reached[0]
-            if steps == 0:
-                raise
-            verdict, plant.disturbance = FAILED, str(error)
+        k, verdict = 0, RUNNING
+        while verdict == RUNNING:
+            try:
+                verdict, q_dot = made.instant(k)
+                if verdict == RUNNING:
+                    verdict = made.command(k, q_dot, period, scale)
+            except WorkFailed as error:
+                if k == 0:
+                    raise
+                verdict, plant.disturbance = FAILED, str(error)
+            k += verdict == RUNNING
     finally:
         plant.stop()
-    return verdict, steps, log
+    return verdict, k, log
 
 
-def _run(
-    law: LoopLaw,
-    plant: LoopPlant,
-    s_star: FloatArray,
-    period: float,
-    limits: Limits,
-    scale: float,
-    log: Log,
-    reached: list[int],
-) -> tuple[int, int]:
-    """Fill the log and return verdict and steps; the instant it has come to is in ``reached``."""
-    first_distance, first_error, waited = 0.0, math.nan, 0
-    for k in range(limits.max_steps + 1):
-        reached[0] = k
+class _Run:
+    """A run as far as it has come: the law on the plant, and what is logged of them."""
+
+    def __init__(self, law: LoopLaw, plant: LoopPlant, s_star: FloatArray, limits: Limits, log: Log) -> None:
+        self.law, self.plant, self.s_star, self.limits, self.log = law, plant, s_star, limits, log
+        self.first_distance, self.first_error, self.waited = math.nan, math.nan, 0
+
+    def instant(self, k: int) -> tuple[int, FloatArray]:
+        """Look and ask the law: the verdict of the instant, and joint velocity (n,), zero while waiting."""
+        plant, log, limits, truth = self.plant, self.log, self.limits, self.plant.plant
         log.read[k] = plant.joints()
         log.q[k], log.H[k] = plant.q, plant.H
         log.s[k] = plant.observe()
         log.hidden[k] = plant.hidden
         distance = plant.distance()
-        first_distance = distance if k == 0 else first_distance
-        left = outside(log.s[k], s_star.shape[1], plant.plant.image_size)
+        self.first_distance = distance if k == 0 else self.first_distance
+        left = outside(log.s[k], self.s_star.shape[1], truth.image_size)
         if left and log.events[0] < 0.0:
             log.events[0] = k
-        joint = beyond_limits(log.read[k], plant.plant.lower, plant.plant.upper)
+        joint = beyond_limits(log.read[k], truth.lower, truth.upper)
         if joint >= 0 and log.events[1] < 0.0 and not limits.stop_at_joint_limit:
             log.events[1], log.events[2] = k, joint
-        log.error[k] = log.judged[k] = image_error(log.s[k], s_star)
-        if plant.disturbance:
-            return DISTURBED, k
+        log.error[k] = log.judged[k] = image_error(log.s[k], self.s_star)
         seen, singular, sound, q_dot = True, False, True, np.zeros_like(log.read[k])
+        if plant.disturbance:
+            return DISTURBED, q_dot
         if plant.in_front:
-            status, q_dot = law(log.s[k], log.read[k])
+            status, q_dot = self.law(log.s[k], log.read[k])
             seen, singular, sound = status != LOST, status == SINGULAR, finite(q_dot)
-            log.errors[k], log.fit[k] = law.errors, getattr(law, "fit", NOT_FITTED)
-            face_px = float(getattr(law, "face_px", UNKNOWN)[0])
+            log.errors[k], log.fit[k] = self.law.errors, self.told("fit")
+            face_px = float(self.told("face_px")[0])
             log.judged[k] = face_px if math.isfinite(face_px) else log.judged[k]
         error = float(log.judged[k])
-        first_error = error if math.isnan(first_error) else first_error
+        self.first_error = error if math.isnan(self.first_error) else self.first_error
         within = tolerance(limits, float(log.fit[k, 2]))
         now = Instant(
-            plant.in_front, seen, left, error, first_error, within, distance, first_distance, sound, singular
+            plant.in_front,
+            seen,
+            left,
+            error,
+            self.first_error,
+            within,
+            distance,
+            self.first_distance,
+            sound,
+            singular,
         )
         verdict = verdict_at(now, limits)
-        if verdict == MARKERS_LOST and waited < limits.lost_steps and k < limits.max_steps:
-            waited += 1
-            plant.command(np.zeros_like(q_dot), period)
-            continue
-        if verdict != RUNNING:
-            return verdict, k
-        if k == limits.max_steps:
-            break
-        waited = 0
-        share = float(getattr(law, "share", LEFT_TO_THE_LOOP)[0])
+        if verdict == MARKERS_LOST and self.waited < limits.lost_steps and k < limits.max_steps:
+            self.waited += 1
+            return RUNNING, np.zeros_like(q_dot)
+        if verdict == RUNNING and k == limits.max_steps:
+            verdict = PLATEAU if on_plateau(log.judged, k, limits.plateau_steps) else MAX_STEPS
+        self.waited = 0
+        return verdict, q_dot
+
+    def command(self, k: int, q_dot: FloatArray, period: float, scale: float) -> int:
+        """Send what the law asks for within the limits; the verdict where a limit leaves no motion."""
+        log, limits, plant = self.log, self.limits, self.plant
+        if self.waited > 0:
+            plant.command(q_dot, period)
+            return RUNNING
+        share = float(self.told("share")[0])
         log.factor[k] = share if share >= 0.0 else limit_speed(q_dot, limits.speed)
         q_dot = q_dot * scale
         dq = q_dot * period
@@ -233,24 +292,22 @@ def _run(
             joint = shorten(log.read[k], dq, plant.plant.lower, plant.plant.upper)
             if joint >= 0:
                 q_dot = dq / period
-            joint = max(joint, int(getattr(law, "blocked", FREE)[0]))
+            joint = max(joint, int(self.told("blocked")[0]))
             if joint >= 0 and stands_still(dq):
                 log.events[2] = joint
-                return JOINT_LIMIT, k
-        steps = _steps(plant, law, dq, scale)
+                return JOINT_LIMIT
+        path = self.told("path")
+        # A long step goes in the parts that the law split it into, where it is not scaled down.
+        in_parts = len(path) > 2 and scale >= 1.0 and plant.takes_parts
+        steps = np.diff(path, axis=0) if in_parts else dq[None]
         for step in steps:
             plant.command(step, time_for(step, period / len(steps), limits.speed * scale))
         log.q_dot[k] = q_dot
-    last = limits.max_steps
-    return (PLATEAU if on_plateau(log.judged, last, limits.plateau_steps) else MAX_STEPS), last
+        return RUNNING
 
-
-def _steps(plant: LoopPlant, law: LoopLaw, dq: FloatArray, scale: float) -> FloatArray:
-    """The joint steps (parts, n) to send: one, or the parts of a long one that is not scaled down."""
-    path = getattr(law, "path", None)
-    if path is None or len(path) < 3 or scale < 1.0 or not plant.takes_parts:
-        return dq[None]
-    return np.asarray(np.diff(path, axis=0))
+    def told(self, name: str) -> Any:
+        """What the law says of its last step beside the command."""
+        return getattr(self.law, name, OPTIONAL[name])
 
 
 def time_for(step: FloatArray, period: float, speed: FloatArray) -> float:

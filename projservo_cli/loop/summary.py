@@ -3,11 +3,11 @@
 import math
 from typing import NamedTuple
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, mul, put_vec, sub, vec
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
+from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.loop.compiled import Log
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant, center_deviation, line_distance
+from projservo_cli.robots.simulated import Plant, pose_after
 from projservo_cli.task.face import center_of
 
 MM = 1e3
@@ -140,7 +140,7 @@ def path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> t
         last = A_c
         if k > 0:
             length += math.sqrt(dot(way, way))
-            most = max(most, line_distance(A_c, start, goal))
+            most = max(most, _line_distance(A_c, start, goal))
     return length, most
 
 
@@ -152,22 +152,52 @@ def path_deviation(
 
     Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
     """
-    M = log.M[: plant.M.shape[0]]
-    dq = log.scratch[2, : log.q.shape[1]]
-    part = log.scratch[3, : log.q.shape[1]]
-    A_c, A_cs = vec(start), vec(goal)
+    start_and_goal = vec(start), vec(goal)
+    q, dq = log.scratch[2, : log.q.shape[1]], log.scratch[3, : log.q.shape[1]]
     most = 0.0
     for k in range(steps):
-        for i in range(dq.shape[0]):
-            dq[i] = log.q_dot[k, i] * period
         H = mat(log.H[k])
         if log.parts[k] == 0:
-            stray = center_deviation(plant, H, log.q[k], dq, A_c, A_cs, samples, M, log.scratch)
-            most = max(most, stray)
+            for i in range(dq.shape[0]):
+                q[i], dq[i] = log.q[k, i], log.q_dot[k, i] * period
+            most = max(most, _step_deviation(plant, log, H, start_and_goal, samples))
         for j in range(log.parts[k]):
             for i in range(dq.shape[0]):
-                part[i] = log.path[k, j + 1, i] - log.path[k, j, i]
+                q[i], dq[i] = log.path[k, j, i], log.path[k, j + 1, i] - log.path[k, j, i]
             share = max(1, samples // log.parts[k])
-            stray = center_deviation(plant, H, log.path[k, j], part, A_c, A_cs, share, M, log.scratch)
-            most = max(most, stray)
+            most = max(most, _step_deviation(plant, log, H, start_and_goal, share))
     return most
+
+
+@internal
+def _step_deviation(
+    plant: Plant, log: Log, H: Mat4, start_and_goal: tuple[Vec4, Vec4], samples: int
+) -> float:
+    """Largest distance of the centre from the line start–goal during one joint step, m.
+
+    The joints and their step are in rows 2 and 3 of ``log.scratch``; they move linearly, and the step is
+    sampled at so many equal parts, its end included.
+    """
+    part, reached, q, dq = log.scratch[0], log.scratch[1], log.scratch[2], log.scratch[3]
+    n, M = log.q.shape[1], log.M[: plant.M.shape[0]]
+    most = 0.0
+    for j in range(1, samples + 1):
+        for i in range(n):
+            part[i] = dq[i] * (j / samples)
+        H_part = pose_after(plant, H, q[:n], part, reached)
+        for k in range(M.shape[0]):
+            put_vec(M[k], apply(H_part, vec(plant.M[k])))
+        start, goal = start_and_goal
+        most = max(most, _line_distance(center_of(M, plant.center), start, goal))
+    return most
+
+
+@merged
+def _line_distance(A: Vec4, start: Vec4, goal: Vec4) -> float:
+    """Distance of a metric point from the line through start and goal; from start where they agree."""
+    way = axpy(-1.0, start, goal)
+    off = axpy(-1.0, start, A)
+    length = dot(way, way)
+    if length > 0.0:
+        off = axpy(-dot(off, way) / length, way, off)
+    return math.sqrt(dot(off, off))

@@ -90,15 +90,15 @@ def begin(
     -------
     What is wrong, ``FOUND`` for nothing; the parts; False where neither sense of a half turn arrived.
     """
-    status, parts = first_parts(model, task, s, q_start, state)
-    if status == FOUND and rehearse and is_half_turn(parts.theta_p):
-        parts, arrives = in_better_sense(model, task, q_start, state, stage)
+    status, parts = _first_parts(model, task, s, q_start, state)
+    if status == FOUND and rehearse and _is_half_turn(parts.theta_p):
+        parts, arrives = _in_better_sense(model, task, q_start, state, stage)
         return FOUND if parts.found else NOT_UNIQUE, parts, arrives
     return status, parts, True
 
 
 @composed
-def first_parts(
+def _first_parts(
     model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
 ) -> tuple[int, Parts]:
     """Measure and partition the task in the sense that the angles have; what is wrong, and the parts."""
@@ -109,22 +109,22 @@ def first_parts(
 
 
 @composed
-def is_half_turn(theta_p: float) -> bool:
+def _is_half_turn(theta_p: float) -> bool:
     """Whether the rotation within the plane is so near to half a turn that its sense must be chosen."""
     return math.pi - abs(theta_p) < HALF_TURN_BAND
 
 
-def in_better_sense(
+def _in_better_sense(
     model: Model, task: Task, q_start: FloatArray, state: State, stage: Stage
 ) -> tuple[Parts, bool]:
     """The parts of a task that was partitioned, with its half turn in the better sense, and if it arrives."""
-    sense, arrives = half_turn_sense(model, task, state.A, q_start, state.q_hat[2], stage)
+    sense, arrives = _half_turn_sense(model, task, state.A, q_start, state.q_hat[2], stage)
     state.memory.rotation[1] = sense * state.q_hat[2]
     parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
     return parts, arrives
 
 
-def half_turn_sense(
+def _half_turn_sense(
     model: Model, task: Task, A: FloatArray, q_start: FloatArray, q_hat_p: FloatArray, stage: Stage
 ) -> tuple[float, bool]:
     """Sense of a half turn within the plane, 1 for that of the motion q̂_p or −1, and whether it arrives.
@@ -211,7 +211,7 @@ class Setting(NamedTuple):
 
 
 class Measuring(NamedTuple):
-    """Workspace in which the task of a run is measured.
+    """Workspace in which the task of a run is measured, and the run driven.
 
     Attributes
     ----------
@@ -219,6 +219,7 @@ class Measuring(NamedTuple):
     bench : in which the task is measured.
     task, own_task : as it is partitioned, and as a law sees it that measures in another way.
     state, own_state : of the partition and of the law.
+    log : of the run.
     """
 
     start: FloatArray
@@ -228,6 +229,15 @@ class Measuring(NamedTuple):
     own_task: Task
     state: State
     own_state: State
+    log: Log
+
+
+class _Opened(NamedTuple):
+    """A task that was measured and partitioned: what is wrong, ``FOUND`` for nothing, and its angles, rad."""
+
+    status: int
+    theta_r: float
+    theta_p: float
 
 
 class Desk(NamedTuple):
@@ -235,14 +245,12 @@ class Desk(NamedTuple):
 
     Attributes
     ----------
-    measuring : of the task.
+    measuring : of the task and the run.
     stage : for half turns.
-    log : of the run.
     """
 
     measuring: Measuring
     stage: Stage
-    log: Log
 
 
 def new_desk(setting: Setting, shown: int) -> Desk:
@@ -266,16 +274,13 @@ def new_desk(setting: Setting, shown: int) -> Desk:
         new_task(setting.believed, s_star, center),
         new_state(n, m, shown),
         new_state(n, m, observed),
-    )
-    return Desk(
-        measuring,
-        new_stage(setting.model, m, setting.lower, setting.upper),
         new_log(n, observed, setting.limits.max_steps, len(ERRORS), parts),
     )
+    return Desk(measuring, new_stage(setting.model, m, setting.lower, setting.upper))
 
 
 @composed
-def put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: Measuring, task: Task) -> int:
+def _put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: Measuring, task: Task) -> int:
     """Measure a task from images (2, 2, b, 2) at its start and goal, px; what is wrong."""
     for view in range(2):
         for k in range(task.s_star.shape[1]):
@@ -290,37 +295,25 @@ def put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: Mea
 
 
 @njit
-def opened(
-    model: Model,
-    believed: Model,
-    shares_task: bool,
-    q_start: FloatArray,
-    shown: FloatArray,
-    desk: Measuring,
-) -> tuple[int, float, float]:
+def _open(setting: Setting, shown: FloatArray, desk: Measuring) -> _Opened:
     """Measure and partition a task, and measure it as the law will.
 
     Parameters
     ----------
-    model, believed, shares_task, q_start : of the setting.
     shown : (2, 2, b, 2) images at the start and at the goal, the face first, px.
     desk : on return with tasks and states.
-
-    Returns
-    -------
-    What is wrong, ``FOUND`` for nothing; the angles onto and within the plane, rad.
     """
     reset(desk.own_state)
-    if not shares_task:
-        status = put_measured(believed, q_start, shown, desk, desk.own_task)
+    if not setting.shares_task:
+        status = _put_measured(setting.believed, setting.q_start, shown, desk, desk.own_task)
         if status != FOUND:
-            return status, 0.0, 0.0
-    status = put_measured(model, q_start, shown, desk, desk.task)
+            return _Opened(status, 0.0, 0.0)
+    status = _put_measured(setting.model, setting.q_start, shown, desk, desk.task)
     if status != FOUND:
-        return status, 0.0, 0.0
+        return _Opened(status, 0.0, 0.0)
     reset(desk.state)
-    status, parts = first_parts(model, desk.task, desk.start, q_start, desk.state)
-    return status, parts.theta_r, parts.theta_p
+    status, parts = _first_parts(setting.model, desk.task, desk.start, setting.q_start, desk.state)
+    return _Opened(status, parts.theta_r, parts.theta_p)
 
 
 def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> None:
@@ -336,21 +329,18 @@ def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, n
     """
     made = 0
     while made < len(shown):
-        made = without_rehearsal(setting, shown, noise, desk.measuring, desk.log, made, numbers)
+        made = _without_rehearsal(setting, shown, noise, desk.measuring, made, numbers)
         if made < len(shown):
-            rehearsed(setting, noise[made], desk, numbers[made])
+            at = desk.measuring
+            parts, _ = _in_better_sense(setting.model, at.task, setting.q_start, at.state, desk.stage)
+            opened = _Opened(FOUND if parts.found else NOT_UNIQUE, parts.theta_r, parts.theta_p)
+            _drive(setting, opened, noise[made], at, numbers[made])
             made += 1
 
 
 @njit
-def without_rehearsal(
-    setting: Setting,
-    shown: FloatArray,
-    noise: FloatArray,
-    desk: Measuring,
-    log: Log,
-    first: int,
-    numbers: FloatArray,
+def _without_rehearsal(
+    setting: Setting, shown: FloatArray, noise: FloatArray, desk: Measuring, first: int, numbers: FloatArray
 ) -> int:
     """Runs from the first on, up to one whose half turn is to be rehearsed; that one is opened.
 
@@ -359,44 +349,27 @@ def without_rehearsal(
     """
     runs = len(shown)
     for made in range(first, runs):
-        status, theta_r, theta_p = opened(
-            setting.model, setting.believed, setting.shares_task, setting.q_start, shown[made], desk
-        )
-        if status == FOUND and setting.rehearse and is_half_turn(theta_p):
+        opened = _open(setting, shown[made], desk)
+        if opened.status == FOUND and setting.rehearse and _is_half_turn(opened.theta_p):
             return made
-        driven(setting, status, theta_r, theta_p, noise[made], desk, log, numbers[made])
+        _drive(setting, opened, noise[made], desk, numbers[made])
     return runs
 
 
-def rehearsed(setting: Setting, noise: FloatArray, desk: Desk, numbers: FloatArray) -> None:
-    """One run that was opened, its half turn in the better sense."""
-    at = desk.measuring
-    parts, _ = in_better_sense(setting.model, at.task, setting.q_start, at.state, desk.stage)
-    status = FOUND if parts.found else NOT_UNIQUE
-    driven(setting, status, parts.theta_r, parts.theta_p, noise, at, desk.log, numbers)
-
-
 @njit
-def driven(
-    setting: Setting,
-    status: int,
-    theta_r: float,
-    theta_p: float,
-    noise: FloatArray,
-    desk: Measuring,
-    log: Log,
-    numbers: FloatArray,
+def _drive(
+    setting: Setting, opened: _Opened, noise: FloatArray, desk: Measuring, numbers: FloatArray
 ) -> None:
-    """Drive the law of a run that was opened, with what is wrong and its angles, rad; its numbers."""
+    """Drive the law of a run that was opened; its numbers."""
     for i in range(numbers.shape[0]):
         numbers[i] = math.nan
     numbers[VERDICT] = NOT_STARTED
-    if status != FOUND:
+    if opened.status != FOUND:
         return
-    state = desk.own_state
+    state, q_hat = desk.own_state, desk.state.q_hat
     for i in range(state.memory.rotation.shape[1]):
-        state.memory.rotation[0, i] = desk.state.q_hat[1, i] if theta_r >= 0.0 else -desk.state.q_hat[1, i]
-        state.memory.rotation[1, i] = desk.state.q_hat[2, i] if theta_p >= 0.0 else -desk.state.q_hat[2, i]
+        state.memory.rotation[0, i] = q_hat[1, i] if opened.theta_r >= 0.0 else -q_hat[1, i]
+        state.memory.rotation[1, i] = q_hat[2, i] if opened.theta_p >= 0.0 else -q_hat[2, i]
     verdict, steps = run(
         setting.code,
         setting.believed,
@@ -407,12 +380,12 @@ def driven(
         noise,
         setting.q_start,
         state,
-        log,
+        desk.log,
     )
     numbers[VERDICT] = verdict
     numbers[STEPS] = steps
     if verdict != RUNNING:
-        found = summary(setting.plant, log, steps, state.limited[0], setting.gains.period, setting.ends)
+        found = summary(setting.plant, desk.log, steps, state.limited[0], setting.gains.period, setting.ends)
         column = 2
         for value in literal_unroll(found):
             numbers[column] = value

@@ -12,7 +12,8 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ from projservo_cli.records import InputError, WorkFailed
 
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
+# How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
+_ALIKE = 0.8
 TARGET = rf"^{DOTTED}:{DOTTED}$"
 
 
@@ -49,7 +52,8 @@ def find(kind: str, target: str, methods: Sequence[str]) -> Any:
         If there is no such class or it lacks a method.
     """
     where = f"{kind} {target}"
-    found = _found(where, *target.split(":"))
+    with said_apart():
+        found = _found(where, *target.split(":"))
     if isinstance(found, type):
         _require_methods(where, found, methods)
     return found
@@ -82,7 +86,8 @@ def make(
     except ValueError:
         pass  # a class in C tells nothing about its arguments; the call itself will
     try:
-        result = found(*arguments, **options)
+        with said_apart():
+            result = found(*arguments, **options)
     except Exception as error:
         raise WorkFailed(f"{where}: cannot be made: {what_failed(error)}") from error
     _require_methods(where, result, methods)
@@ -120,9 +125,34 @@ def _found(where: str, module: str, name: str) -> Any:
 def _require_methods(where: str, found: Any, methods: Sequence[str]) -> None:
     lacking = [name for name in methods if not callable(getattr(found, name, None))]
     if lacking:
+        require_spelt(where, found, lacking)
         raise InputError(
             f"{where}: lacks {', '.join(f'{name}()' for name in lacking)}; needed: {', '.join(methods)}"
         )
+
+
+def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
+    """Refuse an object with an attribute that is spelt almost as one of those that are looked for.
+
+    It would else count as one that the object does not have.
+
+    Raises
+    ------
+    InputError
+        If there is one whose right name is not there as well.
+    """
+    own = [name for name in dir(found) if not name.startswith("_")]
+    for name in own:
+        near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
+        if near and near[0] not in own:
+            raise InputError(f"{where}: has {name}, which nothing looks for; did you mean {near[0]}?")
+
+
+@contextmanager
+def said_apart() -> Iterator[None]:
+    """What somebody else's code prints goes to standard error: standard output is for results."""
+    with redirect_stdout(sys.stderr):
+        yield
 
 
 def what_failed(error: BaseException) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, combine, dot, mat, mul, put_vec, vec
 from projservo_cli.geometry.displacement import as_array, as_mat, twist_exponential
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward, row, start_pose
 from projservo_cli.geometry.lens import bend
 from projservo_cli.records import FREE, FloatArray, IntArray, Model
@@ -139,31 +139,31 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
         camera, lens = plant.model.P[view], plant.model.lens[view]
         for k in range(m):
             A = vec(M[k])
-            if not put_pixel(camera, lens, A, s[view, k]):
+            if not _put_pixel(camera, lens, A, s[view, k]):
                 in_front = False
             elif plant.opaque and not seen:
-                put_unseen(s[view, k])
+                _put_unseen(s[view, k])
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]
             A = apply(H, vec(plant.pins[k]))
-            if put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
-                put_unseen(pixel)
+            if _put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
+                _put_unseen(pixel)
     return in_front
 
 
 @merged
-def put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
+def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
     """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
     depth = row(camera, 2, A)
     if not depth > 0.0:
-        put_unseen(pixel)
+        _put_unseen(pixel)
         return False
     pixel[0], pixel[1] = bend(lens, row(camera, 0, A) / depth, row(camera, 1, A) / depth)
     return True
 
 
 @merged
-def put_unseen(pixel: FloatArray) -> None:
+def _put_unseen(pixel: FloatArray) -> None:
     """Write what stands for an unseen marker, NaN."""
     pixel[0] = math.nan
     pixel[1] = math.nan
@@ -184,47 +184,6 @@ def rig_distance(plant: Plant, M: FloatArray) -> float:
     middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))
     way = axpy(-0.5, middle, center_of(M, plant.center))
     return math.sqrt(dot(way, way))
-
-
-@internal
-def center_deviation(
-    plant: Plant,
-    H: Mat4,
-    q: FloatArray,
-    dq: FloatArray,
-    start: Vec4,
-    goal: Vec4,
-    samples: int,
-    M: FloatArray,
-    scratch: FloatArray,
-) -> float:
-    """Largest distance of the centre from the line start–goal during one joint step, m.
-
-    The joints move linearly; the step is sampled at ``samples`` equal parts, its end included.
-    ``M`` (m, 4) and ``scratch`` (≥2, n) are overwritten.
-    """
-    part = scratch[0]
-    reached = scratch[1]
-    most = 0.0
-    for j in range(1, samples + 1):
-        for i in range(dq.shape[0]):
-            part[i] = dq[i] * (j / samples)
-        H_part = pose_after(plant, H, q, part, reached)
-        for k in range(M.shape[0]):
-            put_vec(M[k], apply(H_part, vec(plant.M[k])))
-        most = max(most, line_distance(center_of(M, plant.center), start, goal))
-    return most
-
-
-@merged
-def line_distance(A: Vec4, start: Vec4, goal: Vec4) -> float:
-    """Distance of a metric point from the line through start and goal; from start where they agree."""
-    way = axpy(-1.0, start, goal)
-    off = axpy(-1.0, start, A)
-    length = dot(way, way)
-    if length > 0.0:
-        off = axpy(-dot(off, way) / length, way, off)
-    return math.sqrt(dot(off, off))
 
 
 class AnalyticPlant:

@@ -8,21 +8,20 @@ import itertools
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control import CODES
-from projservo_cli.control.bound import bind, bound_command
-from projservo_cli.control.law import ERRORS, Gains, State, new_state
+from projservo_cli.control import CODES, LAWS
+from projservo_cli.control.law import ERRORS, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
-from projservo_cli.loop.compiled import Log, new_log
+from projservo_cli.loop.compiled import Job, many_steps, new_log
 from projservo_cli.loop.compiled import run as run_compiled
-from projservo_cli.loop.repeated import many_steps
+from projservo_cli.loop.python import bind, bound_command
 from projservo_cli.loop.step import Limits
-from projservo_cli.records import LAWS, FloatArray, Model
+from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
 from projservo_cli.stages.world import truth_of
@@ -36,21 +35,6 @@ if TYPE_CHECKING:
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
 BODY = "exact, body"
-
-
-class Job(NamedTuple):
-    """The arguments of one run; ``state`` and ``log`` are its own, the rest may be shared."""
-
-    code: int
-    model: Model
-    task: Task
-    gains: Gains
-    limits: Limits
-    plant: Plant
-    noise: FloatArray
-    q_start: FloatArray
-    state: State
-    log: Log
 
 
 class Case:
@@ -93,21 +77,21 @@ class Case:
             new_log(n, seen, limits.max_steps, len(ERRORS)),
         )
 
-    def _states(self, task: Task, plant: Plant) -> tuple[FloatArray, FloatArray]:
-        """Pixels and joints of the states that are cycled through."""
+    def _states(self, task: Task, plant: Plant) -> Job:
+        """A run whose log has the states that are cycled through."""
         job = self.job(task, plant, self.limits)
         run_compiled(*job)
-        return job.log.s, job.log.q
+        return job
 
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
-        task, (S, Q) = (self.body_task, self.whole) if body else (self.task, self.points)
-        return many_steps(CODES[law], self.model, task, self.gains, S, Q, self.state, self.limits.speed)
+        job = self.whole if body else self.points
+        return many_steps(job._replace(code=CODES[law]))
 
     def one_step(self) -> int:
         """One step of direct_three, called from Python."""
-        S, Q = self.points
-        return bound_command(self.bound, S[0], Q[0])
+        log = self.points.log
+        return bound_command(self.bound, log.s[0], log.q[0])
 
     def whole_run(self) -> Job:
         """A run of 150 steps, traced."""
@@ -115,7 +99,7 @@ class Case:
 
     def matrices(self) -> FloatArray:
         """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
-        _, Q = self.points
+        Q = self.points.log.q
         work = workspace(len(self.q_start), 8)
         found = np.empty((STATES, 8, len(self.q_start)))
         for k in range(STATES):

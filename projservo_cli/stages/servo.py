@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.control import CODES
+from projservo_cli.control import BODY_LAWS, CODES
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, Gains, new_state
 from projservo_cli.geometry.mechanisms import in_span, span_of
 from projservo_cli.loop.compiled import new_log
@@ -16,7 +16,6 @@ from projservo_cli.loop.python import BuiltInLaw, LoopLaw
 from projservo_cli.loop.python import run as run_in_python
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.records import (
-    BODY_LAWS,
     REPLAN,
     Calibration,
     FloatArray,
@@ -219,7 +218,8 @@ class ForeignLaw:
         if np.isnan(s).any():
             return LOST, np.zeros_like(q)
         try:
-            answer = self.law(s.copy(), q.copy())
+            with plugins.said_apart():
+                answer = self.law(s.copy(), q.copy())
             if answer is None:
                 return LOST, np.zeros_like(q)
             q_dot = np.array(answer, dtype=np.float64)

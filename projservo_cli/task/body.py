@@ -63,6 +63,21 @@ class Body(NamedTuple):
     shown: BoolArray
 
 
+class Until(NamedTuple):
+    """When a fit ends.
+
+    Attributes
+    ----------
+    shown_only : leave out views that the goal did not show.
+    settled_px : a step that moves the images by no more, px rms a coordinate, is the last.
+    most_steps : the fit after so many steps is taken as it is.
+    """
+
+    shown_only: bool
+    settled_px: float
+    most_steps: int
+
+
 class Fit(NamedTuple):
     """Displacement that markers say, and how well they agree.
 
@@ -138,7 +153,7 @@ def new_normal() -> FloatArray:
 
 
 @inline
-def image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float) -> Row:
+def _image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float) -> Row:
     """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
 
     Parameters
@@ -203,8 +218,8 @@ def normal_equations(
             v = dot(p_v, M) * inverse
             e_u = float(s[view, k, 0]) - u
             e_v = float(s[view, k, 1]) - v
-            row_u = image_row(t_u, t_w, u, inverse, body.turn[k], e_u)
-            row_v = image_row(t_v, t_w, v, inverse, body.turn[k], e_v)
+            row_u = _image_row(t_u, t_w, u, inverse, body.turn[k], e_u)
+            row_v = _image_row(t_v, t_w, v, inverse, body.turn[k], e_v)
             N = accumulate(N, row_u, row_v)
             squares += e_u * e_u + e_v * e_v
             views += 1
@@ -213,7 +228,7 @@ def normal_equations(
 
 
 @internal
-def displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
+def _displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
     """Displacement H exp(ξ), with the coordinates ξ in the last column of the solved equations."""
     xi = normal[:, COORDINATES]
     direction = add(
@@ -227,16 +242,7 @@ def displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
 
 
 @merged
-def fit_body(
-    P: FloatArray,
-    body: Body,
-    s: FloatArray,
-    H: Mat4,
-    shown_only: bool,
-    settled_px: float,
-    most_steps: int,
-    normal: FloatArray,
-) -> Fit:
+def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: Until, normal: FloatArray) -> Fit:
     """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
 
     Any markers do that determine six coordinates: three that one camera sees, in general position.
@@ -246,16 +252,13 @@ def fit_body(
     P : (2, 3, 4) cameras.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : predicted displacement from the reference.
-    shown_only : leave out views that the goal did not show.
-    settled_px : a step that moves the images by no more, px rms a coordinate, is the last.
-    most_steps : the fit after so many steps is taken as it is.
     normal : (6, 7) workspace of the normal equations.
     """
     before = 0.0
     after = 0.0
     views = 0
-    for step in range(most_steps):
-        squares, views = normal_equations(P, body, s, H, shown_only, normal)
+    for step in range(until.most_steps):
+        squares, views = normal_equations(P, body, s, H, until.shown_only, normal)
         if step == 0:
             before = squares
         gradient = (
@@ -267,9 +270,9 @@ def fit_body(
         fall = 0.0
         for i in range(COORDINATES):
             fall += gradient[i] * normal[i, COORDINATES]
-        H = displaced(body, H, normal)
+        H = _displaced(body, H, normal)
         after = max(0.0, squares - fall)
-        if fall <= settled_px * settled_px * (2 * views):
+        if fall <= until.settled_px * until.settled_px * (2 * views):
             break
     return Fit(True, H, before, after, views)
 

@@ -74,6 +74,14 @@ class Parts(NamedTuple):
     A_c: Vec4
 
 
+class _Face(NamedTuple):
+    """Points (m, 4) of the face, its oriented plane and its centre."""
+
+    A: FloatArray
+    a: Vec4
+    A_c: Vec4
+
+
 @merged
 def no_parts() -> Parts:
     """Partition of a task that could not be measured."""
@@ -89,14 +97,14 @@ def clear(q_hat: FloatArray) -> None:
 
 
 @merged
-def negate(q_hat: FloatArray) -> None:
+def _negate(q_hat: FloatArray) -> None:
     """Reverse a joint motion."""
     for i in range(q_hat.shape[0]):
         q_hat[i] = -q_hat[i]
 
 
 @merged
-def agreement(q_hat: FloatArray, previous: FloatArray) -> float:
+def _agreement(q_hat: FloatArray, previous: FloatArray) -> float:
     """Positive where a joint motion goes on with the previous one, 0 where there was none."""
     total = 0.0
     for i in range(q_hat.shape[0]):
@@ -123,20 +131,21 @@ def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tu
         return False, 0.0, NO_OPERATOR
     tau = -dot(a_cs, A_c) / rate
     if tau < 0.0:
-        negate(q_hat)
+        _negate(q_hat)
         return True, -tau, multiple(-1.0, H_t)
     return True, tau, H_t
 
 
 @merged
 def onto_plane_part(
-    work: Work, task: Task, A: FloatArray, a: Vec4, a_t: Vec4, A_c: Vec4, q_hat: FloatArray, memory: Memory
+    work: Work, task: Task, face: _Face, a_t: Vec4, q_hat: FloatArray, memory: Memory
 ) -> tuple[bool, float, Mat4]:
     """Rotation of the face onto the translated target plane, [RH00] eqs. (9), (13)–(15).
 
     The axis is the intersection of both planes; for opposite planes, which leave it open, the line
     through the centre and the first marker. A_d is the marker farthest from the axis.
     """
+    A, a, A_c = face.A, face.a, face.A_c
     same = dot(a, a_t)
     D = sub(a_t, a) if same >= 0.0 else add(a_t, a)
     # Both planes hold the centre; what round-off leaves of its distance must not carry the axis away
@@ -155,19 +164,19 @@ def onto_plane_part(
         found, H_r = rotation_mechanism(work, A_1, A_2, q_hat)
     if not found:
         return False, 0.0, NO_OPERATOR
-    found, theta = oriented_angle(A, a, a_t, H_r)
+    found, theta = _oriented_angle(A, a, a_t, H_r)
     if not found:
         return False, 0.0, NO_OPERATOR
     if theta < 0.0:
-        negate(q_hat)
+        _negate(q_hat)
         H_r = multiple(-1.0, H_r)
         theta = -theta
-    theta = choose_sense(a, a_t, H_r, theta, task, agreement(q_hat, memory.rotation[0]) < 0.0)
+    theta = choose_sense(a, a_t, H_r, theta, task, _agreement(q_hat, memory.rotation[0]) < 0.0)
     return True, theta, H_r
 
 
 @merged
-def oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, float]:
+def _oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, float]:
     """Angle of [RH00] eq. (15), in (−π, π], that brings the front of a onto the front of a_t.
 
     A_d is the marker farthest from the axis, taken to the plane of the face: measured markers lie off
@@ -198,7 +207,7 @@ def oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool, 
 
 @merged
 def within_plane_part(
-    work: Work, A: FloatArray, A_r: FloatArray, a: Vec4, A_c: Vec4, q_hat: FloatArray, memory: Memory
+    work: Work, face: _Face, A_r: FloatArray, q_hat: FloatArray, memory: Memory
 ) -> tuple[bool, float, Mat4]:
     """Rotation of the face within its plane, [RH00] eqs. (10), (13)–(15).
 
@@ -207,6 +216,7 @@ def within_plane_part(
     fixed sense, so that θ_p is comparable from step to step; half a turn counts as +π unless the
     step before turned the other way.
     """
+    A, a, A_c = face.A, face.a, face.A_c
     found, H_p = planar_mechanism(work, a, unit(A_c), q_hat)
     if not found:
         return False, 0.0, NO_OPERATOR
@@ -224,7 +234,7 @@ def within_plane_part(
     A_c2 = add(a, apply(H_p2, a))
     velocity = apply(H_p, A_e)
     if dot(meet(A_e, A_c, A_c2), velocity) < 0.0:
-        negate(q_hat)
+        _negate(q_hat)
         H_p = multiple(-1.0, H_p)
         velocity = scale(-1.0, velocity)
     a_i = meet(A_er, A_c, A_c2)
@@ -239,7 +249,7 @@ def within_plane_part(
     if math.pi - abs(theta) <= HALF_TURN_TOLERANCE:
         theta = abs(theta)
     if math.pi - abs(theta) < CONTINUITY_BAND:
-        previous = agreement(q_hat, memory.rotation[1])
+        previous = _agreement(q_hat, memory.rotation[1])
         if theta > 0.0 and previous < 0.0:
             theta -= 2.0 * math.pi
         elif theta < 0.0 and previous > 0.0:
@@ -271,17 +281,18 @@ def partition(
     for k in range(A.shape[0]):
         A_ks = vec(task.A_star[k])
         put_vec(A_t[k], axpy(-tau, apply(H_t, A_ks), A_ks))
+    face = _Face(A, a, A_c)
     theta_r = 0.0
     theta_p = 0.0
     H_r = NO_OPERATOR
     H_p = NO_OPERATOR
     if found:
-        found, theta_r, H_r = onto_plane_part(work, task, A, a, a_t, A_c, q_hat[1], memory)
+        found, theta_r, H_r = onto_plane_part(work, task, face, a_t, q_hat[1], memory)
     if found:
         back = rotation(H_r, mul(H_r, H_r), -theta_r)
         for k in range(A.shape[0]):
             put_vec(A_r[k], apply(back, vec(A_t[k])))
-        found, theta_p, H_p = within_plane_part(work, A, A_r, a, A_c, q_hat[2], memory)
+        found, theta_p, H_p = within_plane_part(work, face, A_r, q_hat[2], memory)
     if found:
         for i in range(q_hat.shape[1]):
             memory.rotation[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]

@@ -12,7 +12,7 @@ from projservo_cli.geometry.kinematics import forward, operators_at
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import OWN, Span, Work, span_of, workspace
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.task.body import Body, carry, fit_body, new_normal
+from projservo_cli.task.body import Body, Until, carry, fit_body, new_normal
 from projservo_cli.task.face import (
     FOUND,
     MISFIT_GOAL,
@@ -160,7 +160,7 @@ def settled(P: FloatArray, body: Body, s: FloatArray, H: Mat4, normal: FloatArra
     """
     views = 0
     for _ in range(MOST_SIGHT_STEPS):
-        fit = fit_body(P, body, s, H, False, SETTLED_SIGHT_PX, 1, normal)
+        fit = fit_body(P, body, s, H, Until(False, SETTLED_SIGHT_PX, 1), normal)
         views = fit.views
         if not fit.found:
             return TOO_FEW, views, H

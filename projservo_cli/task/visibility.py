@@ -114,22 +114,6 @@ def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, agains
     return theta
 
 
-def margin(a: FloatArray, O: FloatArray, visible: FloatArray) -> FloatArray:
-    """Visibility margin of planes for both cameras: positive where a camera sees the face.
-
-    Parameters
-    ----------
-    a : (..., 4) planes, carried along from one start by H⁻ᵀ.
-    O : (2, 4) optical centres.
-    visible : (2,) sign of a·O on the visible side.
-
-    Returns
-    -------
-    (..., 2) margins.
-    """
-    return np.asarray(a @ O.T * visible)
-
-
 def visibility_translation(a: FloatArray, H_hat_t: FloatArray, O: FloatArray) -> float | None:
     """Amplitude τ_0 at which a translated face changes visibility, [RH00] section 4.2.
 

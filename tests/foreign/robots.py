@@ -96,6 +96,10 @@ class NoStop:
     def command(self, step, period): ...
 
 
+class Stopp(NoStop):
+    def stopp(self): ...
+
+
 class Unmakeable(Sound):
     def __init__(self):
         raise ConnectionError("no route to 10.0.0.7")

@@ -39,6 +39,7 @@ def written(name, text):
         (f"{HERE}:Zzz", r"has no Zzz; classes: Sound, Faulty, "),
         (f"{HERE}:NOT_A_CLASS", r"is no class, but of type int"),
         (f"{HERE}:NoStop", r"lacks stop\(\); needed: joints, observe, command, stop"),
+        (f"{HERE}:Stopp", r"has stopp, which nothing looks for; did you mean stop\?"),
         (f"{HERE}:Sound", r"does not take plant\.options: missing a required argument: 'config'"),
         ("mine_bad_syntax:A", r"importing mine_bad_syntax failed: SyntaxError: .* \(mine_bad_syntax.py:2\)$"),
         (

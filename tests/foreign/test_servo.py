@@ -278,10 +278,44 @@ def test_a_law_of_others_equals_the_built_in_one_it_calls(servo):
     assert np.isnan(theirs.tau).all()
 
 
-def test_a_law_and_a_robot_of_others(servo):
-    answer = servo(*SOUND, "--set", f"law={HERE}:ByImage", *NEAR, "--json", law=None)
+TALKING = """
+import threading
+from tests.foreign.robots import ByImage, Sound
+print("a module says")
+
+class Robot(Sound):
+    def __init__(self, config):
+        super().__init__(config)
+        print("a robot is made")
+    def observe(self):
+        threading.Thread(target=print, args=("a camera says",)).start()
+        print("a robot sees")
+        return super().observe()
+    def stop(self):
+        print("a robot stops")
+        super().stop()
+
+class Law(ByImage):
+    def __init__(self, setup):
+        super().__init__(setup)
+        print("a law is made")
+    def __call__(self, s, q):
+        print("a law is asked")
+        return super().__call__(s, q)
+"""
+SAID = ("a module says", "a robot is made", "a robot sees", "a camera says", "a robot stops", "a law is made")
+
+
+def test_a_law_and_a_robot_of_others_and_what_they_print(servo, monkeypatch):
+    """Standard output is for results: what others print, from whatever thread, goes to standard error."""
+    Path("mine_talks.py").write_text(TALKING)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    plant = ["--set", f"plant={{use: 'mine_talks:Robot', {OPTIONS}}}}}"]
+    answer = servo(*plant, "--set", "law=mine_talks:Law", *NEAR, "--json", law=None)
     assert answer.code == 0, answer.err
     assert answer.json["laws"][0]["verdict"] == "converged"
+    assert [text for text in (*SAID, "a law is asked") if text in answer.out] == []
+    assert [text for text in (*SAID, "a law is asked") if text not in answer.err] == []
 
 
 @pytest.mark.parametrize(

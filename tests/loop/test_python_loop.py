@@ -1,13 +1,15 @@
 """The loop in Python equals the compiled loop to the bit, and takes laws of others."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES
+from projservo_cli.control import CODES, LAWS
 from projservo_cli.control.law import ERRORS, OK
 from projservo_cli.loop.python import BuiltInLaw, run
 from projservo_cli.loop.step import VERDICTS
-from projservo_cli.records import LAWS
+from projservo_cli.records import InputError
 from projservo_cli.robots.simulated import AnalyticPlant
 from tests.control.following import Followed, tracked
 from tests.loop.bits import FOLLOWING
@@ -159,3 +161,15 @@ def test_a_command_that_is_no_number_diverges():
     plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((4, 2, 4, 2)))
     verdict, steps, _ = run(Towards(np.full(6, np.nan)), plant, sc.s_star, 0.04, limits(max_steps=3))
     assert (VERDICTS[verdict], steps) == ("diverged", 0)
+
+
+@pytest.mark.parametrize(
+    ("misspelt", "meant"), [("shares", "share"), ("facepx", "face_px"), ("bloked", "blocked")]
+)
+def test_an_attribute_that_is_misspelt_is_named(misspelt, meant):
+    """It would count as one that the law does not have."""
+    sc = scene()
+    law = SimpleNamespace(errors=np.full(5, np.nan), **{misspelt: np.ones(1)})
+    plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((2, 2, 4, 2)))
+    with pytest.raises(InputError, match=f"law SimpleNamespace: has {misspelt}.* did you mean {meant}"):
+        run(law, plant, sc.s_star, GAINS.period, limits(max_steps=1))

@@ -13,6 +13,7 @@ from projservo_cli.task.body import (
     MOST_STEPS,
     RANK_TOLERANCE,
     SETTLED_PX,
+    Until,
     body_of,
     fit_body,
     new_normal,
@@ -49,7 +50,9 @@ def twist_of(body, xi):
 
 
 def fitted(model, body, s, H, steps=MOST_STEPS, settled=SETTLED_PX):
-    return fit_body(model.P, body, np.ascontiguousarray(s), as_mat(H), False, settled, steps, new_normal())
+    return fit_body(
+        model.P, body, np.ascontiguousarray(s), as_mat(H), Until(False, settled, steps), new_normal()
+    )
 
 
 @pytest.mark.parametrize("seed", FRAMES)

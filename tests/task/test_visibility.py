@@ -14,7 +14,6 @@ from projservo_cli.task.visibility import (
     arc_minimum,
     choose_sense,
     limited_translation,
-    margin,
     margin_coefficients,
     visibility_angles,
     visibility_translation,
@@ -150,15 +149,6 @@ def test_margin_coefficients_describe_the_carried_plane(G, rng):
     for theta in np.linspace(-6, 6, 13):
         wanted = carried(a, expm(theta * H_hat)) @ O
         assert c_0 + c_s * math.sin(theta) + c_c * math.cos(theta) == pytest.approx(wanted, abs=1e-11)
-
-
-def test_margins_of_planes_are_signed_by_the_visible_side():
-    A = face()
-    task = make_task(arm(), A, A)
-    a = plane_of(A)
-    margins = margin(np.stack([a, -a]), task.O, task.visible)
-    assert (margins[0] > 0).all()
-    assert (margins[1] < 0).all()
 
 
 @settings(deadline=None, max_examples=300)
