@@ -272,16 +272,6 @@ def test_a_claim_follows_its_number():
     assert "3 left" in verdicts[1].measured
 
 
-def test_a_law_that_converges_does_not_diverge():
-    material = case()[2]
-    trace = dataclasses.replace(material.traces["blockwise"], verdict="diverged")
-    rows = {c.claim: c.holds for c in claims_of(changed(material, blockwise=trace), None)}
-    assert rows["The block-wise law diverges towards infinity"] is True
-    trace = dataclasses.replace(trace, verdict="converged")
-    rows = {c.claim: c.holds for c in claims_of(changed(material, blockwise=trace), None)}
-    assert rows["The block-wise law does not converge"] is False
-
-
 @pytest.mark.volume
 @pytest.mark.parametrize("name", ["paper", "ur5"])
 def test_claims_of_a_whole_run_with_exact_operators(name):
