@@ -1,9 +1,7 @@
 """Stage report: figures after the paper's, and its claims against what the runs measure."""
 
-import gc
 import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -132,7 +130,7 @@ def draw_all(
     folder = directory / FOLDER
     require_inside(folder, directory)
     written: list[str] = []
-    with style.styled(), _uncollected():
+    with style.styled():
         for done, spec in enumerate(FIGURES):
             progress("figures", done, len(FIGURES))
             contents: dict[str, bytes] = {}
@@ -151,16 +149,6 @@ def draw_all(
             written += [f"{FOLDER}/{spec.name}.{kind}" for kind in contents if kind != _NUMBERS]
     progress("figures", len(FIGURES), len(FIGURES))
     return written
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """No collection of garbage: among so many objects it would be an eighth of the time of drawing."""
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
 
 
 def composition(bench: Comparison, config: "Config", left_out: list[dict[str, str]]) -> _Eq22 | None:

@@ -89,19 +89,6 @@ def test_what_the_fit_left_out_is_drawn_apart_and_counts_nowhere():
     np.testing.assert_array_equal(data["pose_coordinates"][:5], [38, 38, 36, 36, 38])
 
 
-def test_errors_of_poses_are_rms_over_what_was_used():
-    used = np.zeros((3, 2, 2), dtype=bool)
-    used[0, 0, 0] = used[0, 1, 1] = used[2, 0, 1] = True
-    residual = np.full((3, 2, 2, 2), 99.0)
-    residual[0, 0, 0], residual[0, 1, 1], residual[2, 0, 1] = (3.0, 4.0), (0.0, 5.0), (np.sqrt(2.0), 4.0)
-    data = calibration.by_pose(
-        used, residual, np.where(used[..., None], np.full_like(residual, 0.25), np.nan)
-    )
-    np.testing.assert_allclose(data["pose_residual_px"], [np.sqrt(50.0 / 4.0), 3.0])
-    np.testing.assert_allclose(data["pose_predicted_px"], 0.5)
-    np.testing.assert_array_equal(data["pose_coordinates"], [4, 2])
-
-
 def test_held_out_errors_take_the_place_of_those_in_the_fit():
     fit = shifted()
     residual = np.full((49, 2, 10, 2), 3.0)
@@ -149,11 +136,6 @@ def test_arrows_are_magnified_by_a_round_factor_to_a_visible_length(extent, size
     length = factor * size * np.sqrt(2.0) / (0.04 * extent)
     assert 0.4 - 1e-9 <= length <= 1.0 + 1e-9  # the steps 1, 2, 5 are at most 2.5 apart
     assert round(factor / 10.0 ** np.floor(np.log10(factor) + 1e-9), 9) in (1.0, 2.0, 5.0)
-
-
-def test_without_residuals_nothing_is_magnified():
-    assert calibration.magnification(np.zeros(6), 100.0) == 1.0
-    assert calibration.magnification(np.zeros(0), 100.0) == 1.0
 
 
 def test_predicted_errors_add_up_to_the_free_parameters(fitted):

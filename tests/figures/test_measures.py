@@ -50,10 +50,6 @@ def test_gap_sees_what_only_one_path_does():
     assert measures.path_gap(straight, detour) == pytest.approx(4.0, 1e-14)
 
 
-def test_gap_of_a_path_of_one_point():
-    assert measures.path_gap(np.array([[1.0, 1.0]]), np.array([[4.0, 5.0]])) == pytest.approx(5.0, 1e-14)
-
-
 @given(st.lists(st.sampled_from([0.5, 0.95, 0.9999, 1.0, 1.01]), min_size=0, max_size=60), st.integers(1, 20))
 @settings(deadline=None)
 def test_a_plateau_is_the_longest_stretch_on_which_the_verdict_would_be_one(factors, window):
@@ -93,11 +89,6 @@ def test_way_along_a_line_and_distance_from_it():
     np.testing.assert_allclose(off, [0, 4, 2], atol=1e-15)
 
 
-def test_distance_from_a_line_of_no_length_is_that_from_its_point():
-    _, off = measures.along_line(np.array([[3.0, 4.0, 0]]), np.zeros(3), np.zeros(3))
-    np.testing.assert_allclose(off, [5.0])
-
-
 def test_rise_counts_from_the_least_value_before():
     e = np.array([[4.0, -3.0], [1.0, -2.0], [-2.5, -1.0], [0.0, 0.0]])
     np.testing.assert_allclose(measures.coordinate_rise(e), [1.5, 0.0])
@@ -134,13 +125,6 @@ def test_second_order_contributions_add_up_to_the_deviation_of_a_small_step():
         _, off = measures.along_line(moved[None, :3], center[:3], center[:3] + line)
         parts = measures.second_order_drift(H_hat, step, center, line)
         assert parts.sum() == pytest.approx(off[0], rel=tolerance)
-
-
-def test_no_step_contributes_nothing():
-    _, bench, material = case()
-    H_hat = joint_operators(material.plant.model, bench.scenario.ends.q_start)
-    parts = measures.second_order_drift(H_hat, np.zeros(6), material.middle, np.array([1.0, 0, 0]))
-    np.testing.assert_array_equal(parts, np.zeros(6))
 
 
 def test_center_path_runs_through_the_instants_and_finds_the_deviation_of_the_trace():

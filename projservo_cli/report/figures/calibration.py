@@ -53,7 +53,7 @@ def _data(fit: Fit) -> Data:
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
         **(
-            by_pose(used, residual, prediction_variance(calibration, observation.q))
+            _by_pose(used, residual, prediction_variance(calibration, observation.q))
             if fit.held_out is None
             else _by_pose_held_out(fit.held_out)
         ),
@@ -91,7 +91,7 @@ def _left_out(calibration: Calibration, observation: Observation) -> BoolArray:
     return out
 
 
-def by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
+def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
     """Predicted and actual error of each pose with a reading, rms per coordinate.
 
     Parameters
@@ -119,12 +119,12 @@ def by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data
 
 
 def _by_pose_held_out(held_out: CrossValidation) -> Data:
-    """Predicted and actual error of each pose from fits that have not seen it, as of ``by_pose``.
+    """Predicted and actual error of each pose from fits that have not seen it, as of ``_by_pose``.
 
     The predicted one has the noise of the held-out reading in it.
     """
     predicted = np.asarray(np.isfinite(held_out.residual).all(axis=-1))
-    return by_pose(predicted, held_out.residual, held_out.predicted**2)
+    return _by_pose(predicted, held_out.residual, held_out.predicted**2)
 
 
 def information(covariance: FloatArray) -> FloatArray:
