@@ -23,10 +23,7 @@ def replacing(path: Path) -> Iterator[Path]:
     The new content is on the disk before the old name points to it. When the block raises, the
     temporary file is removed and whatever stood at ``path`` before stays.
 
-    Raises
-    ------
-    InputError
-        When the folder cannot be made or written to, or the disk is full.
+    Raises InputError when the folder cannot be made or written to, or the disk is full.
     """
     with _told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,10 +45,7 @@ def require_writable(path: Path) -> None:
 
     Nothing is left behind: where folders lack, the nearest one there is stands for them.
 
-    Raises
-    ------
-    InputError
-        When there is no such folder, or it cannot be written to.
+    Raises InputError when there is no such folder, or it cannot be written to.
     """
     _neighbour(path, next(parent for parent in path.absolute().parents if parent.exists())).unlink()
 
@@ -63,16 +57,10 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
     The lock is the system's: it ends with the process, however that ends. Readers need none, since
     files are put in place as a whole.
 
-    Parameters
-    ----------
     folder : is made where there is none, and removed where nothing was written into it.
     parts : folders in it, from which leftovers are removed as well.
     name : of the lock, where not all of the folder is worked on.
-
-    Raises
-    ------
-    InputError
-        Where another process is at work, with its number, or the folder cannot be written to.
+    Raises InputError where another process is at work, with its number, or the folder cannot be written to.
     """
     from filelock import FileLock, Timeout
 

@@ -18,12 +18,8 @@ _PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
     """Everything that may explain a difference between two runs; values are JSON.
 
-    Parameters
-    ----------
-    seed : int
-        The seed of the configuration.
-    argv : list of str, optional
-        The command, by default that of this process.
+    seed : int, the seed of the configuration.
+    argv : list of str, optional, the command, by default that of this process.
     """
     return {
         "projservo": __version__,

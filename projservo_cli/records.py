@@ -70,22 +70,14 @@ class Model(NamedTuple):
 
     The calibrated model lives in a projective frame; the true one in the metric frame of the robot
     base, where the operators are 4×4 twists and ``a_inf`` is (0, 0, 0, 1).
-
-    Attributes
-    ----------
-    P : (2, 3, 4) cameras, left and right, to pixels.
-    H_hat_0 : (n, 4, 4) joint operators at the reference, one unit of motion per rad or m.
-    joint_types : (n,) ``REVOLUTE``, ``PRISMATIC`` or ``FREE``.
-    q_reference : (n,) joint reading at the reference, rad or m.
-    a_inf : (4,) plane at infinity, the common left null vector of the operators.
-    lens : (2, 5) radial distortion of both views: image centre u, v and radius, px, then k1, k2.
     """
 
-    P: FloatArray
-    H_hat_0: FloatArray
-    joint_types: IntArray
-    q_reference: FloatArray
-    a_inf: FloatArray
+    P: FloatArray  # (2, 3, 4) cameras, left and right, to pixels
+    H_hat_0: FloatArray  # (n, 4, 4) joint operators at the reference, one unit of motion per rad or m
+    joint_types: IntArray  # (n,) ``REVOLUTE``, ``PRISMATIC`` or ``FREE``
+    q_reference: FloatArray  # (n,) joint reading at the reference, rad or m
+    a_inf: FloatArray  # (4,) plane at infinity, the common left null vector of the operators
+    # (2, 5) radial distortion of both views: image centre u, v and radius, px, then k1, k2
     lens: FloatArray = NO_LENS
 
 
@@ -470,10 +462,7 @@ def law_and_mode(name: str) -> tuple[str, str]:
 def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
     """Names of the runs of laws, each in those of the modes that it has.
 
-    Raises
-    ------
-    InputError
-        If a law has none of them.
+    Raises InputError if a law has none of them.
     """
     found = []
     for law in laws:

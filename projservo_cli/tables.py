@@ -36,19 +36,12 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 @dataclass(frozen=True, eq=False)
 class JointList:
-    """Joint readings of numbered poses.
+    """Joint readings of numbered poses."""
 
-    Attributes
-    ----------
-    pose : (K,) numbers; 0, 1 … where the file has none.
-    q : (K, n) readings, rad or m.
-    numbered : whether the file has pose numbers.
-    left, right : names of the images of each pose; None where the file has none.
-    """
-
-    pose: IntArray
-    q: FloatArray
-    numbered: bool
+    pose: IntArray  # (K,) numbers; 0, 1 … where the file has none
+    q: FloatArray  # (K, n) readings, rad or m
+    numbered: bool  # whether the file has pose numbers
+    # left, right: names of the images of each pose; None where the file has none
     left: tuple[str, ...] | None
     right: tuple[str, ...] | None
 
@@ -58,20 +51,11 @@ def read_table(
 ) -> Observation:
     """Read an observation table.
 
-    Parameters
-    ----------
     joint_types : one letter a joint column, R or P, by default all R.
-    joint_unit : unit of the revolute columns, ``deg`` or ``rad``; by default rad, where readings beyond
-        two turns are taken for a mistaken unit and refused.
-
-    Returns
-    -------
-    Poses in the order of their first row, markers by number; NaN where unseen; readings in rad and m.
-
-    Raises
-    ------
-    InputError
-        ``file:line: what`` when the file cannot be read or a row makes no sense.
+    joint_unit : unit of the revolute columns, ``deg`` or ``rad``; by default rad, where readings beyond two
+        turns are taken for a mistaken unit and refused.
+    Returns poses in the order of their first row, markers by number; NaN where unseen; readings in rad and m.
+    Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
     """
     sheet = _Sheet(path, _HEADER, ["pose", "marker", *_PIXELS], joint_types)
     readings: dict[int, tuple[int, list[float]]] = {}
@@ -110,16 +94,11 @@ def read_table(
 def read_joints(path: Path | str, joint_types: str | None = None, joint_unit: str | None = None) -> JointList:
     """Read a list of joint readings, one pose a row: columns ``q1 … qN``, perhaps ``pose, left, right``.
 
-    Parameters
-    ----------
     joint_types : as for an observation table.
-    joint_unit : ``deg`` or ``rad`` as for an observation table; ``as is`` for readings that are only
-        passed on.
-
-    Raises
-    ------
-    InputError
-        ``file:line: what`` when the file cannot be read, a row makes no sense or a pose stands there twice.
+    joint_unit : ``deg`` or ``rad`` as for an observation table; ``as is`` for readings that are only passed
+        on.
+    Raises InputError ``file:line: what`` when the file cannot be read, a row makes no sense or a pose stands
+    there twice.
     """
     sheet = _Sheet(path, "q1…qN", [], joint_types, optional=["pose", "left", "right"])
     if ("left" in sheet.columns) != ("right" in sheet.columns):
@@ -146,10 +125,7 @@ def read_joints(path: Path | str, joint_types: str | None = None, joint_unit: st
 def recording_of(path: Path | str) -> str | None:
     """The recording that all rows of a table belong to; None where they name none or several.
 
-    Raises
-    ------
-    InputError
-        When the file cannot be read.
+    Raises InputError when the file cannot be read.
     """
     sheet = _Sheet(path, _HEADER, [], optional=[_RECORDING])
     found = {row.cells[_RECORDING] for row in sheet.rows() if _RECORDING in row.cells}
@@ -180,11 +156,9 @@ def to_csv(arrays: Mapping[str, npt.NDArray[Any]], down: int | None = None) -> s
 
     Numbers are written so that reading them gives the same numbers.
 
-    Parameters
-    ----------
     arrays : by name.
-    down : axis that runs down; by default the longest of each array. The others stand in the heading,
-        the NumPy expression of the column, such as ``images[0,:,1]``.
+    down : axis that runs down; by default the longest of each array. The others stand in the heading, the
+        NumPy expression of the column, such as ``images[0,:,1]``.
     """
     found = [column for name, array in arrays.items() for column in _columns(name, np.asarray(array), down)]
     stream = io.StringIO()

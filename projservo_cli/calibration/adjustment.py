@@ -32,20 +32,12 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What the adjustment varies.
+    """What the adjustment varies."""
 
-    Attributes
-    ----------
-    P : (2, 3, 4) cameras to pixels.
-    H_hat : (n, 4, 4) twists at the reference: unit rotations without pitch, or translations.
-    M : (m, 4) markers at the reference, last coordinate one.
-    lens : (2, 5) lenses, of which k1 and k2 vary; None where none is sought.
-    """
-
-    P: FloatArray
-    H_hat: FloatArray
-    M: FloatArray
-    lens: FloatArray | None = None
+    P: FloatArray  # (2, 3, 4) cameras to pixels
+    H_hat: FloatArray  # (n, 4, 4) twists at the reference: unit rotations without pitch, or translations
+    M: FloatArray  # (m, 4) markers at the reference, last coordinate one
+    lens: FloatArray | None = None  # (2, 5) lenses, of which k1 and k2 vary; None where none is sought
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,27 +45,16 @@ class Problem:
     """Images to explain, and where each parameter stands: both cameras, joints, markers, then both lenses.
 
     The derivative of the images is compact: (2, N, 2, c) for each reading by the c parameters it depends on.
-
-    Attributes
-    ----------
-    readings : what was seen.
-    q : (K, n) joint values from the reference, rad or m.
-    q_reference : (n,) the reference, rad or m.
-    joint : (n + 1,) first parameter of each joint, then of the markers.
-    lens : first parameter of the lenses; ``size`` where none is sought.
-    size : number of parameters.
-    groups : rows of each marker, as slices of the lists of ``Readings``.
-    columns : (2, m, c) parameters that the images of a marker in a view depend on.
     """
 
-    readings: Readings
-    q: FloatArray
-    q_reference: FloatArray
-    joint: IntArray
-    lens: int
-    size: int
-    groups: tuple[slice, ...]
-    columns: IntArray
+    readings: Readings  # what was seen
+    q: FloatArray  # (K, n) joint values from the reference, rad or m
+    q_reference: FloatArray  # (n,) the reference, rad or m
+    joint: IntArray  # (n + 1,) first parameter of each joint, then of the markers
+    lens: int  # first parameter of the lenses; ``size`` where none is sought
+    size: int  # number of parameters
+    groups: tuple[slice, ...]  # rows of each marker, as slices of the lists of ``Readings``
+    columns: IntArray  # (2, m, c) parameters that the images of a marker in a view depend on
 
     def pixels(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Predicted pixels (2, N, 2) of every sighting and their depths (2, N)."""
@@ -290,20 +271,12 @@ Stalled = Callable[[FloatArray], bool]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A scene, how well it explains the images, and how the search ended.
+    """A scene, how well it explains the images, and how the search ended."""
 
-    Attributes
-    ----------
-    scene : the model.
-    residual : (2, N, 2) predicted minus seen, px, zero where not seen.
-    cost : weighted sum of squares, px².
-    settled : whether the last step was too small to matter.
-    """
-
-    scene: Scene
-    residual: FloatArray
-    cost: float
-    settled: bool
+    scene: Scene  # the model
+    residual: FloatArray  # (2, N, 2) predicted minus seen, px, zero where not seen
+    cost: float  # weighted sum of squares, px²
+    settled: bool  # whether the last step was too small to matter
 
 
 class _Expansion(NamedTuple):

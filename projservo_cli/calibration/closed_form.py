@@ -24,10 +24,7 @@ def closed_form_operators(
     The operator of a joint is the mean over its trials weighted by sin² θ (or τ²), the least-squares
     weights of the quotients in (4) and (5). With the reference joints (n,), and which markers (m,) there are.
 
-    Raises
-    ------
-    WorkFailed
-        If the trials do not determine the operators: which joint, and why.
+    Raises WorkFailed if the trials do not determine the operators: which joint, and why.
     """
     home = reference_pose(readings.q)
     if home is None:

@@ -17,24 +17,14 @@ _A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class ProjectiveScene:
-    """Projective kinematics: what [RH00] section 2 calls P, Ĥ, M and the plane at infinity.
+    """Projective kinematics: what [RH00] section 2 calls P, Ĥ, M and the plane at infinity."""
 
-    Attributes
-    ----------
-    P : (2, 3, 4) cameras; depths of the points seen are positive, of unit mean square a view.
-    H_hat_0 : (n, 4, 4) operators at the reference.
-    M : (m, 4) markers at the reference, a_inf @ M = 1.
-    a_inf : (4,) plane at infinity.
-    W : (4, 4) frame change that led here.
-    camera_scale : (2,) factors the cameras took.
-    """
-
-    P: FloatArray
-    H_hat_0: FloatArray
-    M: FloatArray
-    a_inf: FloatArray
-    W: FloatArray
-    camera_scale: FloatArray
+    P: FloatArray  # (2, 3, 4) cameras; depths of the points seen are positive, of unit mean square a view
+    H_hat_0: FloatArray  # (n, 4, 4) operators at the reference
+    M: FloatArray  # (m, 4) markers at the reference, a_inf @ M = 1
+    a_inf: FloatArray  # (4,) plane at infinity
+    W: FloatArray  # (4, 4) frame change that led here
+    camera_scale: FloatArray  # (2,) factors the cameras took
 
 
 def isotropic(
@@ -163,20 +153,12 @@ _FRAMES, _LEAST_REACHES, _BISECTIONS = 8, 0.01, 7
 
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
-    """A calibration whose predictions err, judged in twice the image region in which markers were seen.
+    """A calibration whose predictions err, judged in twice the image region in which markers were seen."""
 
-    Attributes
-    ----------
-    model : projective robot and rig.
-    M : (m, 4) markers at the reference.
-    factor : (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel.
-    readings : what the calibration was made from.
-    """
-
-    model: Model
-    M: FloatArray
-    factor: FloatArray
-    readings: Readings
+    model: Model  # projective robot and rig
+    M: FloatArray  # (m, 4) markers at the reference
+    factor: FloatArray  # (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel
+    readings: Readings  # what the calibration was made from
 
     def shown(self, q: FloatArray) -> BoolArray:
         """Which images (K, 2, m) at poses (K, n) lie in the region that counts."""

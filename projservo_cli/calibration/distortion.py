@@ -85,10 +85,7 @@ def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
 def with_lens(solution: Solution, frame: ImageFrame, epipolar: Epipolar) -> Solution:
     """The solution with radial distortion freed: which readings count is found anew.
 
-    Raises
-    ------
-    WorkFailed
-        If the data do not determine the distortion.
+    Raises WorkFailed if the data do not determine the distortion.
     """
     readings = solution.problem.readings
     problem = prepare(readings, solution.problem.q_reference, lens=True)

@@ -23,18 +23,11 @@ _LEAST_PARALLAX = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Epipolar:
-    """Fundamental matrix and what its residuals say.
+    """Fundamental matrix and what its residuals say."""
 
-    Attributes
-    ----------
-    F : (3, 3) with rightᵀ F left = 0, unit norm, px.
-    sigma_px : noise per image coordinate from the residuals, px.
-    inlier : (N,) which correspondences agree with F.
-    """
-
-    F: FloatArray
-    sigma_px: float
-    inlier: BoolArray
+    F: FloatArray  # (3, 3) with rightᵀ F left = 0, unit norm, px
+    sigma_px: float  # noise per image coordinate from the residuals, px
+    inlier: BoolArray  # (N,) which correspondences agree with F
 
     @property
     def relative_error(self) -> float:
@@ -52,10 +45,7 @@ def epipolar_geometry(left: FloatArray, right: FloatArray, rng: np.random.Genera
     The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
     a Cauchy loss over minimal parameters.
 
-    Raises
-    ------
-    WorkFailed
-        With fewer than eight correspondences, or where they do not determine the geometry.
+    Raises WorkFailed with fewer than eight correspondences, or where they do not determine the geometry.
     """
     count = left.shape[0]
     if count < 8:
@@ -236,20 +226,12 @@ class ImageFrame:
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Cameras and points in a guessed metric frame.
+    """Cameras and points in a guessed metric frame."""
 
-    Attributes
-    ----------
-    P : (2, 3, 4) cameras to pixels.
-    points : (N, 3) reconstructed points, in units of their median distance from the left camera.
-    spread : how much marker distances vary over the poses, median of |log ratio|.
-    focal : guessed focal length over image size.
-    """
-
-    P: FloatArray
-    points: FloatArray
-    spread: float
-    focal: float
+    P: FloatArray  # (2, 3, 4) cameras to pixels
+    points: FloatArray  # (N, 3) reconstructed points, in units of their median distance from the left camera
+    spread: float  # how much marker distances vary over the poses, median of |log ratio|
+    focal: float  # guessed focal length over image size
 
 
 def image_frame(readings: Readings, image_size: tuple[int, int] | None) -> ImageFrame:
@@ -271,10 +253,7 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: i
     The focal length is the one that keeps the distances between markers most constant over the
     poses, each local minimum of a scan refined by golden section.
 
-    Raises
-    ------
-    WorkFailed
-        If no two markers were seen together at two poses.
+    Raises WorkFailed if no two markers were seen together at two poses.
     """
     both = readings.both
     pairs = _marker_pairs(readings.pose_of[both], readings.marker_of[both])

@@ -37,18 +37,11 @@ class Misfit(WorkFailed):
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """What a fit leaves of the images.
+    """What a fit leaves of the images."""
 
-    Attributes
-    ----------
-    residual : (2, N, 2) predicted minus seen, px.
-    used : (2, N) readings that count; the rest of those seen are outliers.
-    dof : degrees of freedom.
-    """
-
-    residual: FloatArray
-    used: BoolArray
-    dof: int
+    residual: FloatArray  # (2, N, 2) predicted minus seen, px
+    used: BoolArray  # (2, N) readings that count; the rest of those seen are outliers
+    dof: int  # degrees of freedom
 
     @property
     def chi2(self) -> float:
@@ -82,20 +75,12 @@ class Solution:
 
 @dataclass(frozen=True)
 class Expected:
-    """The noise a fit is measured by, px per coordinate.
+    """The noise a fit is measured by, px per coordinate."""
 
-    Attributes
-    ----------
-    sigma_px : noise that was given, else that of the epipolar geometry.
-    known : whether it is the true noise of a simulation, so that χ² decides.
-    origin : where it comes from, in words.
-    error : its own standard error as a share of it, zero where it was given.
-    """
-
-    sigma_px: float
-    known: bool
-    origin: str
-    error: float
+    sigma_px: float  # noise that was given, else that of the epipolar geometry
+    known: bool  # whether it is the true noise of a simulation, so that χ² decides
+    origin: str  # where it comes from, in words
+    error: float  # its own standard error as a share of it, zero where it was given
 
     def ratio(self, agreement: Agreement) -> float:
         """Fitted over expected noise."""
@@ -300,12 +285,7 @@ def solve(
 
     ``tell`` hears before each start how many were tried, of at most how many.
 
-    Raises
-    ------
-    Misfit
-        If no start leads anywhere.
-    WorkFailed
-        If too little was seen to start from.
+    Raises Misfit if no start leads anywhere; WorkFailed if too little was seen to start from.
     """
     readings = problem.readings
     best: Solution | None = None
@@ -375,12 +355,7 @@ def solve_from(
 
     With advice about the start where it did not lead there, else empty.
 
-    Raises
-    ------
-    InputError
-        If the start is one for other joints or markers.
-    WorkFailed
-        If neither leads anywhere.
+    Raises InputError if the start is one for other joints or markers; WorkFailed if neither leads anywhere.
     """
     found = _from(nominal.scene(problem.readings, problem.q_reference), problem, epipolar)
     if found is not None and expected.agrees(found.agreement):

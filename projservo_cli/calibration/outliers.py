@@ -39,18 +39,11 @@ _VIEWS = ("left", "right", "both")
 
 @dataclass(frozen=True, eq=False)
 class Outliers:
-    """Explanations of what was left out.
+    """Explanations of what was left out."""
 
-    Attributes
-    ----------
-    suspect : (S, 2) row of the pose and index of the joint whose reading no image agrees with.
-    swapped : (W, 3) row of the pose, index of the marker that was read and of the one it is.
-    explained : (2, N) readings that these explain.
-    """
-
-    suspect: IntArray
-    swapped: IntArray
-    explained: BoolArray
+    suspect: IntArray  # (S, 2) row of the pose and index of the joint whose reading no image agrees with
+    swapped: IntArray  # (W, 3) row of the pose, index of the marker that was read and of the one it is
+    explained: BoolArray  # (2, N) readings that these explain
 
 
 def none_explained(readings: Readings) -> Outliers:
@@ -143,10 +136,7 @@ def require_explained(readings: Readings, used: BoolArray, found: Outliers, epip
     Errors of detection break the epipolar geometry; what obeys it and still does not fit speaks
     against the model of the robot. Readings are those that projective cameras would have seen.
 
-    Raises
-    ------
-    Misfit
-        If the model of the robot, not single errors, is at odds with the data.
+    Raises Misfit if the model of the robot, not single errors, is at odds with the data.
     """
     both = readings.both
     out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
@@ -191,13 +181,8 @@ def with_lost_markers(record: Calibration, readings: Readings, kept: BoolArray) 
 def findings(calibration: Calibration) -> dict[str, Any]:
     """Single observations that do not fit, and how many do, as plain lists for people and JSON.
 
-    Parameters
-    ----------
     calibration : the record.
-
-    Returns
-    -------
-    ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``.
+    Returns ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``.
     """
     outliers, suspects, swaps = (
         rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.swapped)

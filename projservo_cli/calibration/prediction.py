@@ -122,20 +122,10 @@ def marker_pixels(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
 def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:
     """How far predicted pixels are from seen ones, a distance for each marker and view.
 
-    Parameters
-    ----------
-    calibration : projective kinematics.
-    observation : stereo images of the same robot, px.
-
-    Returns
-    -------
-    ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``skipped`` with the pairs
-    of markers the calibration does not know, of points behind the camera, and not seen.
-
-    Raises
-    ------
-    InputError
-        If the readings have another number of joints or are not finite.
+    calibration : projective kinematics; observation : stereo images of the same robot, px.
+    Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``skipped`` with the
+    pairs; of markers the calibration does not know, of points behind the camera, and not seen. Raises
+    InputError if the readings have another number of joints or are not finite.
     """
     known = np.isin(observation.marker, calibration.marker)
     column = {int(number): j for j, number in enumerate(calibration.marker)}
@@ -167,19 +157,9 @@ def distance_statistics(distance: FloatArray) -> dict[str, Any]:
 def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Variance of predicted pixels from the covariance of the calibration, to first order.
 
-    Parameters
-    ----------
-    calibration : projective kinematics with its covariance.
-    q : (K, n) joint readings, rad or m.
-
-    Returns
-    -------
-    (K, 2, m, 2) variances of u and v, px².
-
-    Raises
-    ------
-    InputError
-        If the readings have another number of joints or are not finite.
+    calibration : projective kinematics with its covariance; q : (K, n) joint readings, rad or m.
+    Returns (K, 2, m, 2) variances of u and v, px². Raises InputError if the readings have another number of
+    joints or are not finite.
     """
     J = prediction_derivative(calibration.model(), calibration.M, q)
     variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
@@ -194,8 +174,6 @@ def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatAr
 
     An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ).
 
-    Parameters
-    ----------
     model : robot and rig in one frame.
     M : (m, 4) markers at the reference.
     q : (K, n) joint readings, rad or m.
@@ -252,17 +230,11 @@ class Innovation:
 
     Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
     Navigation", Wiley 2001, section 5.4 (innovation as a test of the filter).
-
-    Attributes
-    ----------
-    calibration : what predicts the pixels, with its covariance.
-    sigma_px : pixel noise per coordinate.
-    observations : most observations of one sequence, which sets the threshold.
     """
 
-    calibration: Calibration
-    sigma_px: float
-    observations: int
+    calibration: Calibration  # what predicts the pixels, with its covariance
+    sigma_px: float  # pixel noise per coordinate
+    observations: int  # most observations of one sequence, which sets the threshold
     _beyond: list[BoolArray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -278,8 +250,6 @@ class Innovation:
     def disturbed(self, q: FloatArray, images: FloatArray) -> str:
         """What is wrong, in words; empty while nothing is.
 
-        Parameters
-        ----------
         q : (n,) joint readings, rad or m.
         images : (2, m, 2) pixels of the markers of the calibration, NaN where unseen.
         """

@@ -32,20 +32,13 @@ _OFF_LINE = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """What the data say of each joint.
+    """What the data say of each joint."""
 
-    Attributes
-    ----------
-    prismatic : (n,) types.
-    span : (n,) range in the data, rad or m.
-    noise : (n,) predicted noise of images at its reach, in units of the pixel noise; NaN where unknown.
-    needed : (n,) range of a trial motion that would determine it, rad or m, NaN where none does.
-    """
-
-    prismatic: BoolArray
-    span: FloatArray
+    prismatic: BoolArray  # (n,) types
+    span: FloatArray  # (n,) range in the data, rad or m
+    # (n,) predicted noise of images at its reach, in units of the pixel noise; NaN where unknown
     noise: FloatArray
-    needed: FloatArray
+    needed: FloatArray  # (n,) range of a trial motion that would determine it, rad or m, NaN where none does
 
     def advice(self, i: int) -> str:
         """How far to move joint i."""

@@ -21,28 +21,16 @@ MAD = 0.6744897501960817
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Every marker seen at a pose by at least one camera, ordered by marker and then by pose.
+    """Every marker seen at a pose by at least one camera, ordered by marker and then by pose."""
 
-    Attributes
-    ----------
-    q : (K, n) joint readings, rad or m.
-    prismatic : (n,) whether the joint is prismatic.
-    pose : (K,) numbers of the poses.
-    marker : (m,) numbers of the markers.
-    pose_of : (N,) row of ``q``.
-    marker_of : (N,) position in ``marker``, never falling.
-    pixels : (2, N, 2) px, zero where not seen.
-    seen : (2, N) whether the view saw the marker.
-    """
-
-    q: FloatArray
-    prismatic: BoolArray
-    pose: IntArray
-    marker: IntArray
-    pose_of: IntArray
-    marker_of: IntArray
-    pixels: FloatArray
-    seen: BoolArray
+    q: FloatArray  # (K, n) joint readings, rad or m
+    prismatic: BoolArray  # (n,) whether the joint is prismatic
+    pose: IntArray  # (K,) numbers of the poses
+    marker: IntArray  # (m,) numbers of the markers
+    pose_of: IntArray  # (N,) row of ``q``
+    marker_of: IntArray  # (N,) position in ``marker``, never falling
+    pixels: FloatArray  # (2, N, 2) px, zero where not seen
+    seen: BoolArray  # (2, N) whether the view saw the marker
 
     @property
     def both(self) -> BoolArray:
@@ -82,10 +70,7 @@ class Readings:
 def gather(observation: Observation, joint_types: str) -> Readings:
     """Flatten an observation into the list of what was seen; one letter a joint, R or P.
 
-    Raises
-    ------
-    InputError
-        If the arrays or the letters do not fit each other, or values are not finite.
+    Raises InputError if the arrays or the letters do not fit each other, or values are not finite.
     """
     _require_shapes(observation)
     letters = joint_types.upper()
@@ -176,10 +161,7 @@ _LEAST_SPAN = 1e-6
 def require_motion(readings: Readings) -> FloatArray:
     """Range of each joint over the poses, (n,) rad or m.
 
-    Raises
-    ------
-    WorkFailed
-        If a joint never moves, fewer than three markers were seen, or there is only one pose.
+    Raises WorkFailed if a joint never moves, fewer than three markers were seen, or there is only one pose.
     """
     m = readings.marker.size
     if m < 3:
@@ -257,10 +239,7 @@ _OFF_LINE_TAIL = 0.1
 def require_images(readings: Readings, sigma_px: float | None) -> None:
     """Refuse images that show one place, one line, or no motion, at a noise known or not, px.
 
-    Raises
-    ------
-    WorkFailed
-        Naming the view, or the joint whose trials show no motion.
+    Raises WorkFailed naming the view, or the joint whose trials show no motion.
     """
     sigma = max(sigma_px or 0.0, LEAST_SIGMA)
     _require_spread(readings, sigma)

@@ -31,20 +31,12 @@ _ROUNDS = 8
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The body in its own frame and its rigid motion to each pose.
+    """The body in its own frame and its rigid motion to each pose."""
 
-    Attributes
-    ----------
-    body : (m, 3) markers, NaN where never merged.
-    R : (K, 3, 3) rotations from the body to the pose.
-    t : (K, 3) translations.
-    merged : (K,) poses whose rotation is known.
-    """
-
-    body: FloatArray
-    R: FloatArray
-    t: FloatArray
-    merged: BoolArray
+    body: FloatArray  # (m, 3) markers, NaN where never merged
+    R: FloatArray  # (K, 3, 3) rotations from the body to the pose
+    t: FloatArray  # (K, 3) translations
+    merged: BoolArray  # (K,) poses whose rotation is known
 
 
 def merged(guess: Guess, readings: Readings) -> Alignment:
@@ -376,24 +368,14 @@ def placed(
 
 @dataclass(frozen=True, eq=False)
 class Nominal:
-    """What is believed of robot, rig and markers, in one metric frame.
+    """What is believed of robot, rig and markers, in one metric frame."""
 
-    Attributes
-    ----------
-    where : name of its file, for messages.
-    P : (2, 3, 4) cameras to pixels.
-    H_hat : (n, 4, 4) twists at the reference: unit rotations without pitch, or unit translations.
-    q_reference : (n,) rad or m.
-    marker : (m,) numbers of the markers.
-    M : (m, 4) markers at the reference, last coordinate one.
-    """
-
-    where: str
-    P: FloatArray
-    H_hat: FloatArray
-    q_reference: FloatArray
-    marker: IntArray
-    M: FloatArray
+    where: str  # name of its file, for messages
+    P: FloatArray  # (2, 3, 4) cameras to pixels
+    H_hat: FloatArray  # (n, 4, 4) twists at the reference: unit rotations without pitch, or unit translations
+    q_reference: FloatArray  # (n,) rad or m
+    marker: IntArray  # (m,) numbers of the markers
+    M: FloatArray  # (m, 4) markers at the reference, last coordinate one
 
     @property
     def joint_types(self) -> str:
@@ -403,10 +385,7 @@ class Nominal:
     def scene(self, readings: Readings, q_reference: FloatArray) -> Scene:
         """Start for the readings, about their reference joints (n,), rad or m.
 
-        Raises
-        ------
-        InputError
-            If the joints are others, or a marker that was seen is not known.
+        Raises InputError if the joints are others, or a marker that was seen is not known.
         """
         own, letters = self.joint_types, "".join("P" if slides else "R" for slides in readings.prismatic)
         if own != letters:

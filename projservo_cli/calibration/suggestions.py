@@ -18,34 +18,21 @@ _VAGUE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Where poses may lie and markers be seen.
-
-    Attributes
-    ----------
-    low, high : (n,) joint readings between which candidates are drawn, rad or m.
-    image : (2, 2, 2) lower and upper corner of each image, px.
-    """
+    """Where poses may lie and markers be seen."""
 
     low: FloatArray
-    high: FloatArray
-    image: FloatArray
+    high: FloatArray  # low, high: (n,) joint readings between which candidates are drawn, rad or m
+    image: FloatArray  # (2, 2, 2) lower and upper corner of each image, px
 
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """A pose to record, in the order of choice.
+    """A pose to record, in the order of choice."""
 
-    Attributes
-    ----------
-    q : (n,) joint readings, rad or m.
-    from_pose : number of the nearest pose recorded.
-    delta : (n,) the way from it, rad or m.
-    variance_before, variance_after : of predicted coordinates over the region of the data, px².
-    """
-
-    q: FloatArray
-    from_pose: int
-    delta: FloatArray
+    q: FloatArray  # (n,) joint readings, rad or m
+    from_pose: int  # number of the nearest pose recorded
+    delta: FloatArray  # (n,) the way from it, rad or m
+    # variance_before, variance_after: of predicted coordinates over the region of the data, px²
     variance_before: float
     variance_after: float
 
@@ -66,21 +53,14 @@ def suggest(
     both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen where they are
     predicted within the image.
 
-    Parameters
-    ----------
     calibration : with its covariance.
     observation : what it was made from.
     candidates : region of the poses to choose from.
     targets : region of the poses that are to be predicted well.
     count : poses to suggest.
     rng : draws both.
-
-    Raises
-    ------
-    InputError
-        If the method of the calibration has no covariance.
-    WorkFailed
-        If no pose of a region shows the markers to both views.
+    Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose of a region
+    shows the markers to both views.
     """
     if not np.isfinite(calibration.covariance).all():
         raise InputError(

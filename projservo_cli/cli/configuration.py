@@ -22,10 +22,7 @@ _TEXTS = (  # options whose value is text, not YAML, and their keys
 def resolve(options: Mapping[str, Any]) -> tuple[Config, Run]:
     """The configuration with all overrides, and the run as stored so far.
 
-    Raises
-    ------
-    InputError
-        When either cannot be read or makes no sense.
+    Raises InputError when either cannot be read or makes no sense.
     """
     overrides = given_overrides(options)
     if options.get("origin") is not None:
@@ -77,10 +74,7 @@ def _stored(target: str | Path) -> Run | None:
 def shipped(name: str = "paper.yaml") -> Path:
     """A configuration that comes with projservo, in a checkout as in an installed package.
 
-    Raises
-    ------
-    InputError
-        When the installation lacks it.
+    Raises InputError when the installation lacks it.
     """
     package = Path(__file__).resolve().parent.parent
     for folder in (package / "configs", package.parent / "configs"):

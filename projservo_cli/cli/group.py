@@ -165,9 +165,7 @@ def _flag(option: click.Parameter) -> str:
 def run(arguments: Sequence[str]) -> int:
     """Run the command line.
 
-    Returns
-    -------
-    The exit code: 0 done, 1 the work failed, 2 what was given makes no sense, 130 interrupted.
+    Returns the exit code: 0 done, 1 the work failed, 2 what was given makes no sense, 130 interrupted.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal without Greek letters is no reason to fail

@@ -125,10 +125,7 @@ def of_stages(function: _Function) -> _Function:
 def require_new(path: Path, *, force: bool) -> None:
     """Refuse to replace unasked what is there.
 
-    Raises
-    ------
-    InputError
-        Where it exists and ``--force`` was not given.
+    Raises InputError where it exists and ``--force`` was not given.
     """
     from projservo_cli.records import InputError
 

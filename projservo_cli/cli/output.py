@@ -98,10 +98,7 @@ class Console:
     def confirm(self, command: str, plant: Any) -> None:
         """Ask before the first motion of a robot, by the section ``plant`` of the configuration.
 
-        Raises
-        ------
-        KeyboardInterrupt
-            Where the answer is not yes.
+        Raises KeyboardInterrupt where the answer is not yes.
         """
         self._finish()
         try:

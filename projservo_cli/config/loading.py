@@ -60,10 +60,7 @@ class Override:
     def parse(cls, text: str, flag: str = "") -> "Override":
         """Read ``a.b=v``; the value is YAML, list positions are numbers.
 
-        Raises
-        ------
-        InputError
-            When there is no ``=``, no key, or the value is not YAML.
+        Raises InputError when there is no ``=``, no key, or the value is not YAML.
         """
         flag = flag or f"--set {text}"
         key, sign, value = text.partition("=")
@@ -86,24 +83,11 @@ def load_config(
 ) -> Config:
     """Read and check a configuration.
 
-    Parameters
-    ----------
-    path : Path, str or None
-        The YAML file. None for a blank recorded configuration, which overrides fill.
-    overrides : sequence of str or Override
-        ``a.b=v`` as for ``--set``, applied in order.
-    text : str, optional
-        Its content, where it is already at hand; ``path`` then only names it in messages.
-
-    Returns
-    -------
-    Config
-        ``data.table`` and ``calibration.init`` are absolute paths, whatever the working directory later.
-
-    Raises
-    ------
-    InputError
-        All that is wrong, one line ``file:line:column: path: what`` each.
+    path : Path, str or None, the YAML file. None for a blank recorded configuration, which overrides fill.
+    overrides : sequence of str or Override ``a.b=v`` as for ``--set``, applied in order.
+    text : str, optional, its content, where it is already at hand; ``path`` then only names it in messages.
+    Returns Config: ``data.table`` and ``calibration.init`` are absolute paths, whatever the working directory
+    later. Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
     if path is not None and text is None:

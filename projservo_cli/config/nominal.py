@@ -36,16 +36,10 @@ class _File(BaseModel):
 def read_nominal(path: Path | str) -> Nominal:
     """Read what is believed of a robot, its rig and its markers.
 
-    Parameters
-    ----------
     path : JSON with ``screws`` (w and v of each joint at the reference, base frame, rad and m),
-        ``q_reference`` (rad or m), ``camera_left`` and ``camera_right`` (3×4 matrices to px),
-        ``markers_tool`` (m) with ``T_base_tool_at_reference``, and perhaps ``marker_numbers`` (0, 1 …).
-
-    Raises
-    ------
-    InputError
-        ``file: key: what`` when it cannot be read or makes no sense.
+    ``q_reference`` (rad or m), ``camera_left`` and ``camera_right`` (3×4 matrices to px), ``markers_tool``
+    (m) with ``T_base_tool_at_reference``, and perhaps ``marker_numbers`` (0, 1 …).
+    Raises InputError ``file: key: what`` when it cannot be read or makes no sense.
     """
     found = _checked(Path(path))
     n = len(found.screws)

@@ -82,10 +82,7 @@ class JointVector(Section):
     def values(self, joint_types: str) -> tuple[float, ...]:
         """Readings in rad (R) and m (P), one for each letter of ``joint_types``.
 
-        Raises
-        ------
-        ValueError
-            When the numbers of joints differ.
+        Raises ValueError when the numbers of joints differ.
         """
         pairs = zip(self.joints, joint_types, strict=True)
         turn = math.radians if self.unit == "deg" else float

@@ -112,10 +112,7 @@ class SweepConfig(Section):
 def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
     """Read and check the configuration of a sweep; ``base`` becomes absolute paths.
 
-    Raises
-    ------
-    InputError
-        All that is wrong, one line ``file:line:column: path: what`` each.
+    Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
     """
     document = Document.read(path)
     if not isinstance(document.values, dict):

@@ -26,17 +26,11 @@ class Pair(NamedTuple):
 def pair_images(left: str, right: str, joints: JointList, where: str) -> list[Pair]:
     """Both images of every pose.
 
-    Parameters
-    ----------
     left, right : a folder, or a pattern such as ``left/*.png``.
-    joints : the poses. Named images are looked up by name; with pose numbers, the image of a pose is
-        the one whose name ends in its number; else the images are taken in the order of their names.
+    joints : the poses. Named images are looked up by name; with pose numbers, the image of a pose is the one
+        whose name ends in its number; else the images are taken in the order of their names.
     where : the file of the poses, for messages.
-
-    Raises
-    ------
-    InputError
-        When there are no images, or one of a pose is missing or not the only one.
+    Raises InputError when there are no images, or one of a pose is missing or not the only one.
     """
     if joints.left is not None and joints.right is not None:
         sides = [_named(left, joints.left, where), _named(right, joints.right, where)]
@@ -105,20 +99,13 @@ def _by_number(source: str, files: list[Path], poses: list[int], where: str) -> 
 
 @dataclass
 class Findings:
-    """What was found in all images.
+    """What was found in all images."""
 
-    Attributes
-    ----------
-    images : pixels (4 or 1, 2) of each tag, by pose, view and number of the tag.
-    ambiguous : tags left out because they were in an image more than once.
-    unrefined : corners (or centres) left out because an edge of their tag is not clean.
-    empty : images without a tag.
-    """
-
+    # pixels (4 or 1, 2) of each tag, by pose, view and number of the tag
     images: dict[tuple[int, int, int], FloatArray] = field(default_factory=dict)
-    ambiguous: int = 0
-    unrefined: int = 0
-    empty: int = 0
+    ambiguous: int = 0  # tags left out because they were in an image more than once
+    unrefined: int = 0  # corners (or centres) left out because an edge of their tag is not clean
+    empty: int = 0  # images without a tag
 
     @property
     def tags(self) -> list[int]:
@@ -135,20 +122,13 @@ def observe(
 ) -> tuple[Observation, Findings]:
     """Find tags in pairs of images.
 
-    Parameters
-    ----------
     pairs : both images of each pose.
     q : (K, n) joint readings of the poses.
     finder : of the tags.
     points : ``corners``: corner k of tag t is marker 4 t + k; ``centers``: tag t is marker t.
     progress : told after each pose.
-
-    Raises
-    ------
-    InputError
-        If an image cannot be read, or has another size than those before it from the same camera.
-    WorkFailed
-        If there is no tag in any image, or none that both views saw at a pose.
+    Raises InputError if an image cannot be read, or has another size than those before it from the same
+    camera; WorkFailed if there is no tag in any image, or none that both views saw at a pose.
     """
     found = Findings()
     shapes: dict[int, tuple[int, ...]] = {}

@@ -21,15 +21,10 @@ _SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
 def refine_corners(image: FloatArray, corners: FloatArray, cells: int) -> FloatArray:
     """Corners of a tag from the edges between its black border and the bright ground around it.
 
-    Parameters
-    ----------
     image : (height, width) grey values; pixel centres have whole coordinates.
     corners : (4, 2) u, v of a first guess within about two pixels, px, in order around the tag.
     cells : of the tag along a side, border included; the border is one cell wide.
-
-    Returns
-    -------
-    (4, 2) px; NaN where one of the two sides of a corner has no clean edge.
+    Returns (4, 2) px; NaN where one of the two sides of a corner has no clean edge.
     """
     guess = np.asarray(corners, dtype=np.float64)
     for _ in range(_ROUNDS):
@@ -133,14 +128,8 @@ def _edge_model(
 class TagFinder:
     """Finds the tags of one dictionary.
 
-    Parameters
-    ----------
     dictionary : name as OpenCV has it, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
-
-    Raises
-    ------
-    InputError
-        When OpenCV is not installed or does not know the dictionary.
+    Raises InputError when OpenCV is not installed or does not know the dictionary.
     """
 
     def __init__(self, dictionary: str) -> None:
@@ -159,10 +148,7 @@ class TagFinder:
     def read(self, path: Path) -> FloatArray:
         """Grey values (height, width) of an image as the camera took it, unturned.
 
-        Raises
-        ------
-        InputError
-            When the file is not an image.
+        Raises InputError when the file is not an image.
         """
         try:
             content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
@@ -181,8 +167,6 @@ class TagFinder:
         A corner without clean edges is NaN. A tag that is there more than once is left out, since
         which of them is meant cannot be told.
 
-        Parameters
-        ----------
         image : (height, width) grey values from 0 to 255.
         """
         corners, numbers, _ = self._detector.detectMarkers(image.astype(np.uint8))

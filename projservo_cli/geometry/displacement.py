@@ -60,10 +60,7 @@ def exp_translation(H_hat: FloatArray, tau: float) -> FloatArray:
 def log_rotation(H: FloatArray, theta: float) -> FloatArray:
     """Operator (4, 4) of an observed projective rotation (4, 4), det H = 1, θ in rad: [RH00] eq. (4).
 
-    Raises
-    ------
-    WorkFailed
-        If θ is a multiple of π, where H − H⁻¹ vanishes and the operator is undefined.
+    Raises WorkFailed if θ is a multiple of π, where H − H⁻¹ vanishes and the operator is undefined.
     """
     sine = math.sin(theta)
     if abs(sine) < LEAST_SINE:
@@ -78,10 +75,7 @@ def log_rotation(H: FloatArray, theta: float) -> FloatArray:
 def log_translation(H: FloatArray, tau: float) -> FloatArray:
     """Operator (4, 4) of an observed projective translation (4, 4), det H = 1, τ in m: [RH00] eq. (5).
 
-    Raises
-    ------
-    WorkFailed
-        If τ = 0, where the operator is undefined.
+    Raises WorkFailed if τ = 0, where the operator is undefined.
     """
     if abs(tau) < LEAST_SINE:
         raise WorkFailed(f"a translation by {tau:.3g} does not determine its operator: use a longer one")
@@ -94,10 +88,7 @@ def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> F
 
     The determinant leaves ±H (4, 4); the sign is the one that keeps that of a_inf·A for points A (..., 4).
 
-    Raises
-    ------
-    WorkFailed
-        If det H is not positive: then H is no displacement.
+    Raises WorkFailed if det H is not positive: then H is no displacement.
     """
     determinant = float(np.linalg.det(H))
     if not determinant > 0.0:
@@ -161,9 +152,7 @@ def incidence_angles(p_0: float, p_s: float, p_c: float) -> tuple[bool, float, f
     θ± = atan2(p_s, p_c) ± arccos(−p_0 / √(p_s² + p_c²)), each in (−π, π]. The printed
     θ⁻ = π − θ⁺ holds only where p_c = 0.
 
-    Returns
-    -------
-    False and zeros where |p_0| exceeds the amplitude: the point never meets the plane.
+    Returns false and zeros where |p_0| exceeds the amplitude: the point never meets the plane.
     """
     amplitude = math.sqrt(p_s * p_s + p_c * p_c)
     if not abs(p_0) <= amplitude or not amplitude > 0.0:
@@ -194,9 +183,7 @@ def composed_angle(theta_r: float, theta_p: float) -> tuple[float, float, float,
 def composed_operator(H_r: Mat4, H_p: Mat4, cbh_a: float, cbh_b: float, cbh_c: float) -> tuple[bool, Mat4]:
     """Operator Ĥ_s of the single rotation equal to both, [RH00] eq. (24).
 
-    Returns
-    -------
-    False where the rotation is the identity and has no axis.
+    Returns false where the rotation is the identity and has no axis.
     """
     sine = math.sqrt(cbh_a * cbh_a + cbh_b * cbh_b + cbh_c * cbh_c)
     if not sine > 0.0:
@@ -213,10 +200,7 @@ def compose_rotations(
 
     For axes that are perpendicular and meet: [RH00] eqs. (24), (25) as corrected.
 
-    Raises
-    ------
-    WorkFailed
-        If the composition is the identity, which has no axis.
+    Raises WorkFailed if the composition is the identity, which has no axis.
     """
     theta_s, a, b, c = composed_angle(float(theta_r), float(theta_p))
     found, H_s = composed_operator(as_mat(H_hat_r), as_mat(H_hat_p), a, b, c)

@@ -57,16 +57,13 @@ def orthogonalize(
 ) -> tuple[float, float, float]:
     """Column-pivoted modified Gram–Schmidt in place; returns the first, last but one and last pivot.
 
-    Parameters
-    ----------
-    B : (≥n, ≥max(n, m rounded up to four)) columns of the matrix; on return R above the diagonal by
-        rows, and the inverse of the diagonal.
+    B : (≥n, ≥max(n, m rounded up to four)) columns of the matrix; on return R above the diagonal by rows, and
+        the inverse of the diagonal.
     m, n : rows and columns, m ≥ n − 1.
     norms : (n,) workspace.
     z : (n,) on return Qᵀ rhs where ``solve`` is set.
     pivot : (n,) on return the column of the matrix in each position.
     rhs : (≥m rounded up to four) right-hand side, overwritten where ``solve`` is set.
-
     Source: Å. Björck, "Solving linear least squares problems by Gram–Schmidt orthogonalization", BIT
     7 (1967): R is as accurate as Householder's, and so is the solution with the right-hand side
     carried as a further column. Norms are computed anew in each step instead of guarding a down-date.
@@ -135,16 +132,11 @@ def kernel_vector(
     Inverse iteration on RᵀR stops when its gain, the inverse of the squared singular value, changes
     by less than a relative 1e-12; a matrix that is singular to working precision needs none.
 
-    Parameters
-    ----------
     B : (≥n, ≥max(n, m rounded up to four)) columns of the matrix, overwritten.
     m, n : rows and columns.
     x : (n,) on return the unit kernel vector; its sign is arbitrary.
     pivot, z, rhs : workspaces of at least n, n and m entries.
-
-    Returns
-    -------
-    False where there is no kernel or more than one dimension of it; x is then zero.
+    Returns false where there is no kernel or more than one dimension of it; x is then zero.
     """
     first, before_last, last = orthogonalize(B, m, n, x, z, pivot, rhs, False)
     if not before_last >= RANK_TOLERANCE * first or not first > 0.0 or not last <= _KERNEL_TOLERANCE * first:
@@ -205,9 +197,7 @@ def least_squares(
 
     Parameters are those of ``kernel_vector``, with the right-hand side in ``rhs``, overwritten.
 
-    Returns
-    -------
-    False where the columns are dependent (or fewer rows than columns); x is then zero.
+    Returns false where the columns are dependent (or fewer rows than columns); x is then zero.
     """
     full = m >= n
     if full:
@@ -271,18 +261,12 @@ def put_sums(N: FloatArray, sums: Sums) -> None:
 def solve_normal(N: FloatArray, tolerance: float) -> bool:
     """Solution of symmetric positive definite equations by the root-free Cholesky factorisation, in place.
 
-    Parameters
-    ----------
-    N : (6, 7) upper triangle of the matrix, and the right-hand side in the last column, which
-        the solution replaces; the rest is overwritten.
-    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is what of
-        a column of the least-squares problem the columns before do not explain, squared.
-
-    Returns
-    -------
-    False where the matrix is singular.
-
-    Source: G. Golub, C. Van Loan, Matrix Computations, section 4.1.2.
+    N : (6, 7) upper triangle of the matrix, and the right-hand side in the last column, which the solution
+        replaces; the rest is overwritten.
+    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is what of a column
+        of the least-squares problem the columns before do not explain, squared.
+    Returns false where the matrix is singular; source: G. Golub, C. Van Loan, Matrix Computations, section
+    4.1.2.
     """
     n = COORDINATES
     for j in range(n):

@@ -40,16 +40,10 @@ NO_OPERATOR: Mat4 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
 
 
 class Span(NamedTuple):
-    """Six operators that span all displacements; none where those of the joints do.
+    """Six operators that span all displacements; none where those of the joints do."""
 
-    Attributes
-    ----------
-    H_hat : (6, 4, 4) the operators, or (0, 4, 4).
-    dual : (6, 16) by which an operator, read row by row, has its coordinates.
-    """
-
-    H_hat: FloatArray
-    dual: FloatArray
+    H_hat: FloatArray  # (6, 4, 4) the operators, or (0, 4, 4)
+    dual: FloatArray  # (6, 16) by which an operator, read row by row, has its coordinates
 
 
 # Six joints span the displacements by themselves.
@@ -57,32 +51,20 @@ OWN = Span(np.zeros((0, 4, 4)), np.zeros((COORDINATES, 16)))
 
 
 class Work(NamedTuple):
-    """Arrays the compiled functions write to, so that nothing is allocated in a loop.
+    """Arrays the compiled functions write to, so that nothing is allocated in a loop."""
 
-    Attributes
-    ----------
-    H_hat : (n, 4, 4) operators at the current joints.
-    B : (≥ n, rows) columns of the matrix being factorised.
-    rhs : (rows,) right-hand side.
-    z, pivot : (≥ n,) of the factorisation.
-    span : of an arm of n ≠ 6.
-    basis : operators whose sums the mechanisms are: of the span, else ``H_hat`` itself.
-    columns : independent operators for least squares: of the span of n > 6 joints, else ``H_hat`` itself.
-    J : (6, n) coordinates of the operators in the span.
-    norms, xi : (6,) of a factorisation, and coordinates of a displacement.
-    """
-
-    H_hat: FloatArray
-    B: FloatArray
-    rhs: FloatArray
+    H_hat: FloatArray  # (n, 4, 4) operators at the current joints
+    B: FloatArray  # (≥ n, rows) columns of the matrix being factorised
+    rhs: FloatArray  # (rows,) right-hand side
     z: FloatArray
-    pivot: IntArray
-    span: Span
-    basis: FloatArray
+    pivot: IntArray  # z, pivot: (≥ n,) of the factorisation
+    span: Span  # of an arm of n ≠ 6
+    basis: FloatArray  # operators whose sums the mechanisms are: of the span, else ``H_hat`` itself
+    # independent operators for least squares: of the span of n > 6 joints, else ``H_hat`` itself
     columns: FloatArray
-    J: FloatArray
+    J: FloatArray  # (6, n) coordinates of the operators in the span
     norms: FloatArray
-    xi: FloatArray
+    xi: FloatArray  # norms, xi: (6,) of a factorisation, and coordinates of a displacement
 
 
 def workspace(n: int, rows: int, span: Span = OWN) -> Work:
@@ -233,10 +215,7 @@ def span_of(model: Model, A: FloatArray) -> Span:
     Rotations are about the middle of the points A (m, 4), a_inf·A = 1, per rad; a unit of translation moves
     them about as far as a rad of rotation does.
 
-    Raises
-    ------
-    WorkFailed
-        If the joints keep no shape of the frame, as those of a wrong calibration do not.
+    Raises WorkFailed if the joints keep no shape of the frame, as those of a wrong calibration do not.
     """
     if len(model.q_reference) == COORDINATES:
         return OWN
@@ -258,10 +237,7 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
     The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
     where few joints leave it open, the one nearest to the identity, which does as well for these joints.
 
-    Raises
-    ------
-    WorkFailed
-        If no metric is kept.
+    Raises WorkFailed if no metric is kept.
     """
     basis = np.array([_symmetric(i, j) for i in range(3) for j in range(i, 3)])
     changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
@@ -364,17 +340,12 @@ def reach(
 
     Each is of least norm with more than six joints; with fewer the face comes as near as they bring it.
 
-    Parameters
-    ----------
     H_back : inverse forward kinematics at the joints where A was seen.
     goal : displacement from there.
     A : (m, 4) points of the face.
     work, newton : workspaces of n joints and 4m rows; ``newton`` (n,) is left with the last step.
     settled : Newton step that is the last, rad or m.
-
-    Returns
-    -------
-    False where the steps did not settle or the operators are singular.
+    Returns false where the steps did not settle or the operators are singular.
     """
     n = q.shape[0]
     m = A.shape[0]

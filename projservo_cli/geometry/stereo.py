@@ -37,9 +37,7 @@ def triangulate(
     rays meet exactly: the left ray with the plane of the line through the right pixel that is
     perpendicular to its epipolar line.
 
-    Returns
-    -------
-    False and zeros where the rays do not determine a finite point.
+    Returns false and zeros where the rays do not determine a finite point.
     """
     u = float(left[0])
     v = float(left[1])
@@ -90,10 +88,7 @@ def fundamental_matrix(P: FloatArray) -> FloatArray:
 
     Of unit norm, (3, 3). Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., eq. (17.3).
 
-    Raises
-    ------
-    WorkFailed
-        If both cameras share one centre.
+    Raises WorkFailed if both cameras share one centre.
     """
     return _fundamental(P.tobytes()).copy()
 
@@ -129,10 +124,7 @@ def _centers(cameras: bytes, plane: bytes) -> FloatArray:
 def triangulate_points(P: FloatArray, a_inf: FloatArray, s: FloatArray) -> FloatArray:
     """Points (m, 4) of least reprojection error from stereo pixels (2, m, 2), scaled to a_inf·M = 1.
 
-    Raises
-    ------
-    WorkFailed
-        If the rays of a marker do not determine a finite point.
+    Raises WorkFailed if the rays of a marker do not determine a finite point.
     """
     M = np.empty((s.shape[1], 4))
     lost = put_points(P, fundamental_matrix(P), a_inf, s, M)

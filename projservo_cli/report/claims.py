@@ -277,10 +277,7 @@ def _joints(material: Material, trace: Trace) -> Claim:
 def composition_claim(lambdas: FloatArray, distance: FloatArray) -> Claim:
     """Whether both sides of [RH00] eq. (22) agree, and to which order they do.
 
-    Parameters
-    ----------
-    lambdas : (k,) shares of the task.
-    distance : (k,) of the centre between both sides, m.
+    lambdas : (k,) shares of the task; distance : (k,) of the centre between both sides, m.
     """
     small = np.argsort(lambdas)[:3]
     order = ""
@@ -414,11 +411,9 @@ def _level(material: Material, trace: Trace) -> Claim:
 def claims_of(material: Material, eq22: tuple[FloatArray, FloatArray] | None) -> list[Claim]:
     """All claims that this run can speak about, in the order of the paper.
 
-    Parameters
-    ----------
     material : records, truth and extra runs.
-    eq22 : shares λ, and the distances of the centre between both sides of (22), m; None where they
-        could not be computed.
+    eq22 : shares λ, and the distances of the centre between both sides of (22), m; None where they could not
+        be computed.
     """
     found = [*_classical(material), *_planned(material), *_direct(material)]
     if material.studies is not None:

@@ -55,68 +55,40 @@ class Studies:
     """Closed-loop runs beside those of the run file, all without noise.
 
     Operators are ``true`` (metric), ``twin`` (the same in a projective frame) or ``calibrated``.
-
-    Attributes
-    ----------
-    gains : gains per step that are swept.
-    periods : periods, s, that are swept at the configured gains.
-    gains_of_laws : the configured gains.
-    step_limit_deg : joint motion per step of the limited runs, deg.
-    sweep : runs by (law, operators, limited, gain per step).
-    own : runs with the configured gains by (law, operators, limited).
-    rate : runs with true operators by (law, period).
     """
 
-    gains: tuple[float, ...]
-    periods: tuple[float, ...]
-    gains_of_laws: Gains
-    step_limit_deg: float
-    sweep: Mapping[tuple[str, str, bool, float], Trace]
-    own: Mapping[tuple[str, str, bool], Trace]
-    rate: Mapping[tuple[str, float], Trace]
+    gains: tuple[float, ...]  # gains per step that are swept
+    periods: tuple[float, ...]  # periods, s, that are swept at the configured gains
+    gains_of_laws: Gains  # the configured gains
+    step_limit_deg: float  # joint motion per step of the limited runs, deg
+    sweep: Mapping[tuple[str, str, bool, float], Trace]  # runs by (law, operators, limited, gain per step)
+    own: Mapping[tuple[str, str, bool], Trace]  # runs with the configured gains by (law, operators, limited)
+    rate: Mapping[tuple[str, float], Trace]  # runs with true operators by (law, period)
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """What the figures of a calibration show; a recorded run may hold no more.
+    """What the figures of a calibration show; a recorded run may hold no more."""
 
-    Attributes
-    ----------
-    calibration : the calibration.
-    observation : what it was made from.
-    held_out : its cross-validation, if there is one.
-    """
-
-    calibration: Calibration
-    observation: Observation
+    calibration: Calibration  # the calibration
+    observation: Observation  # what it was made from
+    # its cross-validation, if there is one
     held_out: CrossValidation | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
 class Material(Fit):
-    """All that the figures of a run may show.
+    """All that the figures of a run may show."""
 
-    Attributes
-    ----------
-    calibrated : model the laws use.
-    robot, plant : the truth.
-    plan : the plan.
-    numbers : numbers of the face markers.
-    traces : runs of the laws by name.
-    studies : extra runs; None where they could not be made.
-    no_studies : why not.
-    plateau_steps : steps in which the error of a run that stands still falls by less than 1 %.
-    """
-
-    calibrated: Model
+    calibrated: Model  # model the laws use
     robot: Robot
-    plant: Plant
-    plan: Plan
-    numbers: tuple[int, ...]
-    traces: Mapping[str, Trace] = field(default_factory=dict)
-    studies: Studies | None = None
-    no_studies: str = ""
-    plateau_steps: int = 20
+    plant: Plant  # robot, plant: the truth
+    plan: Plan  # the plan
+    numbers: tuple[int, ...]  # numbers of the face markers
+    traces: Mapping[str, Trace] = field(default_factory=dict)  # runs of the laws by name
+    studies: Studies | None = None  # extra runs; None where they could not be made
+    no_studies: str = ""  # why not
+    plateau_steps: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
 
     def compared(self) -> list[str]:
         """Names of the runs of laws that follow the plan, each after that in which the law plans anew."""
@@ -144,36 +116,22 @@ class Material(Fit):
 
 @dataclass(frozen=True)
 class FigureSpec:
-    """One figure, and what it needs.
+    """One figure, and what it needs."""
 
-    Attributes
-    ----------
-    name : of its files.
-    title : what it shows, in a phrase.
-    paper : the figure of the paper it follows, and its section.
-    height : inches.
-    data, draw : what makes it, from a ``Material``; from a ``Fit`` where it needs no task.
-    alt : what can be seen, for those who do not see it; by default the title.
-    laws : whose traces it shows: all of them, or any of them where ``any_law`` is set.
-    studies : whether it shows the extra runs.
-    modes : whether it compares runs that follow the plan with others.
-    goal : whether it needs a known goal pose.
-    task : whether it needs a task; without, a calibration and what it was made from will do.
-    """
-
-    name: str
-    title: str
-    paper: str
-    height: float
+    name: str  # of its files
+    title: str  # what it shows, in a phrase
+    paper: str  # the figure of the paper it follows, and its section
+    height: float  # inches
+    # data, draw: what makes it, from a ``Material``; from a ``Fit`` where it needs no task
     data: Callable[[Any], Data]
     draw: Callable[[Data, "Figure"], None]
-    alt: str = ""
-    laws: tuple[str, ...] = ()
+    alt: str = ""  # what can be seen, for those who do not see it; by default the title
+    laws: tuple[str, ...] = ()  # whose traces it shows: all of them, or any of them where ``any_law`` is set
     any_law: bool = False
-    studies: bool = False
-    modes: bool = False
-    goal: bool = False
-    task: bool = True
+    studies: bool = False  # whether it shows the extra runs
+    modes: bool = False  # whether it compares runs that follow the plan with others
+    goal: bool = False  # whether it needs a known goal pose
+    task: bool = True  # whether it needs a task; without, a calibration and what it was made from will do
 
     def lacking(self, material: Fit) -> str:
         """Why the figure cannot be drawn; empty where it can."""
@@ -240,15 +198,10 @@ def settled_at(trace: Trace) -> int:
 def decay_factors(values: FloatArray, first: int, least: float) -> FloatArray:
     """Ratios of successive values, from instant ``first`` to the last value above ``least``.
 
-    Parameters
-    ----------
     values : (k,) positive errors.
     first : instant of the first value.
     least : value below which nothing is counted.
-
-    Returns
-    -------
-    (j,) ratios, possibly none.
+    Returns (j,) ratios, possibly none.
     """
     small = np.flatnonzero(values[first:] <= least)
     used = values[first : first + int(small[0])] if len(small) else values[first:]
@@ -305,13 +258,8 @@ def along_line(points: FloatArray, start: FloatArray, goal: FloatArray) -> tuple
 def path_gap(first: FloatArray, second: FloatArray) -> FloatArray:
     """Largest distance between two polylines, each point to the nearest of the other path.
 
-    Parameters
-    ----------
     first, second : (k, ..., 2) and (l, ..., 2) points of the paths, px.
-
-    Returns
-    -------
-    (...) Hausdorff distance of the vertices of either path from the other, px.
+    Returns (...) Hausdorff distance of the vertices of either path from the other, px.
     """
     shape = first.shape[1:-1]
     a = first.reshape(len(first), -1, 2)
@@ -337,8 +285,6 @@ def _to_polyline(points: FloatArray, path: FloatArray) -> FloatArray:
 def coordinate_rise(e: FloatArray) -> FloatArray:
     """How far each error rises in size above the least it had before; 0 where it only falls.
 
-    Parameters
-    ----------
     e : (k, ...) errors over time.
     """
     size = np.abs(e)
@@ -381,16 +327,11 @@ def second_order_drift(
     joint; contributions are counted along the direction of their sum, so that they add up to its
     length.
 
-    Parameters
-    ----------
     H_hat : (n, 4, 4) metric operators at the current joints.
     joint_step : (n,) joint step, rad or m.
     center : (4,) centre, m.
     line : (3,) unit direction of the line.
-
-    Returns
-    -------
-    (n,) signed contributions, m.
+    Returns (n,) signed contributions, m.
     """
     n = len(joint_step)
     parts = np.zeros((n, 3))

@@ -62,8 +62,6 @@ def number(value: Any, digits: int = 3) -> Markup:
 def calibration_words(found: Mapping[str, Any], *, estimated: bool) -> list[str]:
     """Whether a calibration is good, why, and which joint is known worst, a sentence each.
 
-    Parameters
-    ----------
     found : its plain values, as of ``stage_object``.
     estimated : whether the noise was estimated from the same images, so that χ² alone decides nothing.
     """
@@ -154,8 +152,6 @@ def inline(svg: bytes, prefix: str, alt: str) -> Markup | None:
     Only shapes and what paints them are kept, so that the file of a stranger can neither run a
     script nor fetch anything; references lead to names that start with ``prefix``.
 
-    Parameters
-    ----------
     svg : content of the file.
     prefix : unlike those of all other images of the page.
     alt : what the image shows, for those who do not see it.
@@ -530,10 +526,7 @@ def template(name: str) -> "Template":
 def write_page(run: Run) -> Path:
     """Write the page of a run into its folder, from the run and the figures that lie there.
 
-    Raises
-    ------
-    InputError
-        If the configuration cannot be read or the page cannot be written.
+    Raises InputError if the configuration cannot be read or the page cannot be written.
     """
     path = run.path.parent / PAGE_FILE
     _write(path, [_view(run)])
@@ -543,10 +536,7 @@ def write_page(run: Run) -> Path:
 def write_comparison(runs: Sequence[Run], path: Path) -> None:
     """Write one page that shows runs side by side; their figures are read from their folders.
 
-    Raises
-    ------
-    InputError
-        If a configuration cannot be read or the page cannot be written.
+    Raises InputError if a configuration cannot be read or the page cannot be written.
     """
     base = path.parent.resolve()
     views = []

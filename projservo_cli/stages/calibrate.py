@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 def trial_motions(config: "Config") -> FloatArray:
     """Joint readings (k, n) of the reference and of every single-joint trial, rad or m.
 
-    Raises
-    ------
-    InputError
-        If a trial would pass a joint limit, or no reference is set.
+    Raises InputError if a trial would pass a joint limit, or no reference is set.
     """
     settings = config.calibration
     vector = reference_of(config)
@@ -61,11 +58,7 @@ def simulate(config: "Config", truth: Truth) -> Observation:
 def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
     """Noisy pixels (2, m, 2) of all markers at the joints q (n,), rad or m; NaN outside an image.
 
-    Parameters
-    ----------
-    truth : robot, rig and markers.
-    q : (n,) rad or m.
-    noise : (2, m, 2) px.
+    truth : robot, rig and markers; q : (n,) rad or m; noise : (2, m, 2) px.
     """
     images = truth.images(q, truth.M) + noise
     inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)
@@ -78,16 +71,9 @@ def run(
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from simulated trial motions, or from the recorded table of the configuration.
 
-    Returns
-    -------
-    What was seen, the calibration, and its held-out errors if the configuration asks for them.
-
-    Raises
-    ------
-    InputError
-        If the table or the configuration cannot be used.
-    WorkFailed
-        If the data do not support a calibration.
+    Returns what was seen, the calibration, and its held-out errors if the configuration asks for them. Raises
+    InputError if the table or the configuration cannot be used; WorkFailed if the data do not support a
+    calibration.
     """
     from projservo_cli.config.nominal import read_nominal
 
@@ -145,18 +131,11 @@ def suggested(
     Predictions are judged over the range of the recorded readings, a little widened. Candidates lie in
     the same range, or for a simulated robot in one three times as wide.
 
-    Parameters
-    ----------
     config : robot and rig as far as they are known.
     observation, calibration : of the run.
     count : poses to suggest.
-
-    Raises
-    ------
-    InputError
-        If the method of the calibration has no covariance.
-    WorkFailed
-        If no pose shows the markers to both views.
+    Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose shows the
+    markers to both views.
     """
     image = _image(config, observation)
     targets = _region(config, observation.q, WIDER, image)
@@ -190,17 +169,11 @@ def write_suggestions(
 ) -> None:
     """Write suggestions as a list of motions, a row each: q1 … qN, from_pose, delta_q1 … delta_qN.
 
-    Parameters
-    ----------
     found : the suggestions.
     path : CSV to write; it appears whole or not at all.
     prismatic : (n,) which joints are prismatic.
     joint_unit : unit of the revolute joints, ``deg``, else rad.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
+    Raises InputError if it cannot be written.
     """
     scale = np.where(np.array(prismatic) | (joint_unit != "deg"), 1.0, np.degrees(1.0))
     joints = [f"q{i}" for i in range(1, len(scale) + 1)]

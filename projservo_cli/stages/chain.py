@@ -36,21 +36,11 @@ def make(
 ) -> tuple[Run, list[str]]:
     """Make one result and put it into the run file.
 
-    Parameters
-    ----------
     step, config, run : what to make, from what.
     laws : names of the runs a report is about; others may be stored, of other settings perhaps.
     progress : told how far the stage is.
-
-    Returns
-    -------
-    tuple
-        The run with it, and the names of results dropped because they were made from older ones.
-
-    Raises
-    ------
-    InputError, WorkFailed
-        What the stage raises; the run file is then as it was.
+    Returns tuple: The run with it, and the names of results dropped because they were made from older ones.
+    Raises InputError, WorkFailed what the stage raises; the run file is then as it was.
     """
     run = replace(run, configuration=to_yaml(config))
     records = _records(step, config, run, laws, progress)

@@ -23,12 +23,8 @@ SETTLE = 10  # further commands for what rounding or a controller left at the en
 def foreign_robot(config: "Config", joints: Joints, markers: int) -> ForeignRobot:
     """Make the robot of ``plant.use``.
 
-    Raises
-    ------
-    InputError
-        If there is no such class, or a joint has no speed limit.
-    WorkFailed
-        If it cannot be made.
+    Raises InputError if there is no such class, or a joint has no speed limit; WorkFailed if it cannot be
+    made.
     """
     target = config.plant.use
     assert target is not None
@@ -44,18 +40,12 @@ def foreign_robot(config: "Config", joints: Joints, markers: int) -> ForeignRobo
 def drive_to(robot: Robot, target: FloatArray, limit: FloatArray, period: float, what: str = "record") -> int:
     """Move along a straight line in joint space, each command within the limit; the number of commands.
 
-    Parameters
-    ----------
     robot : what is driven.
     target : (n,) joints to arrive at, rad or m.
     limit : (n,) largest step of each joint, rad or m.
     period : control period, s.
     what : the command it is for, in messages.
-
-    Raises
-    ------
-    WorkFailed
-        If the robot is farther than ``ARRIVED`` from the target in the end.
+    Raises WorkFailed if the robot is farther than ``ARRIVED`` from the target in the end.
     """
     gap = target - robot.joints()
     most = math.ceil(float(np.max(np.abs(gap) / limit))) + SETTLE

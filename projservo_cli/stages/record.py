@@ -31,8 +31,6 @@ SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 class SimulatedRobot:
     """The robot of a configuration, with given pixel noise.
 
-    Parameters
-    ----------
     truth : robot, rig and markers.
     q_start : (n,) first joints, rad or m.
     noise : (k, 2, m, 2) px, added to each observation in turn.
@@ -62,27 +60,17 @@ class SimulatedRobot:
 
 @dataclass
 class Recording:
-    """A table in the making.
+    """A table in the making."""
 
-    Attributes
-    ----------
-    path : of the table.
-    key : hash of what the pixels depend on, stored with every row.
-    targets : (K, n) joints to drive to, rad or m; the row is the number of the pose.
-    marker : (m,) numbers of the markers.
-    q, images : joints (n,) and pixels (2, m, 2) of the poses that are done.
-    found : how many of them an earlier call recorded.
-    commands : steps sent to the robot.
-    """
-
-    path: Path
-    key: str
-    targets: FloatArray
-    marker: IntArray
+    path: Path  # of the table
+    key: str  # hash of what the pixels depend on, stored with every row
+    targets: FloatArray  # (K, n) joints to drive to, rad or m; the row is the number of the pose
+    marker: IntArray  # (m,) numbers of the markers
+    # q, images: joints (n,) and pixels (2, m, 2) of the poses that are done
     q: dict[int, FloatArray] = field(default_factory=dict)
     images: dict[int, FloatArray] = field(default_factory=dict)
-    found: int = 0
-    commands: int = 0
+    found: int = 0  # how many of them an earlier call recorded
+    commands: int = 0  # steps sent to the robot
 
     @property
     def pending(self) -> list[int]:
@@ -108,18 +96,12 @@ def prepare(
 ) -> Recording:
     """What there is to record, and what of it the table holds already.
 
-    Parameters
-    ----------
     config : robot, rig, markers and trial motions.
     path : of the table.
     motions : further poses after the trial motions, numbered on.
     force : begin anew, whatever stands at ``path``.
-
-    Raises
-    ------
-    InputError
-        If the configuration does not describe a robot and its trial motions, a pose lies beyond the
-        joint limits, or the table at ``path`` was not recorded with this configuration.
+    Raises InputError if the configuration does not describe a robot and its trial motions, a pose lies beyond
+    the joint limits, or the table at ``path`` was not recorded with this configuration.
     """
     if config.plant.use is None:
         truth_of(config)  # refuses what lacks a part of the simulation
@@ -165,19 +147,12 @@ def record(
 ) -> None:
     """Record the pending poses, and keep those that are done however it ends.
 
-    Parameters
-    ----------
     config : with the control period and the joint-speed limits.
     recording : what is to be done; on return, or on an interruption, what was done.
     robot : what is driven; None takes that of ``plant.use``, or simulates the robot of the configuration.
     progress : told after each pose.
-
-    Raises
-    ------
-    InputError
-        If the table cannot be written.
-    WorkFailed
-        If the robot fails or does not arrive where it was sent.
+    Raises InputError if the table cannot be written; WorkFailed if the robot fails or does not arrive where
+    it was sent.
     """
     if robot is None and config.plant.use is not None:
         robot = foreign_robot(config, joints_of(config), len(recording.marker))

@@ -50,16 +50,10 @@ _Eq22 = tuple[FloatArray, FloatArray]
 def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     """Make the extra runs, draw the figures, measure the claims and write the page that tells all.
 
-    Parameters
-    ----------
     run : with calibration, plan and traces; where there is no task, with the calibration.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     progress : told how far it is.
-
-    Raises
-    ------
-    InputError
-        If the run lacks what the stage needs, or a file cannot be written.
+    Raises InputError if the run lacks what the stage needs, or a file cannot be written.
     """
     config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
@@ -118,14 +112,7 @@ def draw_all(
 
     Files that an earlier report left of them, and formats that are not asked for now, are removed.
 
-    Returns
-    -------
-    Files written, relative to the folder.
-
-    Raises
-    ------
-    InputError
-        If a file cannot be written.
+    Returns files written, relative to the folder. Raises InputError if a file cannot be written.
     """
     folder = directory / FOLDER
     require_inside(folder, directory)
@@ -194,10 +181,7 @@ def _write_claims(report: Report, path: Path) -> None:
 def require(config: "Config", wanted: Sequence[str]) -> None:
     """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted.
 
-    Raises
-    ------
-    InputError
-        If plotly is not installed, the robot is not known in metres, or there is no task.
+    Raises InputError if plotly is not installed, the robot is not known in metres, or there is no task.
     """
     if config.task is None:
         text = "shows runs of laws, which need a task: set task.start and task.goal"

@@ -56,18 +56,12 @@ def calibration_seed(config: "Config") -> int:
 
 @dataclass(frozen=True, eq=False)
 class StartAndGoal:
-    """Start and goal of a task, and what images show of them.
+    """Start and goal of a task, and what images show of them."""
 
-    Attributes
-    ----------
-    q_start : (n,) rad or m, with the offset of the start if there is one.
-    goal_pose : (4, 4) true pose of the tool at the goal, m; None where nobody knows it.
-    s_start, s_star : (2, b, 2) pixels of the face, then of the other markers that are watched, px, NaN
-        where unknown.
-    """
-
-    q_start: FloatArray
-    goal_pose: FloatArray | None
+    q_start: FloatArray  # (n,) rad or m, with the offset of the start if there is one
+    goal_pose: FloatArray | None  # (4, 4) true pose of the tool at the goal, m; None where nobody knows it
+    # s_start, s_star: (2, b, 2) pixels of the face, then of the other markers that are watched, px, NaN where
+    # unknown
     s_start: FloatArray
     s_star: FloatArray
 
@@ -77,48 +71,31 @@ class StartAndGoal:
 
 
 class Watched(NamedTuple):
-    """The markers by which a face is measured.
+    """The markers by which a face is measured."""
 
-    Attributes
-    ----------
-    face : how many of them are on the face.
-    numbers : of all of them, those of the face first, then the pins.
-    body : that they belong to, as calibrated; None where the face is measured point by point.
-    pins : (p, 4) pins at the robot's reference, m; of a robot that is not simulated as calibrated.
-    which : (p,) the pins among all true markers beside the face.
-    """
-
-    face: int
-    numbers: tuple[int, ...]
+    face: int  # how many of them are on the face
+    numbers: tuple[int, ...]  # of all of them, those of the face first, then the pins
+    # that they belong to, as calibrated; None where the face is measured point by point
     body: Body | None = None
+    # (p, 4) pins at the robot's reference, m; of a robot that is not simulated as calibrated
     pins: FloatArray = NO_PINS
-    which: tuple[int, ...] = ()
+    which: tuple[int, ...] = ()  # (p,) the pins among all true markers beside the face
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """What the runs of a configuration with a calibration take place in.
-
-    Attributes
-    ----------
-    truth : robot, rig and markers as they are; None for a robot that is not simulated.
-    joints : as the laws take them.
-    watched : the markers by which the face is measured.
-    exact, ends : start and goal without noise, and as they are shown to the laws.
-    gains, limits : of the laws, and when a run ends.
-    ideal : without noise and disturbances in the loop.
-    """
+    """What the runs of a configuration with a calibration take place in."""
 
     config: "Config"
     calibration: Calibration
-    truth: Truth | None
-    joints: Joints
-    watched: Watched
+    truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
+    joints: Joints  # as the laws take them
+    watched: Watched  # the markers by which the face is measured
     exact: StartAndGoal
-    ends: StartAndGoal
+    ends: StartAndGoal  # exact, ends: start and goal without noise, and as they are shown to the laws
     gains: Gains
-    limits: Limits
-    ideal: bool = False
+    limits: Limits  # gains, limits: of the laws, and when a run ends
+    ideal: bool = False  # without noise and disturbances in the loop
 
     def body_of(self, law: str) -> Body | None:
         """The body that a law measures with; None for one that measures point by point."""
@@ -142,10 +119,7 @@ class Scenario:
     def task_of(self, model: Model, body: Body | None) -> Task:
         """The task as start and goal show it to a model, by the body or point by point.
 
-        Raises
-        ------
-        WorkFailed
-            If the images do not show where the face or its body is.
+        Raises WorkFailed if the images do not show where the face or its body is.
         """
         ends, sight = self.ends, None if body is None else Sight(body, self.ends.s_start, self.ends.s_star)
         center = center_index(self.config)
@@ -154,10 +128,7 @@ class Scenario:
     def plant_of(self, law: str) -> Plant:
         """The simulated robot as a law sees it, and what befalls it.
 
-        Raises
-        ------
-        WorkFailed
-            If a camera sees the face edge-on at the start.
+        Raises WorkFailed if a camera sees the face edge-on at the start.
         """
         assert self.truth is not None
         plant = plant_of(self.config, self.truth, self.exact.q_start)
@@ -216,16 +187,10 @@ def true_ends(truth: Truth | None, goal_pose: FloatArray | None) -> Ends:
 
 
 class Sense(NamedTuple):
-    """All of a plan that a law needs that plans anew in each step: which way to turn.
+    """All of a plan that a law needs that plans anew in each step: which way to turn."""
 
-    Attributes
-    ----------
-    motions : (2, n) joint motions of the rotations r and p in the sense they are planned.
-    task : measured as the plan is; None where the whole plan was made.
-    """
-
-    motions: FloatArray
-    task: Task | None
+    motions: FloatArray  # (2, n) joint motions of the rotations r and p in the sense they are planned
+    task: Task | None  # measured as the plan is; None where the whole plan was made
 
     def rotation_sense(self) -> FloatArray:
         """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
@@ -256,10 +221,7 @@ def measured_task(
 ) -> Task:
     """The task as the images (2, m, 2) of the face or of its body at start and goal show it.
 
-    Raises
-    ------
-    WorkFailed
-        If the images do not show where the face or its body is.
+    Raises WorkFailed if the images do not show where the face or its body is.
     """
     if sight is None:
         return task_from_images(model, s_start, s_star, center)
@@ -269,12 +231,8 @@ def measured_task(
 def scenario_of(config: "Config", calibration: Calibration) -> Scenario:
     """Make the scenario of a configuration, of its simulated robot or of the one in ``plant.use``.
 
-    Raises
-    ------
-    InputError
-        If the configuration lacks a part of it, naming the key to set.
-    WorkFailed
-        If the goal cannot be reached or seen, or the body not be measured with.
+    Raises InputError if the configuration lacks a part of it, naming the key to set; WorkFailed if the goal
+    cannot be reached or seen, or the body not be measured with.
     """
     if config.plant.use is not None:
         return _scenario_of_own_robot(config, calibration)
@@ -367,12 +325,7 @@ def _body(calibration: Calibration, indices: tuple[int, ...]) -> Body:
 def start_and_goal(config: "Config", truth: Truth, pins: Sequence[int] = ()) -> StartAndGoal:
     """Start and goal of the simulated task without noise, seen by the face and some of the other markers.
 
-    Raises
-    ------
-    InputError
-        If the configuration has no task.
-    WorkFailed
-        If the goal cannot be reached.
+    Raises InputError if the configuration has no task; WorkFailed if the goal cannot be reached.
     """
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
@@ -486,10 +439,7 @@ def _predicted_images(calibration: Calibration, watched: Watched, q: FloatArray,
 def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
     """The truth as the loop sees it from the joints q_start (n,), undisturbed.
 
-    Raises
-    ------
-    WorkFailed
-        If a camera sees the face edge-on there.
+    Raises WorkFailed if a camera sees the face edge-on there.
     """
     return _plant(truth, q_start.tobytes(), config.plant.self_occlusion == "opaque")
 
@@ -547,10 +497,7 @@ def _end(first: int, count: int | None) -> int:
 def _lose_markers(config: "Config", noise: FloatArray, numbers: Sequence[int]) -> None:
     """Make the noise of lost markers NaN, in place, by which they are unseen.
 
-    Parameters
-    ----------
-    noise : (k, 2, m, 2) at every instant, px.
-    numbers : (m,) of the markers.
+    noise : (k, 2, m, 2) at every instant, px; numbers : (m,) of the markers.
     """
     lost = config.disturbance.lost_markers
     if lost is None:

@@ -45,17 +45,10 @@ def run(
 ) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
-    Parameters
-    ----------
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
-
-    Raises
-    ------
-    InputError
-        If the configuration lacks a part of the simulation, or the plan to follow has no time.
-    WorkFailed
-        If the goal cannot be reached, or the joints cannot follow the plan and ``control.without_plan``
-        refuses to go without.
+    Raises InputError if the configuration lacks a part of the simulation, or the plan to follow has no time;
+    WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
+    ``control.without_plan`` refuses to go without.
     """
     scenario = scenario_of(config, calibration)
     return recorded(scenario, plan, name, drive(scenario, plan, name))
@@ -73,15 +66,9 @@ def recorded(scenario: Scenario, plan: Plan | Sense, name: str, run: Run) -> Tra
 def drive(scenario: Scenario, plan: Plan | Sense, name: str, believed: Model | None = None) -> Run:
     """Drive the run of a name to its verdict.
 
-    Parameters
-    ----------
     plan : of the task; the sense of its rotations is enough for a built-in law that does not follow it.
     believed : what the law takes for robot and rig; None for what a law of its kind is given.
-
-    Raises
-    ------
-    InputError, WorkFailed
-        As of ``run``.
+    Raises InputError, WorkFailed as of ``run``.
     """
     law, mode = law_and_mode(name)
     replans = mode == REPLAN or bool(_unplanned(scenario, plan, name))
@@ -235,13 +222,8 @@ class ForeignLaw:
 def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw:
     """A law, ready for the Python loop.
 
-    Raises
-    ------
-    InputError
-        If there is no such law, it needs a model of the robot that the configuration lacks, or the plan to
-        follow has no time.
-    WorkFailed
-        If it cannot be made, or the joints cannot follow the plan.
+    Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks, or
+    the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the plan.
     """
     gains, ends = scenario.gains, scenario.ends
     if law not in CODES:

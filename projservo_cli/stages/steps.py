@@ -41,22 +41,13 @@ EXPECTED = {"table": "a table", "init": "JSON with screws, cameras and markers"}
 
 @dataclass(frozen=True)
 class Step:
-    """One result that is needed.
+    """One result that is needed."""
 
-    Attributes
-    ----------
-    stage : name of the stage.
-    law : name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty.
-    key : what the key of the result will be.
-    why : why it has to be made; empty where the stored one is up to date.
-    inputs : files read and their hashes.
-    """
-
-    stage: str
-    law: str
-    key: str
-    why: str
-    inputs: dict[str, str]
+    stage: str  # name of the stage
+    law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty
+    key: str  # what the key of the result will be
+    why: str  # why it has to be made; empty where the stored one is up to date
+    inputs: dict[str, str]  # files read and their hashes
 
     @property
     def name(self) -> str:
@@ -69,23 +60,13 @@ def steps_for(
 ) -> list[Step]:
     """All results that the named stages consist of or need, in the order of making.
 
-    Parameters
-    ----------
-    config : Config
-    run : Run
-        What is stored so far; possibly nothing.
-    named : sequence of str
-        Stages the user asked for.
-    laws : sequence of str
-        Laws instead of ``control.laws``.
-    force : bool
-        Make the named stages even where they are up to date.
-
-    Raises
-    ------
-    InputError
-        When a file cannot be read, a law has none of the modes of ``control.mode``, or a recorded
-        calibration would be replaced by a simulated one without ``force``.
+    config : Config.
+    run : Run, what is stored so far; possibly nothing.
+    named : sequence of str, stages the user asked for.
+    laws : sequence of str, laws instead of ``control.laws``.
+    force : bool, make the named stages even where they are up to date.
+    Raises InputError when a file cannot be read, a law has none of the modes of ``control.mode``, or a
+    recorded calibration would be replaced by a simulated one without ``force``.
     """
     last = max(named, key=STAGES.index)
     stages = STAGES[: STAGES.index(last) + 1]

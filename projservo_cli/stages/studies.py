@@ -40,19 +40,12 @@ H_PE = np.array([[1.1, 0.2, -0.1, 0.3], [-0.2, 0.9, 0.2, -0.1], [0.1, -0.1, 1.2,
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What all extra runs share: the task without noise, with the configured gains.
+    """What all extra runs share: the task without noise, with the configured gains."""
 
-    Attributes
-    ----------
-    scenario : without noise and disturbances, and without an end at a border or a joint limit.
-    models : by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and
-        ``calibrated``.
-    sense : in which the plan turns, which decides the sense of a half turn.
-    """
-
-    scenario: Scenario
+    scenario: Scenario  # without noise and disturbances, and without an end at a border or a joint limit
+    # by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and ``calibrated``
     models: dict[str, Model]
-    sense: Sense
+    sense: Sense  # in which the plan turns, which decides the sense of a half turn
 
     @property
     def truth(self) -> Truth:
@@ -90,10 +83,8 @@ def projective_twin(model: Model) -> Model:
 def comparison_of(config: "Config", calibration: Calibration, plan: Plan) -> Comparison:
     """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
 
-    Raises
-    ------
-    InputError, WorkFailed
-        If the configuration describes no simulated task, or the task cannot be done.
+    Raises InputError, WorkFailed if the configuration describes no simulated task, or the task cannot be
+    done.
     """
     truth_of(config)  # refuses what lacks a part of the simulation
     scenario = idealized(scenario_of(config, calibration))
@@ -121,17 +112,11 @@ def run_studies(
 ) -> Studies:
     """Make all extra runs.
 
-    Parameters
-    ----------
     gains : gains per step to sweep.
-    periods : periods to sweep at the configured gains, s; those with a gain of 1 a step or more,
-        which no loop survives, are left out.
+    periods : periods to sweep at the configured gains, s; those with a gain of 1 a step or more, which no
+        loop survives, are left out.
     progress : told how far it is.
-
-    Raises
-    ------
-    WorkFailed
-        If the task cannot be partitioned with one of the models.
+    Raises WorkFailed if the task cannot be partitioned with one of the models.
     """
     own = bench.scenario.gains
     most = max(own.gain_t, own.gain_r, own.gain_p, own.gain_s)
@@ -164,10 +149,7 @@ def run_studies(
 def metric_plan(bench: Comparison, delta: float) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres.
 
-    Raises
-    ------
-    WorkFailed
-        If the task cannot be partitioned.
+    Raises WorkFailed if the task cannot be partitioned.
     """
     ends, robot = bench.scenario.ends, bench.truth.robot
     return plan_task(
@@ -181,15 +163,9 @@ def metric_plan(bench: Comparison, delta: float) -> Plan:
 def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> tuple[FloatArray, FloatArray]:
     """How far both sides of [RH00] eq. (22) differ when the task is taken in shares λ.
 
-    Parameters
-    ----------
-    plan : metric plan.
-    lambdas : shares of τ and θ_s.
-
-    Returns
-    -------
-    distance : (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m.
-    norm : (k,) Frobenius norm of the difference of both displacements, m and rad mixed.
+    plan : metric plan; lambdas : shares of τ and θ_s.
+    Returns distance: (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m; norm:
+    (k,) Frobenius norm of the difference of both displacements, m and rad mixed.
     """
     theta_s, H_hat_s = compose_rotations(plan.H_hat[1], plan.H_hat[2], plan.theta_r, plan.theta_p)
     distance, norm = [], []

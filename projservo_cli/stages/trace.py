@@ -19,26 +19,16 @@ SUBSAMPLES = 50  # points of a joint step at which the deviation between samples
 
 
 class Run(NamedTuple):
-    """A run as it ended.
-
-    Attributes
-    ----------
-    verdict, disturbance : the verdict, and why the images no longer agree where that is it.
-    steps : commands sent.
-    log : what was recorded.
-    limited : how often visibility limited the translation.
-    plant : that was driven; of a robot that is not simulated what the calibration takes it for.
-    law, mode : what it is a run of.
-    """
+    """A run as it ended."""
 
     verdict: str
-    disturbance: str
-    steps: int
-    log: Log
-    limited: float
-    plant: Plant
+    disturbance: str  # verdict, disturbance: the verdict, and why the images no longer agree where that is it
+    steps: int  # commands sent
+    log: Log  # what was recorded
+    limited: float  # how often visibility limited the translation
+    plant: Plant  # that was driven; of a robot that is not simulated what the calibration takes it for
     law: str = ""
-    mode: str = REPLAN
+    mode: str = REPLAN  # law, mode: what it is a run of
 
 
 def summary_of(scenario: Scenario, run: Run) -> Summary:
@@ -59,8 +49,6 @@ def trace_of(
 ) -> Trace:
     """Record of a run.
 
-    Parameters
-    ----------
     planned_s : when the plan that it followed arrives, s.
     unplanned, untested : why it went without the plan, and without a test of the images.
     """

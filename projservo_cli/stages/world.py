@@ -30,19 +30,12 @@ if TYPE_CHECKING:
 
 
 class Joints(NamedTuple):
-    """What a configuration says of the joints.
+    """What a configuration says of the joints."""
 
-    Attributes
-    ----------
-    types : one letter a joint, R or P.
-    lower, upper : (n,) limits, rad or m; infinite where none is set.
-    speed : (n,) most motion per second, rad/s or m/s; infinite for none.
-    """
-
-    types: str
+    types: str  # one letter a joint, R or P
     lower: FloatArray
-    upper: FloatArray
-    speed: FloatArray
+    upper: FloatArray  # lower, upper: (n,) limits, rad or m; infinite where none is set
+    speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
 
     def require_inside(self, q: FloatArray, where: str) -> None:
         """Refuse readings (n,) outside the limits."""
@@ -87,26 +80,15 @@ def image_size_of(config: "Config") -> tuple[int, int] | None:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Robot, rig and markers as they are.
+    """Robot, rig and markers as they are."""
 
-    Attributes
-    ----------
-    robot : true kinematics.
-    P : (2, 3, 4) true cameras, px.
-    M : (m, 4) all markers at the robot's reference, m.
-    number : (m,) their numbers.
-    face : indices of the face markers; none where the configuration has no face.
-    center : position of the centre marker within the face, or ``MIDPOINT``.
-    image_size : (2,) px.
-    """
-
-    robot: Robot
-    P: FloatArray
-    M: FloatArray
-    number: tuple[int, ...]
-    face: tuple[int, ...]
-    center: int
-    image_size: FloatArray
+    robot: Robot  # true kinematics
+    P: FloatArray  # (2, 3, 4) true cameras, px
+    M: FloatArray  # (m, 4) all markers at the robot's reference, m
+    number: tuple[int, ...]  # (m,) their numbers
+    face: tuple[int, ...]  # indices of the face markers; none where the configuration has no face
+    center: int  # position of the centre marker within the face, or ``MIDPOINT``
+    image_size: FloatArray  # (2,) px
 
     @cached_property
     def model(self) -> Model:
@@ -155,10 +137,7 @@ def center_index(config: "Config") -> int:
 def truth_of(config: "Config") -> Truth:
     """Build the truth, or find it again where it was built for another seed or task.
 
-    Raises
-    ------
-    InputError
-        If the configuration lacks a part of it, naming the key to set.
+    Raises InputError if the configuration lacks a part of it, naming the key to set.
     """
     if config.robot is None:
         raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")

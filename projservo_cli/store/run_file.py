@@ -57,22 +57,13 @@ _ANEW = "restore it, or make it anew in another folder"
 
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """What one stage (or one law of ``servo``) made, and from what.
+    """What one stage (or one law of ``servo``) made, and from what."""
 
-    Attributes
-    ----------
-    key : hash of all the result depends on.
-    configuration : resolved YAML.
-    provenance : versions, host, date and so on; JSON values.
-    inputs : files read and their hashes.
-    records : the records by name; the name "" stands for the only one.
-    """
-
-    key: str
-    configuration: str
-    provenance: Mapping[str, Any]
-    inputs: Mapping[str, str]
-    records: Mapping[str, Any]
+    key: str  # hash of all the result depends on
+    configuration: str  # resolved YAML
+    provenance: Mapping[str, Any]  # versions, host, date and so on; JSON values
+    inputs: Mapping[str, str]  # files read and their hashes
+    records: Mapping[str, Any]  # the records by name; the name "" stands for the only one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,10 +121,7 @@ def run_path(target: Path | str) -> Path:
 def save(run: Run) -> None:
     """Write a run file in place of the one at ``run.path``, as a whole or not at all.
 
-    Raises
-    ------
-    InputError
-        When it cannot be written; the file that stood there stays.
+    Raises InputError when it cannot be written; the file that stood there stays.
     """
     with new_file(run.path) as new, labelled(new) as file:
         told = {"configuration": run.configuration, "order": json.dumps(list(run.results))}

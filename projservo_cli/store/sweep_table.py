@@ -40,10 +40,7 @@ Heading = tuple[str, str, str, str]
 def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Trace]) -> None:
     """Write rows and traces, as a whole or not at all.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
+    Raises InputError if the file cannot be written.
     """
     with new_file(path) as file:
         if traces:
@@ -59,14 +56,8 @@ def assemble(
 ) -> int:
     """Put parts together, in the order given, a few at a time; the number of rows.
 
-    Parameters
-    ----------
     attributes : of the file: numbers and texts, everything else as JSON.
-
-    Raises
-    ------
-    InputError
-        If a part is damaged or the file cannot be written; the table that stood there stays.
+    Raises InputError if a part is damaged or the file cannot be written; the table that stood there stays.
     """
     rows = sum(_rows(part) for part in parts)
     size = rows * sum(np.dtype(dtype).itemsize for _, dtype, _, _ in headings)
@@ -142,19 +133,9 @@ def _rows(part: Path) -> int:
 class SweepTable:
     """A table read from its file, a column at a time.
 
-    Parameters
-    ----------
     path : the file.
-
-    Attributes
-    ----------
-    names : of the columns.
-    attributes : of the file; JSON as its values.
-
-    Raises
-    ------
-    InputError
-        If there is none or it is no table of a sweep.
+    ``names``: of the columns. ``attributes``: of the file; JSON as its values. Raises InputError if there is
+    none or it is no table of a sweep.
     """
 
     def __init__(self, path: Path) -> None:
@@ -183,10 +164,7 @@ class SweepTable:
     def trace(self, run: int) -> Trace:
         """Trace of a run that was kept.
 
-        Raises
-        ------
-        InputError
-            If it was not.
+        Raises InputError if it was not.
         """
         with opened(self.path, _AGAIN) as file:
             if f"{_TRACES}/{run}" not in file:

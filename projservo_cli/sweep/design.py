@@ -99,16 +99,10 @@ class Numbers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """A sweep with its bases at hand, so that it needs no file.
+    """A sweep with its bases at hand, so that it needs no file."""
 
-    Attributes
-    ----------
-    sweep : its configuration.
-    bases : name and resolved YAML of each base.
-    """
-
-    sweep: SweepConfig
-    bases: tuple[tuple[str, str], ...]
+    sweep: SweepConfig  # its configuration
+    bases: tuple[tuple[str, str], ...]  # name and resolved YAML of each base
 
     @cached_property
     def axes(self) -> tuple[Axis, ...]:

@@ -40,14 +40,9 @@ def run(
 ) -> Status:
     """Make the runs of a sweep that are not stored yet, and the table.
 
-    Raises
-    ------
-    InputError
-        If the folder holds another sweep, a file cannot be written, or a drawn value is invalid.
-    WorkFailed
-        If tasks cannot be drawn, or workers are lost again and again; what was stored is kept.
-    KeyboardInterrupt
-        After the table of what was stored has been assembled.
+    Raises InputError if the folder holds another sweep, a file cannot be written, or a drawn value is
+    invalid; WorkFailed if tasks cannot be drawn, or workers are lost again and again; what was stored is
+    kept; KeyboardInterrupt after the table of what was stored has been assembled.
     """
     status = folder.status(design, force=force)
     if status.complete:

@@ -59,8 +59,6 @@ class Engine:
 
         No more jobs wait than keep all workers busy, and a result is let go when the next is asked for.
 
-        Parameters
-        ----------
         most : workers that the jobs are worth.
         threads : whether they seldom wait for each other; the memory is that of one process then.
         """

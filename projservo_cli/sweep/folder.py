@@ -74,10 +74,8 @@ class Folder:
     def status(self, design: Design, *, force: bool = False) -> Status:
         """How far a sweep is.
 
-        Raises
-        ------
-        InputError
-            If the folder holds another sweep, or one made with other versions, and ``force`` is not set.
+        Raises InputError if the folder holds another sweep, or one made with other versions, and ``force`` is
+        not set.
         """
         total = design.total
         if not force and self.table.exists() and not self.manifest.exists():
@@ -191,20 +189,9 @@ class Folder:
 def run_of(target: str) -> tuple[Config, Result | None]:
     """Configuration of a run of a sweep, and the calibration it was made with.
 
-    Parameters
-    ----------
     target : SWEEP:INDEX, the folder of a sweep (or its table) and the number of the run.
-
-    Returns
-    -------
-    The calibration is None where the sweep has not come to it yet.
-
-    Raises
-    ------
-    InputError
-        If there is no such sweep or run.
-    WorkFailed
-        If the calibration of the run was refused.
+    Returns the calibration is None where the sweep has not come to it yet. Raises InputError if there is no
+    such sweep or run; WorkFailed if the calibration of the run was refused.
     """
     sweep, _, index = target.rpartition(":")
     if not sweep or not index.isdecimal():

@@ -38,9 +38,7 @@ class _Picture(NamedTuple):
 def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
     """Write statistics and figures of a sweep, of the runs that are done.
 
-    Returns
-    -------
-    The statistics, and the files.
+    Returns the statistics, and the files.
     """
     if folder.stored():
         folder.assemble(folder.design())

@@ -109,17 +109,12 @@ _COUNTS = tuple(column.name for column in MEASURED if column.dtype.startswith("i
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Runs ``first`` to ``last`` - 1 and all they need.
-
-    Attributes
-    ----------
-    calibrations : by their key; None where there could be none.
-    """
+    """Runs ``first`` to ``last`` - 1 and all they need."""
 
     design: Design
     first: int
     last: int
-    calibrations: Mapping[str, Calibration | None]
+    calibrations: Mapping[str, Calibration | None]  # by their key; None where there could be none
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +130,7 @@ class Made:
 def run_part(part: Part) -> Made:
     """Make the runs of a part; the same on any machine of one kind, whatever ran before.
 
-    Raises
-    ------
-    InputError
-        If a drawn value is not one that its key takes.
+    Raises InputError if a drawn value is not one that its key takes.
     """
     design = _interned(part.design)
     runs = np.arange(part.first, part.last)
@@ -259,10 +251,7 @@ def _setting_of(scenario: Scenario, law: str) -> Setting:
 def numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
     """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone.
 
-    Raises
-    ------
-    WorkFailed
-        If the task cannot be begun, whatever the seed.
+    Raises WorkFailed if the task cannot be begun, whatever the seed.
     """
     setting = _setting_of(scenario, law)
     desk = new_desk(setting, len(scenario.watched.numbers))

@@ -41,8 +41,6 @@ def wilson(successes: int, count: int) -> tuple[float, float]:
 class Rows:
     """Columns of a table as they are needed, and what follows from them.
 
-    Parameters
-    ----------
     table : of a sweep.
     """
 
@@ -165,9 +163,7 @@ def _chance(first: int, second: int) -> float:
 def success_by(rows: Rows, name: str, edges: Sequence[float] | None = None) -> Mapping[str, dict[str, Any]]:
     """Success of each law over a column: at each of its values, or within edges.
 
-    Returns
-    -------
-    For each law arrays (k,): x, runs, rate, low and high of the interval.
+    Returns for each law arrays (k,): x, runs, rate, low and high of the interval.
     """
     x, success = rows[name], rows["success"]
     law = rows[LAW] if LAW in rows.table.names else np.full(len(x), "all")

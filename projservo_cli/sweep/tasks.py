@@ -20,28 +20,20 @@ MOST_DRAWS = 20_000_000
 
 @dataclass(frozen=True, eq=False)
 class RandomTasks:
-    """Tasks and how they came about.
-
-    Attributes
-    ----------
-    q_start, q_goal : (k, n) joints, rad or m.
-    angle : (k,) rotation from start to goal, rad; a sixth of the tasks in each sixth of half a turn.
-    drawn : joint vectors drawn.
-    rejected : how many of them were rejected for each reason, and pairs whose stratum was full.
-    """
+    """Tasks and how they came about."""
 
     q_start: FloatArray
-    q_goal: FloatArray
+    q_goal: FloatArray  # q_start, q_goal: (k, n) joints, rad or m
+    # (k,) rotation from start to goal, rad; a sixth of the tasks in each sixth of half a turn
     angle: FloatArray
-    drawn: int
+    drawn: int  # joint vectors drawn
+    # how many of them were rejected for each reason, and pairs whose stratum was full
     rejected: dict[str, int]
 
 
 def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator) -> RandomTasks:
     """Draw tasks.
 
-    Parameters
-    ----------
     truth : robot, rig and markers.
     q_front : (n,) joints at which the cameras see the front of the face, rad or m.
     count : tasks wanted.

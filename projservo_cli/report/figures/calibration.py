@@ -94,15 +94,10 @@ def _left_out(calibration: Calibration, observation: Observation) -> BoolArray:
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
     """Predicted and actual error of each pose with a reading, rms per coordinate.
 
-    Parameters
-    ----------
     used : (K, 2, m) readings that count.
     residual : (K, 2, m, 2) px.
     variance : (K, 2, m, 2) variance of the prediction, px².
-
-    Returns
-    -------
-    ``pose_predicted_px``, ``pose_residual_px`` (L,) and ``pose_coordinates`` (L,), their number.
+    Returns ``pose_predicted_px``, ``pose_residual_px`` (L,) and ``pose_coordinates`` (L,), their number.
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
@@ -133,8 +128,6 @@ def information(covariance: FloatArray) -> FloatArray:
     Zero are the gauge directions, and those across the constraint that all operators are conjugate
     to rigid motions by one matrix. Empty for a method without covariance.
 
-    Parameters
-    ----------
     covariance : (d, d) of P, H_hat_0 and M.
     """
     if not np.isfinite(covariance).all():
@@ -150,10 +143,7 @@ def expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
     A least-squares residual is noise less the error of the fitted prediction, which it follows:
     variance σ² − p²; D. A. Belsley, E. Kuh, R. E. Welsch, "Regression Diagnostics", 1980, section 2.1.
 
-    Parameters
-    ----------
-    predicted : (L,) predicted error p, px per coordinate.
-    sigma : noise σ, px per coordinate.
+    predicted : (L,) predicted error p, px per coordinate; sigma : noise σ, px per coordinate.
     """
     return np.asarray(np.sqrt(np.maximum(sigma**2 - predicted**2, 0.0)))
 
@@ -161,10 +151,7 @@ def expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
 def magnification(residual: FloatArray, extent: float) -> float:
     """Factor 1, 2 or 5 times a power of ten that makes the rms residual visible in an image.
 
-    Parameters
-    ----------
-    residual : (N,) px per coordinate.
-    extent : width or height of what was seen, px.
+    residual : (N,) px per coordinate; extent : width or height of what was seen, px.
     """
     rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
     if rms == 0.0:

@@ -68,13 +68,8 @@ def _data(material: Material) -> Data:
 def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     """Least distance of a marker from the border of each image, px, where μ_p is best for both.
 
-    Parameters
-    ----------
     mu : (k,) shares of t and of r.
-
-    Returns
-    -------
-    (2, k, k) distances over μ_t and μ_r, negative outside.
+    Returns (2, k, k) distances over μ_t and μ_r, negative outside.
     """
     plan, P, lens = material.plan, material.calibrated.P, material.calibrated.lens
     turns = np.linspace(0.0, 1.0, _TURNS)

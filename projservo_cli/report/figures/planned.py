@@ -64,10 +64,7 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
 
     Its focal length is the mean of both, its principal point the middle of the image.
 
-    Parameters
-    ----------
-    P : (2, 3, 4) metric cameras.
-    image_size : (2,) px.
+    P : (2, 3, 4) metric cameras; image_size : (2,) px.
     """
     center, z = roll_axis(P)
     across = np.zeros(3)

@@ -54,8 +54,6 @@ def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArra
     From each point the perpendicular is dropped onto the next axis; a prismatic joint has a
     direction but no place.
 
-    Parameters
-    ----------
     H_hat : (n, 4, 4) metric operators at the current joints.
     joint_types : (n,) ``REVOLUTE`` or ``PRISMATIC``.
     tool : (3,) place of the tool, m.
