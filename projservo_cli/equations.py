@@ -209,7 +209,6 @@ REGISTER = (
         "One rotation for both rotations",
         "geometry.displacement.composed_angle geometry.displacement.composed_operator",
         "geometry/test_composition.py::test_one_rotation_equals_two "
-        "geometry/test_composition.py::test_operator_is_the_matrix_logarithm_of_the_product "
         "control/test_direct.py::test_error_of_both_rotations_is_the_true_angle",
     ),
     _entry(

@@ -13,7 +13,7 @@ CODE = 1
 
 
 @merged
-def axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
+def _axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
     """Point at infinity on the axis of a rotation about the centre, of unit norm.
 
     (I + Ĥ²) X is the foot of X on the axis; the four coordinate vectors X less the centre give
@@ -41,7 +41,7 @@ def rotation_about_center(
 
     Returns the factor that scales the unit-rate motion in ``q_hat`` to the sense of Ĥ_s.
     """
-    found, H = rotation_mechanism(work, unit(A_c), axis_direction(H_s, a_inf, A_c), q_hat)
+    found, H = rotation_mechanism(work, unit(A_c), _axis_direction(H_s, a_inf, A_c), q_hat)
     size = inner(H, H)
     if not found or size == 0.0:
         return False, 0.0

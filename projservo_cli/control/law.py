@@ -197,7 +197,7 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
     """
     H = operators_at(model, q, state.work.H_hat)
     if task.body.M.shape[0] > 0:
-        return measure_body(model, task, s, H, state)
+        return _measure_body(model, task, s, H, state)
     for k in range(state.A.shape[0]):
         if not (
             math.isfinite(s[0, k, 0])
@@ -214,7 +214,7 @@ def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State
 
 
 @merged
-def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State) -> bool:
+def _measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State) -> bool:
     """Measure the face by all markers of the body, predicted at the displacement H of the joints.
 
     At the goal the errors of the calibration cancel between what is seen and what was shown where both
@@ -233,12 +233,12 @@ def measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State)
     if not fit.found:
         return False
     carry(task.body, fit.H, state.A)
-    state.face_px[0] = predicted_error(model.P, state.A, task.A_star)
+    state.face_px[0] = _predicted_error(model.P, state.A, task.A_star)
     return True
 
 
 @internal
-def predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
+def _predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
     """Image error between points A and A_star (m, 4), px rms per point and view, [RH00] eq. (1)."""
     total = 0.0
     for view in range(2):
@@ -254,7 +254,7 @@ def predicted_error(P: FloatArray, A: FloatArray, A_star: FloatArray) -> float:
 
 
 @merged
-def aimed(task: Task, state: State) -> Task:
+def _aimed(task: Task, state: State) -> Task:
     """The task whose target is where the plan is now; the task itself where none is followed."""
     if not following(task.reference):
         return task
@@ -283,7 +283,7 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
         state.errors[i] = math.nan
     if not measure(model, task, s, q, state):
         return LOST, no_parts()
-    aim = aimed(task, state)
+    aim = _aimed(task, state)
     parts = partition(state.work, aim, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
     if not parts.found:
         return SINGULAR, parts

@@ -141,7 +141,7 @@ def run(
     for k in range(limits.max_steps + 1):
         if k == noise.shape[0]:
             return RUNNING, k - 1
-        begin_row(log, k)
+        _begin_row(log, k)
         s = log.s[k]
         in_front = observe(plant, mat(log.H[k]), M, s, log.hidden[k])
         distance = rig_distance(plant, M)
@@ -188,7 +188,7 @@ def run(
             waited += 1
             for i in range(n):
                 dq[i] = 0.0
-            advance(plant, log, k, dq)
+            _advance(plant, log, k, dq)
             continue
         if verdict != RUNNING:
             return verdict, k
@@ -217,13 +217,13 @@ def run(
                     log.path[k, j, i] = state.path[j, i]
         for i in range(n):
             log.q_dot[k, i] = state.q_dot[i]
-        advance(plant, log, k, dq)
+        _advance(plant, log, k, dq)
     last = limits.max_steps
     return PLATEAU if on_plateau(log.judged, last, limits.plateau_steps) else MAX_STEPS, last
 
 
 @internal
-def begin_row(log: Log, k: int) -> None:
+def _begin_row(log: Log, k: int) -> None:
     """Make the row of an instant say that nothing was measured nor commanded."""
     for i in range(log.errors.shape[1]):
         log.errors[k, i] = math.nan
@@ -236,7 +236,7 @@ def begin_row(log: Log, k: int) -> None:
 
 
 @internal
-def advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
+def _advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
     """Move the robot by a joint step, rad or m, overwritten, and whatever befalls it; read its joints."""
     knock(plant.disturbance, k + 1, dq)
     put_mat(log.H[k + 1], pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1]))

@@ -86,10 +86,10 @@ def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, e
         int(log.events[1]),
         slowed,
         int(limited),
-        effort(log, steps, period),
+        _effort(log, steps, period),
         math.degrees(angle_between(mul(first, base_tool), goal_pose)),
-        MM * distance(start, goal),
-        MM * distance(end, goal),
+        MM * _distance(start, goal),
+        MM * _distance(end, goal),
         math.degrees(angle_between(mul(last, base_tool), goal_pose)),
         MM * length,
         MM * at_samples,
@@ -97,7 +97,7 @@ def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, e
 
 
 @njit
-def effort(log: Log, steps: int, period: float) -> float:
+def _effort(log: Log, steps: int, period: float) -> float:
     """Integral of the squared joint velocities, rad²/s and m²/s added."""
     total = 0.0
     for k in range(steps):
@@ -107,7 +107,7 @@ def effort(log: Log, steps: int, period: float) -> float:
 
 
 @njit
-def distance(A: Vec4, B: Vec4) -> float:
+def _distance(A: Vec4, B: Vec4) -> float:
     """Distance of two metric points, m."""
     way = sub(A, B)
     return math.sqrt(dot(way, way))

@@ -41,7 +41,7 @@ REHEARSAL = Gains(0.1, 0.1, 0.1, 0.1, 1.0, 0.1, 1.0, 0.9)
 DIRECT_TWO = CODES["direct_two"]
 
 
-class Stage(NamedTuple):
+class _Stage(NamedTuple):
     """Where half turns are rehearsed: a robot that is as the model says, without noise.
 
     Attributes
@@ -59,11 +59,11 @@ class Stage(NamedTuple):
     log: Log
 
 
-def new_stage(model: Model, m: int, lower: FloatArray, upper: FloatArray, span: Span = OWN) -> Stage:
+def new_stage(model: Model, m: int, lower: FloatArray, upper: FloatArray, span: Span = OWN) -> _Stage:
     """Stage for a face of m markers and joint limits (n,), rad or m; an arm of n ≠ 6 joints has a span."""
     n, endless = len(lower), np.full(2, np.inf)
     no_face = (np.zeros((m, 4)), np.zeros(m, dtype=np.int64), MIDPOINT, np.zeros((2, 4)), np.zeros(2))
-    return Stage(
+    return _Stage(
         Limits(np.full(n, REHEARSAL_STEP), REHEARSAL_PX, math.inf, 20, REHEARSAL_STEPS, False, False),
         Plant(model, *no_face, endless, lower, upper, False),
         np.zeros((REHEARSAL_STEPS + 1, 2, m, 2)),
@@ -73,7 +73,7 @@ def new_stage(model: Model, m: int, lower: FloatArray, upper: FloatArray, span: 
 
 
 def begin(
-    model: Model, task: Task, s: FloatArray, q_start: FloatArray, rehearse: bool, state: State, stage: Stage
+    model: Model, task: Task, s: FloatArray, q_start: FloatArray, rehearse: bool, state: State, stage: _Stage
 ) -> tuple[int, Parts, bool]:
     """Measure and partition the task at its start.
 
@@ -115,7 +115,7 @@ def _is_half_turn(theta_p: float) -> bool:
 
 
 def _in_better_sense(
-    model: Model, task: Task, q_start: FloatArray, state: State, stage: Stage
+    model: Model, task: Task, q_start: FloatArray, state: State, stage: _Stage
 ) -> tuple[Parts, bool]:
     """The parts of a task that was partitioned, with its half turn in the better sense, and if it arrives."""
     sense, arrives = _half_turn_sense(model, task, state.A, q_start, state.q_hat[2], stage)
@@ -125,7 +125,7 @@ def _in_better_sense(
 
 
 def _half_turn_sense(
-    model: Model, task: Task, A: FloatArray, q_start: FloatArray, q_hat_p: FloatArray, stage: Stage
+    model: Model, task: Task, A: FloatArray, q_start: FloatArray, q_hat_p: FloatArray, stage: _Stage
 ) -> tuple[float, bool]:
     """Sense of a half turn within the plane, 1 for that of the motion q̂_p or −1, and whether it arrives.
 
@@ -210,7 +210,7 @@ class Setting(NamedTuple):
     ends: Ends
 
 
-class Measuring(NamedTuple):
+class _Measuring(NamedTuple):
     """Workspace in which the task of a run is measured, and the run driven.
 
     Attributes
@@ -249,8 +249,8 @@ class Desk(NamedTuple):
     stage : for half turns.
     """
 
-    measuring: Measuring
-    stage: Stage
+    measuring: _Measuring
+    stage: _Stage
 
 
 def new_desk(setting: Setting, shown: int) -> Desk:
@@ -266,7 +266,7 @@ def new_desk(setting: Setting, shown: int) -> Desk:
     s_star = np.zeros((2, m, 2))
     body = setting.body._replace(shown=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
     center, parts = setting.plant.center, MOST_PARTS if setting.gains.substeps else 0
-    measuring = Measuring(
+    measuring = _Measuring(
         np.zeros((2, shown, 2)),
         np.zeros((2, shown, 2)),
         new_bench(n, m),
@@ -280,7 +280,7 @@ def new_desk(setting: Setting, shown: int) -> Desk:
 
 
 @composed
-def _put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: Measuring, task: Task) -> int:
+def _put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: _Measuring, task: Task) -> int:
     """Measure a task from images (2, 2, b, 2) at its start and goal, px; what is wrong."""
     for view in range(2):
         for k in range(task.s_star.shape[1]):
@@ -295,7 +295,7 @@ def _put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: Me
 
 
 @njit
-def _open(setting: Setting, shown: FloatArray, desk: Measuring) -> _Opened:
+def _open(setting: Setting, shown: FloatArray, desk: _Measuring) -> _Opened:
     """Measure and partition a task, and measure it as the law will.
 
     Parameters
@@ -340,7 +340,7 @@ def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, n
 
 @njit
 def _without_rehearsal(
-    setting: Setting, shown: FloatArray, noise: FloatArray, desk: Measuring, first: int, numbers: FloatArray
+    setting: Setting, shown: FloatArray, noise: FloatArray, desk: _Measuring, first: int, numbers: FloatArray
 ) -> int:
     """Runs from the first on, up to one whose half turn is to be rehearsed; that one is opened.
 
@@ -358,7 +358,7 @@ def _without_rehearsal(
 
 @njit
 def _drive(
-    setting: Setting, opened: _Opened, noise: FloatArray, desk: Measuring, numbers: FloatArray
+    setting: Setting, opened: _Opened, noise: FloatArray, desk: _Measuring, numbers: FloatArray
 ) -> None:
     """Drive the law of a run that was opened; its numbers."""
     for i in range(numbers.shape[0]):

@@ -12,8 +12,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -52,8 +51,7 @@ def find(kind: str, target: str, methods: Sequence[str]) -> Any:
         If there is no such class or it lacks a method.
     """
     where = f"{kind} {target}"
-    with said_apart():
-        found = _found(where, *target.split(":"))
+    found = _found(where, *target.split(":"))
     if isinstance(found, type):
         _require_methods(where, found, methods)
     return found
@@ -86,8 +84,7 @@ def make(
     except ValueError:
         pass  # a class in C tells nothing about its arguments; the call itself will
     try:
-        with said_apart():
-            result = found(*arguments, **options)
+        result = found(*arguments, **options)
     except Exception as error:
         raise WorkFailed(f"{where}: cannot be made: {what_failed(error)}") from error
     _require_methods(where, result, methods)
@@ -146,13 +143,6 @@ def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
         near = difflib.get_close_matches(name, names, n=1, cutoff=_ALIKE)
         if near and near[0] not in own:
             raise InputError(f"{where}: has {name}, which nothing looks for; did you mean {near[0]}?")
-
-
-@contextmanager
-def said_apart() -> Iterator[None]:
-    """What somebody else's code prints goes to standard error: standard output is for results."""
-    with redirect_stdout(sys.stderr):
-        yield
 
 
 def what_failed(error: BaseException) -> str:

@@ -8,9 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.records import (
-    FREE,
     PRISMATIC,
     REVOLUTE,
     FloatArray,
@@ -19,8 +17,6 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.robots.simulated import Plant
-from projservo_cli.task.face import center_of, cyclic_order, face_plane
 
 METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -152,7 +148,7 @@ def camera_center(camera: FloatArray) -> FloatArray:
     return np.asarray(-np.linalg.solve(camera[:, :3], camera[:, 3]))
 
 
-def optical_axis(camera: FloatArray) -> FloatArray:
+def _optical_axis(camera: FloatArray) -> FloatArray:
     """Unit viewing direction (3,) of a metric camera (3, 4)."""
     forward_direction = np.linalg.det(camera[:, :3]) * camera[2, :3]
     return np.asarray(forward_direction / np.linalg.norm(forward_direction))
@@ -166,7 +162,7 @@ def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     P : (2, 3, 4) metric cameras.
     """
     point = 0.5 * (camera_center(P[0]) + camera_center(P[1]))
-    direction = optical_axis(P[0]) + optical_axis(P[1])
+    direction = _optical_axis(P[0]) + _optical_axis(P[1])
     return point, direction / np.linalg.norm(direction)
 
 
@@ -243,31 +239,3 @@ def _unwind(robot: Robot, q: FloatArray, near: FloatArray) -> FloatArray:
         if len(inside):
             turned[i] = inside[np.argmin(np.abs(inside - near[i]))]
     return turned
-
-
-def rig_twists() -> FloatArray:
-    """Operators (6, 4, 4) of the face in the rig's frame for the rig's velocities v (m/s), ω (rad/s)."""
-    unit = np.eye(3).tolist()
-    moving = [twist((0, 0, 0), v) for v in unit] + [twist(w, (0, 0, 0)) for w in unit]
-    return -np.array(moving)
-
-
-def free_flying_plant(P: FloatArray, M: FloatArray, center: int) -> Plant:
-    """Plant of a free-flying rig.
-
-    Parameters
-    ----------
-    P : (2, 3, 4) cameras in the rig's frame, any image unit.
-    M : (m, 4) points of the face in the rig's frame at the start, m.
-    center : index of the centre marker, or ``MIDPOINT``.
-
-    Returns
-    -------
-    Plant whose images have no border and whose twists have no limits.
-    """
-    model = Model(P, rig_twists(), np.full(6, FREE, dtype=np.int64), np.zeros(6), METRIC_A_INF.copy())
-    order = cyclic_order(M)
-    O = optical_centers(P, METRIC_A_INF)
-    side = O @ np.array(face_plane(M, order, center_of(M, center)))
-    endless = np.full(6, np.inf)
-    return Plant(model, M, order, center, O, np.sign(side), np.full(2, np.inf), -endless, endless, False)

@@ -1,13 +1,11 @@
 """A robot of somebody else: every call timed and checked, stopped on every way out."""
 
-import io
 import queue
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol
 
 import numpy as np
@@ -152,11 +150,8 @@ class ForeignRobot:
 
 @contextmanager
 def at_rest_after(robot: Any) -> Iterator[None]:
-    """Stop a robot on every way out: the end, an exception, Ctrl-C, SIGTERM and a lost terminal.
-
-    What it prints, in whatever thread, goes to standard error.
-    """
-    with _signals_interrupt(), redirect_stdout(_OwnOutput()):
+    """Stop a robot on every way out: the end, an exception, Ctrl-C, SIGTERM and a lost terminal."""
+    with _signals_interrupt():
         try:
             yield
         except BaseException as error:
@@ -167,22 +162,6 @@ def at_rest_after(robot: Any) -> Iterator[None]:
             raise
         else:
             robot.stop()
-
-
-class _OwnOutput(io.TextIOBase):
-    """Standard output for the thread that made this one, standard error for all others."""
-
-    def __init__(self) -> None:
-        self._own, self._stream = threading.get_ident(), sys.stdout
-
-    def write(self, text: str) -> int:
-        """Write what the calling thread says."""
-        return (self._stream if threading.get_ident() == self._own else sys.stderr).write(text)
-
-    def flush(self) -> None:
-        """Flush both."""
-        self._stream.flush()
-        sys.stderr.flush()
 
 
 def _line(error: BaseException) -> str:

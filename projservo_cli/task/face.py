@@ -114,7 +114,7 @@ def face_plane(A: FloatArray, order: IntArray, A_c: Vec4) -> Vec4:
 
 
 @composed
-def put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
+def _put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     """Write the order of the markers around their midpoint; False where they lie on one line.
 
     Angles are measured in affine coordinates of the plane of the face, which keep the order: along the
@@ -129,8 +129,8 @@ def put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     """
     m = A.shape[0]
     middle = center_of(A, MIDPOINT)
-    x_axis = longest_offset(A, middle, NO_AXIS)
-    y_axis = longest_offset(A, middle, x_axis)
+    x_axis = _longest_offset(A, middle, NO_AXIS)
+    y_axis = _longest_offset(A, middle, x_axis)
     if not dot(y_axis, y_axis) > ON_A_LINE * ON_A_LINE * dot(x_axis, x_axis):
         return False
     x_axis, y_axis = unit(x_axis), unit(y_axis)
@@ -154,7 +154,7 @@ def put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
 
 
 @composed
-def longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
+def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
     """Longest of what the offsets of points (m, 4) from the middle leave perpendicular to an axis, if any."""
     size = dot(axis, axis)
     longest = NO_AXIS
@@ -168,7 +168,7 @@ def longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
 
 
 def cyclic_order(A: FloatArray) -> IntArray:
-    """Order of the face markers around their midpoint, as of ``put_order``.
+    """Order of the face markers around their midpoint, as of ``_put_order``.
 
     Parameters
     ----------
@@ -183,14 +183,14 @@ def cyclic_order(A: FloatArray) -> IntArray:
     WorkFailed
         If there are fewer than three points or they lie on one line.
     """
-    require_three(len(A))
+    _require_three(len(A))
     order = np.zeros(len(A), dtype=np.int64)
-    if not put_order(A, order, np.zeros(len(A))):
+    if not _put_order(A, order, np.zeros(len(A))):
         raise WorkFailed(PROBLEMS[ONE_LINE])
     return order
 
 
-def require_three(m: int) -> None:
+def _require_three(m: int) -> None:
     """Refuse a face of fewer than three markers."""
     if m < 3:
         raise WorkFailed(f"a face needs three markers or more, not {m}: add to markers.face")
@@ -225,7 +225,7 @@ def put_task(
         lost = put_points(P, task.F, a_inf, goal, task.A_star)
     if lost >= 0:
         return NO_POINT, lost
-    if not put_order(task.A_star, task.order, angle):
+    if not _put_order(task.A_star, task.order, angle):
         return ONE_LINE, 0
     a = face_plane(A, task.order, center_of(A, task.center))
     a_star = face_plane(task.A_star, task.order, center_of(task.A_star, task.center))
@@ -264,7 +264,7 @@ def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
         If there are fewer than three markers, or both cameras are in one place.
     """
     m = s_star.shape[1]
-    require_three(m)
+    _require_three(m)
     return Task(
         np.array(s_star, dtype=np.float64, order="C"),
         np.zeros((m, 4)),

@@ -90,7 +90,7 @@ class Reaching(NamedTuple):
     q_start: FloatArray
 
 
-class View(NamedTuple):
+class Seen(NamedTuple):
     """What both cameras have of the face at s instants.
 
     Attributes
@@ -119,7 +119,7 @@ class Along(NamedTuple):
     margins : (s, 4) the smallest of each of ``CONSTRAINTS``; ``WORST`` where the joints cannot follow.
     """
 
-    view: View
+    view: Seen
     q: FloatArray
     limit: FloatArray
     condition: FloatArray
@@ -142,7 +142,7 @@ def visibility_margin(reaching: Reaching, view: int, mu_t: float, mu_r: float) -
 
 
 @njit
-def put_displaced(reaching: Reaching, mu: FloatArray, H_d: FloatArray, visibility: FloatArray) -> None:
+def _put_displaced(reaching: Reaching, mu: FloatArray, H_d: FloatArray, visibility: FloatArray) -> None:
     """Write displacements (s, 4, 4) and margins of visibility (s, 2) at the shares mu (s, 3)."""
     for i in range(mu.shape[0]):
         put_mat(H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[i, 0], mu[i, 1], mu[i, 2]))
@@ -150,17 +150,17 @@ def put_displaced(reaching: Reaching, mu: FloatArray, H_d: FloatArray, visibilit
             visibility[i, view] = visibility_margin(reaching, view, mu[i, 0], mu[i, 1])
 
 
-def view_at(reaching: Reaching, mu: FloatArray) -> View:
+def view_at(reaching: Reaching, mu: FloatArray) -> Seen:
     """What both cameras have of the face at the shares mu (s, 3)."""
     model = reaching.model
     H_d, visibility = np.empty((len(mu), 4, 4)), np.empty((len(mu), 2))
-    put_displaced(reaching, np.ascontiguousarray(mu), H_d, visibility)
+    _put_displaced(reaching, np.ascontiguousarray(mu), H_d, visibility)
     M = reaching.A @ np.swapaxes(H_d, 1, 2)
     images = np.moveaxis(project(model.P, M, model.lens), 0, 1)
     depth, at_start = M @ model.P[:, 2].T, reaching.A @ model.P[:, 2].T
     shown = np.isfinite(images).all(axis=3) & np.swapaxes(depth * at_start > 1e-9 * at_start**2, 1, 2)
     border = np.minimum(images + 0.5, reaching.demands.image_size - 0.5 - images).min(axis=3)
-    return View(H_d, images, visibility, np.where(shown, border, BEHIND).min(axis=2))
+    return Seen(H_d, images, visibility, np.where(shown, border, BEHIND).min(axis=2))
 
 
 def image_margin(distance: FloatArray, demands: Demands) -> FloatArray:
@@ -179,7 +179,7 @@ def limit_margin(q: FloatArray, demands: Demands) -> FloatArray:
     return np.clip(margin, WORST, 1.0)
 
 
-class Carrier(NamedTuple):
+class _Carrier(NamedTuple):
     """What carries the joints along a path.
 
     Attributes
@@ -196,16 +196,16 @@ class Carrier(NamedTuple):
     M: FloatArray
 
 
-def carrier_of(reaching: Reaching) -> Carrier:
+def carrier_of(reaching: Reaching) -> _Carrier:
     """Workspace in which the joints of a task are carried."""
     n = len(reaching.q_start)
     work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
-    return Carrier(reaching, work, np.empty(n), np.empty(n), np.empty((2, 4)))
+    return _Carrier(reaching, work, np.empty(n), np.empty(n), np.empty((2, 4)))
 
 
 @njit
 def carry_joints(
-    carrier: Carrier, ends: FloatArray, parts: int, settled: float, stride: float, q: FloatArray
+    carrier: _Carrier, ends: FloatArray, parts: int, settled: float, stride: float, q: FloatArray
 ) -> float:
     """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
 
@@ -238,11 +238,11 @@ def carry_joints(
         for i in range(q.shape[0]):
             if not abs(q[i] - before[i]) <= stride:
                 return -1.0
-    return reciprocal_condition(carrier, goal)
+    return _reciprocal_condition(carrier, goal)
 
 
 @merged
-def reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
+def _reciprocal_condition(carrier: _Carrier, H: Mat4) -> float:
     """Reciprocal condition of the image Jacobian of the displaced face, [RH00] eq. (7).
 
     The ratio of the last to the first pivot of an orthogonalisation, which no projective frame changes.

@@ -206,7 +206,7 @@ def _oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool,
 
 
 @merged
-def within_plane_part(
+def _within_plane_part(
     work: Work, face: _Face, A_r: FloatArray, q_hat: FloatArray, memory: Memory
 ) -> tuple[bool, float, Mat4]:
     """Rotation of the face within its plane, [RH00] eqs. (10), (13)–(15).
@@ -292,7 +292,7 @@ def partition(
         back = rotation(H_r, mul(H_r, H_r), -theta_r)
         for k in range(A.shape[0]):
             put_vec(A_r[k], apply(back, vec(A_t[k])))
-        found, theta_p, H_p = within_plane_part(work, face, A_r, q_hat[2], memory)
+        found, theta_p, H_p = _within_plane_part(work, face, A_r, q_hat[2], memory)
     if found:
         for i in range(q_hat.shape[1]):
             memory.rotation[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]

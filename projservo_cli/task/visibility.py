@@ -45,7 +45,7 @@ def arc_minimum(c_0: float, c_s: float, c_c: float, theta: float) -> float:
 
 
 @merged
-def translation_limit(a: Vec4, H_t: Mat4, O: Vec4) -> tuple[bool, float]:
+def _translation_limit(a: Vec4, H_t: Mat4, O: Vec4) -> tuple[bool, float]:
     """Amplitude τ_0 at which a translated face changes visibility, [RH00] eq. (11) on the optical centre."""
     rate = dot(a, apply(H_t, O))
     if rate == 0.0:
@@ -61,7 +61,7 @@ def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: T
     """
     for view in range(2):
         O = vec(task.O[view])
-        found, tau_0 = translation_limit(a, H_t, O)
+        found, tau_0 = _translation_limit(a, H_t, O)
         seen = task.visible[view] * dot(a, O) > 0.0
         if found and seen and tau_0 > 0.0 and amount > delta * tau_0:
             amount = delta * tau_0
@@ -69,7 +69,7 @@ def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: T
 
 
 @merged
-def violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, float]:
+def _violations(a: Vec4, H_r: Mat4, theta: float, task: Task) -> tuple[int, float]:
     """Cameras that lose sight of the face while it turns by θ, and the worst margin over its start's."""
     lost = 0
     worst = math.inf
@@ -103,8 +103,8 @@ def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, agains
     if seen and math.pi - theta > HALF_TURN_TOLERANCE:
         return theta
     other = theta - 2.0 * math.pi
-    lost, worst = violations(a, H_r, theta, task)
-    lost_other, worst_other = violations(a, H_r, other, task)
+    lost, worst = _violations(a, H_r, theta, task)
+    lost_other, worst_other = _violations(a, H_r, other, task)
     if lost != lost_other:
         return theta if lost < lost_other else other
     if near_half_turn:

@@ -13,11 +13,13 @@ from scipy.linalg import expm
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, new_state
 from projservo_cli.geometry.displacement import IDENTITY, as_array
+from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.compiled import new_log, run
 from projservo_cli.loop.step import VERDICTS, Limits
-from projservo_cli.robots.simulated import pose_after
-from projservo_cli.robots.truth import free_flying_plant, rig_twists
-from projservo_cli.task.face import task_from_images
+from projservo_cli.records import FREE, Model
+from projservo_cli.robots.simulated import Plant, pose_after
+from projservo_cli.robots.truth import METRIC_A_INF, twist
+from projservo_cli.task.face import center_of, cyclic_order, face_plane, task_from_images
 from tests.samples import displacement, pixels
 
 P = np.array([np.c_[np.eye(3), [0.15, 0, 0]], np.c_[np.eye(3), [-0.15, 0, 0]]])
@@ -25,6 +27,23 @@ FACE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [0, 0]]) * 0.06
 GAIN, PERIOD = 0.5, 0.04
 # Σ e² < 1e-8 over five points in two views, as a root mean square per point and view.
 CONVERGED_RMS = math.sqrt(1e-8 / 10)
+
+
+def rig_twists():
+    """Operators (6, 4, 4) of the face in the rig's frame for the rig's velocities v (m/s), ω (rad/s)."""
+    unit = np.eye(3).tolist()
+    moving = [twist((0, 0, 0), v) for v in unit] + [twist(w, (0, 0, 0)) for w in unit]
+    return -np.array(moving)
+
+
+def free_flying_plant(P, M, center):
+    """Plant of a free-flying rig with cameras P, whose images have no border and whose twists no limits."""
+    model = Model(P, rig_twists(), np.full(6, FREE, dtype=np.int64), np.zeros(6), METRIC_A_INF.copy())
+    order = cyclic_order(M)
+    O = optical_centers(P, METRIC_A_INF)
+    side = np.sign(O @ np.array(face_plane(M, order, center_of(M, center))))
+    endless = np.full(6, np.inf)
+    return Plant(model, M, order, center, O, side, np.full(2, np.inf), -endless, endless, False)
 
 
 def task_of_reference(perturbation):
