@@ -112,7 +112,7 @@ def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
     assert trace.unplanned == "no joints can follow the plan: too near to something"
     assert alone.unplanned == ""
     np.testing.assert_array_equal(trace.q, alone.q)
-    words = summary("servo", {"laws": [scalars(trace)]})
+    words = " ".join(" ".join(summary("servo", {"laws": [scalars(trace)]})).split())
     assert "driven without a plan: no joints can follow the plan: too near to something" in words
 
 
