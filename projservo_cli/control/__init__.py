@@ -36,13 +36,8 @@ def command(
 
     The only place that tells the laws apart.
 
-    Parameters
-    ----------
     s : (2, b, 2) pixels as the cameras report them, NaN where unseen.
-
-    Returns
-    -------
-    Status of the law; ``LOST`` for a state made for another number of markers.
+    Returns status of the law; ``LOST`` for a state made for another number of markers.
     """
     seen = s
     if bends(model.lens):

@@ -57,17 +57,9 @@ def single_rotation(
     For λ_r/λ_p = ρ ≠ 1 the rotations composed in (24) are θ_r and θ_p weighted by ρ/max(1, ρ) and
     1/max(1, ρ): each then decays at its own rate, and the axis of the single rotation changes.
 
-    Parameters
-    ----------
-    ratio : ρ.
-    state : the joint motion is written to its row s.
-
-    Returns
-    -------
-    found : False where the joint motion is not unique.
-    theta_s : angle, rad; 0 where no rotation is left.
-    sense : factor that scales row s to the sense of Ĥ_s.
-    H_s : operator Ĥ_s.
+    ratio : ρ; state : the joint motion is written to its row s.
+    Returns found: False where the joint motion is not unique; theta_s: angle, rad; 0 where no rotation is
+    left; sense: factor that scales row s to the sense of Ĥ_s; H_s: operator Ĥ_s.
     """
     most = max(1.0, ratio)
     theta_s, a, b, c = composed_angle(ratio / most * parts.theta_r, parts.theta_p / most)

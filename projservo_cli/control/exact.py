@@ -42,25 +42,15 @@ BRANCH_FACTOR = 2.0
 
 
 class _Step(NamedTuple):
-    """Displacement of one period, which is solved for a joint step in so many equal parts.
+    """Displacement of one period, which is solved for a joint step in so many equal parts."""
 
-    Attributes
-    ----------
-    parts : translation and rotations that are left.
-    H_s : operator Ĥ_s of both rotations.
-    tau, theta : amplitudes of the translation and of that rotation, rad.
-    sense : factor that scales the joint motion q̂_s to the sense of Ĥ_s.
-    ahead : share of a period by which a plan is followed.
-    pieces : how many parts.
-    """
-
-    parts: Parts
-    H_s: Mat4
+    parts: Parts  # translation and rotations that are left
+    H_s: Mat4  # operator Ĥ_s of both rotations
     tau: float
-    theta: float
-    sense: float
-    ahead: float
-    pieces: int
+    theta: float  # tau, theta: amplitudes of the translation and of that rotation, rad
+    sense: float  # factor that scales the joint motion q̂_s to the sense of Ĥ_s
+    ahead: float  # share of a period by which a plan is followed
+    pieces: int  # how many parts
 
 
 @merged
@@ -102,9 +92,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
     The first part is predicted by the first-order step in ``state.q_dot``, the others by the part
     before. A part more than twice as long as predicted is on another kinematic branch.
 
-    Returns
-    -------
-    False where a part does not settle or leaves the branch.
+    Returns false where a part does not settle or leaves the branch.
     """
     n, count = q.shape[0], step.pieces
     H_back = backward(model, q)

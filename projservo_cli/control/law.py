@@ -75,59 +75,36 @@ class Gains(NamedTuple):
 
 
 class State(NamedTuple):
-    """Workspace of a law and what it returns.
+    """Workspace of a law and what it returns."""
 
-    Attributes
-    ----------
-    work : arrays of the kernels, the current operators among them.
-    A, A_t, A_r : (m, 4) current points, target without translation, target without both.
-    q_hat : (4, n) joint motions t, r, p, s; (4, 6) coordinates in the span of an arm of n ≠ 6.
-    q_dot : (n,) joint velocity commanded, rad/s or m/s.
-    xi_dot : (6,) the same in the coordinates of ``q_hat``; ``q_dot`` itself for six joints.
-    errors : (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad.
-    memory : what is carried to the next step.
-    limited : (1,) how often visibility limited the translation.
-    fit : (3,) sums of squared residuals of the predicted and of the fitted body, px², and the markers
-        used, counted once a view; NaN where the face is measured point by point.
-    face_px : (1,) image error of the face where the body was measured to be, px rms per marker and view,
-        whether the face was seen or not; NaN where it is measured point by point.
-    normal : (6, 7) workspace of the fit of the body.
-    newton : (n,) one Newton step.
-    path : (129, n) joints at the ends of the parts of a step, the current ones first.
-    share : (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the
-        limit to the loop.
-    parts : (1,) parts of the step in ``path``; 0 where the joints go straight to the end.
-    blocked : (1,) joint at whose limit the step was made to end, −1 for none.
-    straight : (2, b, 2) pixels as projective cameras would see them, where a lens bends them.
-    clock : (1,) periods of the plan that are done, where one is followed.
-    A_aim : (m, 4) the face where the plan is now.
-    s_aim : (2, m, 2) pixels the image-based law aims at while it follows a plan.
-    q_ahead : (n,) joint motion of the plan in the next period; zero where none is followed.
-    """
-
-    work: Work
+    work: Work  # arrays of the kernels, the current operators among them
     A: FloatArray
     A_t: FloatArray
-    A_r: FloatArray
-    q_hat: FloatArray
-    q_dot: FloatArray
-    xi_dot: FloatArray
-    errors: FloatArray
-    memory: Memory
-    limited: FloatArray
+    A_r: FloatArray  # A, A_t, A_r: (m, 4) current points, target without translation, target without both
+    q_hat: FloatArray  # (4, n) joint motions t, r, p, s; (4, 6) coordinates in the span of an arm of n ≠ 6
+    q_dot: FloatArray  # (n,) joint velocity commanded, rad/s or m/s
+    xi_dot: FloatArray  # (6,) the same in the coordinates of ``q_hat``; ``q_dot`` itself for six joints
+    errors: FloatArray  # (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad
+    memory: Memory  # what is carried to the next step
+    limited: FloatArray  # (1,) how often visibility limited the translation
+    # (3,) sums of squared residuals of the predicted and of the fitted body, px², and the markers used,
+    # counted once a view; NaN where the face is measured point by point
     fit: FloatArray
+    # (1,) image error of the face where the body was measured to be, px rms per marker and view, whether the
+    # face was seen or not; NaN where it is measured point by point
     face_px: FloatArray
-    normal: FloatArray
-    newton: FloatArray
-    path: FloatArray
+    normal: FloatArray  # (6, 7) workspace of the fit of the body
+    newton: FloatArray  # (n,) one Newton step
+    path: FloatArray  # (129, n) joints at the ends of the parts of a step, the current ones first
+    # (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the limit to the loop
     share: FloatArray
-    parts: IntArray
-    blocked: IntArray
-    straight: FloatArray
-    clock: FloatArray
-    A_aim: FloatArray
-    s_aim: FloatArray
-    q_ahead: FloatArray
+    parts: IntArray  # (1,) parts of the step in ``path``; 0 where the joints go straight to the end
+    blocked: IntArray  # (1,) joint at whose limit the step was made to end, −1 for none
+    straight: FloatArray  # (2, b, 2) pixels as projective cameras would see them, where a lens bends them
+    clock: FloatArray  # (1,) periods of the plan that are done, where one is followed
+    A_aim: FloatArray  # (m, 4) the face where the plan is now
+    s_aim: FloatArray  # (2, m, 2) pixels the image-based law aims at while it follows a plan
+    q_ahead: FloatArray  # (n,) joint motion of the plan in the next period; zero where none is followed
 
 
 def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
@@ -392,8 +369,6 @@ def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
 def go_on(reference: Reference, gains: Gains, status: int, limited: bool, state: State) -> None:
     """Advance the plan by as much of a period as the joint-speed limit leaves of the step.
 
-    Parameters
-    ----------
     limited : whether the law kept the limit itself; it is else applied here.
     """
     if status != OK:

@@ -34,44 +34,27 @@ from projservo_cli.task.face import Task
 
 
 class Log(NamedTuple):
-    """What a run records at each instant; one row more than commands.
+    """What a run records at each instant; one row more than commands."""
 
-    Attributes
-    ----------
-    q : (k, n) true joints, rad or m.
-    read : (k, n) joint readings, which is what the law is given.
-    H : (k, 4, 4) true displacement of the face from the reference.
-    s : (k, 2, m, 2) measured pixels of the face and, after them, of the pins.
-    hidden : (k, 2) 1 where a view is self-occluded.
-    error : (k,) image error of the face as it is seen, px rms per marker and view.
-    judged : (k,) image error by which the run ends: of the body where it is measured, else as seen.
-    errors : (k, 5) control errors of the law.
-    q_dot : (k, n) commanded joint velocities after the limit; zero where none was sent.
-    factor : (k,) factor of the joint-speed limit.
-    path : (k, parts + 1, n) joints at the ends of the parts of each step.
-    parts : (k,) parts each step was sent in; 0 where the joints went straight to the end.
-    fit : (k, 3) what measuring with the body left, as in the state of the law.
-    events : (4,) first instant outside an image, first beyond a joint limit, the joint that passed one
-        or stopped the run at its own, and how often visibility limited the translation; −1 for never.
-    M, scratch : (m, 4) and (4, n), at least (4, 2), workspaces of the simulated robot.
-    """
-
-    q: FloatArray
-    read: FloatArray
-    H: FloatArray
-    s: FloatArray
-    hidden: FloatArray
-    error: FloatArray
+    q: FloatArray  # (k, n) true joints, rad or m
+    read: FloatArray  # (k, n) joint readings, which is what the law is given
+    H: FloatArray  # (k, 4, 4) true displacement of the face from the reference
+    s: FloatArray  # (k, 2, m, 2) measured pixels of the face and, after them, of the pins
+    hidden: FloatArray  # (k, 2) 1 where a view is self-occluded
+    error: FloatArray  # (k,) image error of the face as it is seen, px rms per marker and view
+    # (k,) image error by which the run ends: of the body where it is measured, else as seen
     judged: FloatArray
-    errors: FloatArray
-    q_dot: FloatArray
-    factor: FloatArray
-    path: FloatArray
-    parts: IntArray
-    fit: FloatArray
+    errors: FloatArray  # (k, 5) control errors of the law
+    q_dot: FloatArray  # (k, n) commanded joint velocities after the limit; zero where none was sent
+    factor: FloatArray  # (k,) factor of the joint-speed limit
+    path: FloatArray  # (k, parts + 1, n) joints at the ends of the parts of each step
+    parts: IntArray  # (k,) parts each step was sent in; 0 where the joints went straight to the end
+    fit: FloatArray  # (k, 3) what measuring with the body left, as in the state of the law
+    # (4,) first instant outside an image, first beyond a joint limit, the joint that passed one or stopped
+    # the run at its own, and how often visibility limited the translation; −1 for never
     events: FloatArray
     M: FloatArray
-    scratch: FloatArray
+    scratch: FloatArray  # M, scratch: (m, 4) and (4, n), at least (4, 2), workspaces of the simulated robot
 
 
 def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
@@ -112,19 +95,13 @@ def run(
 ) -> tuple[int, int]:
     """Drive one law to its verdict.
 
-    Parameters
-    ----------
     code : of the law.
     model : what the law believes; its frame is that of the task.
     noise : (k, 2, m + p, 2) added to the true pixels of the first k instants, px.
     q_start : (n,) first joints, rad or m.
     log : filled up to the last instant, whatever it held before.
-
-    Returns
-    -------
-    verdict : code of the verdict; ``RUNNING`` where the noise ended before the run, which needs more of it
-        to be made anew.
-    steps : commands sent; the log has one instant more.
+    Returns verdict: code of the verdict; ``RUNNING`` where the noise ended before the run, which needs more
+    of it to be made anew; steps: commands sent; the log has one instant more.
     """
     n = q_start.shape[0]
     M = log.M[: plant.M.shape[0]]

@@ -103,28 +103,18 @@ class LoopLaw(Protocol):
 
 
 class LoopPlant(Protocol):
-    """What the Python loop asks of a plant.
+    """What the Python loop asks of a plant."""
 
-    Attributes
-    ----------
-    plant : the truth, or what the calibration takes for it: image size, joint limits.
-    q : (n,) joints as they are, or as they were read.
-    H : (4, 4) displacement of the face from the reference.
-    hidden, in_front : as of ``plants.plant.observe``, when last observed.
-    markers : how many are observed, those of the face first.
-    disturbance : why the run cannot go on, the images no longer agree with the calibration or something
-        failed; empty where it can.
-    takes_parts : whether a long step is sent in the parts that the law split it into.
-    """
-
-    plant: Plant
-    q: FloatArray
-    H: FloatArray
+    plant: Plant  # the truth, or what the calibration takes for it: image size, joint limits
+    q: FloatArray  # (n,) joints as they are, or as they were read
+    H: FloatArray  # (4, 4) displacement of the face from the reference
     hidden: FloatArray
-    in_front: bool
-    markers: int
+    in_front: bool  # hidden, in_front: as of ``plants.plant.observe``, when last observed
+    markers: int  # how many are observed, those of the face first
+    # why the run cannot go on, the images no longer agree with the calibration or something failed; empty
+    # where it can
     disturbance: str
-    takes_parts: bool
+    takes_parts: bool  # whether a long step is sent in the parts that the law split it into
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
@@ -145,12 +135,7 @@ class LoopPlant(Protocol):
 class BuiltInLaw:
     """A compiled law as an object of the Python loop.
 
-    Parameters
-    ----------
-    code : of the law.
-    model : what the law believes.
-    task : in the frame of the model.
-    gains : of the law.
+    code : of the law; model : what the law believes; task : in the frame of the model; gains : of the law.
     """
 
     def __init__(self, code: int, model: Model, task: Task, gains: Gains) -> None:
@@ -180,25 +165,15 @@ def run(
 ) -> tuple[int, int, Log]:
     """Drive a law on a plant to its verdict.
 
-    Parameters
-    ----------
     law : any law.
     plant : any plant; it is stopped however the run ends.
     s_star : (2, m, 2) target pixels.
     period : control period, s.
     limits : when the run ends.
     scale : factor of every command.
-
-    Returns
-    -------
-    verdict, steps, log : as of the compiled loop, to the bit for the built-in laws.
-
-    Raises
-    ------
-    InputError
-        If the law has an attribute that is a misspelt one of ``OPTIONAL``.
-    WorkFailed
-        If the plant or the law fails before the first instant is complete.
+    Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
+    if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
+    fails before the first instant is complete.
     """
     try:
         require_spelt(f"law {type(law).__name__}", law, ("errors", *OPTIONAL))

@@ -14,50 +14,32 @@ MM = 1e3
 
 
 class Summary(NamedTuple):
-    """Numbers of a run that ended; NaN where they need the true goal and that is not known.
+    """Numbers of a run that ended; NaN where they need the true goal and that is not known."""
 
-    Attributes
-    ----------
-    image_error_px : at the end, rms over markers and views.
-    self_occluded_steps_left, self_occluded_steps_right : instants at which a camera is behind the face.
-    first_outside_image, first_beyond_limit : instants, −1 for never.
-    speed_limited_steps, visibility_limited_steps : commands.
-    effort : integral of the squared joint velocities, rad²/s and m²/s added.
-    rotation_deg, distance_mm : true rotation, and distance of the centre, from start to goal.
-    position_error_mm, rotation_error_deg : what is left of both at the end.
-    path_length_mm : of the centre, from sample to sample.
-    center_deviation_at_samples_mm : largest distance of the centre from its line.
-    """
-
-    image_error_px: float
+    image_error_px: float  # at the end, rms over markers and views
+    # self_occluded_steps_left, self_occluded_steps_right: instants at which a camera is behind the face
     self_occluded_steps_left: int
     self_occluded_steps_right: int
     first_outside_image: int
-    first_beyond_limit: int
+    first_beyond_limit: int  # first_outside_image, first_beyond_limit: instants, −1 for never
     speed_limited_steps: int
-    visibility_limited_steps: int
-    effort: float
+    visibility_limited_steps: int  # speed_limited_steps, visibility_limited_steps: commands
+    effort: float  # integral of the squared joint velocities, rad²/s and m²/s added
+    # rotation_deg, distance_mm: true rotation, and distance of the centre, from start to goal
     rotation_deg: float
     distance_mm: float
     position_error_mm: float
-    rotation_error_deg: float
-    path_length_mm: float
-    center_deviation_at_samples_mm: float
+    rotation_error_deg: float  # position_error_mm, rotation_error_deg: what is left of both at the end
+    path_length_mm: float  # of the centre, from sample to sample
+    center_deviation_at_samples_mm: float  # largest distance of the centre from its line
 
 
 class Ends(NamedTuple):
-    """Where the true robot holds the tool.
+    """Where the true robot holds the tool."""
 
-    Attributes
-    ----------
-    base_tool : (4, 4) pose of the tool at the reference, m.
-    goal_pose : (4, 4) pose at the goal, m; NaN where it is not known.
-    goal : (4,) centre of the face there, m.
-    """
-
-    base_tool: FloatArray
-    goal_pose: FloatArray
-    goal: FloatArray
+    base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
+    goal_pose: FloatArray  # (4, 4) pose at the goal, m; NaN where it is not known
+    goal: FloatArray  # (4,) centre of the face there, m
 
 
 @njit

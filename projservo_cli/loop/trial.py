@@ -42,21 +42,13 @@ DIRECT_TWO = CODES["direct_two"]
 
 
 class _Stage(NamedTuple):
-    """Where half turns are rehearsed: a robot that is as the model says, without noise.
+    """Where half turns are rehearsed: a robot that is as the model says, without noise."""
 
-    Attributes
-    ----------
-    limits : at most 5° a step.
-    plant : with the limits of the true joints; its model and face are those of the task.
-    noise : (k, 2, m, 2) none.
-    state, log : of the law and its run.
-    """
-
-    limits: Limits
-    plant: Plant
-    noise: FloatArray
+    limits: Limits  # at most 5° a step
+    plant: Plant  # with the limits of the true joints; its model and face are those of the task
+    noise: FloatArray  # (k, 2, m, 2) none
     state: State
-    log: Log
+    log: Log  # state, log: of the law and its run
 
 
 def new_stage(model: Model, m: int, lower: FloatArray, upper: FloatArray, span: Span = OWN) -> _Stage:
@@ -77,18 +69,13 @@ def begin(
 ) -> tuple[int, Parts, bool]:
     """Measure and partition the task at its start.
 
-    Parameters
-    ----------
     model : calibrated.
     task : in its frame.
     s : (2, b, 2) straight pixels at the start.
     q_start : (n,) joints there, rad or m.
     rehearse : whether a half turn is made in the sense that is better when rehearsed.
     state : fresh; on return with the face and the joint motions.
-
-    Returns
-    -------
-    What is wrong, ``FOUND`` for nothing; the parts; False where neither sense of a half turn arrived.
+    Returns what is wrong, ``FOUND`` for nothing; the parts; False where neither sense of a half turn arrived.
     """
     status, parts = _first_parts(model, task, s, q_start, state)
     if status == FOUND and rehearse and _is_half_turn(parts.theta_p):
@@ -133,10 +120,7 @@ def _half_turn_sense(
     calibrated model itself, at a tenth of the error and at most 5° a step; the sense that arrives
     without passing a joint limit is taken, between equals the one that arrives in fewer steps.
 
-    Parameters
-    ----------
-    A : (m, 4) face at the start.
-    q_hat_p : (n,) joint motion, or (6,) coordinates in the span.
+    A : (m, 4) face at the start; q_hat_p : (n,) joint motion, or (6,) coordinates in the span.
     """
     # Cameras have no sign of their own; the plant tells front from back by positive depths.
     depth = model.P[:, 2] @ np.array(center_of(A, MIDPOINT))
@@ -178,58 +162,34 @@ NUMBERS = ("verdict", "steps", *Summary._fields)
 
 
 class Setting(NamedTuple):
-    """All that runs share which differ in their images alone; of a robot with six joints.
+    """All that runs share which differ in their images alone; of a robot with six joints."""
 
-    Attributes
-    ----------
-    code : of the law.
-    model : calibrated, by which the task is partitioned.
-    believed : what the law believes, the same or the metric one.
-    body : with which the task is measured; none for point by point.
-    shares_task : whether the law measures the task in the same way; it else does point by point.
-    rehearse : whether half turns are rehearsed.
-    gains, limits : of the law.
-    plant : true robot as the law observes it.
-    lower, upper : (n,) limits of the joints, rad or m.
-    q_start : (n,) joints at the start, rad or m.
-    ends : true poses of the tool.
-    """
-
-    code: int
-    model: Model
-    believed: Model
-    body: Body
-    shares_task: bool
-    rehearse: bool
+    code: int  # of the law
+    model: Model  # calibrated, by which the task is partitioned
+    believed: Model  # what the law believes, the same or the metric one
+    body: Body  # with which the task is measured; none for point by point
+    shares_task: bool  # whether the law measures the task in the same way; it else does point by point
+    rehearse: bool  # whether half turns are rehearsed
     gains: Gains
-    limits: Limits
-    plant: Plant
+    limits: Limits  # gains, limits: of the law
+    plant: Plant  # true robot as the law observes it
     lower: FloatArray
-    upper: FloatArray
-    q_start: FloatArray
-    ends: Ends
+    upper: FloatArray  # lower, upper: (n,) limits of the joints, rad or m
+    q_start: FloatArray  # (n,) joints at the start, rad or m
+    ends: Ends  # true poses of the tool
 
 
 class _Measuring(NamedTuple):
-    """Workspace in which the task of a run is measured, and the run driven.
-
-    Attributes
-    ----------
-    start, goal : (2, b, 2) straight pixels of the images there.
-    bench : in which the task is measured.
-    task, own_task : as it is partitioned, and as a law sees it that measures in another way.
-    state, own_state : of the partition and of the law.
-    log : of the run.
-    """
+    """Workspace in which the task of a run is measured, and the run driven."""
 
     start: FloatArray
-    goal: FloatArray
-    bench: Bench
+    goal: FloatArray  # start, goal: (2, b, 2) straight pixels of the images there
+    bench: Bench  # in which the task is measured
     task: Task
-    own_task: Task
+    own_task: Task  # task, own_task: as it is partitioned, and as a law sees it that measures in another way
     state: State
-    own_state: State
-    log: Log
+    own_state: State  # state, own_state: of the partition and of the law
+    log: Log  # of the run
 
 
 class _Opened(NamedTuple):
@@ -241,25 +201,16 @@ class _Opened(NamedTuple):
 
 
 class Desk(NamedTuple):
-    """Workspace for the runs of a setting, one after the other.
+    """Workspace for the runs of a setting, one after the other."""
 
-    Attributes
-    ----------
-    measuring : of the task and the run.
-    stage : for half turns.
-    """
-
-    measuring: _Measuring
-    stage: _Stage
+    measuring: _Measuring  # of the task and the run
+    stage: _Stage  # for half turns
 
 
 def new_desk(setting: Setting, shown: int) -> Desk:
     """Workspace for a setting in which so many markers are shown at the start and at the goal.
 
-    Raises
-    ------
-    WorkFailed
-        If the face has fewer than three markers.
+    Raises WorkFailed if the face has fewer than three markers.
     """
     n, m = len(setting.q_start), len(setting.plant.M)
     observed = m + len(setting.plant.pins)
@@ -298,8 +249,6 @@ def _put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: _M
 def _open(setting: Setting, shown: FloatArray, desk: _Measuring) -> _Opened:
     """Measure and partition a task, and measure it as the law will.
 
-    Parameters
-    ----------
     shown : (2, 2, b, 2) images at the start and at the goal, the face first, px.
     desk : on return with tasks and states.
     """
@@ -319,8 +268,6 @@ def _open(setting: Setting, shown: FloatArray, desk: _Measuring) -> _Opened:
 def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> None:
     """Runs, one after the other: measure the task, partition it, drive the law to its verdict, and sum up.
 
-    Parameters
-    ----------
     shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.
     noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
         short.

@@ -39,16 +39,10 @@ def target_of(kind: str, name: str) -> str | None:
 def find(kind: str, target: str, methods: Sequence[str]) -> Any:
     """Import a class, or a function that makes objects.
 
-    Parameters
-    ----------
     kind : ``plant`` or ``law``, for messages.
     target : ``module:Class``; modules are sought on the Python path, then in the working directory.
     methods : names of the methods its objects must have.
-
-    Raises
-    ------
-    InputError
-        If there is no such class or it lacks a method.
+    Raises InputError if there is no such class or it lacks a method.
     """
     where = f"{kind} {target}"
     found = _found(where, *target.split(":"))
@@ -62,17 +56,9 @@ def make(
 ) -> Any:
     """Import a class and make an object of it.
 
-    Parameters
-    ----------
-    kind, target, methods : as for ``find``.
-    arguments, options : what the class is called with.
-
-    Raises
-    ------
-    InputError
-        If there is no such class, it lacks a method or does not take the arguments.
-    WorkFailed
-        If the class fails when called.
+    kind, target, methods : as for ``find``; arguments, options : what the class is called with.
+    Raises InputError if there is no such class, it lacks a method or does not take the arguments; WorkFailed
+    if the class fails when called.
     """
     where = f"{kind} {target}"
     found = find(kind, target, methods)
@@ -133,10 +119,7 @@ def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:
 
     It would else count as one that the object does not have.
 
-    Raises
-    ------
-    InputError
-        If there is one whose right name is not there as well.
+    Raises InputError if there is one whose right name is not there as well.
     """
     own = [name for name in dir(found) if not name.startswith("_")]
     for name in own:

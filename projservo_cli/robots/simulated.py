@@ -18,23 +18,14 @@ NEVER = 2**62
 
 
 class Disturbance(NamedTuple):
-    """What befalls a simulated robot beside noise; instants count from 0, the start.
+    """What befalls a simulated robot beside noise; instants count from 0, the start."""
 
-    Attributes
-    ----------
-    delay : periods by which images are late; the first ones show the start.
-    bump_at : instant by which the joints have been knocked; −1 for never.
-    bump : (n,) by how much, rad or m.
-    bump_read : whether the readings follow the bump, or a joint slipped on its encoder.
-    frozen : joint whose reading stands still, −1 for none.
-    frozen_at, frozen_until : instant of the reading that stays, and the first that is true again.
-    """
-
-    delay: int
-    bump_at: int
-    bump: FloatArray
-    bump_read: bool
-    frozen: int
+    delay: int  # periods by which images are late; the first ones show the start
+    bump_at: int  # instant by which the joints have been knocked; −1 for never
+    bump: FloatArray  # (n,) by how much, rad or m
+    bump_read: bool  # whether the readings follow the bump, or a joint slipped on its encoder
+    frozen: int  # joint whose reading stands still, −1 for none
+    # frozen_at, frozen_until: instant of the reading that stays, and the first that is true again
     frozen_at: int
     frozen_until: int
 
@@ -44,35 +35,21 @@ UNDISTURBED = Disturbance(0, -1, np.zeros(64), True, -1, 0, NEVER)
 
 
 class Plant(NamedTuple):
-    """True robot, rig and face in the metric frame.
+    """True robot, rig and face in the metric frame."""
 
-    Attributes
-    ----------
-    model : metric model; ``FREE`` joint types make the rig fly.
-    M : (m, 4) points of the face at the reference, m.
-    order : (m,) markers around the face.
-    center : index of the centre marker, or ``MIDPOINT``.
-    O : (2, 4) optical centres.
-    visible : (2,) sign of a·O on the visible side of the face.
-    image_size : (2,) width and height, px; infinite where an image has no border.
-    lower, upper : (n,) joint limits, rad or m.
-    opaque : whether the face hides its markers from a camera behind it.
-    pins : (p, 4) further markers of the body at the reference, m; a camera sees those within its image.
-    disturbance : what befalls the robot.
-    """
-
-    model: Model
-    M: FloatArray
-    order: IntArray
-    center: int
-    O: FloatArray
-    visible: FloatArray
-    image_size: FloatArray
+    model: Model  # metric model; ``FREE`` joint types make the rig fly
+    M: FloatArray  # (m, 4) points of the face at the reference, m
+    order: IntArray  # (m,) markers around the face
+    center: int  # index of the centre marker, or ``MIDPOINT``
+    O: FloatArray  # (2, 4) optical centres
+    visible: FloatArray  # (2,) sign of a·O on the visible side of the face
+    image_size: FloatArray  # (2,) width and height, px; infinite where an image has no border
     lower: FloatArray
-    upper: FloatArray
-    opaque: bool
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    opaque: bool  # whether the face hides its markers from a camera behind it
+    # (p, 4) further markers of the body at the reference, m; a camera sees those within its image
     pins: FloatArray = NO_PINS
-    disturbance: Disturbance = UNDISTURBED
+    disturbance: Disturbance = UNDISTURBED  # what befalls the robot
 
 
 @njit
@@ -118,15 +95,10 @@ def read_joints(
 def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatArray) -> bool:
     """True pixels of the face after the displacement H.
 
-    Parameters
-    ----------
     M : (m, 4) on return the points of the face.
     s : (2, m + p, 2) on return the pixels of face and pins, NaN where unseen.
     hidden : (2,) on return 1 where the face is self-occluded in a view.
-
-    Returns
-    -------
-    False where a marker is not in front of a camera.
+    Returns false where a marker is not in front of a camera.
     """
     m = M.shape[0]
     for k in range(m):
@@ -189,20 +161,14 @@ def rig_distance(plant: Plant, M: FloatArray) -> float:
 class AnalyticPlant:
     """Simulated robot and rig, with given pixel noise.
 
-    Parameters
-    ----------
     plant : the truth, and what befalls it.
     q_start : (n,) first joints, rad or m.
     noise : (k, 2, markers, 2) added to the pixels of each observation in turn, px.
-
-    Attributes
-    ----------
-    q, H : (n,) true joints, rad or m, and (4, 4) displacement of the face.
-    in_front : whether every marker was in front of both cameras when last observed.
-    markers : how many are observed, those of the face first.
-    hidden : (2,) 1 where the face was self-occluded when last observed.
-    disturbance : nothing ever disturbs it; why the law that drove it failed.
-    takes_parts : it goes straight to the end of each step; the samples are the same.
+    ``q, H``: (n,) true joints, rad or m, and (4, 4) displacement of the face. ``in_front``: whether every
+    marker was in front of both cameras when last observed. ``markers``: how many are observed, those of the
+    face first. ``hidden``: (2,) 1 where the face was self-occluded when last observed. ``disturbance``:
+    nothing ever disturbs it; why the law that drove it failed. ``takes_parts``: it goes straight to the end
+    of each step; the samples are the same.
     """
 
     disturbance = ""

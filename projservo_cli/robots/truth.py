@@ -83,14 +83,10 @@ def dh_robot(
 ) -> Robot:
     """Robot of a Denavit–Hartenberg table; its reference is all joints zero.
 
-    Parameters
-    ----------
-    rows : prismatic?, θ (rad), d (m), a (m), α (rad) of each joint; the joint variable is added to
-        d or θ.
+    rows : prismatic?, θ (rad), d (m), a (m), α (rad) of each joint; the joint variable is added to d or θ.
     modified : whether the table is in Craig's convention (a, α before θ, d) or the standard one.
     tool : (4, 4) pose of the tool in the last frame.
     limits : lower and upper limit of each joint, rad or m.
-
     Source: P. Corke, Robotics, Vision and Control, 2nd ed., section 7.1.
     """
     T = np.eye(4)
@@ -126,10 +122,7 @@ def look_at_camera(
 
     ``up`` is a direction that appears upward in the image.
 
-    Raises
-    ------
-    InputError
-        If the camera sits on its target or looks along ``up``.
+    Raises InputError if the camera sits on its target or looks along ``up``.
     """
     z = np.subtract(target, position)
     x = np.cross(z, up)
@@ -157,8 +150,6 @@ def _optical_axis(camera: FloatArray) -> FloatArray:
 def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Roll axis of a rig: the point midway between the optical centres, m, and the mean direction.
 
-    Parameters
-    ----------
     P : (2, 3, 4) metric cameras.
     """
     point = 0.5 * (camera_center(P[0]) + camera_center(P[1]))
@@ -172,15 +163,8 @@ def inverse_kinematics(robot: Robot, goal: FloatArray, q_start: FloatArray) -> F
     Damped Newton steps on the pose from the start and from 30 seeded places within the limits; the
     solution with the least joint motion wins.
 
-    Parameters
-    ----------
-    goal : (4, 4) pose of the tool, m.
-    q_start : (n,) rad or m.
-
-    Raises
-    ------
-    WorkFailed
-        If none of the starts reaches the goal within the limits.
+    goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
+    Raises WorkFailed if none of the starts reaches the goal within the limits.
     """
     rng = np.random.default_rng(0)
     span_lower = np.maximum(robot.lower, q_start - 2 * math.pi)

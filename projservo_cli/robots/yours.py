@@ -41,13 +41,10 @@ class Robot(Protocol):
 class ForeignRobot:
     """A robot whose answers are awaited for a time and checked.
 
-    Parameters
-    ----------
     robot : what is driven.
     name : of it, for messages.
     joints, markers : how many it has to report.
     timeout_s : most time an answer may take, s; of a command beyond its period.
-
     All methods raise ``WorkFailed`` where the robot fails, is late or answers nonsense. Calls are made
     in one thread of their own, so that the loop goes on where one never returns.
     """
@@ -194,21 +191,15 @@ def _signals_interrupt() -> Iterator[None]:
 class DrivenRobot:
     """A robot with its cameras beside the plant that the calibration takes it for.
 
-    Parameters
-    ----------
     robot : what is driven.
     plant : calibrated model and face; image size and joint limits.
-    shown : (k,) indices of the markers that the loop is shown among those that the robot observes, the
-        face first.
+    shown : (k,) indices of the markers that the loop is shown among those that the robot observes, the face
+        first.
     order : (m,) index there of each marker of the calibration, −1 where it is not observed.
     innovation : test of the images against the calibration; None tests nothing.
-
-    Attributes
-    ----------
-    q : (n,) joint readings when last asked for, rad or m.
-    H, hidden : displacement of the face and self-occlusion as the calibration has them there.
-    in_front : a camera sees nothing behind it.
-    disturbance : why the images no longer agree with the calibration, or what failed; else empty.
+    ``q``: (n,) joint readings when last asked for, rad or m. ``H, hidden``: displacement of the face and
+    self-occlusion as the calibration has them there. ``in_front``: a camera sees nothing behind it.
+    ``disturbance``: why the images no longer agree with the calibration, or what failed; else empty.
     """
 
     in_front = True

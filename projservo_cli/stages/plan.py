@@ -48,38 +48,23 @@ VIEWS = ("left", "right")
 
 
 class Shown(NamedTuple):
-    """What a task is planned from.
+    """What a task is planned from."""
 
-    Attributes
-    ----------
-    q_start : (n,) joint readings at the start, rad or m.
-    s_start, s_star : (2, m, 2) pixels of the face at the start and at the goal.
-    center : index of the centre marker, or ``MIDPOINT``.
-    """
-
-    q_start: FloatArray
+    q_start: FloatArray  # (n,) joint readings at the start, rad or m
     s_start: FloatArray
-    s_star: FloatArray
-    center: int
+    s_star: FloatArray  # s_start, s_star: (2, m, 2) pixels of the face at the start and at the goal
+    center: int  # index of the centre marker, or ``MIDPOINT``
 
 
 class Profile(NamedTuple):
-    """The motion that is asked for.
+    """The motion that is asked for."""
 
-    Attributes
-    ----------
-    name : which part is driven when.
-    delta : share of τ_0 that a pure translation may use.
-    samples : points of the path.
-    duration : time it is given, s; None for as little as the joint-speed limit lets it take.
-    ramp : time in which it comes up to its pace, and to rest again at its end, s.
-    """
-
-    name: str = "linear"
-    delta: float = 0.9
-    samples: int = 101
+    name: str = "linear"  # which part is driven when
+    delta: float = 0.9  # share of τ_0 that a pure translation may use
+    samples: int = 101  # points of the path
+    # time it is given, s; None for as little as the joint-speed limit lets it take
     duration: float | None = None
-    ramp: float = 0.0
+    ramp: float = 0.0  # time in which it comes up to its pace, and to rest again at its end, s
 
 
 def _timed(shortest: FloatArray, sigma: FloatArray, profile: Profile) -> FloatArray:
@@ -87,10 +72,7 @@ def _timed(shortest: FloatArray, sigma: FloatArray, profile: Profile) -> FloatAr
 
     Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
 
-    Raises
-    ------
-    WorkFailed
-        If the joints would be too fast.
+    Raises WorkFailed if the joints would be too fast.
     """
     duration = profile.duration
     eased = from_rest(shortest, profile.ramp)
@@ -185,8 +167,6 @@ def _least(path: Path) -> tuple[FloatArray, FloatArray]:
 def demands_of(config: "Config", joint_types: str = "") -> Demands:
     """What the planned motion must keep to, as configured.
 
-    Parameters
-    ----------
     joint_types : one letter a joint, where the configuration does not tell.
     """
     joints = joints_of(config, joint_types)
@@ -203,14 +183,8 @@ def demands_of(config: "Config", joint_types: str = "") -> Demands:
 def _motion(reaching: Reaching, profile: Profile, pure_translation: float) -> tuple[Path, Path, FloatArray]:
     """Motion of a profile: the path by which it is judged, its samples, and their times (s,), s.
 
-    Parameters
-    ----------
     pure_translation : most share of the translation before any rotation, δ τ_0 / τ.
-
-    Raises
-    ------
-    WorkFailed
-        If the joints would be too fast.
+    Raises WorkFailed if the joints would be too fast.
     """
     sigma = np.linspace(0.0, 1.0, profile.samples)
     if profile.name == CONSTRAINED:
@@ -232,17 +206,9 @@ def _partitioned(
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; ``rehearse`` half turns within joint limits.
 
-    Returns
-    -------
-    state : with the face and the joint motions.
-    task : in the frame of the model.
-    parts : translation and rotations, a half turn in the sense that was rehearsed.
-    note : what to say of the rehearsal.
-
-    Raises
-    ------
-    WorkFailed
-        If a marker cannot be triangulated or a motion is not unique.
+    Returns state: with the face and the joint motions; task: in the frame of the model; parts: translation
+    and rotations, a half turn in the sense that was rehearsed; note: what to say of the rehearsal. Raises
+    WorkFailed if a marker cannot be triangulated or a motion is not unique.
     """
     n, m = len(shown.q_start), shown.s_start.shape[1]
     task = measured_task(model, *shown, sight)
@@ -281,17 +247,11 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
 
     The joints that bring the face nearest to its planned images, in px, are carried along the plan.
 
-    Parameters
-    ----------
     model : calibrated model.
     A : (m, 4) face at the start.
     q_start : (n,) joints there, rad or m.
     images : (s, 2, m, 2) planned pixels of the face.
-
-    Raises
-    ------
-    WorkFailed
-        If more than ``LEFT_PX`` of image error are left at the goal.
+    Raises WorkFailed if more than ``LEFT_PX`` of image error are left at the goal.
     """
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
     q = q_start
@@ -313,12 +273,8 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
 def run(config: "Config", calibration: Calibration) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
-    Raises
-    ------
-    InputError
-        If the configuration lacks the task or the face.
-    WorkFailed
-        If the task cannot be partitioned.
+    Raises InputError if the configuration lacks the task or the face; WorkFailed if the task cannot be
+    partitioned.
     """
     known = set(calibration.marker.tolist())
     missing = [number for number in face_numbers(config) if number not in known]
@@ -353,18 +309,13 @@ def plan_task(
 ) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
-    Parameters
-    ----------
     model : calibrated model.
     shown : start and goal.
     profile : the motion that is asked for.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
     sight : the body to measure with; without it the face is measured point by point.
-
-    Raises
-    ------
-    WorkFailed
-        If a marker cannot be triangulated, a motion is not unique or the joints would be too fast.
+    Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
+    fast.
     """
     rehearse, bounds = rehearses(profile.name), (demands.lower, demands.upper)
     state, task, parts, note = _partitioned(model, shown, rehearse, bounds, sight)
@@ -475,10 +426,7 @@ def _in_sight(profile: str, found: Along) -> tuple[bool, str]:
 def rotation_sense(scenario: Scenario) -> Sense:
     """The sense that the plan of a task takes; only the profile constrained needs the whole plan for it.
 
-    Raises
-    ------
-    WorkFailed
-        If the task cannot be partitioned.
+    Raises WorkFailed if the task cannot be partitioned.
     """
     config, calibration = scenario.config, scenario.calibration
     profile = config.trajectory.profile

@@ -43,57 +43,34 @@ class Body(NamedTuple):
 
     The coordinates of a displacement are three translations and three rotations about the middle of
     the markers; the translations have a_inf for their plane at infinity.
-
-    Attributes
-    ----------
-    M : (m, 4) markers at the reference, a_inf·M = 1, those of the face first; none where the face is
-        measured point by point.
-    D : (3, 4) points at infinity along which the translations go.
-    H_hat : (3, 4, 4) operators of the rotations, per rad.
-    turn : (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation.
-    a_inf : (4,) plane at infinity.
-    shown : (2, m) views of the markers that the goal showed.
     """
 
+    # (m, 4) markers at the reference, a_inf·M = 1, those of the face first; none where the face is measured
+    # point by point
     M: FloatArray
-    D: FloatArray
-    H_hat: FloatArray
-    turn: FloatArray
-    a_inf: FloatArray
-    shown: BoolArray
+    D: FloatArray  # (3, 4) points at infinity along which the translations go
+    H_hat: FloatArray  # (3, 4, 4) operators of the rotations, per rad
+    turn: FloatArray  # (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation
+    a_inf: FloatArray  # (4,) plane at infinity
+    shown: BoolArray  # (2, m) views of the markers that the goal showed
 
 
 class Until(NamedTuple):
-    """When a fit ends.
+    """When a fit ends."""
 
-    Attributes
-    ----------
-    shown_only : leave out views that the goal did not show.
-    settled_px : a step that moves the images by no more, px rms a coordinate, is the last.
-    most_steps : the fit after so many steps is taken as it is.
-    """
-
-    shown_only: bool
-    settled_px: float
-    most_steps: int
+    shown_only: bool  # leave out views that the goal did not show
+    settled_px: float  # a step that moves the images by no more, px rms a coordinate, is the last
+    most_steps: int  # the fit after so many steps is taken as it is
 
 
 class Fit(NamedTuple):
-    """Displacement that markers say, and how well they agree.
+    """Displacement that markers say, and how well they agree."""
 
-    Attributes
-    ----------
-    found : False where the markers that were seen do not determine it.
-    H : displacement from the reference.
-    before, after : sum of squared residuals of the prediction and of the fit, px².
-    views : markers used, counted once a view.
-    """
-
-    found: bool
-    H: Mat4
+    found: bool  # False where the markers that were seen do not determine it
+    H: Mat4  # displacement from the reference
     before: float
-    after: float
-    views: int
+    after: float  # before, after: sum of squared residuals of the prediction and of the fit, px²
+    views: int  # markers used, counted once a view
 
 
 # The face measured point by point.
@@ -114,15 +91,8 @@ def body_of(model: Model, M: FloatArray) -> Body:
     infinity spread most, orthonormal in the invariant form −½ trace(L L'), hence per rad. Where the joints
     do not turn the body about three directions, they are those of a metric that the joints keep.
 
-    Parameters
-    ----------
-    model : calibrated model.
-    M : (m, 4) its markers at the reference, those of the face first.
-
-    Raises
-    ------
-    WorkFailed
-        If the joints keep no metric of the calibrated frame.
+    model : calibrated model; M : (m, 4) its markers at the reference, those of the face first.
+    Raises WorkFailed if the joints keep no metric of the calibrated frame.
     """
     M = M / (M @ model.a_inf)[:, None]
     D = np.linalg.svd(model.a_inf[None])[2][1:]
@@ -156,8 +126,6 @@ def new_normal() -> FloatArray:
 def _image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float) -> Row:
     """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
 
-    Parameters
-    ----------
     t, t_depth : numerator and denominator of the coordinate under the translations.
     turn : (3, 3) rotations of the marker as translations.
     """
@@ -181,18 +149,13 @@ def normal_equations(
 ) -> tuple[float, int]:
     """Normal equations of the displacement exp(ξ) after which H carries the markers to their images.
 
-    Parameters
-    ----------
     P : (2, 3, 4) cameras.
     body : as calibrated.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : displacement from the reference about which the images are linear in ξ.
     shown_only : leave out views that the goal did not show.
     normal : (6, 7) on return the equations.
-
-    Returns
-    -------
-    Sum of squared residuals, px², and the number of markers seen, counted once a view.
+    Returns sum of squared residuals, px², and the number of markers seen, counted once a view.
     """
     N = NOTHING
     squares = 0.0
@@ -247,8 +210,6 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: Until, no
 
     Any markers do that determine six coordinates: three that one camera sees, in general position.
 
-    Parameters
-    ----------
     P : (2, 3, 4) cameras.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : predicted displacement from the reference.

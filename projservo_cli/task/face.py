@@ -61,30 +61,17 @@ PROBLEMS = {
 
 
 class Task(NamedTuple):
-    """What the control laws know of the task, in the frame of their model.
+    """What the control laws know of the task, in the frame of their model."""
 
-    Attributes
-    ----------
-    s_star : (2, m, 2) target pixels of the face.
-    A_star : (m, 4) target points, a_inf·A = 1.
-    order : (m,) markers around the face, which orients its plane.
-    center : index of the centre marker, or ``MIDPOINT``.
-    F : (3, 3) fundamental matrix.
-    O : (2, 4) optical centres, a_inf·O = 1.
-    visible : (2,) sign of a·O on the visible side of the face, one a camera.
-    body : all markers of the body, by which the face is measured; none for point by point.
-    reference : the plan that is followed; none where every step plans anew.
-    """
-
-    s_star: FloatArray
-    A_star: FloatArray
-    order: IntArray
-    center: int
-    F: FloatArray
-    O: FloatArray
-    visible: FloatArray
-    body: Body = NO_BODY
-    reference: Reference = NO_REFERENCE
+    s_star: FloatArray  # (2, m, 2) target pixels of the face
+    A_star: FloatArray  # (m, 4) target points, a_inf·A = 1
+    order: IntArray  # (m,) markers around the face, which orients its plane
+    center: int  # index of the centre marker, or ``MIDPOINT``
+    F: FloatArray  # (3, 3) fundamental matrix
+    O: FloatArray  # (2, 4) optical centres, a_inf·O = 1
+    visible: FloatArray  # (2,) sign of a·O on the visible side of the face, one a camera
+    body: Body = NO_BODY  # all markers of the body, by which the face is measured; none for point by point
+    reference: Reference = NO_REFERENCE  # the plan that is followed; none where every step plans anew
 
 
 @njit
@@ -121,8 +108,6 @@ def _put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     offset from the midpoint that is longest, and along the one that lies farthest off it. The order begins
     with the first marker and goes on to the lower of its neighbours, whatever the frame.
 
-    Parameters
-    ----------
     A : (m, 4) points of the face scaled to a_inf·A = 1, three or more.
     order : (m,) on return the indices.
     angle : (m,) workspace.
@@ -170,18 +155,8 @@ def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
 def cyclic_order(A: FloatArray) -> IntArray:
     """Order of the face markers around their midpoint, as of ``_put_order``.
 
-    Parameters
-    ----------
     A : (m, 4) points of the face scaled to a_inf·A = 1.
-
-    Returns
-    -------
-    (m,) indices.
-
-    Raises
-    ------
-    WorkFailed
-        If there are fewer than three points or they lie on one line.
+    Returns (m,) indices. Raises WorkFailed if there are fewer than three points or they lie on one line.
     """
     _require_three(len(A))
     order = np.zeros(len(A), dtype=np.int64)
@@ -208,17 +183,12 @@ def put_task(
 ) -> tuple[int, int]:
     """What the images at start and goal say of a task: target points, order of the markers, visible side.
 
-    Parameters
-    ----------
     P, a_inf : (2, 3, 4), (4,) cameras and plane at infinity of the model.
     start, goal : (2, ≥m, 2) straight pixels, the m markers of the face first.
     A : (m, 4) on return the face at the start.
     angle : (m,) workspace.
     task : with target pixels, fundamental matrix and optical centres; on return with the rest.
-
-    Returns
-    -------
-    What is wrong, ``FOUND`` for nothing, and with which marker.
+    Returns what is wrong, ``FOUND`` for nothing, and with which marker.
     """
     lost = put_points(P, task.F, a_inf, start, A)
     if lost < 0:
@@ -240,10 +210,7 @@ def put_task(
 def require_found(status: int, detail: int) -> None:
     """Say what is wrong with the images of a task.
 
-    Raises
-    ------
-    WorkFailed
-        If the status is not ``FOUND``.
+    Raises WorkFailed if the status is not ``FOUND``.
     """
     if status != FOUND:
         raise WorkFailed(PROBLEMS[status].format(detail))
@@ -252,16 +219,10 @@ def require_found(status: int, detail: int) -> None:
 def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
     """A task whose target is not known yet.
 
-    Parameters
-    ----------
     model : calibrated (or metric) model.
     s_star : (2, m, 2) pixels of the face at the goal.
     center : index of the centre marker, or ``MIDPOINT``.
-
-    Raises
-    ------
-    WorkFailed
-        If there are fewer than three markers, or both cameras are in one place.
+    Raises WorkFailed if there are fewer than three markers, or both cameras are in one place.
     """
     m = s_star.shape[1]
     _require_three(m)
@@ -279,16 +240,10 @@ def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
 def task_from_images(model: Model, s_start: FloatArray, s_star: FloatArray, center: int) -> Task:
     """What the laws know of a task, from images alone.
 
-    Parameters
-    ----------
     model : calibrated (or metric) model.
     s_start, s_star : (2, m, 2) pixels of the face at the start and at the goal.
     center : index of the centre marker, or ``MIDPOINT``.
-
-    Raises
-    ------
-    WorkFailed
-        If a marker cannot be triangulated, the face is degenerate, or a camera looks along it.
+    Raises WorkFailed if a marker cannot be triangulated, the face is degenerate, or a camera looks along it.
     """
     task = new_task(model, s_star, center)
     start, goal = straight_views(model.lens, s_start), straight_views(model.lens, s_star)

@@ -20,18 +20,10 @@ DIFFERENCE = 1e-4
 def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -> Task:
     """The task with the plan to follow, [RH00] section 4.
 
-    Parameters
-    ----------
     model : calibrated model, in whose frame the plan was made.
     period : control period, s.
     rate : factor of every command.
-
-    Raises
-    ------
-    InputError
-        If the plan has no time.
-    WorkFailed
-        If the joints cannot follow it.
+    Raises InputError if the plan has no time; WorkFailed if the joints cannot follow it.
     """
     times = _instants(plan, period)
     mu, q, A, s = _followed_at(model, task, plan, times)
@@ -53,10 +45,7 @@ def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -
 def _instants(plan: Plan, period: float) -> FloatArray:
     """Times (k,), k ≥ 2, one control period apart, the last that at which the plan arrives, s.
 
-    Raises
-    ------
-    InputError, WorkFailed
-        As of ``followed``.
+    Raises InputError, WorkFailed as of ``followed``.
     """
     if not np.isfinite(plan.q).all():
         raise WorkFailed(

@@ -40,23 +40,14 @@ PARTS = (1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 
 class Demands(NamedTuple):
-    """What a planned motion must keep to.
-
-    Attributes
-    ----------
-    lower, upper : (n,) joint limits, rad or m.
-    speed : (n,) most joint motion per second, rad/s or m/s; infinite for none.
-    image_size : (2,) width and height of both images, px; infinite where an image has no border.
-    border_px : least distance of a marker from the border of an image, px.
-    conditioning : least reciprocal condition of the image Jacobian of the face.
-    """
+    """What a planned motion must keep to."""
 
     lower: FloatArray
-    upper: FloatArray
-    speed: FloatArray
-    image_size: FloatArray
-    border_px: float
-    conditioning: float
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    speed: FloatArray  # (n,) most joint motion per second, rad/s or m/s; infinite for none
+    image_size: FloatArray  # (2,) width and height of both images, px; infinite where an image has no border
+    border_px: float  # least distance of a marker from the border of an image, px
+    conditioning: float  # least reciprocal condition of the image Jacobian of the face
 
 
 def within(lower: FloatArray, upper: FloatArray) -> Demands:
@@ -66,63 +57,36 @@ def within(lower: FloatArray, upper: FloatArray) -> Demands:
 
 
 class Reaching(NamedTuple):
-    """A partitioned task as the planner sees it.
+    """A partitioned task as the planner sees it."""
 
-    Attributes
-    ----------
-    model : calibrated model; a_inf·M keeps its scale under all displacements.
-    demands : what the motion must keep to.
-    H_hat : (3, 4, 4) operators t, r, p.
-    amplitudes : (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad.
-    A : (m, 4) face at the start.
-    a : (4,) its plane.
-    O : (2, 4) optical centres.
-    q_start : (n,) joints at the start, rad or m.
-    """
-
-    model: Model
-    demands: Demands
-    H_hat: FloatArray
-    amplitudes: FloatArray
-    A: FloatArray
-    a: FloatArray
-    O: FloatArray
-    q_start: FloatArray
+    model: Model  # calibrated model; a_inf·M keeps its scale under all displacements
+    demands: Demands  # what the motion must keep to
+    H_hat: FloatArray  # (3, 4, 4) operators t, r, p
+    amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
+    A: FloatArray  # (m, 4) face at the start
+    a: FloatArray  # (4,) its plane
+    O: FloatArray  # (2, 4) optical centres
+    q_start: FloatArray  # (n,) joints at the start, rad or m
 
 
 class Seen(NamedTuple):
-    """What both cameras have of the face at s instants.
+    """What both cameras have of the face at s instants."""
 
-    Attributes
-    ----------
-    H_d : (s, 4, 4) planned displacement.
-    s : (s, 2, m, 2) images of the face, px.
-    visibility : (s, 2) margins a·O, 1 at the start.
-    distance : (s, 2) least distance of a marker from the image border, px; ``BEHIND`` where none shows it.
-    """
-
-    H_d: FloatArray
-    s: FloatArray
-    visibility: FloatArray
+    H_d: FloatArray  # (s, 4, 4) planned displacement
+    s: FloatArray  # (s, 2, m, 2) images of the face, px
+    visibility: FloatArray  # (s, 2) margins a·O, 1 at the start
+    # (s, 2) least distance of a marker from the image border, px; ``BEHIND`` where none shows it
     distance: FloatArray
 
 
 class Along(NamedTuple):
-    """Margins along a path of s instants.
+    """Margins along a path of s instants."""
 
-    Attributes
-    ----------
-    view : what both cameras have of the face.
-    q : (s, n) joints, rad or m; NaN from where they cannot follow.
-    limit : (s,) margins of the joint limits, NaN likewise.
-    condition : (s,) reciprocal conditions of the image Jacobian, NaN likewise.
-    margins : (s, 4) the smallest of each of ``CONSTRAINTS``; ``WORST`` where the joints cannot follow.
-    """
-
-    view: Seen
-    q: FloatArray
-    limit: FloatArray
-    condition: FloatArray
+    view: Seen  # what both cameras have of the face
+    q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
+    limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
+    condition: FloatArray  # (s,) reciprocal conditions of the image Jacobian, NaN likewise
+    # (s, 4) the smallest of each of ``CONSTRAINTS``; ``WORST`` where the joints cannot follow
     margins: FloatArray
 
 
@@ -180,20 +144,13 @@ def limit_margin(q: FloatArray, demands: Demands) -> FloatArray:
 
 
 class _Carrier(NamedTuple):
-    """What carries the joints along a path.
+    """What carries the joints along a path."""
 
-    Attributes
-    ----------
-    reaching : the task.
-    work : workspace of n joints and 4m rows.
-    newton, before, M : (n,), (n,) and (2, 4) workspaces.
-    """
-
-    reaching: Reaching
-    work: Work
+    reaching: Reaching  # the task
+    work: Work  # workspace of n joints and 4m rows
     newton: FloatArray
     before: FloatArray
-    M: FloatArray
+    M: FloatArray  # newton, before, M: (n,), (n,) and (2, 4) workspaces
 
 
 def carrier_of(reaching: Reaching) -> _Carrier:
@@ -209,16 +166,12 @@ def carry_joints(
 ) -> float:
     """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
 
-    Parameters
-    ----------
     ends : (2, 3) shares at both ends.
     parts : how many; of none the joints stay where they are.
     settled : Newton step, rad or m, that is the last of a part.
     stride : most that a part may move a joint, rad or m.
-
-    Returns
-    -------
-    Reciprocal condition of the image Jacobian there; −1 where a part does not settle or moves too far.
+    Returns reciprocal condition of the image Jacobian there; −1 where a part does not settle or moves too
+    far.
     """
     reaching, work, before = carrier.reaching, carrier.work, carrier.before
     model = reaching.model

@@ -39,39 +39,24 @@ COINCIDENT = 1e-14
 
 
 class Memory(NamedTuple):
-    """What a law carries from one step to the next.
+    """What a law carries from one step to the next."""
 
-    Attributes
-    ----------
-    rotation : (2, n) joint motions of the last rotations r and p, in the sense they were driven.
-    """
-
-    rotation: FloatArray
+    rotation: FloatArray  # (2, n) joint motions of the last rotations r and p, in the sense they were driven
 
 
 class Parts(NamedTuple):
-    """Partition of the task at one instant; the joint motions are in rows t, r, p of ``q_hat``.
+    """Partition of the task at one instant; the joint motions are in rows t, r, p of ``q_hat``."""
 
-    Attributes
-    ----------
-    found : False where an operator kernel is not unique.
-    tau : amplitude of the translation, ≥ 0, in the unit of ``H_t``.
-    theta_r, theta_p : angles onto and within the plane, rad.
-    H_t, H_r, H_p : operators, zero where the part is nothing.
-    a, a_t : oriented planes of the face and of the translated target.
-    A_c : centre of the face.
-    """
-
-    found: bool
-    tau: float
+    found: bool  # False where an operator kernel is not unique
+    tau: float  # amplitude of the translation, ≥ 0, in the unit of ``H_t``
     theta_r: float
-    theta_p: float
+    theta_p: float  # theta_r, theta_p: angles onto and within the plane, rad
     H_t: Mat4
     H_r: Mat4
-    H_p: Mat4
+    H_p: Mat4  # H_t, H_r, H_p: operators, zero where the part is nothing
     a: Vec4
-    a_t: Vec4
-    A_c: Vec4
+    a_t: Vec4  # a, a_t: oriented planes of the face and of the translated target
+    A_c: Vec4  # centre of the face
 
 
 class _Face(NamedTuple):
@@ -263,8 +248,6 @@ def partition(
 ) -> Parts:
     """Partition of the remaining task, [RH00] eqs. (8)–(16).
 
-    Parameters
-    ----------
     work : operators at the current joints in ``work.H_hat``.
     task : target and visibility.
     A : (m, 4) current points of the face, a_inf·A = 1.

@@ -57,18 +57,11 @@ STEPS = np.array([step for step in product((0, 1), repeat=3) if any(step)])
 
 
 class Path(NamedTuple):
-    """A path of shares and what is along it.
+    """A path of shares and what is along it."""
 
-    Attributes
-    ----------
-    reaching : the task in the senses of both rotations that were chosen.
-    mu : (s, 3) shares.
-    along : joints and margins there.
-    """
-
-    reaching: Reaching
-    mu: FloatArray
-    along: Along
+    reaching: Reaching  # the task in the senses of both rotations that were chosen
+    mu: FloatArray  # (s, 3) shares
+    along: Along  # joints and margins there
 
     def shares(self) -> FloatArray:
         """Each margin (s, 4) over that at the worse of both ends, or over 1 where that is not positive."""
@@ -173,8 +166,6 @@ def _best_of(paths: list[Path]) -> Path:
 class _Lattice:
     """Shares of the constraints over μ_t, μ_r, μ_p in one choice of senses, and their widest path.
 
-    Parameters
-    ----------
     reaching : the task in these senses.
     coarse : values of each share at which joints are solved; 0 where they need not follow: the views alone
         are looked at, and what takes time are the shares themselves.
@@ -311,8 +302,6 @@ def widest(shares: FloatArray) -> FloatArray:
 def shortest(free: BoolArray, joints: FloatArray, speed: FloatArray) -> IntArray:
     """Nodes (k, 3) of the monotone path through free ones that takes the least time, first to last.
 
-    Parameters
-    ----------
     free : (a, b, c) whether a path may pass a node.
     joints : (a, b, c, n) at the nodes, rad or m.
     speed : (n,) limits, rad/s or m/s.

@@ -35,26 +35,17 @@ SETTLED, TOO_FEW, UNSETTLED = range(3)  # how it ended
 
 
 class Bench(NamedTuple):
-    """Workspace in which a task is measured.
+    """Workspace in which a task is measured."""
 
-    Attributes
-    ----------
-    work : arrays of the kernels.
-    A, A_t, A_r : (m, 4) the face at the start, the target without translation, and without both.
-    q_hat : (3, k) joint motions t, r, p, or coordinates in the span.
-    memory : of the partition.
-    normal : (6, 7) of the fit of the body.
-    angle : (m,) of the order of the markers.
-    """
-
-    work: Work
+    work: Work  # arrays of the kernels
+    # A, A_t, A_r: (m, 4) the face at the start, the target without translation, and without both
     A: FloatArray
     A_t: FloatArray
     A_r: FloatArray
-    q_hat: FloatArray
-    memory: Memory
-    normal: FloatArray
-    angle: FloatArray
+    q_hat: FloatArray  # (3, k) joint motions t, r, p, or coordinates in the span
+    memory: Memory  # of the partition
+    normal: FloatArray  # (6, 7) of the fit of the body
+    angle: FloatArray  # (m,) of the order of the markers
 
 
 def new_bench(n: int, m: int, span: Span = OWN) -> Bench:
@@ -76,20 +67,14 @@ def task_from_body(
 ) -> Task:
     """What the laws know of a task, from images of the whole body.
 
-    Parameters
-    ----------
     model, body : calibrated.
     q_start : (n,) joints at the start, rad or m.
     s_start, s_star : (2, b, 2) pixels of the body at the start and at the goal, the m of the face first,
         which both cameras must see; of the others NaN where unseen.
     center : index of the centre marker, or ``MIDPOINT``.
     m : markers of the face.
-
-    Raises
-    ------
-    WorkFailed
-        If the face cannot be triangulated, a motion is not unique or the markers do not agree on a
-        place of the body.
+    Raises WorkFailed if the face cannot be triangulated, a motion is not unique or the markers do not agree
+    on a place of the body.
     """
     shown = np.zeros(s_star.shape[:2], dtype=np.bool_)
     task = new_task(model, s_star[:, :m], center)._replace(body=body._replace(shown=shown))
@@ -110,15 +95,10 @@ def put_body_task(
     The goal is found from the start by the partition of the task, which the triangulated face
     determines, and fitted to all markers seen there.
 
-    Parameters
-    ----------
     start, goal : (2, b, 2) straight pixels of the body, NaN where unseen.
     bench : on return with the face at the start.
     task : as ``put_task`` leaves it, with the body; on return with its points and the views that were shown.
-
-    Returns
-    -------
-    What is wrong, ``FOUND`` for nothing, and how many markers were seen, counted once a view.
+    Returns what is wrong, ``FOUND`` for nothing, and how many markers were seen, counted once a view.
     """
     ended, views, H_start = settled(model.P, task.body, start, forward(model, q_start), bench.normal)
     if ended != SETTLED:
@@ -146,17 +126,12 @@ def put_body_task(
 def settled(P: FloatArray, body: Body, s: FloatArray, H: Mat4, normal: FloatArray) -> tuple[int, int, Mat4]:
     """Displacement of least reprojection error, from a predicted one.
 
-    Parameters
-    ----------
     P : (2, 3, 4) cameras.
     s : (2, b, 2) straight pixels, NaN where unseen.
     H : prediction.
     normal : (6, 7) workspace.
-
-    Returns
-    -------
-    ``SETTLED``, ``TOO_FEW`` markers seen, or ``UNSETTLED`` after the most steps; markers seen, counted once a
-    view; the displacement.
+    Returns ``SETTLED``, ``TOO_FEW`` markers seen, or ``UNSETTLED`` after the most steps; markers seen,
+    counted once a; view; the displacement.
     """
     views = 0
     for _ in range(MOST_SIGHT_STEPS):

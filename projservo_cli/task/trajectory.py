@@ -22,20 +22,10 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
     the path and the others stay flat until then; a translation first goes no farther than visibility
     lets the unturned face go, and does the rest while the face turns.
 
-    Parameters
-    ----------
     profile : one of ``PROFILES``.
     sigma : (k,) path parameter in [0, 1].
     pure_translation : most share of the translation before any rotation, δ τ_0 / τ.
-
-    Returns
-    -------
-    (k, 3) shares, each monotone from 0 to 1.
-
-    Raises
-    ------
-    ValueError
-        If the profile is unknown.
+    Returns (k, 3) shares, each monotone from 0 to 1. Raises ValueError if the profile is unknown.
     """
     if profile not in PROFILES:
         raise ValueError(f"unknown profile {profile!r}: choose one of {', '.join(PROFILES)}")
@@ -78,42 +68,28 @@ def trajectory_displacement(
 ) -> FloatArray:
     """Planned displacement of the face, [RH00] eqs. (17), (18).
 
-    Parameters
-    ----------
     H_hat : (3, 4, 4) operators t, r, p.
     amplitudes : τ in the unit of Ĥ_t, θ_r and θ_p in rad.
     mu : (3,) shares.
-
-    Returns
-    -------
-    (4, 4) displacement exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p).
+    Returns (4, 4) displacement exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p).
     """
     H_hat = np.ascontiguousarray(H_hat, dtype=np.float64)
     return as_array(displaced(H_hat, np.array(amplitudes, dtype=np.float64), *(float(share) for share in mu)))
 
 
 class Reference(NamedTuple):
-    """A planned motion at k instants, one control period apart but for the last, where it arrives.
+    """A planned motion at k instants, one control period apart but for the last, where it arrives."""
 
-    Attributes
-    ----------
-    H_hat : (3, 4, 4) operators t, r, p of the plan.
-    amplitudes : (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad.
-    mu : (k, 3) shares that are done; k is 0 where nothing is followed, else at least 2.
-    q : (k, n) joints that follow, rad or m.
-    A : (k, m, 4) points of the face, a_inf·A = 1, before the displacement that is planned until then.
-    s : (k, 2, m, 2) its pixels as projective cameras see them.
-    s_ahead : (k, 2, m, 2) their motion in the next period to first order, velocity times time, px.
-    rate : periods of the plan that a period of the loop is worth: less than 1 where commands are scaled.
-    """
-
-    H_hat: FloatArray
-    amplitudes: FloatArray
-    mu: FloatArray
-    q: FloatArray
+    H_hat: FloatArray  # (3, 4, 4) operators t, r, p of the plan
+    amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
+    mu: FloatArray  # (k, 3) shares that are done; k is 0 where nothing is followed, else at least 2
+    q: FloatArray  # (k, n) joints that follow, rad or m
+    # (k, m, 4) points of the face, a_inf·A = 1, before the displacement that is planned until then
     A: FloatArray
-    s: FloatArray
+    s: FloatArray  # (k, 2, m, 2) its pixels as projective cameras see them
+    # (k, 2, m, 2) their motion in the next period to first order, velocity times time, px
     s_ahead: FloatArray
+    # periods of the plan that a period of the loop is worth: less than 1 where commands are scaled
     rate: float
 
 

@@ -117,15 +117,8 @@ def choose_sense(a: Vec4, a_t: Vec4, H_r: Mat4, theta: float, task: Task, agains
 def visibility_translation(a: FloatArray, H_hat_t: FloatArray, O: FloatArray) -> float | None:
     """Amplitude τ_0 at which a translated face changes visibility, [RH00] section 4.2.
 
-    Parameters
-    ----------
-    a : (4,) plane of the face.
-    H_hat_t : (4, 4) translation operator.
-    O : (4,) optical centre.
-
-    Returns
-    -------
-    τ_0 in the unit of the operator, or None where translating never changes visibility.
+    a : (4,) plane of the face; H_hat_t : (4, 4) translation operator; O : (4,) optical centre.
+    Returns τ_0 in the unit of the operator, or None where translating never changes visibility.
     """
     rate = float(a @ H_hat_t @ O)
     if abs(rate) <= 1e-14 * float(np.linalg.norm(H_hat_t) * np.linalg.norm(a) * np.linalg.norm(O)):
@@ -136,15 +129,8 @@ def visibility_translation(a: FloatArray, H_hat_t: FloatArray, O: FloatArray) ->
 def visibility_angles(a: FloatArray, H_hat: FloatArray, O: FloatArray) -> tuple[float, float] | None:
     """Angles θ_0± at which a rotated face changes visibility, [RH00] section 4.2.
 
-    Parameters
-    ----------
-    a : (4,) plane of the face.
-    H_hat : (4, 4) revolute operator.
-    O : (4,) optical centre.
-
-    Returns
-    -------
-    θ_0⁺ and θ_0⁻ in (−π, π], rad, or None where the rotation never changes visibility.
+    a : (4,) plane of the face; H_hat : (4, 4) revolute operator; O : (4,) optical centre.
+    Returns θ_0⁺ and θ_0⁻ in (−π, π], rad, or None where the rotation never changes visibility.
     """
     first = H_hat @ O
     second = H_hat @ first
