@@ -4,8 +4,9 @@ from dataclasses import replace
 
 from projservo_cli.config import load_config
 from projservo_cli.stages import servo
-from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
-from projservo_cli.stages.scenario import Scenario, Watched, gains_of, limits_of, start_and_goal
+from projservo_cli.stages.plan import Profile, demands_of, plan_task
+from projservo_cli.stages.scenario import Scenario, gains_of, limits_of, start_and_goal
+from projservo_cli.stages.trace import trace_of
 from projservo_cli.stages.world import joints_of, truth_of
 from tests.conftest import ROOT
 
@@ -17,29 +18,19 @@ def configured(name, *overrides):
 
 def known_scenario(config):
     """The scenario of a configuration whose face is measured point by point; nothing is calibrated."""
-    truth = truth_of(config)
-    numbers = tuple(truth.number[i] for i in truth.face)
-    exact = start_and_goal(config, truth)
-    joints, watched = joints_of(config), Watched(len(numbers), numbers)
-    scenario = Scenario(
-        config, None, truth, joints, watched, exact, exact, gains_of(config), limits_of(config)
-    )
-    return replace(scenario, ends=scenario.shown_at(config.seed))
-
-
-def shown(scenario):
-    """Start and goal of a scenario as a plan has them."""
-    ends = scenario.ends
-    return Shown(ends.q_start, *ends.first(scenario.watched.face), scenario.truth.center)
+    truth, joints = truth_of(config), joints_of(config)
+    exact, ends = start_and_goal(config, truth)
+    gains, limits = gains_of(config, joints), limits_of(config, joints, config.noise.servo_px)
+    return Scenario(config, None, truth, joints, config.markers.face, exact, ends, gains, limits)
 
 
 def planned(scenario, model, profile="linear", samples=11, **more):
     """Plan of a scenario with a model of it."""
     asked = Profile(profile, scenario.config.trajectory.delta, samples, **more)
-    return plan_task(model, shown(scenario), asked, demands_of(scenario.config))
+    return plan_task(model, scenario.ends, asked, demands_of(scenario.config))
 
 
 def driven(scenario, plan, name, model, **limits):
     """Trace of the run of a name with a model; ``limits`` replace those of the scenario."""
     scenario = replace(scenario, limits=scenario.limits._replace(**limits))
-    return servo.recorded(scenario, plan, name, servo.drive(scenario, plan, name, model))
+    return trace_of(scenario, servo.drive(scenario, plan, name, model))

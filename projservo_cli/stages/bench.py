@@ -24,10 +24,9 @@ from projservo_cli.loop.step import Limits
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
-from projservo_cli.stages.world import truth_of
+from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.task.body import body_of
-from projservo_cli.task.face import Task, task_from_images
-from projservo_cli.task.target import task_from_body
+from projservo_cli.task.face import Task
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -42,19 +41,19 @@ class Case:
 
     def __init__(self, config: "Config") -> None:
         truth = truth_of(config)
-        ends = start_and_goal(config, truth, range(len(truth.pins)))
-        self.m, self.q_start, self.model = len(truth.face), ends.q_start, truth.model
-        self.gains = gains_of(config)
-        self.limits = limits_of(config)._replace(
+        joints, pins = joints_of(config), [truth.number[i] for i in truth.pins]
+        shown, _ = start_and_goal(config, truth, pins)
+        self.m, self.q_start, self.model = len(truth.face), shown.q_start, truth.model
+        self.gains = gains_of(config, joints)
+        self.limits = limits_of(config, joints, config.noise.servo_px)._replace(
             image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
-        self.plant = plant_of(config, truth, ends.q_start)
-        self.task = task_from_images(self.model, *ends.first(self.m), truth.center)
+        self.plant = plant_of(config, truth, shown.q_start)
+        self.task = shown.task(self.model)
         order = [*truth.face, *truth.pins]
         body = body_of(self.model, truth.M[order])
-        shown = ends.q_start, ends.s_start, ends.s_star
-        self.body_task = task_from_body(self.model, body, *shown, truth.center, self.m)
-        self.body_plant = self.plant._replace(pins=np.ascontiguousarray(truth.M[list(truth.pins)]))
+        self.body_task = shown._replace(body=body).task(self.model)
+        self.body_plant = self.plant._replace(pins=truth.of(pins))
         self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, len(order), 2))
         self.points = self._states(self.task, self.plant)
         self.whole = self._states(self.body_task, self.body_plant)

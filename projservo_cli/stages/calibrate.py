@@ -13,7 +13,15 @@ from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, calibration_seed, generator
-from projservo_cli.stages.world import Truth, image_size_of, joints_of, reference_of, robot_of, truth_of
+from projservo_cli.stages.world import (
+    Truth,
+    image_size_of,
+    joints_of,
+    outside,
+    reference_of,
+    robot_of,
+    truth_of,
+)
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
@@ -36,11 +44,10 @@ def trial_motions(config: "Config") -> FloatArray:
         for offset in np.linspace(-amplitude, amplitude, settings.frames_per_joint):
             q = reference.copy()
             q[i] += offset
-            if not joints.lower[i] <= q[i] <= joints.upper[i]:
+            if wrong := outside(q, joints.lower, joints.upper):
                 raise InputError(
-                    f"calibration: a trial would move joint {i + 1} to {q[i]:.4g}, beyond its limits "
-                    f"{joints.lower[i]:.4g} to {joints.upper[i]:.4g} (rad or m): choose another "
-                    "calibration.reference or a smaller amplitude"
+                    f"calibration: in a trial {wrong}: choose another calibration.reference or a smaller "
+                    "amplitude"
                 )
             rows.append(q)
     return np.array(rows)

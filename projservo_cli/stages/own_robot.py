@@ -90,13 +90,13 @@ def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
 
 def _believed_plant(scenario: Scenario) -> Plant:
     """The calibrated robot and face as the plant that the loop takes it for."""
-    config, calibration, m = scenario.config, scenario.calibration, scenario.watched.face
+    config, calibration = scenario.config, scenario.calibration
     model, known = calibration.model(), calibration.marker.tolist()
-    task = scenario.task_of(model, None)
+    task = scenario.ends.by_points().task(model)
     size = config.rig.image_size_px if config.rig is not None else (math.inf, math.inf)
     return Plant(
         model,
-        np.ascontiguousarray(calibration.M[[known.index(number) for number in scenario.watched.numbers[:m]]]),
+        np.ascontiguousarray(calibration.M[[known.index(n) for n in scenario.numbers[: scenario.m]]]),
         task.order,
         task.center,
         task.O,

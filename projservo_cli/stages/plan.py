@@ -15,8 +15,8 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import joint_motion, span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
-from projservo_cli.stages.scenario import Scenario, Sense, Sight, measured_task, scenario_of, sight_of
-from projservo_cli.stages.world import center_index, face_numbers, image_size_of, joints_of
+from projservo_cli.stages.scenario import Scenario, Sense, Shown, scenario_of
+from projservo_cli.stages.world import face_numbers, image_size_of, joints_of
 from projservo_cli.task.face import Task, center_of, face_plane, require_found
 from projservo_cli.task.margins import (
     BEHIND,
@@ -45,15 +45,6 @@ if TYPE_CHECKING:
 
 CONSTRAINED = "constrained"
 VIEWS = ("left", "right")
-
-
-class Shown(NamedTuple):
-    """What a task is planned from."""
-
-    q_start: FloatArray  # (n,) joint readings at the start, rad or m
-    s_start: FloatArray
-    s_star: FloatArray  # s_start, s_star: (2, m, 2) pixels of the face at the start and at the goal
-    center: int  # index of the centre marker, or ``MIDPOINT``
 
 
 class Profile(NamedTuple):
@@ -202,7 +193,7 @@ def _motion(reaching: Reaching, profile: Profile, pure_translation: float) -> tu
 
 
 def _partitioned(
-    model: Model, shown: Shown, rehearse: bool, bounds: tuple[FloatArray, FloatArray], sight: Sight | None
+    model: Model, shown: Shown, rehearse: bool, bounds: tuple[FloatArray, FloatArray]
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; ``rehearse`` half turns within joint limits.
 
@@ -210,9 +201,8 @@ def _partitioned(
     and rotations, a half turn in the sense that was rehearsed; note: what to say of the rehearsal. Raises
     WorkFailed if a marker cannot be triangulated or a motion is not unique.
     """
-    n, m = len(shown.q_start), shown.s_start.shape[1]
-    task = measured_task(model, *shown, sight)
-    seen = straight_views(model.lens, shown.s_start if sight is None else sight.s_start)
+    n, m = len(shown.q_start), shown.s_start.shape[1] - shown.pins
+    task, seen = shown.task(model), straight_views(model.lens, shown.s_start)
     span = span_of(model, task.A_star)
     state, stage = new_state(n, m, span=span), new_stage(model, m, *bounds, span)
     status, parts, arrives = begin(model, task, seen, shown.q_start, rehearse, state, stage)
@@ -286,7 +276,7 @@ def run(config: "Config", calibration: Calibration) -> Plan:
     scenario, trajectory = scenario_of(config, calibration), config.trajectory
     return plan_task(
         calibration.model(),
-        _shown(scenario),
+        scenario.ends,
         Profile(
             trajectory.profile,
             trajectory.delta,
@@ -295,30 +285,21 @@ def run(config: "Config", calibration: Calibration) -> Plan:
             trajectory.ramp_s,
         ),
         demands_of(config, calibration.joint_types),
-        sight_of(scenario),
     )
 
 
-def _shown(scenario: Scenario) -> Shown:
-    ends = scenario.ends
-    return Shown(ends.q_start, *ends.first(scenario.watched.face), center_index(scenario.config))
-
-
-def plan_task(
-    model: Model, shown: Shown, profile: Profile, demands: Demands, sight: Sight | None = None
-) -> Plan:
+def plan_task(model: Model, shown: Shown, profile: Profile, demands: Demands) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
     model : calibrated model.
     shown : start and goal.
     profile : the motion that is asked for.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
-    sight : the body to measure with; without it the face is measured point by point.
     Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
     fast.
     """
-    rehearse, bounds = rehearses(profile.name), (demands.lower, demands.upper)
-    state, task, parts, note = _partitioned(model, shown, rehearse, bounds, sight)
+    rehearse, bounds, face = rehearses(profile.name), (demands.lower, demands.upper), shown.by_points()
+    state, task, parts, note = _partitioned(model, shown, rehearse, bounds)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
@@ -357,8 +338,8 @@ def plan_task(
         condition=motion.along.condition,
         least=least,
         least_mu=least_mu,
-        s_start=shown.s_start,
-        s_star=shown.s_star,
+        s_start=face.s_start,
+        s_star=face.s_star,
         A=state.A,
         A_star=task.A_star,
         A_t=state.A_t,
@@ -435,9 +416,8 @@ def rotation_sense(scenario: Scenario) -> Sense:
     joints = joints_of(config, calibration.joint_types)
     state, task, parts, _ = _partitioned(
         calibration.model(),
-        _shown(scenario),
+        scenario.ends,
         rehearses(profile),
         (joints.lower, joints.upper),
-        sight_of(scenario),
     )
     return Sense(signed(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3]), task)

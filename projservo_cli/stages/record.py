@@ -14,7 +14,7 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.calibrate import images_at, trial_motions
 from projservo_cli.stages.own_robot import drive_to, foreign_robot, near, step_limit
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, calibration_seed, generator
-from projservo_cli.stages.world import Truth, joints_of, truth_of
+from projservo_cli.stages.world import Truth, joints_of, outside, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 if TYPE_CHECKING:
@@ -112,7 +112,8 @@ def prepare(
     if motions is not None:
         joints = joints_of(config)
         for pose, q in zip(motions.pose, motions.q, strict=True):
-            joints.require_inside(q, f"motions: pose {pose}")
+            if wrong := outside(q, joints.lower, joints.upper):
+                raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
     key = digest(config, DEPENDS_ON)[:16]
     recording = Recording(path, key, targets, np.array(numbers, dtype=np.int64))

@@ -51,16 +51,7 @@ def run(
     ``control.without_plan`` refuses to go without.
     """
     scenario = scenario_of(config, calibration)
-    return recorded(scenario, plan, name, drive(scenario, plan, name))
-
-
-def recorded(scenario: Scenario, plan: Plan | Sense, name: str, run: Run) -> Trace:
-    """Trace of the run of a name, and why it went without the plan if it did."""
-    why, planned_s = _unplanned(scenario, plan, name), None
-    if run.mode != REPLAN and not why and isinstance(plan, Plan) and plan.duration is not None:
-        planned_s = plan.duration / scenario.config.plant.speed_scale
-    untested = own_robot.untested(scenario) if scenario.truth is None else ""
-    return trace_of(scenario, run, planned_s=planned_s, unplanned=why, untested=untested)
+    return trace_of(scenario, drive(scenario, plan, name))
 
 
 def drive(scenario: Scenario, plan: Plan | Sense, name: str, believed: Model | None = None) -> Run:
@@ -71,7 +62,13 @@ def drive(scenario: Scenario, plan: Plan | Sense, name: str, believed: Model | N
     Raises InputError, WorkFailed as of ``run``.
     """
     law, mode = law_and_mode(name)
-    replans = mode == REPLAN or bool(_unplanned(scenario, plan, name))
+    unplanned, planned_s = "", None
+    if mode != REPLAN and isinstance(plan, Plan):
+        if not np.isfinite(plan.q).all() and scenario.config.control.without_plan != "refuse":
+            unplanned = f"no joints can follow the plan: {plan.reason}"
+        elif plan.duration is not None:
+            planned_s = plan.duration / scenario.config.plant.speed_scale
+    replans = mode == REPLAN or bool(unplanned)
     if scenario.truth is None:
         assert isinstance(plan, Plan)
         run = _drive_own_robot(scenario, plan, law, replans)
@@ -82,7 +79,7 @@ def drive(scenario: Scenario, plan: Plan | Sense, name: str, believed: Model | N
         run = _driven_in_python(scenario, controller, simulated)
     else:
         run = _drive_compiled(scenario, plan, law, replans, believed)
-    return run._replace(law=law, mode=mode)
+    return run._replace(law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
 
 
 def in_compiled_loop(config: "Config", law: str) -> bool:
@@ -96,29 +93,20 @@ def sense_is_enough(config: "Config", name: str) -> bool:
     return mode == REPLAN and in_compiled_loop(config, law)
 
 
-def _unplanned(scenario: Scenario, plan: Plan | Sense, name: str) -> str:
-    """Why a run that was to follow the plan goes without it; empty where it follows, or never was to."""
-    mode = law_and_mode(name)[1]
-    if mode == REPLAN or not isinstance(plan, Plan) or np.isfinite(plan.q).all():
-        return ""
-    refused = scenario.config.control.without_plan == "refuse"
-    return "" if refused else f"no joints can follow the plan: {plan.reason}"
-
-
 def _drive_compiled(
     scenario: Scenario, plan: Plan | Sense, law: str, replans: bool, believed: Model | None
 ) -> Run:
     """Drive a built-in law on the simulated robot in the compiled loop."""
     model = scenario.believed_by(law) if believed is None else believed
-    body, ends, gains, limits = scenario.body_of(law), scenario.ends, scenario.gains, scenario.limits
+    ends, gains, limits = scenario.ends, scenario.gains, scenario.limits
     # Of the same model and images, the task of the plan is that of a law that measures as the plan does.
     task = plan.task if isinstance(plan, Sense) and law in BODY_LAWS else None
     if task is None or believed is not None:
-        task = scenario.task_of(model, body)
+        task = scenario.shown_to(law).task(model)
     if not replans:
         assert isinstance(plan, Plan)
         task = followed(model, task, plan, gains.period, 1.0)
-    n, m, observed = len(ends.q_start), scenario.watched.face, len(scenario.numbers_of(law))
+    n, m, observed = len(ends.q_start), scenario.m, len(scenario.numbers_of(law))
     span = span_of(model, task.A_star)
     state = new_state(n, m, observed, span)
     state.memory.rotation[:] = in_span(span, model, ends.q_start, plan.rotation_sense())
@@ -134,7 +122,7 @@ def _drive_compiled(
 def _driven_in_python(scenario: Scenario, law: LoopLaw, plant: AnalyticPlant | DrivenRobot) -> Run:
     """Drive any law on any plant, every command scaled."""
     gains, scale = scenario.gains, scenario.config.plant.speed_scale
-    s_star = scenario.ends.first(scenario.watched.face)[1]
+    s_star = scenario.ends.by_points().s_star
     code, steps, log = run_in_python(law, plant, s_star, gains.period, scenario.limits, scale)
     limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
     return Run(VERDICTS[code], plant.disturbance, steps, log, limited, plant.plant)
@@ -224,16 +212,17 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
     Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks, or
     the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the plan.
     """
-    gains, ends = scenario.gains, scenario.ends
+    gains, ends = scenario.gains, scenario.ends.by_points()
     if law not in CODES:
-        m, known = scenario.watched.face, scenario.calibration.marker.tolist()
-        face = np.array([known.index(number) for number in scenario.watched.numbers[:m]])
-        setup = LawSetup(image_model(scenario.calibration), face, *ends.first(m), plan, gains, gains.period)
+        known = scenario.calibration.marker.tolist()
+        face = np.array([known.index(number) for number in scenario.numbers[: scenario.m]])
+        model = image_model(scenario.calibration)
+        setup = LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period)
         # What a law writes to must not be what other laws are given.
         own = copy.deepcopy(setup)
         return ForeignLaw(plugins.make("law", law, ("__call__",), (own,), {}), f"law {law}")
     believed = scenario.believed_by(law)
-    task = scenario.task_of(believed, scenario.body_of(law))
+    task = scenario.shown_to(law).task(believed)
     if not replans:
         task = followed(believed, task, plan, gains.period, scenario.config.plant.speed_scale)
     built_in = BuiltInLaw(CODES[law], believed, task, gains)

@@ -19,7 +19,7 @@ from projservo_cli.geometry.displacement import (
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.plan import Profile, Shown, plan_task
+from projservo_cli.stages.plan import Profile, plan_task
 from projservo_cli.stages.scenario import Scenario, Sense, idealized, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.trace import trace_of
@@ -87,10 +87,9 @@ def comparison_of(config: "Config", calibration: Calibration, plan: Plan) -> Com
     done.
     """
     truth_of(config)  # refuses what lacks a part of the simulation
-    scenario = idealized(scenario_of(config, calibration))
-    limits = scenario.limits._replace(
-        image_px=config.stop.image_px, stop_at_joint_limit=False, stop_at_border=False
-    )
+    control = config.control.model_copy(update={"observation": "points"})
+    scenario = scenario_of(idealized(config).model_copy(update={"control": control}), calibration)
+    limits = scenario.limits._replace(stop_at_joint_limit=False, stop_at_border=False)
     scenario = replace(scenario, limits=limits)
     assert scenario.truth is not None
     metric = scenario.truth.model
@@ -151,10 +150,10 @@ def metric_plan(bench: Comparison, delta: float) -> Plan:
 
     Raises WorkFailed if the task cannot be partitioned.
     """
-    ends, robot = bench.scenario.ends, bench.truth.robot
+    robot = bench.truth.robot
     return plan_task(
         bench.models["true"],
-        Shown(ends.q_start, ends.s_start, ends.s_star, bench.truth.center),
+        bench.scenario.ends,
         Profile("linear", delta, 2),
         within(robot.lower, robot.upper),
     )

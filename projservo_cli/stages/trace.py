@@ -12,6 +12,7 @@ from projservo_cli.loop.step import Limits, plateau_stretch, tolerance
 from projservo_cli.loop.summary import MM, Summary, path_deviation, summary
 from projservo_cli.records import REPLAN, FloatArray, Trace
 from projservo_cli.robots.simulated import Plant
+from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.task.face import center_of
 
@@ -29,33 +30,30 @@ class Run(NamedTuple):
     plant: Plant  # that was driven; of a robot that is not simulated what the calibration takes it for
     law: str = ""
     mode: str = REPLAN  # law, mode: what it is a run of
+    planned_s: float | None = None  # when the plan that it followed arrives, s
+    unplanned: str = ""  # why it went without the plan that it was to follow
 
 
 def summary_of(scenario: Scenario, run: Run) -> Summary:
     """Numbers of a run; NaN where they need a truth that nobody knows."""
-    return summary(run.plant, run.log, run.steps, run.limited, scenario.gains.period, scenario.true_ends())
+    return summary(run.plant, run.log, run.steps, run.limited, scenario.gains.period, scenario.true_ends)
 
 
 def deviation_between_samples_mm(scenario: Scenario, run: Run, found: Summary) -> float:
     """Largest distance of the true centre from its line, between the samples too, mm."""
     start = run.log.H[0] @ np.array(center_of(run.plant.M, run.plant.center))
-    goal, period = scenario.true_ends().goal, scenario.gains.period
+    goal, period = scenario.true_ends.goal, scenario.gains.period
     between = path_deviation(run.plant, run.log, run.steps, period, start, goal, SUBSAMPLES)
     return max(MM * between, found.center_deviation_at_samples_mm)
 
 
-def trace_of(
-    scenario: Scenario, run: Run, *, planned_s: float | None = None, unplanned: str = "", untested: str = ""
-) -> Trace:
-    """Record of a run.
-
-    planned_s : when the plan that it followed arrives, s.
-    unplanned, untested : why it went without the plan, and without a test of the images.
-    """
+def trace_of(scenario: Scenario, run: Run) -> Trace:
+    """Record of a run."""
     log, steps, limits = run.log, run.steps, scenario.limits
     rows = steps + 1
     found = summary_of(scenario, run)
-    known = scenario.exact.goal_pose is not None
+    ends = scenario.true_ends
+    known = bool(np.isfinite(ends.goal).all())
     between = deviation_between_samples_mm(scenario, run, found) if known else math.nan
     before, after, views = log.fit[:rows].T
     errors, H = log.errors[:rows], log.H[:rows]
@@ -64,12 +62,11 @@ def trace_of(
     outside, beyond, joint = (int(x) for x in log.events[:3])
     simulated = scenario.truth is not None
     stretch = plateau_stretch(log.judged[:rows], limits.plateau_steps)
-    ends = scenario.true_ends()
-    s_star = scenario.ends.first(scenario.watched.face)[1]
+    s_star = scenario.ends.by_points().s_star
     return Trace(
         law=run.law,
         mode=run.mode,
-        planned_s=planned_s,
+        planned_s=run.planned_s,
         verdict=run.verdict,
         reason=run.disturbance or _reason(run, limits, joint, remaining),
         steps=steps,
@@ -111,8 +108,8 @@ def trace_of(
         pose=H @ ends.base_tool,
         goal_pose=ends.goal_pose,
         center=_centers(run) if simulated else np.full((rows, 3), np.nan),
-        unplanned=unplanned,
-        untested=untested,
+        unplanned=run.unplanned,
+        untested="" if simulated else untested(scenario),
     )
 
 

@@ -1,6 +1,7 @@
 """The world of a simulated experiment: robot, rig and markers as a configuration describes them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, NamedTuple
@@ -8,7 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.loop.summary import Ends
+from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model
 from projservo_cli.robots.truth import (
     Robot,
     dh_robot,
@@ -19,12 +21,11 @@ from projservo_cli.robots.truth import (
     rotation_about_axis,
     twist,
 )
-from projservo_cli.task.face import MIDPOINT
+from projservo_cli.task.face import MIDPOINT, center_of
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
-    from projservo_cli.config.models import Perturbation
-    from projservo_cli.config.models import Task as TaskSettings
+    from projservo_cli.config.models import Goal
     from projservo_cli.config.robot import Camera, JointVector, Markers, Rig
     from projservo_cli.config.robot import Robot as DescribedRobot
 
@@ -37,13 +38,13 @@ class Joints(NamedTuple):
     upper: FloatArray  # lower, upper: (n,) limits, rad or m; infinite where none is set
     speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
 
-    def require_inside(self, q: FloatArray, where: str) -> None:
-        """Refuse readings (n,) outside the limits."""
-        for i in np.flatnonzero((q < self.lower) | (q > self.upper)):
-            raise InputError(
-                f"{where} puts joint {i + 1} at {q[i]:.6g}, beyond its limits {self.lower[i]:.6g} to "
-                f"{self.upper[i]:.6g} (rad or m): choose another"
-            )
+
+def outside(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
+    """Which of the readings (n,) lies beyond its limits, in words; empty where none does."""
+    for i in np.flatnonzero((q < lower) | (q > upper)):
+        limits = f"{lower[i]:.6g} to {upper[i]:.6g} (rad or m)"
+        return f"joint {i + 1} would be at {q[i]:.6g}, beyond its limits {limits}"
+    return ""
 
 
 def reference_of(config: "Config") -> "JointVector | None":
@@ -105,6 +106,16 @@ class Truth:
         """Indices of the markers that are not on the face."""
         return tuple(i for i in range(len(self.M)) if i not in self.face)
 
+    def of(self, numbers: Sequence[int]) -> FloatArray:
+        """Markers (k, 4) of some numbers at the robot's reference, m."""
+        return np.ascontiguousarray(self.M[[self.number.index(number) for number in numbers]])
+
+    def ends(self, q_goal: FloatArray) -> Ends:
+        """Where the robot holds the tool at its reference and at the goal joints (n,)."""
+        base_tool, pose = self.robot.base_tool, self.robot.pose(q_goal)
+        middle = np.array(center_of(self.M_face, self.center))
+        return Ends(base_tool, pose, pose @ np.linalg.solve(base_tool, middle))
+
     def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
         """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
         return project(self.P, M @ self.displacement(q).T)
@@ -129,9 +140,10 @@ def face_numbers(config: "Config") -> tuple[int, ...]:
 
 def center_index(config: "Config") -> int:
     """Position of the centre marker within the face, or ``MIDPOINT``."""
+    face = face_numbers(config)
     assert config.markers is not None
     center = config.markers.center
-    return MIDPOINT if center == "midpoint" else face_numbers(config).index(center)
+    return MIDPOINT if center == "midpoint" else face.index(center)
 
 
 def truth_of(config: "Config") -> Truth:
@@ -208,34 +220,15 @@ def camera_of(camera: "Camera") -> FloatArray:
     )
 
 
-def goal_joints(task: "TaskSettings", types: str, truth: Truth, q_start: FloatArray) -> FloatArray:
-    """Joints (n,) of a goal that is given by them or by a turn of the true robot, rad or m."""
-    if task.goal.joints is not None:
-        return np.array(task.goal.joints.values(types))
-    assert task.goal.turn_deg is not None
-    return _turned(truth, q_start, task.goal.turn_deg, task.goal.perturbation)
-
-
-def _turned(
-    truth: Truth, q_start: FloatArray, turn_deg: float, perturbation: "Perturbation | None"
-) -> FloatArray:
-    """Joints after a turn about the roll axis of the rig and a small displacement of the tool."""
+def turned(truth: Truth, q_start: FloatArray, goal: "Goal") -> FloatArray:
+    """Joints after a turn about the roll axis of the rig and a small displacement of the tool, rad or m."""
+    assert goal.turn_deg is not None
     point, direction = roll_axis(truth.P)
-    goal = rotation_about_axis(point, direction, math.radians(turn_deg)) @ truth.robot.pose(q_start)
-    if perturbation is not None:
-        v = np.array(perturbation.rotation_rad)
-        t = np.array(perturbation.translation_m)
+    pose = rotation_about_axis(point, direction, math.radians(goal.turn_deg)) @ truth.robot.pose(q_start)
+    if goal.perturbation is not None:
+        v = np.array(goal.perturbation.rotation_rad)
+        t = np.array(goal.perturbation.translation_m)
         angle = float(np.linalg.norm(v))
         turn = rotation_about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
-        goal = goal @ rigid(np.eye(3), t) @ turn
-    return inverse_kinematics(truth.robot, goal, q_start)
-
-
-def require_limits(robot: Robot, q: FloatArray, where: str) -> None:
-    """Refuse joints outside the limits."""
-    for i, value in enumerate(q):
-        if not robot.lower[i] <= value <= robot.upper[i]:
-            raise WorkFailed(
-                f"{where}: joint {i + 1} would be at {value:.4g}, outside its limits "
-                f"{robot.lower[i]:.4g} to {robot.upper[i]:.4g} (rad or m): choose others or wider limits"
-            )
+        pose = pose @ rigid(np.eye(3), t) @ turn
+    return inverse_kinematics(truth.robot, pose, q_start)

@@ -20,8 +20,8 @@ from projservo_cli.records import Calibration, FloatArray, IntArray, Trace, Work
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.servo import drive, recorded, sense_is_enough
-from projservo_cli.stages.trace import deviation_between_samples_mm, summary_of
+from projservo_cli.stages.servo import drive, sense_is_enough
+from projservo_cli.stages.trace import deviation_between_samples_mm, summary_of, trace_of
 from projservo_cli.sweep.design import RUNS, Design, name_of_run, seed_of
 from projservo_cli.task.body import NO_BODY
 
@@ -230,12 +230,12 @@ def is_compiled(config: Config, name: str) -> bool:
 
 def _setting_of(scenario: Scenario, law: str) -> Setting:
     """All that compiled runs of a law share whose seeds differ."""
-    watched, model = scenario.watched, scenario.calibration.model()
+    body, model = scenario.exact.body, scenario.calibration.model()
     return Setting(
         CODES[law],
         model,
         scenario.believed_by(law),
-        NO_BODY if watched.body is None else watched.body,
+        NO_BODY if body is None else body,
         law in BODY_LAWS,
         rehearses(scenario.config.trajectory.profile),
         scenario.gains,
@@ -244,7 +244,7 @@ def _setting_of(scenario: Scenario, law: str) -> Setting:
         scenario.joints.lower,
         scenario.joints.upper,
         scenario.exact.q_start,
-        scenario.true_ends(),
+        scenario.true_ends,
     )
 
 
@@ -254,7 +254,7 @@ def numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray
     Raises WorkFailed if the task cannot be begun, whatever the seed.
     """
     setting = _setting_of(scenario, law)
-    desk = new_desk(setting, len(scenario.watched.numbers))
+    desk = new_desk(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))
     for first in range(0, len(seeds), TOGETHER):
         last = first + TOGETHER
@@ -309,4 +309,4 @@ def _run(
     row = {"verdict": made.verdict, "steps": made.steps, **summary._asdict()}
     if design.sweep.between_samples:
         row[BETWEEN.name] = deviation_between_samples_mm(scenario, made, summary)
-    return row, recorded(scenario, plan, name, made) if keep else None
+    return row, trace_of(scenario, made) if keep else None

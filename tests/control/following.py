@@ -5,7 +5,8 @@ import math
 import numpy as np
 
 from projservo_cli.records import NO_LENS
-from projservo_cli.stages.plan import Profile, Shown, plan_task
+from projservo_cli.stages.plan import Profile, plan_task
+from projservo_cli.stages.scenario import Shown
 from projservo_cli.task.following import followed
 from projservo_cli.task.margins import within
 from tests.scene import GAINS, Run, limits

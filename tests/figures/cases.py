@@ -40,7 +40,9 @@ def case(name="paper", steps=SHORT, whole=False):
     for law in FOLLOWING:
         followed = name_of(law, following_mode(law))
         traces[followed] = driven(scenario, plan, followed, model)
-    clean = replace(idealized(scenario), limits=scenario.limits._replace(stop_at_joint_limit=False))
+    clean = replace(
+        known_scenario(idealized(config)), limits=scenario.limits._replace(stop_at_joint_limit=False)
+    )
     models = {"true": true.model, "twin": model, "calibrated": model}
     bench = studies.Comparison(clean, models, sense)
     extra = studies.run_studies(bench) if whole else studies.run_studies(bench, GAINS, PERIODS_S)

@@ -29,7 +29,7 @@ def constrained(name, model=None, samples=101, **demands):
     example = case(name)
     return plan_task(
         example.truth.model if model is None else model,
-        example.shown,
+        example.ends,
         Profile("constrained", samples=samples),
         demands_of(example.config)._replace(**demands),
     )

@@ -12,7 +12,8 @@ import numpy as np
 
 from projservo_cli.config import load_config
 from projservo_cli.records import Plan, WorkFailed
-from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
+from projservo_cli.stages.plan import Profile, demands_of, plan_task
+from projservo_cli.stages.scenario import Shown
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.tasks import random_tasks

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
+from projservo_cli.stages.plan import Profile, demands_of, plan_task
+from projservo_cli.stages.scenario import Shown
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 

@@ -139,7 +139,7 @@ def test_what_makes_a_task_infeasible_is_named():
 
 def test_a_start_that_is_the_goal_is_planned_as_no_motion():
     example = case("ur5")
-    shown = example.shown._replace(s_star=example.shown.s_start)
+    shown = example.ends._replace(s_star=example.ends.s_start)
     asked = Profile("constrained", samples=5)
     plan = plan_task(example.truth.model, shown, asked, demands_of(example.config))
     assert plan.feasible

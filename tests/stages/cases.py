@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from projservo_cli.stages.scenario import Sense
-from tests.known import configured, driven, known_scenario, planned, shown
+from projservo_cli.stages.scenario import Sense, idealized
+from tests.known import configured, driven, known_scenario, planned
 
 
 class Case:
@@ -16,7 +16,6 @@ class Case:
         self.config = configured(name, *overrides)
         self.scenario = known_scenario(self.config)
         self.truth, self.ends = self.scenario.truth, self.scenario.ends
-        self.shown = shown(self.scenario)
         self.plant = self.scenario.plant_of("direct_three")
         self.gains, self.limits = self.scenario.gains, self.scenario.limits
         self.plan = self.planned(self.truth.model)
@@ -27,7 +26,8 @@ class Case:
 
     def servo(self, law, model=None, gains=None, sense=None, **limits):
         """Trace of one law without noise, by default with the true metric model and the planned sense."""
-        scenario = replace(self.scenario, gains=self.gains if gains is None else gains, ideal=True)
+        gains, clean = self.gains if gains is None else gains, idealized(self.config)
+        scenario = replace(self.scenario, config=clean, exact=self.ends, gains=gains)
         sense = Sense(self.plan.rotation_sense() if sense is None else sense, None)
         return driven(scenario, sense, law, self.truth.model if model is None else model, **limits)
 
@@ -41,7 +41,7 @@ class Case:
     def goal_center(self):
         """True centre of the face at the goal, m."""
         body = np.linalg.solve(self.truth.robot.base_tool, self.truth.M_face.mean(axis=0))
-        return (self.ends.goal_pose @ body)[:3]
+        return (self.scenario.true_ends.goal_pose @ body)[:3]
 
 
 @cache

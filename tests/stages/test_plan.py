@@ -96,7 +96,7 @@ def test_an_infeasible_profile_is_named():
 def test_a_start_that_is_the_goal_is_a_plan_without_motion():
     example = case("ur5")
     bounds = within(example.truth.robot.lower, example.truth.robot.upper)
-    shown = example.shown._replace(s_star=example.shown.s_start)
+    shown = example.ends._replace(s_star=example.ends.s_start)
     plan = plan_task(example.truth.model, shown, Profile(samples=5), bounds)
     assert plan.tau == 0.0
     assert abs(plan.theta_s) < 1e-9

@@ -14,7 +14,7 @@ from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import Sense, StartAndGoal, Watched, scenario_of
+from projservo_cli.stages.scenario import Sense, scenario_of
 from tests.known import driven
 from tests.stages.cases import Case, case
 
@@ -33,7 +33,7 @@ def bounds_at_goal(example, sigma):
     """Least rms errors of the centre, mm, and of the rotation, deg, of one look at the goal (Cramér–Rao)."""
     truth = example.truth
     M = truth.M[[*truth.face, *truth.pins]]
-    M = M @ (example.ends.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T
+    M = M @ (example.scenario.true_ends.goal_pose @ np.linalg.inv(truth.robot.base_tool)).T
 
     def images(x):
         R = Rotation.from_rotvec(x[3:]).as_matrix()
@@ -52,22 +52,19 @@ def steady(law, sigma, observation, runs):
     scenario = scenario_of(example.config, calibration)
     assert scenario.exact.s_start.shape[1] == 10
     if observation == "points":
-        scenario = replace(scenario, watched=Watched(4, scenario.watched.numbers[:4]))
-    exact, sense = scenario.exact, Sense(planned.rotation_sense(), None)
-    noisy = scenario.config.model_copy(update={"noise": Noise(servo_px=sigma)})
+        scenario = replace(scenario, numbers=scenario.numbers[:4], exact=scenario.exact.by_points())
+    sense = Sense(planned.rotation_sense(), None)
+    noise = Noise(servo_px=sigma, shown_frames=1)
     position, rotation, verdicts = [], [], Counter()
     for seed in range(runs):
-        rng = np.random.default_rng(seed)
-        shown = [s + sigma * rng.standard_normal(s.shape) for s in (exact.s_start, exact.s_star)]
-        ends = StartAndGoal(exact.q_start, exact.goal_pose, *shown)
-        config = noisy.model_copy(update={"seed": seed})
+        config = scenario.config.model_copy(update={"noise": noise, "seed": seed})
         limits = {"image_px": 1e-9, "max_steps": STEPS}
-        trace = driven(replace(scenario, config=config, ends=ends), sense, law, None, **limits)
+        trace = driven(replace(scenario, config=config), sense, law, None, **limits)
         verdicts[trace.verdict] += 1
         assert trace.observation == observation
         gap = 1e3 * np.linalg.norm(trace.center[TAIL:] - example.goal_center, axis=1)
         turn = [
-            math.degrees(angle_between(as_mat(pose), as_mat(example.ends.goal_pose)))
+            math.degrees(angle_between(as_mat(pose), as_mat(example.scenario.true_ends.goal_pose)))
             for pose in trace.pose[TAIL:]
         ]
         position.append(np.mean(gap**2))
@@ -127,15 +124,15 @@ def test_points_measure_the_face_alone():
     example, calibration, planned = noisy("control.observation=points")
     trace = servo.run(example.config, calibration, planned, "direct_two")
     assert trace.observation == "points"
-    assert scenario_of(example.config, calibration).watched.body is None
+    assert scenario_of(example.config, calibration).exact.body is None
 
 
 def test_a_calibration_that_is_not_usable_has_no_body_unless_one_is_asked_for():
     example, calibration, _ = calibrated()
     poor = replace(calibration, usable=False)
-    assert scenario_of(example.config, poor).watched.body is None
+    assert scenario_of(example.config, poor).exact.body is None
     asked = Case("paper", ["control.observation=body"])
-    assert scenario_of(asked.config, poor).watched.body is not None
+    assert scenario_of(asked.config, poor).exact.body is not None
 
 
 def test_only_markers_that_the_calibration_knows_are_used():
@@ -144,10 +141,10 @@ def test_only_markers_that_the_calibration_knows_are_used():
     fewer = replace(calibration, marker=calibration.marker[keep], M=calibration.M[keep])
     some = scenario_of(example.config, fewer)
     full = scenario_of(example.config, calibration)
-    assert len(some.watched.pins) == 2
+    assert some.numbers[4:] == (5, 9)
     order = [0, 1, 2, 3, 5, 9]
-    assert np.abs(some.watched.body.M - full.watched.body.M[order]).max() < 1e-15
-    assert (some.watched.pins == example.truth.M[[5, 9]]).all()
+    assert np.abs(some.exact.body.M - full.exact.body.M[order]).max() < 1e-15
+    assert (some.plant_of("exact").pins == example.truth.M[[5, 9]]).all()
     assert (some.ends.s_star == full.ends.s_star[:, order]).all()
 
 

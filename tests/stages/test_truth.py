@@ -38,7 +38,7 @@ def test_the_reference_task(reference_truth):
     assert example.plan.theta_r == pytest.approx(math.radians(task["theta_r_deg"]), abs=1e-9)
     assert example.plan.theta_s == pytest.approx(math.pi, abs=1e-9)
     goal = example.truth.robot.pose(np.array(task["q_goal"]))
-    assert example.ends.goal_pose == pytest.approx(goal, abs=0)
+    assert example.scenario.true_ends.goal_pose == pytest.approx(goal, abs=0)
 
 
 @pytest.mark.parametrize("turn_deg", [180, 165])
@@ -46,8 +46,8 @@ def test_turn_about_the_roll_axis_of_the_rig(turn_deg):
     """Start and goal differ by that rotation about the axis midway between the cameras."""
     config = loaded("paper", f"task.goal.turn_deg={turn_deg}")
     truth = truth_of(config)
-    reach = start_and_goal(config, truth)
-    T = reach.goal_pose @ np.linalg.inv(truth.robot.pose(reach.q_start))
+    shown, ends = start_and_goal(config, truth)
+    T = ends.goal_pose @ np.linalg.inv(truth.robot.pose(shown.q_start))
     axis = np.array([-1.0, 0, 0])  # the cameras look along −x of the base, symmetric about y = 0
     eigenvalues = np.linalg.eigvals(T[:3, :3])
     assert np.abs(np.angle(eigenvalues)).max() == pytest.approx(abs(math.radians(turn_deg)), abs=1e-9)
@@ -103,7 +103,7 @@ def test_an_unreachable_goal_is_refused():
 
 
 def test_perturbation_displaces_the_goal_by_what_it_says():
-    exact, other = case("paper").ends, case("paper_perturbed").ends
+    exact, other = (case(name).scenario.true_ends for name in ("paper", "paper_perturbed"))
     gap = np.linalg.inv(exact.goal_pose) @ other.goal_pose
     assert 5e-4 < np.linalg.norm(gap[:3, 3]) < 2e-3
     assert 5e-4 < np.linalg.norm(gap[:3, :3] - np.eye(3)) / math.sqrt(2) < 2e-3
@@ -162,9 +162,9 @@ def test_an_offset_moves_the_start_and_leaves_the_goal():
     plain = loaded("paper")
     moved = loaded("paper", "task.start_offset={joints: [1, -2, 3, 0, 0, 0], unit: deg}")
     truth = truth_of(plain)
-    start, goal = start_and_goal(plain, truth), start_and_goal(moved, truth_of(moved))
-    assert np.allclose(np.degrees(goal.q_start - start.q_start), [1, -2, 3, 0, 0, 0], atol=1e-12)
-    assert np.array_equal(start.goal_pose, goal.goal_pose)
+    (start, goal), (there, same) = start_and_goal(plain, truth), start_and_goal(moved, truth_of(moved))
+    assert np.allclose(np.degrees(there.q_start - start.q_start), [1, -2, 3, 0, 0, 0], atol=1e-12)
+    assert np.array_equal(goal.goal_pose, same.goal_pose)
     beyond = loaded("paper", "task.start_offset={joints: [300, 0, 0, 0, 0, 0], unit: deg}")
     with pytest.raises(WorkFailed, match=r"task\.start_offset: joint 1"):
         start_and_goal(beyond, truth)
