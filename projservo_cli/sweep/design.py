@@ -19,7 +19,7 @@ from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.records import FloatArray, InputError, IntArray, law_and_mode, names_of
 from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.tasks import STRATA, random_tasks
+from projservo_cli.sweep.tasks import random_tasks
 
 
 def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
@@ -216,7 +216,7 @@ class Design:
 
     @lru_cache(maxsize=64)  # noqa: B019 - a process has one design
     def tasks(self, base: int) -> tuple[FloatArray, FloatArray]:
-        """Random tasks of a base: joints (k, n) at start and goal, rad or m, a stratum after the other."""
+        """Random tasks of a base: joints (k, n) at start and goal, rad or m, one of each stratum in turn."""
         config = self.cell(base * (self.cells // len(self.bases)))
         assert config.task is not None
         assert config.robot is not None
@@ -225,10 +225,7 @@ class Design:
         q_front = np.array(config.task.start.values(config.robot.joint_types))
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
         tasks = random_tasks(truth_of(config), q_front, count, rng)
-        quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]  # they come sorted by stratum
-        first = np.cumsum([0, *quota[:-1]])
-        order = [first[i] + k for k in range(max(quota)) for i in range(STRATA) if k < quota[i]]
-        return tasks.q_start[order], tasks.q_goal[order]
+        return tasks.q_start, tasks.q_goal
 
     def config(self, run: int) -> Config:
         """Configuration of a run."""

@@ -16,13 +16,11 @@ from projservo_cli.store import write_part
 from projservo_cli.sweep.design import Design, name_of_run
 from projservo_cli.sweep.engine import Engine
 from projservo_cli.sweep.folder import Calibrated, Folder, Status
-from projservo_cli.sweep.runs import Part, compiled_by, run_part
+from projservo_cli.sweep.runs import Part, is_compiled, run_part
 
 PARTS = 4  # of each worker at least
-SHARED, OWN = (
-    2_000,
-    100,
-)  # runs that take a second or two, by whether many have all but their images in common
+# Runs that take a second or two, by whether many have all but their images in common.
+SHARED, OWN = 2_000, 100
 CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
 SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 # Indices of the machine code of the closed loop, by whether many runs are made in one call.
@@ -112,7 +110,7 @@ def _shares_settings(design: Design) -> bool:
     settings = math.lcm(design.sweep.calibrations, tasks)
     if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:
         return False
-    return all(compiled_by(design, design.cell(cell)) for cell in range(design.cells))
+    return all(is_compiled(design, design.cell(cell)) for cell in range(design.cells))
 
 
 def calibrate_one(wanted: tuple[str, Config]) -> Calibrated:
@@ -129,7 +127,7 @@ def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) ->
 
     That process ends here: the compiler keeps hundreds of megabytes.
     """
-    loop = LOOPS[compiled_by(design, design.cell(0))]
+    loop = LOOPS[is_compiled(design, design.cell(0))]
     if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
         return
     say("compiling kernels, once, before the processes start")

@@ -15,7 +15,7 @@ from projservo_cli.config.sweep import Distribution
 from projservo_cli.control import BODY_LAWS, CODES
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.step import RUNNING, VERDICTS
-from projservo_cli.loop.trial import NUMBERS, VERDICT, Desk, Setting, new_desk, trials
+from projservo_cli.loop.trial import NUMBERS, VERDICT, Setting, new_desk, trials
 from projservo_cli.records import Calibration, FloatArray, IntArray, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
@@ -148,7 +148,7 @@ def run_part(part: Part) -> Made:
                 continue
             _put(table, rows, {"usable": int(calibration.usable)})
             config = design.config(at.run)
-            if compiled_by(design, config):
+            if is_compiled(design, config):
                 _put(table, rows, _measured(config, calibration, table["seed"][rows]))
                 these = np.array([run for run in these if run in wanted], dtype=np.int64)
             for run in these.tolist():
@@ -169,9 +169,12 @@ def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
     yield from (runs[these] for these in np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
 
 
-def compiled_by(design: Design, config: Config) -> bool:
-    """Whether a run is made by the kernel of whole runs, which leaves no trace."""
-    return not design.sweep.between_samples and is_compiled(config, name_of_run(config))
+def is_compiled(design: Design, config: Config) -> bool:
+    """Whether a run is made by the kernel of whole runs, which needs no plan and leaves no trace."""
+    assert config.robot is not None
+    six = len(config.robot.joint_types) == COORDINATES
+    kernel = six and sense_is_enough(config, name_of_run(config)) and rehearses(config.trajectory.profile)
+    return kernel and not design.sweep.between_samples
 
 
 def _numbered(design: Design, runs: IntArray) -> _Columns:
@@ -222,12 +225,6 @@ INSTANTS, FURTHER = 192, 4
 TOGETHER = 16
 
 
-def is_compiled(config: Config, name: str) -> bool:
-    """Whether runs of a name are made by the kernel of whole runs; others need their plan or Python."""
-    six = config.robot is not None and len(config.robot.joint_types) == COORDINATES
-    return six and sense_is_enough(config, name) and rehearses(config.trajectory.profile)
-
-
 def _setting_of(scenario: Scenario, law: str) -> Setting:
     """All that compiled runs of a law share whose seeds differ."""
     body, model = scenario.exact.body, scenario.calibration.model()
@@ -257,27 +254,18 @@ def numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray
     desk = new_desk(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))
     for first in range(0, len(seeds), TOGETHER):
-        last = first + TOGETHER
-        _make(scenario, law, setting, desk, seeds[first:last], found[first:last])
+        running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
+        while running:  # those that outlast their noise are made anew with more
+            drawn = min(instants, setting.limits.max_steps + 1)
+            shown = [scenario.shown_at(seeds[i]) for i in running]
+            images = np.array([(ends.s_start, ends.s_star) for ends in shown])
+            noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
+            numbers = np.empty((len(running), len(NUMBERS)))
+            trials(setting, images, noise, desk, numbers)
+            found[running] = numbers
+            running = [i for i in running if found[i, VERDICT] == RUNNING]
+            instants *= FURTHER
     return found
-
-
-def _make(
-    scenario: Scenario, law: str, setting: Setting, desk: Desk, seeds: Sequence[int], numbers: FloatArray
-) -> None:
-    """Write the numbers (k, ``NUMBERS``) of runs; those that outlast their noise are made anew with more."""
-    instants, most = INSTANTS, setting.limits.max_steps + 1
-    running = list(range(len(seeds)))
-    while running:
-        drawn = min(instants, most)
-        shown = [scenario.shown_at(seeds[i]) for i in running]
-        images = np.array([(ends.s_start, ends.s_star) for ends in shown])
-        noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
-        found = np.empty((len(running), len(NUMBERS)))
-        trials(setting, images, noise, desk, found)
-        numbers[running] = found
-        running = [i for i, row in zip(running, found, strict=True) if row[VERDICT] == RUNNING]
-        instants *= FURTHER
 
 
 _designs: dict[str, Design] = {}

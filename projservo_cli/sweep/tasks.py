@@ -20,15 +20,12 @@ MOST_DRAWS = 20_000_000
 
 @dataclass(frozen=True, eq=False)
 class RandomTasks:
-    """Tasks and how they came about."""
+    """Tasks, one of each stratum in turn while there are any."""
 
     q_start: FloatArray
     q_goal: FloatArray  # q_start, q_goal: (k, n) joints, rad or m
     # (k,) rotation from start to goal, rad; a sixth of the tasks in each sixth of half a turn
     angle: FloatArray
-    drawn: int  # joint vectors drawn
-    # how many of them were rejected for each reason, and pairs whose stratum was full
-    rejected: dict[str, int]
 
 
 def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator) -> RandomTasks:
@@ -45,7 +42,6 @@ def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.G
         raise InputError("random tasks need joint limits: set limits of every joint of the robot")
     front = math.copysign(1.0, float(_cosines(truth, _poses(truth, q_front[None]))[0, 0]))
     quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]
-    rejected = dict.fromkeys(("behind a camera", "turned away", "outside an image", "stratum full"), 0)
     found: list[list[tuple[FloatArray, FloatArray, float]]] = [[] for _ in range(STRATA)]
     waiting: list[tuple[FloatArray, FloatArray]] = []
     drawn = 0
@@ -58,18 +54,16 @@ def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.G
         q = middle + half * rng.uniform(-1.0, 1.0, (BATCH, len(middle)))
         drawn += BATCH
         poses = _poses(truth, q)
-        waiting += [(q[i], poses[i, :3, :3]) for i in _accepted(truth, poses, front, rejected)]
+        waiting += [(q[i], poses[i, :3, :3]) for i in _accepted(truth, poses, front)]
         while len(waiting) >= 2:
             (start, R), (goal, R_goal) = waiting.pop(0), waiting.pop(0)
             angle = math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R.T @ R_goal)) - 1.0))))
             stratum = min(STRATA - 1, int(STRATA * angle / math.pi))
             if len(found[stratum]) < quota[stratum]:
                 found[stratum].append((start, goal, angle))
-            else:
-                rejected["stratum full"] += 1
-    tasks = [task for stratum in found for task in stratum]
+    tasks = [tasks[k] for k in range(max(quota)) for tasks in found if k < len(tasks)]
     starts, goals, angles = (np.array(column) for column in zip(*tasks, strict=True))
-    return RandomTasks(starts, goals, angles, drawn, rejected)
+    return RandomTasks(starts, goals, angles)
 
 
 def _poses(truth: Truth, q: FloatArray) -> FloatArray:
@@ -91,14 +85,11 @@ def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("kvi,ki->kv", rays, poses[:, :3, :3] @ normal))
 
 
-def _accepted(truth: Truth, poses: FloatArray, front: float, rejected: dict[str, int]) -> IntArray:
-    """Indices of the poses that show the face to both cameras; the others are counted by reason."""
+def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
+    """Indices of the poses that show the face to both cameras."""
     m = image_points(truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
     before = (m[..., 2] > 0.0).all(axis=(1, 2))
-    turned = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
+    facing = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
     pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
     inside = ((pixels >= -0.5) & (pixels <= truth.image_size - 0.5)).all(axis=(1, 2, 3))
-    rejected["behind a camera"] += int((~before).sum())
-    rejected["turned away"] += int((before & ~turned).sum())
-    rejected["outside an image"] += int((before & turned & ~inside).sum())
-    return np.flatnonzero(before & turned & inside)
+    return np.flatnonzero(before & facing & inside)

@@ -67,11 +67,9 @@ def feasible_tasks(name, count, seed=1):
     rng = np.random.default_rng(seed)
     quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]
     kept = [[] for _ in range(STRATA)]
-    looked_at, rejected, drawn = 0, Counter(), 0
+    looked_at = 0
     while any(len(found) < most for found, most in zip(kept, quota, strict=True)):
         batch = random_tasks(truth, q_front, BATCH, rng)
-        drawn += batch.drawn
-        rejected.update(batch.rejected)
         for q_start, q_goal, angle in zip(batch.q_start, batch.q_goal, batch.angle, strict=True):
             stratum = min(STRATA - 1, int(STRATA * angle / np.pi))
             if len(kept[stratum]) < quota[stratum]:
@@ -79,8 +77,7 @@ def feasible_tasks(name, count, seed=1):
                 if feasible(arm, true_task(truth, q_start, q_goal), q_start):
                     kept[stratum].append((q_start, q_goal))
     starts, goals = (np.array(column) for column in zip(*chain.from_iterable(kept), strict=True))
-    words = f"{count} feasible of {looked_at} tasks; of {drawn} joint vectors rejected: {dict(rejected)}"
-    return Tasks(starts, goals, looked_at, words)
+    return Tasks(starts, goals, looked_at, f"{count} feasible of {looked_at} tasks")
 
 
 @cache

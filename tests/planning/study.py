@@ -131,6 +131,6 @@ def study(arm, count, seed=1):
 
 if __name__ == "__main__":
     found, drawn = study(sys.argv[1], int(sys.argv[2]), *map(int, sys.argv[3:]))
-    print(f"{len(drawn.angle)} tasks from {drawn.drawn} joint vectors; rejected: {drawn.rejected}")
+    print(f"{len(drawn.angle)} tasks")
     for line in found.words():
         print(line)

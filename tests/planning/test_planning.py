@@ -187,8 +187,6 @@ def test_random_tasks_are_what_they_say():
     for q_start, q_goal, angle in zip(tasks.q_start, tasks.q_goal, tasks.angle, strict=True):
         R = poe(truth.model, q_goal)[:3, :3] @ poe(truth.model, q_start)[:3, :3].T
         assert math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)) == pytest.approx(angle, abs=1e-6)
-    vectors = sum(count for reason, count in tasks.rejected.items() if reason != "stratum full")
-    assert 0 < vectors < tasks.drawn
 
 
 def test_random_tasks_need_limits():

@@ -54,7 +54,6 @@ def test_a_task_that_cannot_be_begun_has_a_verdict_and_no_numbers():
     [("plant.speed_scale", 0.5), ("trajectory.profile", "constrained"), ("control.mode", "track")],
 )
 def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
-    config = design(grid={"law": ["exact"]}).cell(0)
-    assert is_compiled(config, name_of_run(config))
-    config = changed(config, {key: value}, "test")
-    assert not is_compiled(config, name_of_run(config))
+    found = design(grid={"law": ["exact"]})
+    assert is_compiled(found, found.cell(0))
+    assert not is_compiled(found, changed(found.cell(0), {key: value}, "test"))
