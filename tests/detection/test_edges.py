@@ -31,13 +31,6 @@ def test_blur_does_not_move_the_corners(rng, blur):
     np.testing.assert_allclose(found, CORNERS, atol=0.03)
 
 
-@pytest.mark.parametrize("grey", [40.0, 120.0, 200.0])
-def test_a_side_that_is_covered_a_little_still_counts(grey):
-    image = dark_square(CORNERS)
-    image[20:36, 56:60] = grey
-    np.testing.assert_allclose(refine_corners(image, CORNERS, 6), CORNERS, atol=0.03)
-
-
 def test_turning_around_the_tag_turns_the_answer():
     image = dark_square(CORNERS)
     found = refine_corners(image, CORNERS, 6)
@@ -48,9 +41,11 @@ def test_turning_around_the_tag_turns_the_answer():
 
 
 @pytest.mark.parametrize("grey", [40.0, 120.0, 200.0])
-def test_a_side_that_is_covered_costs_its_two_corners(grey):
+def test_a_side_that_is_covered_costs_its_two_corners_unless_it_is_a_little(grey):
     image = dark_square(CORNERS)
-    image[20:36, 50:70] = grey  # over the upper side
+    image[20:36, 56:60] = grey  # over the upper side
+    np.testing.assert_allclose(refine_corners(image, CORNERS, 6), CORNERS, atol=0.03)
+    image[20:36, 50:70] = grey
     found = refine_corners(image, CORNERS, 6)
     assert np.isnan(found[:2]).all()
     np.testing.assert_allclose(found[2:], CORNERS[2:], atol=0.03)

@@ -99,22 +99,6 @@ def test_markers_named_are_lost_and_no_others():
     assert (np.isnan(for_ever).all(axis=(1, 2, 3)) == (np.arange(10) >= 4)).all()
 
 
-@pytest.mark.parametrize(
-    ("override", "says"),
-    [
-        ("disturbance.bump={at_step: 7, joint: 7, by_deg: 3}", "6 joints, counted from 1"),
-        ("disturbance.bump={at_step: 7, joint: 1}", "exactly one of by_deg and by_m"),
-        ("disturbance.bump={at_step: 7, joint: 1, by_m: 0.1}", "type R: give by_deg"),
-        ("disturbance.frozen_joint={joint: 9, from_step: 7}", "6 joints"),
-        ("disturbance.lost_markers={from_step: 1, markers: [99]}", "no marker 99"),
-        ("disturbance.delay_periods=-1", "delay_periods"),
-    ],
-)
-def test_what_cannot_befall_this_robot_is_refused(override, says):
-    with pytest.raises(InputError, match=says):
-        config(override)
-
-
 def test_a_robot_of_somebody_else_is_not_disturbed():
     with pytest.raises(InputError, match="disturbs the simulated robot"):
         config("disturbance.delay_periods=1", "plant=my_robot:Robot")

@@ -81,31 +81,18 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     np.testing.assert_array_equal(again.drift_mm, record.drift_mm)
 
 
-def test_every_figure_is_supported_by_a_whole_run():
+def test_a_figure_names_the_law_that_it_lacks():
+    """Both direct laws where it compares them; of the classical ones it draws what there is."""
     material = case()[2]
-    for spec in SPECS.values():
-        assert spec.lacking(material) == ""
-        assert spec.partly(material) == ""
-
-
-@pytest.mark.parametrize("law", DIRECT)
-def test_a_figure_of_both_laws_needs_both(law):
-    material = changed(case()[2], **{law: None})
-    assert law in SPECS["fig07_three_two"].lacking(material)
-    assert SPECS["fig01_partition"].lacking(material) == ""
-
-
-def test_a_missing_classical_law_is_named_and_the_others_are_drawn():
-    material = changed(case()[2], blockwise=None)
-    spec = SPECS["fig04_classical"]
-    assert spec.lacking(material) == ""
-    assert "blockwise" in spec.partly(material)
-
-
-def test_a_run_without_a_step_has_nothing_to_show():
-    material = case()[2]
-    material = changed(material, direct_three=short(material.traces["direct_three"], 0))
-    assert "direct_three" in SPECS["fig11_image_errors"].lacking(material)
+    for law in DIRECT:
+        without = changed(material, **{law: None})
+        assert law in SPECS["fig07_three_two"].lacking(without)
+        assert SPECS["fig01_partition"].lacking(without) == ""
+    classical = SPECS["fig04_classical"]
+    assert classical.lacking(changed(material, blockwise=None)) == ""
+    assert "blockwise" in classical.partly(changed(material, blockwise=None))
+    still = changed(material, direct_three=short(material.traces["direct_three"], 0))
+    assert "direct_three" in SPECS["fig11_image_errors"].lacking(still)
 
 
 def test_a_run_that_ended_after_three_steps_is_drawn(tmp_path, monkeypatch):
@@ -156,8 +143,9 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
     assert all(row["drift_mm"] is None for row in report.drift_rows(record))
 
 
-def test_failed_studies_are_named_and_their_figures_left_out(tmp_path, monkeypatch):
-    _, bench, material = case()
+def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
+    """Studies, and the comparison of both sides of equation (22)."""
+    config, bench, material = case()
 
     def fail(*_, **__):
         raise WorkFailed("the task\ncannot be partitioned")
@@ -172,18 +160,9 @@ def test_failed_studies_are_named_and_their_figures_left_out(tmp_path, monkeypat
         assert ("cannot be partitioned" in spec.lacking(made)) == spec.studies
     record = report.record_of(None, None, figures=(), left_out=(), claims=())
     assert report.drift_rows(record) == []
-
-
-def test_a_failed_comparison_of_eq_22_is_named(monkeypatch):
-    config, bench, _ = case()
-
-    def fail(*_):
-        raise WorkFailed("no unique motion")
-
     monkeypatch.setattr(report, "metric_plan", fail)
-    left_out = []
     assert report.composition(bench, config, left_out) is None
-    assert left_out == [{"what": "equation (22)", "reason": "no unique motion"}]
+    assert left_out[1] == {"what": "equation (22)", "reason": "the task cannot be partitioned"}
 
 
 def test_which_laws_must_converge_outdates_the_page_that_says_so_and_no_run(tmp_path):

@@ -89,16 +89,23 @@ def test_a_camera_is_given_up_to_scale(scale):
     assert there == pytest.approx(P, rel=1e-8)
 
 
-def test_goal_beyond_a_limit_is_refused():
-    config = loaded("ur5", "task.goal.joints.joints=[0, 0, 3.5, 0, 0, 0]")
-    with pytest.raises(WorkFailed, match=r"task\.goal: joint 3"):
-        start_and_goal(config, truth_of(config))
+FAR = "{translation_m: [0, 0, 5], rotation_rad: [0, 0, 0]}"
+REFUSED = {
+    "a goal beyond a limit": ("ur5", "task.goal.joints.joints=[0, 0, 3.5, 0, 0, 0]", r"goal: joint 3"),
+    "a goal out of reach": ("paper", f"task.goal.perturbation={FAR}", "goal: the robot cannot put its tool"),
+    "a start beyond a limit": (
+        "paper",
+        "task.start_offset={joints: [300, 0, 0, 0, 0, 0], unit: deg}",
+        r"start_offset: joint 1 .* limits",
+    ),
+}
 
 
-def test_an_unreachable_goal_is_refused():
-    config = loaded("paper", "task.goal.perturbation.translation_m=[0, 0, 5]",
-                    "task.goal.perturbation.rotation_rad=[0, 0, 0]")  # fmt: skip
-    with pytest.raises(WorkFailed, match=r"task\.goal: the robot cannot put its tool"):
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_the_robot_cannot_reach_is_refused(what):
+    name, override, message = REFUSED[what]
+    config = loaded(name, override)
+    with pytest.raises(WorkFailed, match=rf"task\.{message}"):
         start_and_goal(config, truth_of(config))
 
 
@@ -165,9 +172,6 @@ def test_an_offset_moves_the_start_and_leaves_the_goal():
     (start, goal), (there, same) = start_and_goal(plain, truth), start_and_goal(moved, truth_of(moved))
     assert np.allclose(np.degrees(there.q_start - start.q_start), [1, -2, 3, 0, 0, 0], atol=1e-12)
     assert np.array_equal(goal.goal_pose, same.goal_pose)
-    beyond = loaded("paper", "task.start_offset={joints: [300, 0, 0, 0, 0, 0], unit: deg}")
-    with pytest.raises(WorkFailed, match=r"task\.start_offset: joint 1"):
-        start_and_goal(beyond, truth)
 
 
 def test_the_seed_of_the_calibration_is_its_own():

@@ -22,14 +22,6 @@ def prepared(**settings):
     return scenario_of(config, calibration), name_of_run(config)
 
 
-def test_numbers_depend_on_the_seed_alone():
-    found = prepared()
-    together = numbers_of(*found, [5, 6, 7])
-    apart = np.concatenate([numbers_of(*found, [seed]) for seed in (7, 6, 5)])[::-1]
-    assert together.tobytes() == apart.tobytes()
-    assert len(np.unique(together[:, NUMBERS.index("image_error_px")])) == 3
-
-
 def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
     """A run that outlasts its noise is made anew with more of it."""
     found = prepared()
