@@ -63,10 +63,7 @@ def simulate(config: "Config", truth: Truth) -> Observation:
 
 
 def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
-    """Noisy pixels (2, m, 2) of all markers at the joints q (n,), rad or m; NaN outside an image.
-
-    truth : robot, rig and markers; q : (n,) rad or m; noise : (2, m, 2) px.
-    """
+    """Pixels (2, m, 2) of all markers at the joints q (n,), rad or m, with noise; NaN outside an image."""
     images = truth.images(q, truth.M) + noise
     inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)
     images[~inside] = np.nan
@@ -138,9 +135,6 @@ def suggested(
     Predictions are judged over the range of the recorded readings, a little widened. Candidates lie in
     the same range, or for a simulated robot in one three times as wide.
 
-    config : robot and rig as far as they are known.
-    observation, calibration : of the run.
-    count : poses to suggest.
     Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose shows the
     markers to both views.
     """
@@ -176,8 +170,6 @@ def write_suggestions(
 ) -> None:
     """Write suggestions as a list of motions, a row each: q1 … qN, from_pose, delta_q1 … delta_qN.
 
-    found : the suggestions.
-    path : CSV to write; it appears whole or not at all.
     prismatic : (n,) which joints are prismatic.
     joint_unit : unit of the revolute joints, ``deg``, else rad.
     Raises InputError if it cannot be written.

@@ -96,8 +96,6 @@ def prepare(
 ) -> Recording:
     """What there is to record, and what of it the table holds already.
 
-    config : robot, rig, markers and trial motions.
-    path : of the table.
     motions : further poses after the trial motions, numbered on.
     force : begin anew, whatever stands at ``path``.
     Raises InputError if the configuration does not describe a robot and its trial motions, a pose lies beyond
@@ -148,10 +146,8 @@ def record(
 ) -> None:
     """Record the pending poses, and keep those that are done however it ends.
 
-    config : with the control period and the joint-speed limits.
     recording : what is to be done; on return, or on an interruption, what was done.
     robot : what is driven; None takes that of ``plant.use``, or simulates the robot of the configuration.
-    progress : told after each pose.
     Raises InputError if the table cannot be written; WorkFailed if the robot fails or does not arrive where
     it was sent.
     """
@@ -159,8 +155,7 @@ def record(
         robot = foreign_robot(config, joints_of(config), len(recording.marker))
     driven = robot or simulated(config, recording)
     limit = step_limit(config, joints_of(config))
-    total, saved, took = len(recording.targets), time.monotonic(), 0.0
-    unsaved = False
+    total, saved, took, unsaved = len(recording.targets), time.monotonic(), 0.0, False
     try:
         with at_rest_after(driven):
             for pose in recording.pending:

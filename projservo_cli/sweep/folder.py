@@ -147,8 +147,7 @@ class Folder:
             "provenance": self._read()["provenance"],
             "total": design.total,
         }
-        headings = [(column.name, column.dtype, column.units, column.about) for column in columns]
-        assemble(self.table, self.stored(), headings, attributes)
+        assemble(self.table, self.stored(), columns, attributes)
 
     def calibration(self, key: str) -> Path:
         """The run file that holds a calibration, or beside which a file says why there is none."""

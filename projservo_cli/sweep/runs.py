@@ -4,14 +4,13 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
-from projservo_cli.config.sweep import Distribution
 from projservo_cli.control import BODY_LAWS, CODES
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.step import RUNNING, VERDICTS
@@ -30,8 +29,7 @@ ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
 NONE = -1  # in columns of counts, where a run did not begin
 
 
-@dataclass(frozen=True)
-class Column:
+class Column(NamedTuple):
     """One column of the table: its name, NumPy type, unit and what it holds."""
 
     name: str
@@ -77,20 +75,15 @@ BETWEEN = Column("center_deviation_mm", "f8", "mm", "largest distance of the cen
 
 def columns_of(design: Design) -> tuple[Column, ...]:
     """All columns of the table of a sweep: numbers, inputs, what was measured."""
-    about = "value of the grid"
-    axes = [_input(axis.name, axis.values, about) for axis in design.axes]
-    drawn = [_drawn(key, distribution) for key, distribution in design.sweep.random.items()]
+    axes = [_input(axis.name, axis.values, "value of the grid") for axis in design.axes]
+    random = design.sweep.random.items()
+    drawn = [_input(key, given.choice or (0.0,), "value drawn for the run") for key, given in random]
     between = (BETWEEN,) if design.sweep.between_samples else ()
     return (*NUMBERED, *axes, *drawn, *MEASURED, *between)
 
 
-def _drawn(key: str, distribution: Distribution) -> Column:
-    if distribution.choice is not None:
-        return _input(key, distribution.choice, "value drawn for the run")
-    return Column(key, "f8", "1", "value drawn for the run")
-
-
 def _input(name: str, values: Sequence[Any], about: str) -> Column:
+    """A column of values that are given: of numbers where all are, else of texts."""
     if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
         return Column(name, "f8", "1", about)
     return _text(name, [_shown(value) for value in values], about)

@@ -41,9 +41,9 @@ def table(folder, draws=40, seed=3):
         "law": law,
     }
     own = (Column("noise.servo_px", "f8", "1", ""), Column("law", "S10", "1", ""))
-    headings = [(c.name, c.dtype, c.units, c.about) for c in (*NUMBERED, *own, *MEASURED)]
+    headings = (*NUMBERED, *own, *MEASURED)
     write_part(folder / "part.h5", values, {})
-    attributes = {"axes": AXES, "columns": [h[0] for h in headings], "random": [], "total": count}
+    attributes = {"axes": AXES, "columns": [column.name for column in headings], "random": [], "total": count}
     assemble(folder / "sweep.h5", [folder / "part.h5"], headings, attributes)
     return Rows(SweepTable(folder / "sweep.h5")), values, good
 
