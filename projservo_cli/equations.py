@@ -8,32 +8,19 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Entry:
-    """One equation, or a statement of a section where the number starts with ``§``.
-
-    Attributes
-    ----------
-    number, title : of the equation.
-    functions : dotted names of the functions that implement it.
-    tests : ``file::name`` of the tests that show it holds.
-    erratum : what is wrong in print, and what is right; empty where nothing is.
-    """
+    """One equation, or a statement of a section where the number starts with ``§``."""
 
     number: str
     title: str
-    functions: tuple[str, ...]
-    tests: tuple[str, ...]
-    erratum: str
+    functions: tuple[str, ...]  # dotted names of what implements it
+    tests: tuple[str, ...]  # ``file::name`` of those that show it holds
+    erratum: str  # what is wrong in print, and what is right; empty where nothing is
 
 
 def _entry(number: str, title: str, functions: str, tests: str = "", erratum: str = "") -> Entry:
     """An entry from names separated by spaces, below the package and the folder of tests."""
-    return Entry(
-        number,
-        title,
-        tuple(f"projservo_cli.{name}" for name in functions.split()),
-        tuple(f"tests/{name}" for name in tests.split()),
-        erratum,
-    )
+    run = tuple(f"projservo_cli.{name}" for name in functions.split())
+    return Entry(number, title, run, tuple(f"tests/{name}" for name in tests.split()), erratum)
 
 
 REGISTER = (
@@ -48,7 +35,7 @@ REGISTER = (
         "2",
         "Projective displacement, conjugate to a rigid motion, of unit determinant",
         "geometry.displacement.normalize_displacement",
-        " geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
+        "geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
         "det = 1 leaves ±H in dimension 4 (the trace is 0 at 180°): choose the sign that keeps the sign "
         "of a_inf·M.",
     ),

@@ -117,8 +117,8 @@ def observe(
     pairs: Sequence[Pair],
     q: FloatArray,
     finder: TagFinder,
-    points: str = "corners",
-    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    points: str,
+    progress: Callable[[str, int, int], None],
 ) -> tuple[Observation, Findings]:
     """Find tags in pairs of images.
 

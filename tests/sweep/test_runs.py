@@ -5,10 +5,13 @@ import math
 import numpy as np
 import pytest
 
+from projservo_cli.loop.trial import NUMBERS, VERDICT
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.sweep.design import name_of_run
+from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.sweep import runs
+from projservo_cli.sweep.design import changed, name_of_run
 from projservo_cli.sweep.driver import calibrate_one
-from projservo_cli.sweep.runs import Part, run_part
+from projservo_cli.sweep.runs import Part, is_compiled, numbers_of, run_part
 from tests.sweep.cases import design
 
 # Of each case every run is redone.
@@ -106,3 +109,39 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert made.columns["verdict"].tolist() == [b"not started"] * 2
     assert np.isnan(made.columns["position_error_mm"]).all()
     assert made.columns["steps"].tolist() == [-1, -1]
+
+
+def prepared(**settings):
+    """What runs of a small sweep share, with a value or two of its configuration changed."""
+    config = changed(design().calibrated(0, 0), settings, "test")
+    _, calibration, _ = calibrate.run(config)
+    return scenario_of(config, calibration), name_of_run(config)
+
+
+@pytest.mark.volume
+def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
+    """A run that outlasts its noise is made anew with more of it."""
+    found = prepared()
+    whole = numbers_of(*found, [1, 2])
+    assert whole[:, NUMBERS.index("steps")].min() > 8
+    monkeypatch.setattr(runs, "INSTANTS", 2)
+    assert numbers_of(*found, [1, 2]).tobytes() == whole.tobytes()
+
+
+@pytest.mark.volume
+def test_a_run_whose_images_show_nothing_has_a_verdict_and_no_numbers():
+    """Images so noisy that markers have no place leave nothing to count."""
+    numbers = numbers_of(*prepared(**{"noise.servo_px": 3000.0}), [1, 2, 3])
+    assert (numbers[:, VERDICT] < 0).any()
+    lost = numbers[numbers[:, VERDICT] < 0]
+    assert np.isnan(np.delete(lost, VERDICT, axis=1)).all()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("plant.speed_scale", 0.5), ("trajectory.profile", "constrained"), ("control.mode", "track")],
+)
+def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
+    found = design(grid={"law": ["exact"]})
+    assert is_compiled(found, found.cell(0))
+    assert not is_compiled(found, changed(found.cell(0), {key: value}, "test"))
