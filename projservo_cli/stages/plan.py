@@ -15,7 +15,7 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import joint_motion, span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
-from projservo_cli.stages.scenario import Scenario, Sense, Shown, scenario_of
+from projservo_cli.stages.scenario import Scenario, Shown, scenario_of
 from projservo_cli.stages.world import face_numbers, image_size_of, joints_of
 from projservo_cli.task.face import Task, center_of, face_plane, require_found
 from projservo_cli.task.margins import (
@@ -404,20 +404,22 @@ def _in_sight(profile: str, found: Along) -> tuple[bool, str]:
     )
 
 
-def rotation_sense(scenario: Scenario) -> Sense:
-    """The sense that the plan of a task takes; only the profile constrained needs the whole plan for it.
+def rotation_sense(scenario: Scenario) -> FloatArray:
+    """Joint motions (2, n) of both rotations in the sense that the plan takes.
+
+    Only the profile constrained needs the whole plan for it.
 
     Raises WorkFailed if the task cannot be partitioned.
     """
     config, calibration = scenario.config, scenario.calibration
     profile = config.trajectory.profile
     if profile == CONSTRAINED:
-        return Sense(run(config, calibration).rotation_sense(), None)
+        return run(config, calibration).rotation_sense()
     joints = joints_of(config, calibration.joint_types)
-    state, task, parts, _ = _partitioned(
+    state, _, parts, _ = _partitioned(
         calibration.model(),
         scenario.ends,
         rehearses(profile),
         (joints.lower, joints.upper),
     )
-    return Sense(signed(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3]), task)
+    return signed(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

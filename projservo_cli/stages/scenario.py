@@ -169,17 +169,6 @@ class Scenario:
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
 
-class Sense(NamedTuple):
-    """All of a plan that a law needs that plans anew in each step: which way to turn."""
-
-    motions: FloatArray  # (2, n) joint motions of the rotations r and p in the sense they are planned
-    task: Task | None  # measured as the plan is; None where the whole plan was made
-
-    def rotation_sense(self) -> FloatArray:
-        """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
-        return self.motions
-
-
 def scenario_of(config: "Config", calibration: Calibration) -> Scenario:
     """Make the scenario of a configuration, of its simulated robot or of the one in ``plant.use``.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.control import BODY_LAWS, CODES
+from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, Gains, new_state
 from projservo_cli.geometry.mechanisms import in_span, span_of
 from projservo_cli.loop.compiled import new_log
@@ -32,7 +32,7 @@ from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant
 from projservo_cli.robots.yours import DrivenRobot, at_rest_after
 from projservo_cli.stages import own_robot
-from projservo_cli.stages.scenario import Scenario, Sense, scenario_of
+from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.trace import Run, trace_of
 from projservo_cli.task.following import followed
 
@@ -54,10 +54,11 @@ def run(
     return trace_of(scenario, drive(scenario, plan, name))
 
 
-def drive(scenario: Scenario, plan: Plan | Sense, name: str, believed: Model | None = None) -> Run:
+def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Model | None = None) -> Run:
     """Drive the run of a name to its verdict.
 
-    plan : of the task; the sense of its rotations is enough for a built-in law that does not follow it.
+    plan : of the task; a built-in law that does not follow it needs but the joint motions (2, n) of its
+        rotations, which tell which way to turn.
     believed : what the law takes for robot and rig; None for what a law of its kind is given.
     Raises InputError, WorkFailed as of ``run``.
     """
@@ -94,22 +95,20 @@ def sense_is_enough(config: "Config", name: str) -> bool:
 
 
 def _drive_compiled(
-    scenario: Scenario, plan: Plan | Sense, law: str, replans: bool, believed: Model | None
+    scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, believed: Model | None
 ) -> Run:
     """Drive a built-in law on the simulated robot in the compiled loop."""
     model = scenario.believed_by(law) if believed is None else believed
     ends, gains, limits = scenario.ends, scenario.gains, scenario.limits
-    # Of the same model and images, the task of the plan is that of a law that measures as the plan does.
-    task = plan.task if isinstance(plan, Sense) and law in BODY_LAWS else None
-    if task is None or believed is not None:
-        task = scenario.shown_to(law).task(model)
+    task = scenario.shown_to(law).task(model)
     if not replans:
         assert isinstance(plan, Plan)
         task = followed(model, task, plan, gains.period, 1.0)
     n, m, observed = len(ends.q_start), scenario.m, len(scenario.numbers_of(law))
     span = span_of(model, task.A_star)
     state = new_state(n, m, observed, span)
-    state.memory.rotation[:] = in_span(span, model, ends.q_start, plan.rotation_sense())
+    sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
+    state.memory.rotation[:] = in_span(span, model, ends.q_start, sense)
     log = new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
     plant = scenario.plant_of(law)
     noise = scenario.noise_of(law, scenario.config.seed, limits.max_steps + 1)

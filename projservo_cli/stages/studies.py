@@ -20,7 +20,7 @@ from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Pla
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import Profile, plan_task
-from projservo_cli.stages.scenario import Scenario, Sense, idealized, scenario_of
+from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.trace import trace_of
 from projservo_cli.stages.world import Truth, truth_of
@@ -45,7 +45,7 @@ class Comparison:
     scenario: Scenario  # without noise and disturbances, and without an end at a border or a joint limit
     # by operators, ``true`` (metric), ``twin`` (the same in a projective frame) and ``calibrated``
     models: dict[str, Model]
-    sense: Sense  # in which the plan turns, which decides the sense of a half turn
+    sense: FloatArray  # (2, n) joint motions of both rotations as planned, for the sense of a half turn
 
     @property
     def truth(self) -> Truth:
@@ -94,7 +94,7 @@ def comparison_of(config: "Config", calibration: Calibration, plan: Plan) -> Com
     assert scenario.truth is not None
     metric = scenario.truth.model
     models = {"true": metric, "twin": projective_twin(metric), "calibrated": calibration.model()}
-    return Comparison(scenario, models, Sense(plan.rotation_sense(), None))
+    return Comparison(scenario, models, plan.rotation_sense())
 
 
 def with_gain(gains: Gains, gain_per_step: float) -> Gains:

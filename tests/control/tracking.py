@@ -16,7 +16,7 @@ from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import REPLAN, law_and_mode
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import Sense, idealized, scenario_of
+from projservo_cli.stages.scenario import idealized, scenario_of
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 from tests.known import driven
@@ -77,7 +77,7 @@ def goal_shown(config, calibration, planned, name):
     """Pose (4, 4) in which the loop comes to rest without noise: the goal as its images show it."""
     scenario = scenario_of(config, calibration)
     scenario = replace(scenario, config=idealized(config), exact=scenario.ends)
-    plan = Sense(planned.rotation_sense(), None) if law_and_mode(name)[1] == REPLAN else planned
+    plan = planned.rotation_sense() if law_and_mode(name)[1] == REPLAN else planned
     trace = driven(scenario, plan, name, None, image_px=1e-3, noise_px=0.0, max_steps=400)
     assert trace.verdict == "converged"
     return trace.pose[-1]

@@ -11,7 +11,7 @@ from projservo_cli.records import METRIC_LAWS, Calibration, following_mode, name
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
 from projservo_cli.stages import calibrate, studies
-from projservo_cli.stages.scenario import Sense, idealized
+from projservo_cli.stages.scenario import idealized
 from tests.fake_records import fake
 from tests.known import configured, driven, known_scenario, planned
 
@@ -35,7 +35,7 @@ def case(name="paper", steps=SHORT, whole=False):
     true = scenario.truth
     model = studies.projective_twin(true.model)
     plan = planned(scenario, model, samples=21, duration=3.0)
-    sense = Sense(plan.rotation_sense(), None)
+    sense = plan.rotation_sense()
     traces = {law: driven(scenario, sense, law, true.model if law in METRIC_LAWS else model) for law in LAWS}
     for law in FOLLOWING:
         followed = name_of(law, following_mode(law))

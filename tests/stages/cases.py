@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from projservo_cli.stages.scenario import Sense, idealized
+from projservo_cli.stages.scenario import idealized
 from tests.known import configured, driven, known_scenario, planned
 
 
@@ -28,7 +28,7 @@ class Case:
         """Trace of one law without noise, by default with the true metric model and the planned sense."""
         gains, clean = self.gains if gains is None else gains, idealized(self.config)
         scenario = replace(self.scenario, config=clean, exact=self.ends, gains=gains)
-        sense = Sense(self.plan.rotation_sense() if sense is None else sense, None)
+        sense = self.plan.rotation_sense() if sense is None else sense
         return driven(scenario, sense, law, self.truth.model if model is None else model, **limits)
 
     def trace(self, law):

@@ -5,9 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.stages.plan import Profile, plan_task
+from projservo_cli.stages import calibrate
+from projservo_cli.stages import plan as planning
+from projservo_cli.stages.plan import Profile, plan_task, rotation_sense
+from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.margins import within
 from projservo_cli.task.trajectory import PROFILES
+from tests.known import configured
 from tests.samples import frame, in_frame, pixels
 from tests.stages.cases import case
 
@@ -136,3 +140,19 @@ def test_the_planned_half_turn_does_not_depend_on_frame_or_scale(name):
         in_frame(negative, frame(2, mirrored=True)),
     ):
         assert example.planned(there).rotation_sense()[1] == pytest.approx(wanted, abs=1e-6)
+
+
+SENSES = [
+    ("paper", ("noise.servo_px=0.5",)),  # half a turn, either sense of which is rehearsed
+    ("ur5", ("noise.servo_px=1", "control.observation=points")),
+    ("coupled", ("trajectory.profile=exponential",)),
+    ("coupled", ("trajectory.profile=constrained", "trajectory.samples=5")),
+]
+
+
+@pytest.mark.parametrize(("name", "overrides"), SENSES)
+def test_the_sense_is_that_of_the_whole_plan(name, overrides):
+    config = configured(name, "trajectory.samples=11", *overrides)
+    _, calibration, _ = calibrate.run(config)
+    found = rotation_sense(scenario_of(config, calibration))
+    assert np.array_equal(found, planning.run(config, calibration).rotation_sense())

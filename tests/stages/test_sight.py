@@ -14,7 +14,7 @@ from projservo_cli.geometry.displacement import as_mat
 from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import Sense, scenario_of
+from projservo_cli.stages.scenario import scenario_of
 from tests.known import driven
 from tests.stages.cases import Case, case
 
@@ -53,7 +53,7 @@ def steady(law, sigma, observation, runs):
     assert scenario.exact.s_start.shape[1] == 10
     if observation == "points":
         scenario = replace(scenario, numbers=scenario.numbers[:4], exact=scenario.exact.by_points())
-    sense = Sense(planned.rotation_sense(), None)
+    sense = planned.rotation_sense()
     noise = Noise(servo_px=sigma, shown_frames=1)
     position, rotation, verdicts = [], [], Counter()
     for seed in range(runs):
