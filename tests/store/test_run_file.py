@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from projservo_cli import store
-from projservo_cli.records import InputError, Trace
+from projservo_cli.records import InputError, Plan, Trace
+from projservo_cli.store import run_file
+from projservo_cli.store.hdf5 import save_record
 from tests.fake_records import fake
 from tests.store.sound import result, sound_file, sound_run
 from tests.survival.mutations import EDITS, HEADS, edited, mutate, resealed
@@ -99,6 +101,26 @@ def test_the_checksum_is_that_of_the_data_and_every_array_has_one_of_its_own(pat
 def test_same_records_make_the_same_bytes(path):
     store.save(dataclasses.replace(store.load(path), path=path.parent / "other.h5"))
     assert path.read_bytes() == (path.parent / "other.h5").read_bytes()
+
+
+def test_what_is_added_to_and_what_is_written_as_a_whole_hold_the_same(tmp_path, monkeypatch):
+    made = sound_run(tmp_path / "run.h5").results
+    stored = []
+    monkeypatch.setattr(
+        run_file, "save_record", lambda group, record: stored.append(group.name) or save_record(group, record)
+    )
+    run = store.Run(tmp_path / "run.h5")
+    for name in made:
+        run = store.save(dataclasses.replace(run, results={**run.results, name: made[name]}))
+    assert len(stored) == len(set(stored)) == 7  # each record once
+    replaced = {**made, "plan": result(**{"": fake(Plan, 8)})}
+    for results in (made, replaced):
+        run = store.save(dataclasses.replace(run, results=results))
+        back = store.load(run.path).results
+        assert list(back) == list(results)
+        for name, one in results.items():
+            for label, record in one.records.items():
+                assert_same(back[name].records[label], record)
 
 
 @pytest.mark.parametrize("name", ["sigma", "s_start"])
