@@ -1,6 +1,5 @@
 """The command line called in a process of its own, forked from this one, and what became of it."""
 
-import importlib
 import io
 import os
 import sys
@@ -9,28 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from projservo_cli import cli
-from projservo_cli.stages.steps import STAGES
 
 TRACEBACK = "Traceback (most recent call last)"
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a call ended.
+    """How a call ended."""
 
-    Attributes
-    ----------
-    code : exit code, negative for the number of a signal.
-    out, err : what it said, with characters that are not UTF-8 escaped.
-    seconds : of processors, its children included.
-    megabytes : largest memory of the process or of a child.
-    """
-
-    code: int
-    out: str
+    code: int  # of its exit, negative for the number of a signal
+    out: str  # what it said, with characters that are not UTF-8 escaped
     err: str
-    seconds: float
-    megabytes: float
 
     def wrong_refusal(self) -> str:
         """What is wrong with it as a refusal of bad input; empty where nothing is."""
@@ -53,14 +41,13 @@ class Call:
 
     def end(self) -> Ending:
         """Wait for its end."""
-        _, status, usage = os.wait4(self.process, 0)
+        _, status = os.waitpid(self.process, 0)
         with self.folder as folder:
             said = [
                 path.read_text(encoding="utf-8", errors="backslashreplace") if path.exists() else ""
                 for path in (Path(folder, "out"), Path(folder, "err"))
             ]
-        seconds = usage.ru_utime + usage.ru_stime
-        return Ending(os.waitstatus_to_exitcode(status), *said, seconds, usage.ru_maxrss / 1024.0)
+        return Ending(os.waitstatus_to_exitcode(status), *said)
 
 
 def start(*arguments: str) -> Call:
@@ -90,10 +77,3 @@ def _run(arguments: tuple[str, ...], out: Path, err: Path) -> None:
         sys.stderr.flush()
     finally:
         os._exit(code)
-
-
-def prepare() -> None:
-    """Import once what calls import, rather than in every one of them."""
-    modules = ("cli.configuration", "cli.words", "store.run_file", "report.page", "sweep.report", "tables")
-    for name in (*modules, *(f"stages.{stage}" for stage in STAGES)):
-        importlib.import_module(f"projservo_cli.{name}")
