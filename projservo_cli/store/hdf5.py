@@ -36,11 +36,6 @@ _FORMAT = ("v110", "v110")  # that of HDF5 from 2016, with checksums in its stru
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 # Kind and size in bytes of the numbers of each type of array, as they are stored.
 _STORED = {"float64": ("f", 8), "int64": ("i", 8), "bool": ("i", 1)}
-# Keys of the mappings that a field lists.
-_KEYS = {
-    "claims": {"claim", "source", "measured", "criterion", "holds"},
-    "left_out": {"what", "reason"},
-}
 
 
 @contextmanager
@@ -236,14 +231,7 @@ def _value(name: str, value: Any, hint: Any) -> Any:
     if hint is str:
         return value
     entries, element = json.loads(value), typing.get_args(hint)[0]
-    if not isinstance(entries, list) or not all(_fits(name, entry, element) for entry in entries):
+    kind = typing.get_origin(element) or element
+    if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
         raise wrong
     return tuple(entries)
-
-
-def _fits(name: str, entry: Any, element: Any) -> bool:
-    if element is str:
-        return isinstance(entry, str)
-    if not isinstance(entry, dict) or not _KEYS.get(name, set()) <= set(entry):
-        return False
-    return all(isinstance(value, (str, bool, int, type(None))) for value in entry.values())

@@ -1,9 +1,12 @@
 """The command line called in a process of its own, forked from this one, and what became of it."""
 
 import io
+import math
 import os
+import signal
 import sys
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,36 +35,19 @@ class Ending:
         return ""
 
 
-@dataclass(frozen=True)
-class Call:
-    """A call that runs; ``process`` is its number, ``folder`` takes what it says."""
-
-    process: int
-    folder: tempfile.TemporaryDirectory[str]
-
-    def end(self) -> Ending:
-        """Wait for its end."""
-        _, status = os.waitpid(self.process, 0)
-        with self.folder as folder:
-            said = [
-                path.read_text(encoding="utf-8", errors="backslashreplace") if path.exists() else ""
-                for path in (Path(folder, "out"), Path(folder, "err"))
-            ]
-        return Ending(os.waitstatus_to_exitcode(status), *said)
-
-
-def start(*arguments: str) -> Call:
-    """Begin to call ``projservo`` in a forked process, where nothing has to be imported anew."""
-    folder = tempfile.TemporaryDirectory()
-    child = os.fork()
-    if child == 0:
-        _run(arguments, Path(folder.name, "out"), Path(folder.name, "err"))
-    return Call(child, folder)
-
-
-def call(*arguments: str) -> Ending:
-    """Call ``projservo`` with arguments to its end."""
-    return start(*arguments).end()
+def call(*arguments: str, kill_after: float = math.inf) -> Ending:
+    """Call ``projservo`` in a forked process, where nothing has to be imported anew; s until it is killed."""
+    with tempfile.TemporaryDirectory() as folder:
+        said = [Path(folder, name) for name in ("out", "err")]
+        child = os.fork()
+        if child == 0:
+            _run(arguments, *said)
+        if math.isfinite(kill_after):
+            time.sleep(kill_after)
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        texts = [p.read_text(encoding="utf-8", errors="backslashreplace") if p.exists() else "" for p in said]
+        return Ending(os.waitstatus_to_exitcode(status), *texts)
 
 
 def _run(arguments: tuple[str, ...], out: Path, err: Path) -> None:

@@ -1,16 +1,13 @@
 """Calls that are killed while they work in a folder that holds a complete run of another seed."""
 
-import contextlib
-import os
 import shutil
-import signal
 import time
 from pathlib import Path
 
 from projservo_cli import store
 from projservo_cli.records import InputError
 from tests.conftest import ROOT
-from tests.survival.calls import call, start
+from tests.survival.calls import call
 
 SETTINGS = (
     *("calibration.frames_per_joint=4", "control.laws=[direct_three, stacked]", "stop.max_steps=12"),
@@ -53,11 +50,7 @@ class Study:
     def kill(self, moment: float) -> list[str]:
         """Kill a call after so many seconds: all that was wrong after it, and after the next call."""
         self._copy()
-        process = start(*self._words(self._killed, 1))
-        time.sleep(moment)
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process.process, signal.SIGKILL)
-        process.end()
+        call(*self._words(self._killed, 1), kill_after=moment)
         found = self._damage()
         ending = call(*self._words(self._killed, 1))
         if ending.code != 0:
