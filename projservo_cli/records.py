@@ -402,51 +402,15 @@ class Report:
     )
 
 
-__all__ = [
-    "FREE",
-    "METRIC_LAWS",
-    "NO_LENS",
-    "POINT_LAWS",
-    "PRISMATIC",
-    "REVOLUTE",
-    "SIZES",
-    "BoolArray",
-    "Calibration",
-    "CrossValidation",
-    "FloatArray",
-    "InputError",
-    "IntArray",
-    "Model",
-    "Observation",
-    "Plan",
-    "Report",
-    "Trace",
-    "WorkFailed",
-    "array",
-    "scalar",
-    "signed",
-]
-
-
 REPLAN, TRACK, IMAGE_TRACK = "replan", "track", "image_track"
 MODES = (REPLAN, TRACK, IMAGE_TRACK)
-MODES_OF = {
+MODES_OF = {  # of laws of the package that follow a plan as well; all others only replan
     "direct_three": (REPLAN, TRACK),
     "direct_two": (REPLAN, TRACK),
     "exact": (REPLAN, TRACK),
     "stacked": (REPLAN, IMAGE_TRACK),
 }
 NAMES = {f"{law}_{mode}": (law, mode) for law, modes in MODES_OF.items() for mode in modes if mode != REPLAN}
-
-
-def modes_of(law: str) -> tuple[str, ...]:
-    """Modes a law has; one of somebody else, and one that compares, sees to its steps itself."""
-    return MODES_OF.get(law, (REPLAN,))
-
-
-def following_mode(law: str) -> str:
-    """The mode in which a law follows a plan."""
-    return next(mode for mode in modes_of(law) if mode != REPLAN)
 
 
 def name_of(law: str, mode: str) -> str:
@@ -466,12 +430,12 @@ def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
     """
     found = []
     for law in laws:
-        own = [mode for mode in modes if mode in modes_of(law)]
-        if not own:
-            able = [other for other in MODES_OF if any(mode in MODES_OF[other] for mode in modes)]
+        own = MODES_OF.get(law, (REPLAN,))
+        if not set(own) & set(modes):
+            able = [other for other in MODES_OF if set(MODES_OF[other]) & set(modes)]
             raise InputError(
                 f"control.mode {' and '.join(modes)}: {law} has no such mode, only "
-                f"{' and '.join(modes_of(law))}; laws that have one: {', '.join(able)} (--law, control.laws)"
+                f"{' and '.join(own)}; laws that have one: {', '.join(able)} (--law, control.laws)"
             )
-        found += [name_of(law, mode) for mode in own]
+        found += [name_of(law, mode) for mode in modes if mode in own]
     return tuple(dict.fromkeys(found))

@@ -95,8 +95,9 @@ def given_overrides(options: Mapping[str, Any]) -> list[Override]:
             found.append(Override.parse(f"{where}={given}", f"{_flag(name)} {given}"))
     if options.get("lens"):
         found.append(Override("--lens", ("calibration", "lens"), True))
-    if options.get("image_size") is not None:
-        found.append(_image_size(options["image_size"]))
+    if (size := options.get("image_size")) is not None:  # such as 1280x1024
+        sides = size.lower().replace("x", ", ")
+        found.append(Override.parse(f"data.image_size_px=[{sides}]", f"--image-size {size}"))
     found += map(Override.parse, options["sets"])
     if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
         found.append(Override.parse(f"plant.speed_scale={scale}", f"--speed-scale {scale}"))
@@ -105,12 +106,3 @@ def given_overrides(options: Mapping[str, Any]) -> list[Override]:
 
 def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
-
-
-def _image_size(text: str) -> Override:
-    """``--image-size 1280x1024``."""
-    flag = f"--image-size {text}"
-    sides = text.lower().split("x")
-    if len(sides) != 2 or not all(side.isascii() and side.isdigit() for side in sides):
-        raise InputError(f"{flag}: expected width and height in px, such as 1280x1024")
-    return Override(flag, ("data", "image_size_px"), [int(side) for side in sides])

@@ -1,6 +1,8 @@
 """Looking at what there is: ``show``, ``compare``, ``export`` and ``equations``."""
 
 import dataclasses
+import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -87,21 +89,17 @@ def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bo
     console.tell(value, [f"compare: {len(runs)} runs: {output}"])
 
 
-@main.command(epilog="Example: projservo export results/ur5 --to csv")
+@main.command(epilog="Example: projservo export results/ur5 -o tables")
 @click.argument("run", type=option.PATH)
 @option.output("DIR", "Folder to write. Default: csv beside run.h5.")
-@click.option(
-    "--to", type=click.Choice(["csv"]), default="csv", help="The kind of file, of which there is one."
-)
 @option.force("Replace what is there.")
 @option.told
-def export(console: Console, *, run: Path, output: Path | None, to: str, force: bool) -> None:
+def export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:
     """Write all arrays of a run as CSV tables.
 
     Writes a folder with a table for each result, a column for each index of an array, and fields.csv, which
     says what every array is, in which unit.
     """
-    del to
     from projservo_cli.store import load
 
     found = load(run)
@@ -114,49 +112,33 @@ def export(console: Console, *, run: Path, output: Path | None, to: str, force: 
 
 def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     """A table that says what every field is, and one for each record."""
-    import csv
-    import io
-    import json
-    import re
-
     import numpy as np
 
     from projservo_cli.files import replacing
     from projservo_cli.tables import to_csv
 
-    def scalar(value: Any) -> str:
-        if isinstance(value, str):
-            return value
-        return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
-
-    stream = io.StringIO()
-    about = csv.writer(stream, lineterminator="\n")
-    about.writerow(["file", "field", "dimensions", "unit", "about", "value"])
+    rows, tables = [], {}
     records = {(n, label): r for n, result in run.results.items() for label, r in result.records.items()}
-    tables: dict[str, str] = {}
-    for (name, label), record in records.items():
-        place = f"{name}/{label}" if label else name
-        file = re.sub(r"\W", "_", place, flags=re.ASCII) + ".csv"  # a name that a file can have anywhere
+    for place, record in records.items():
+        # A name that a file can have anywhere.
+        file = re.sub(r"\W", "_", "_".join(filter(None, place)), flags=re.ASCII) + ".csv"
         arrays = {}
         for field in dataclasses.fields(record):
             if (value := getattr(record, field.name)) is None:
                 continue
-            dims = field.metadata.get("dims")
+            dims, told = field.metadata.get("dims"), ""
             if dims is not None:
                 arrays[field.name] = np.asarray(value)
-            told = scalar(value) if dims is None else ""
-            about.writerow(
-                [
-                    file,
-                    field.name,
-                    " ".join(dims or ()),
-                    field.metadata["units"],
-                    field.metadata["about"],
-                    told,
-                ]
-            )
+            elif isinstance(value, (str, float)):
+                told = str(value)
+            else:
+                told = json.dumps(value, ensure_ascii=False)
+            about = (field.metadata["units"], field.metadata["about"])
+            rows.append((file, field.name, " ".join(dims or ()), *about, told))
         tables[file] = to_csv(arrays, down=0)
-    for file, text in ({"fields.csv": stream.getvalue()} | tables).items():
+    names = ("file", "field", "dimensions", "unit", "about", "value")
+    tables["fields.csv"] = to_csv(dict(zip(names, np.array(rows, dtype=object).T, strict=True)))
+    for file, text in tables.items():
         with replacing(folder / file) as temporary:
             temporary.write_bytes(text.encode())
         yield folder / file

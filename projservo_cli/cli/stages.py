@@ -340,8 +340,7 @@ def _make_steps(chain: _Chain) -> None:
                 return
     text = to_yaml(chain.config)
     if chain.run.configuration != text:  # overrides are stored also where nothing had to be made
-        chain.run = replace(chain.run, configuration=text)
-        save(chain.run)
+        chain.run = save(replace(chain.run, configuration=text))
 
 
 def _say_compilation(chain: _Chain) -> None:

@@ -47,9 +47,7 @@ def make(
     result = Result(step.key, run.configuration, provenance.collect(seed=config.seed), step.inputs, records)
     after = [name for name in run.results if _stage_of(name) > STAGES.index(step.stage)]
     results = {name: stored for name, stored in run.results.items() if name not in after}
-    run = replace(run, results={**results, step.name: result})
-    save(run)
-    return run, after
+    return save(replace(run, results={**results, step.name: result})), after
 
 
 def _stage_of(name: str) -> int:

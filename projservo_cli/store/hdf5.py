@@ -36,26 +36,23 @@ _FORMAT = ("v110", "v110")  # that of HDF5 from 2016, with checksums in its stru
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 # Kind and size in bytes of the numbers of each type of array, as they are stored.
 _STORED = {"float64": ("f", 8), "int64": ("i", 8), "bool": ("i", 1)}
-# Keys of the mappings that a field lists.
-_KEYS = {
-    "claims": {"claim", "source", "measured", "criterion", "holds"},
-    "left_out": {"what", "reason"},
-}
 
 
 @contextmanager
-def new_file(path: Path, size: int | None = None) -> Iterator[h5py.File]:
+def new_file(path: Path, size: int | None = None, image: io.BytesIO | None = None) -> Iterator[h5py.File]:
     """A file to be filled, that takes the place of the one at ``path`` when the block succeeds.
 
-    It is made in memory, since HDF5 neither survives a full disk nor tells of it in one line; or, where it
-    may have ``size`` bytes and is too large for that, on a disk that has them to begin with.
+    It is made in memory, from an ``image`` that is added to or from nothing, since HDF5 neither survives a
+    full disk nor tells of it in one line; or, where it may have ``size`` bytes and is too large for that, on
+    a disk that has them to begin with.
     """
     with replacing(path) as temporary:
         if size is not None and shutil.disk_usage(temporary.parent).free < size:
             raise InputError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC)}")
-        image = io.BytesIO()
+        image = image or io.BytesIO()
+        mode = "r+" if image.getbuffer().nbytes else "w"
         target = image if size is None else temporary
-        with h5py.File(target, "w", libver=_FORMAT, track_order=True) as file:  # order as netCDF has it
+        with h5py.File(target, mode, libver=_FORMAT, track_order=True) as file:  # order as netCDF has it
             yield file
         if size is None:
             temporary.write_bytes(image.getbuffer())
@@ -68,7 +65,7 @@ def labelled(file: h5py.File) -> "h5netcdf.File":
     """A new file as netCDF-4, to be closed before it: variables with dimensions take 1.5 ms each, not 0.1."""
     import h5netcdf  # what only reads does not need it
 
-    return h5netcdf.File(file, "w")
+    return h5netcdf.File(file, "a" if len(file) else "w")
 
 
 def _digest(path: Path, size: int) -> str:
@@ -160,9 +157,9 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             data=value.astype(np.int8) if boolean else value,
             **({"chunks": value.shape, "fletcher32": True} if value.size else {}),
         )
-        if boolean:  # netCDF has no booleans; this is how xarray marks them
-            data.attrs["dtype"] = "bool"
-        data.attrs["units"], data.attrs["long_name"] = field.metadata["units"], field.metadata["about"]
+        told = {"units": field.metadata["units"], "long_name": field.metadata["about"]}
+        # netCDF has no booleans; this is how xarray marks them.
+        data.attrs.update(({"dtype": "bool"} if boolean else {}) | told)
 
 
 def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], sizes: dict[str, int]) -> None:
@@ -234,14 +231,7 @@ def _value(name: str, value: Any, hint: Any) -> Any:
     if hint is str:
         return value
     entries, element = json.loads(value), typing.get_args(hint)[0]
-    if not isinstance(entries, list) or not all(_fits(name, entry, element) for entry in entries):
+    kind = typing.get_origin(element) or element
+    if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
         raise wrong
     return tuple(entries)
-
-
-def _fits(name: str, entry: Any, element: Any) -> bool:
-    if element is str:
-        return isinstance(entry, str)
-    if not isinstance(entry, dict) or not _KEYS.get(name, set()) <= set(entry):
-        return False
-    return all(isinstance(value, (str, bool, int, type(None))) for value in entry.values())

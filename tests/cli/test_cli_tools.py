@@ -25,7 +25,7 @@ def fields(run):
 
 def test_an_export_holds_every_array_and_says_what_it_is(projservo, reported, tmp_path):
     run = load("out")
-    answer = projservo("export", "out", "--to", "csv", "--json")
+    answer = projservo("export", "out", "--json")
     assert answer.code == 0, answer.err
     folder = tmp_path / "out" / "csv"
     assert {Path(file).parent for file in answer.json["files"]} == {folder}

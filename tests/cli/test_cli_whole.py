@@ -167,19 +167,3 @@ def test_the_same_seed_makes_identical_arrays_and_running_again_changes_nothing(
     assert Path("one/run.h5").read_bytes() == before
     assert projservo("calibrate", *PAPER, "-o", "two", "--set", "seed=2", "-q").code == 0
     assert not np.array_equal(store.load("two").observation.images, store.load("one").observation.images)
-
-
-@pytest.mark.volume
-def test_xarray_opens_a_whole_run_with_names_and_units(first_chain):
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip("h5netcdf")
-    with xarray.open_datatree(first_chain / "run.h5", engine="h5netcdf") as tree:
-        assert {"/calibrate/observation", "/calibrate/calibration", "/plan", "/report"} < set(tree.groups)
-        for node in tree.subtree:
-            for name, data in node.data_vars.items():
-                assert data.attrs["units"], name
-                assert data.attrs["long_name"], name
-                assert not any(str(dim).startswith("phony") for dim in data.dims), name
-        trace = tree["servo/direct_two"]
-        assert trace["q"].dims == ("instant", "joint")
-        assert trace.sizes["instant"] == trace.sizes["step"] + 1 == trace.attrs["steps"] + 1

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.calibration.prediction import prediction_derivative
 from projservo_cli.control import LAWS
-from projservo_cli.records import METRIC_LAWS, Calibration, following_mode, name_of
+from projservo_cli.records import METRIC_LAWS, MODES_OF, Calibration, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
 from projservo_cli.stages import calibrate, studies
@@ -38,7 +38,7 @@ def case(name="paper", steps=SHORT, whole=False):
     sense = plan.rotation_sense()
     traces = {law: driven(scenario, sense, law, true.model if law in METRIC_LAWS else model) for law in LAWS}
     for law in FOLLOWING:
-        followed = name_of(law, following_mode(law))
+        followed = name_of(law, MODES_OF[law][1])
         traces[followed] = driven(scenario, plan, followed, model)
     clean = replace(
         known_scenario(idealized(config)), limits=scenario.limits._replace(stop_at_joint_limit=False)

@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from projservo_cli.cli.export import write_csv
 
 from projservo_cli.files import inside, replacing, require_inside, require_writable, working_in
 from projservo_cli.records import InputError
@@ -142,7 +141,6 @@ def test_a_full_disk_is_told_and_the_old_file_stays(little_disk):
     (little_disk / "filling").write_bytes(bytes(240_000))
     writers = [
         lambda: save(replace(run, path=path)),
-        lambda: write_csv(run, little_disk / "csv"),
         lambda: write_comparison([run, run], path),
         lambda: write_table(run.observation, path),
     ]
@@ -150,4 +148,4 @@ def test_a_full_disk_is_told_and_the_old_file_stays(little_disk):
         with pytest.raises(InputError, match=": cannot be written: No space left on device"):
             write()
     assert path.read_bytes() == b"old"
-    assert {found.name for found in little_disk.iterdir()} <= {"file", "filling", "csv"}
+    assert {found.name for found in little_disk.iterdir()} <= {"file", "filling"}

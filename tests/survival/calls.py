@@ -1,36 +1,27 @@
 """The command line called in a process of its own, forked from this one, and what became of it."""
 
-import importlib
 import io
+import math
 import os
+import signal
 import sys
 import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 from projservo_cli import cli
-from projservo_cli.stages.steps import STAGES
 
 TRACEBACK = "Traceback (most recent call last)"
 
 
 @dataclass(frozen=True)
 class Ending:
-    """How a call ended.
+    """How a call ended."""
 
-    Attributes
-    ----------
-    code : exit code, negative for the number of a signal.
-    out, err : what it said, with characters that are not UTF-8 escaped.
-    seconds : of processors, its children included.
-    megabytes : largest memory of the process or of a child.
-    """
-
-    code: int
-    out: str
+    code: int  # of its exit, negative for the number of a signal
+    out: str  # what it said, with characters that are not UTF-8 escaped
     err: str
-    seconds: float
-    megabytes: float
 
     def wrong_refusal(self) -> str:
         """What is wrong with it as a refusal of bad input; empty where nothing is."""
@@ -44,37 +35,19 @@ class Ending:
         return ""
 
 
-@dataclass(frozen=True)
-class Call:
-    """A call that runs; ``process`` is its number, ``folder`` takes what it says."""
-
-    process: int
-    folder: tempfile.TemporaryDirectory[str]
-
-    def end(self) -> Ending:
-        """Wait for its end."""
-        _, status, usage = os.wait4(self.process, 0)
-        with self.folder as folder:
-            said = [
-                path.read_text(encoding="utf-8", errors="backslashreplace") if path.exists() else ""
-                for path in (Path(folder, "out"), Path(folder, "err"))
-            ]
-        seconds = usage.ru_utime + usage.ru_stime
-        return Ending(os.waitstatus_to_exitcode(status), *said, seconds, usage.ru_maxrss / 1024.0)
-
-
-def start(*arguments: str) -> Call:
-    """Begin to call ``projservo`` in a forked process, where nothing has to be imported anew."""
-    folder = tempfile.TemporaryDirectory()
-    child = os.fork()
-    if child == 0:
-        _run(arguments, Path(folder.name, "out"), Path(folder.name, "err"))
-    return Call(child, folder)
-
-
-def call(*arguments: str) -> Ending:
-    """Call ``projservo`` with arguments to its end."""
-    return start(*arguments).end()
+def call(*arguments: str, kill_after: float = math.inf) -> Ending:
+    """Call ``projservo`` in a forked process, where nothing has to be imported anew; s until it is killed."""
+    with tempfile.TemporaryDirectory() as folder:
+        said = [Path(folder, name) for name in ("out", "err")]
+        child = os.fork()
+        if child == 0:
+            _run(arguments, *said)
+        if math.isfinite(kill_after):
+            time.sleep(kill_after)
+            os.kill(child, signal.SIGKILL)
+        _, status = os.waitpid(child, 0)
+        texts = [p.read_text(encoding="utf-8", errors="backslashreplace") if p.exists() else "" for p in said]
+        return Ending(os.waitstatus_to_exitcode(status), *texts)
 
 
 def _run(arguments: tuple[str, ...], out: Path, err: Path) -> None:
@@ -90,10 +63,3 @@ def _run(arguments: tuple[str, ...], out: Path, err: Path) -> None:
         sys.stderr.flush()
     finally:
         os._exit(code)
-
-
-def prepare() -> None:
-    """Import once what calls import, rather than in every one of them."""
-    modules = ("cli.configuration", "cli.words", "store.run_file", "report.page", "sweep.report", "tables")
-    for name in (*modules, *(f"stages.{stage}" for stage in STAGES)):
-        importlib.import_module(f"projservo_cli.{name}")
