@@ -72,7 +72,7 @@ REGISTER = (
     _entry(
         "7",
         "Velocity of a projective point and of its image",
-        "geometry.kinematics.image_velocity calibration.adjustment.derivative",
+        "geometry.kinematics.image_velocity calibration.prediction.projection_derivative",
         "geometry/test_kinematics.py::test_image_jacobian_is_the_derivative_of_the_pixels",
         "The second row of J_G is printed as 1/m3, 0, …; it is 0, 1/m3, −m2/m3².",
     ),

@@ -5,7 +5,6 @@ bundle adjustment (``adjustment``), robustly (``fit``) → what was left out (``
 ``covariance`` → the verdict (``quality``); ``estimate`` leads through it.
 """
 
-from projservo_cli.calibration.covariance import WEAK_NOISE
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
 from projservo_cli.calibration.outliers import findings
@@ -16,7 +15,7 @@ from projservo_cli.calibration.prediction import (
     prediction_variance,
     residual_statistics,
 )
-from projservo_cli.calibration.quality import cross_validate
+from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.calibration.start import Nominal
 from projservo_cli.calibration.suggestions import Region, Suggestion, suggest

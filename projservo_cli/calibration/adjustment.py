@@ -30,6 +30,18 @@ from projservo_cli.geometry.lens import FIRST, bent
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 
+def cross_matrix(w: FloatArray) -> FloatArray:
+    """Matrices (…, 3, 3) of the cross products with w (…, 3)."""
+    S = np.zeros((*w.shape[:-1], 3, 3))
+    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
+    return S - np.swapaxes(S, -1, -2)
+
+
+def _axis_of(H_hat: FloatArray) -> FloatArray:
+    """Axes (…, 3) of the rotation parts of twists (…, 4, 4)."""
+    return np.stack([H_hat[..., 2, 1], H_hat[..., 0, 2], H_hat[..., 1, 0]], axis=-1)
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """What the adjustment varies."""
@@ -38,6 +50,31 @@ class Scene:
     H_hat: FloatArray  # (n, 4, 4) twists at the reference: unit rotations without pitch, or translations
     M: FloatArray  # (m, 4) markers at the reference, last coordinate one
     lens: FloatArray | None = None  # (2, 5) lenses, of which k1 and k2 vary; None where none is sought
+
+    def generators(self, prismatic: BoolArray) -> list[FloatArray]:
+        """Rigid motions (b, 4, 4) that move each joint's screw: four for an axis, two for a direction.
+
+        An axis turns about its point nearest to the markers and shifts across itself; a direction turns.
+        """
+        center = self.M[:, :3].mean(axis=0)
+        size = float(np.linalg.norm(self.M[:, :3] - center, axis=1).mean()) or 1.0
+        H_hat = self.H_hat
+        w = np.where(prismatic[:, None], H_hat[:, :3, 3], _axis_of(H_hat))
+        w = w / np.linalg.norm(w, axis=1, keepdims=True)
+        # Two unit vectors across w: from the coordinate axis farthest from it, so that neither is short.
+        across = np.empty((len(w), 2, 3))
+        W = cross_matrix(w)
+        across[:, 0] = W[np.arange(len(w)), :, np.argmin(np.abs(w), axis=1)]
+        across[:, 0] /= np.linalg.norm(across[:, 0], axis=1, keepdims=True)
+        across[:, 1] = (W @ across[:, 0, :, None])[..., 0]
+        velocity = H_hat[:, :3] @ np.append(center, 1.0)
+        near = center + (W @ velocity[..., None])[..., 0]
+        B = np.zeros((len(w), 4, 4, 4))
+        B[:, :2, :3, :3] = cross_matrix(across)
+        B[:, :2, :3, 3] = -(B[:, :2, :3, :3] @ near[:, None, :, None])[..., 0]
+        B[:, 2:, :3, 3] = across * size
+        B[prismatic, :2, :3, 3] = 0.0
+        return [B[i, : 2 if slides else 4] for i, slides in enumerate(prismatic)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +95,7 @@ class Problem:
 
     def pixels(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Predicted pixels (2, N, 2) of every sighting and their depths (2, N)."""
-        m = image_points(scene.P, carried(self, scene)[1][0])
+        m = image_points(scene.P, self.carried(scene)[1][0])
         pixels = m[..., :2] / m[..., 2:]
         return pixels if scene.lens is None else bent(scene.lens[:, None], pixels), m[..., 2]
 
@@ -68,6 +105,106 @@ class Problem:
             self.readings.seen[..., None], self.pixels(scene)[0] - self.readings.pixels, 0.0
         )
         return result
+
+    def carried(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
+        """Displacements (n, N, 4, 4) at each sighting, and its point behind each joint (n + 1, N, 4)."""
+        readings = self.readings
+        E = displacements(scene.H_hat, readings.prismatic, self.q)[:, readings.pose_of]
+        return E, moved_points(E, scene.M[readings.marker_of][:, None])[:, :, 0]
+
+    def derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
+        """Pixels (2, N, 2) and their compact derivative (2, N, 2, c), [RH00] eq. (7) carried through eq. (6).
+
+        With Y_i the point behind joint i, D_i the image derivative carried to it and B a generator, a joint
+        contributes D_i (B Y_i − E_i B Y_{i+1}). Columns are those of ``Problem.columns``.
+        """
+        E, Y = self.carried(scene)
+        pixels, G, by_lens = projection_derivative(scene.P, scene.lens, Y[0])
+        blocks = [(G[..., None] * Y[0][:, None, None, :]).reshape(*G.shape[:3], CAMERA)]
+        D = G @ scene.P[:, None]
+        for i, B in enumerate(scene.generators(self.readings.prismatic)):
+            before = D @ np.einsum("bij,Nj->Nib", B, Y[i])
+            D = D @ E[i]
+            blocks.append(before - D @ np.einsum("bij,Nj->Nib", B, Y[i + 1]))
+        blocks.append(D[..., :3])
+        if by_lens is not None:
+            blocks.append(by_lens)
+        return pixels, np.concatenate(blocks, axis=3)
+
+    def joint_derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
+        """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values, [RH00] eqs. (7), (19)."""
+        E, Y = self.carried(scene)
+        pixels, G, _ = projection_derivative(scene.P, scene.lens, Y[0])
+        D = G @ scene.P[:, None]
+        J = np.empty((*pixels.shape, len(E)))
+        for i in range(len(E)):
+            J[..., i] = np.einsum("vNrc,Nc->vNr", D, Y[i] @ scene.H_hat[i].T)
+            D = D @ E[i]
+        return pixels, J
+
+    def retract(self, scene: Scene, x: FloatArray) -> Scene:
+        """Scene after a step x (size,); screws move as rigid bodies and keep their constraints."""
+        prismatic = self.readings.prismatic
+        steps = np.split(x[self.joint[0] : self.joint[-1]], self.joint[1:-1] - self.joint[0])
+        twists = [
+            np.tensordot(step, B, axes=1) for step, B in zip(steps, scene.generators(prismatic), strict=True)
+        ]
+        motion = expm(np.array(twists))
+        moved = motion @ scene.H_hat @ np.linalg.inv(motion)
+        # Without the round-off of the step: speed and vanishing pitch restored.
+        H_hat = np.zeros_like(moved)
+        for i, slides in enumerate(prismatic):
+            v = moved[i, :3, 3]
+            if slides:
+                H_hat[i, :3, 3] = v * np.linalg.norm(scene.H_hat[i, :3, 3]) / np.linalg.norm(v)
+            else:
+                w = _axis_of(0.5 * (moved[i] - moved[i].T))
+                w /= np.linalg.norm(w)
+                H_hat[i, :3, :3] = cross_matrix(w)
+                H_hat[i, :3, 3] = v - w * (w @ v)
+        M = scene.M.copy()
+        M[:, :3] += x[self.joint[-1] : self.lens].reshape(-1, 3)
+        lens = scene.lens
+        if lens is not None:
+            lens = lens.copy()
+            lens[:, FIRST:] += x[self.lens :].reshape(2, LENS)
+        return Scene(scene.P + x[: 2 * CAMERA].reshape(2, 3, 4), H_hat, M, lens)
+
+    def gauge(self, scene: Scene) -> FloatArray:
+        """Directions (size, g) of the parameters that change no image, of unit norm each.
+
+        Six rigid motions of the frame, its scale unless a prismatic joint sets it, and the cameras' scales.
+        """
+        prismatic = self.readings.prismatic
+        motions = np.zeros((6 if prismatic.any() else 7, 4, 4))
+        motions[:3, :3, :3] = cross_matrix(np.eye(3))
+        motions[3:6, :3, 3] = np.eye(3)
+        motions[6:, :3, :3] = np.eye(3)
+        bases = scene.generators(prismatic)
+        result = np.zeros((self.size, len(motions) + 2))
+        for k, Z in enumerate(motions):
+            result[: 2 * CAMERA, k] = -(scene.P @ Z).ravel()
+            for i, B in enumerate(bases):
+                wanted = (Z @ scene.H_hat[i] - scene.H_hat[i] @ Z).ravel()
+                reach = (B @ scene.H_hat[i] - scene.H_hat[i] @ B).reshape(len(B), 16).T
+                result[self.joint[i] : self.joint[i + 1], k] = np.linalg.lstsq(reach, wanted, rcond=None)[0]
+            result[self.joint[-1] : self.lens, k] = (scene.M @ Z.T)[:, :3].ravel()
+        for v in (0, 1):
+            result[v * CAMERA : (v + 1) * CAMERA, len(motions) + v] = scene.P[v].ravel()
+        directions: FloatArray = result / np.linalg.norm(result, axis=0)
+        return directions
+
+    def scaled_normal(
+        self, scene: Scene, J: FloatArray, weight: FloatArray, first: int, least: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Normal matrix from a first parameter on, its diagonal at most one and the gauge tied; its units."""
+        A = self.normal(J, weight)[first:, first:]
+        scale = np.maximum(least, np.sqrt(np.maximum(np.diagonal(A), 1e-300)))
+        A = A / np.outer(scale, scale)
+        if first == 0:
+            G = np.linalg.qr(scale[:, None] * self.gauge(scene))[0]
+            A += G @ G.T
+        return A, scale
 
     def normal(self, J: FloatArray, weight: FloatArray) -> FloatArray:
         """Normal matrix Jᵀ W J (size, size) from the compact derivative, one marker and view at a time."""
@@ -125,137 +262,6 @@ def prepare(readings: Readings, q_reference: FloatArray, lens: bool = False) -> 
     return Problem(readings, q, q_reference, joint, first, first + 2 * count, groups, columns)
 
 
-def carried(problem: Problem, scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Displacements (n, N, 4, 4) at each sighting, and its point behind each joint (n + 1, N, 4)."""
-    readings = problem.readings
-    E = displacements(scene.H_hat, readings.prismatic, problem.q)[:, readings.pose_of]
-    return E, moved_points(E, scene.M[readings.marker_of][:, None])[:, :, 0]
-
-
-def derivative(problem: Problem, scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Pixels (2, N, 2) and their compact derivative (2, N, 2, c), [RH00] eq. (7) carried through eq. (6).
-
-    With Y_i the point behind joint i, D_i the image derivative carried to it and B a generator, a joint
-    contributes D_i (B Y_i − E_i B Y_{i+1}). Columns are those of ``Problem.columns``.
-    """
-    E, Y = carried(problem, scene)
-    pixels, G, by_lens = projection_derivative(scene.P, scene.lens, Y[0])
-    blocks = [(G[..., None] * Y[0][:, None, None, :]).reshape(*G.shape[:3], CAMERA)]
-    D = G @ scene.P[:, None]
-    for i, B in enumerate(generators(scene, problem.readings.prismatic)):
-        before = D @ np.einsum("bij,Nj->Nib", B, Y[i])
-        D = D @ E[i]
-        blocks.append(before - D @ np.einsum("bij,Nj->Nib", B, Y[i + 1]))
-    blocks.append(D[..., :3])
-    if by_lens is not None:
-        blocks.append(by_lens)
-    return pixels, np.concatenate(blocks, axis=3)
-
-
-def joint_derivative(problem: Problem, scene: Scene) -> tuple[FloatArray, FloatArray]:
-    """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values, [RH00] eqs. (7), (19)."""
-    E, Y = carried(problem, scene)
-    pixels, G, _ = projection_derivative(scene.P, scene.lens, Y[0])
-    D = G @ scene.P[:, None]
-    J = np.empty((*pixels.shape, len(E)))
-    for i in range(len(E)):
-        J[..., i] = np.einsum("vNrc,Nc->vNr", D, Y[i] @ scene.H_hat[i].T)
-        D = D @ E[i]
-    return pixels, J
-
-
-def cross_matrix(w: FloatArray) -> FloatArray:
-    """Matrices (…, 3, 3) of the cross products with w (…, 3)."""
-    S = np.zeros((*w.shape[:-1], 3, 3))
-    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -w[..., 2], w[..., 1], -w[..., 0]
-    return S - np.swapaxes(S, -1, -2)
-
-
-def _axis_of(H_hat: FloatArray) -> FloatArray:
-    """Axes (…, 3) of the rotation parts of twists (…, 4, 4)."""
-    return np.stack([H_hat[..., 2, 1], H_hat[..., 0, 2], H_hat[..., 1, 0]], axis=-1)
-
-
-def generators(scene: Scene, prismatic: BoolArray) -> list[FloatArray]:
-    """Rigid motions (b, 4, 4) that move each joint's screw: four for an axis, two for a direction.
-
-    An axis turns about its point nearest to the markers and shifts across itself; a direction turns.
-    """
-    center = scene.M[:, :3].mean(axis=0)
-    size = float(np.linalg.norm(scene.M[:, :3] - center, axis=1).mean()) or 1.0
-    H_hat = scene.H_hat
-    w = np.where(prismatic[:, None], H_hat[:, :3, 3], _axis_of(H_hat))
-    w = w / np.linalg.norm(w, axis=1, keepdims=True)
-    # Two unit vectors across w: from the coordinate axis farthest from it, so that neither is short.
-    across = np.empty((len(w), 2, 3))
-    W = cross_matrix(w)
-    across[:, 0] = W[np.arange(len(w)), :, np.argmin(np.abs(w), axis=1)]
-    across[:, 0] /= np.linalg.norm(across[:, 0], axis=1, keepdims=True)
-    across[:, 1] = (W @ across[:, 0, :, None])[..., 0]
-    velocity = H_hat[:, :3] @ np.append(center, 1.0)
-    near = center + (W @ velocity[..., None])[..., 0]
-    B = np.zeros((len(w), 4, 4, 4))
-    B[:, :2, :3, :3] = cross_matrix(across)
-    B[:, :2, :3, 3] = -(B[:, :2, :3, :3] @ near[:, None, :, None])[..., 0]
-    B[:, 2:, :3, 3] = across * size
-    B[prismatic, :2, :3, 3] = 0.0
-    return [B[i, : 2 if slides else 4] for i, slides in enumerate(prismatic)]
-
-
-def retract(problem: Problem, scene: Scene, x: FloatArray) -> Scene:
-    """Scene after a step x (size,); screws move as rigid bodies and keep their constraints."""
-    prismatic = problem.readings.prismatic
-    steps = np.split(x[problem.joint[0] : problem.joint[-1]], problem.joint[1:-1] - problem.joint[0])
-    twists = [
-        np.tensordot(step, B, axes=1) for step, B in zip(steps, generators(scene, prismatic), strict=True)
-    ]
-    motion = expm(np.array(twists))
-    moved = motion @ scene.H_hat @ np.linalg.inv(motion)
-    # Without the round-off of the step: speed and vanishing pitch restored.
-    H_hat = np.zeros_like(moved)
-    for i, slides in enumerate(prismatic):
-        v = moved[i, :3, 3]
-        if slides:
-            H_hat[i, :3, 3] = v * np.linalg.norm(scene.H_hat[i, :3, 3]) / np.linalg.norm(v)
-        else:
-            w = _axis_of(0.5 * (moved[i] - moved[i].T))
-            w /= np.linalg.norm(w)
-            H_hat[i, :3, :3] = cross_matrix(w)
-            H_hat[i, :3, 3] = v - w * (w @ v)
-    M = scene.M.copy()
-    M[:, :3] += x[problem.joint[-1] : problem.lens].reshape(-1, 3)
-    lens = scene.lens
-    if lens is not None:
-        lens = lens.copy()
-        lens[:, FIRST:] += x[problem.lens :].reshape(2, LENS)
-    return Scene(scene.P + x[: 2 * CAMERA].reshape(2, 3, 4), H_hat, M, lens)
-
-
-def gauge(problem: Problem, scene: Scene) -> FloatArray:
-    """Directions (size, g) of the parameters that change no image, of unit norm each.
-
-    Six rigid motions of the frame, its scale unless a prismatic joint sets it, and the scales of the cameras.
-    """
-    prismatic = problem.readings.prismatic
-    motions = np.zeros((6 if prismatic.any() else 7, 4, 4))
-    motions[:3, :3, :3] = cross_matrix(np.eye(3))
-    motions[3:6, :3, 3] = np.eye(3)
-    motions[6:, :3, :3] = np.eye(3)
-    bases = generators(scene, prismatic)
-    result = np.zeros((problem.size, len(motions) + 2))
-    for k, Z in enumerate(motions):
-        result[: 2 * CAMERA, k] = -(scene.P @ Z).ravel()
-        for i, B in enumerate(bases):
-            wanted = (Z @ scene.H_hat[i] - scene.H_hat[i] @ Z).ravel()
-            reach = (B @ scene.H_hat[i] - scene.H_hat[i] @ B).reshape(len(B), 16).T
-            result[problem.joint[i] : problem.joint[i + 1], k] = np.linalg.lstsq(reach, wanted, rcond=None)[0]
-        result[problem.joint[-1] : problem.lens, k] = (scene.M @ Z.T)[:, :3].ravel()
-    for v in (0, 1):
-        result[v * CAMERA : (v + 1) * CAMERA, len(motions) + v] = scene.P[v].ravel()
-    directions: FloatArray = result / np.linalg.norm(result, axis=0)
-    return directions
-
-
 # Largest ratio of second-order to first-order step, and the probe of the second derivative, as by the source.
 _BEND, _PROBE = 0.75, 0.1
 LEAST_DAMPING = 1e-15
@@ -271,12 +277,11 @@ Stalled = Callable[[FloatArray], bool]
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A scene, how well it explains the images, and how the search ended."""
+    """A scene, and how well it explains the images."""
 
     scene: Scene  # the model
     residual: FloatArray  # (2, N, 2) predicted minus seen, px, zero where not seen
     cost: float  # weighted sum of squares, px²
-    settled: bool  # whether the last step was too small to matter
 
 
 class _Expansion(NamedTuple):
@@ -314,14 +319,14 @@ def minimize(
     fresh = True
     for _ in range(most):
         if fresh:
-            J = derivative(problem, scene)[1]
-            A, scale = scaled_normal(problem, scene, J, weight, first, scale)
+            J = problem.derivative(scene)[1]
+            A, scale = problem.scaled_normal(scene, J, weight, first, scale)
             here = _Expansion(scene, residual, weight, J, A, scale)
             cost = _cost(weight, residual)
             fresh = False
         x = _step(problem, here, damping)
         if x is not None:
-            candidate = retract(problem, scene, x)
+            candidate = problem.retract(scene, x)
             new_residual = problem.residual(candidate)
             new_cost = _cost(weight, new_residual)
             fresh = bool(np.isfinite(new_cost)) and new_cost <= cost
@@ -336,25 +341,12 @@ def minimize(
             damping *= 10.0
         if settled or damping > _MOST_DAMPING:
             break
-    return Fit(scene, residual, _cost(weight, residual), settled)
+    return Fit(scene, residual, _cost(weight, residual))
 
 
 def _cost(weight: FloatArray, residual: FloatArray) -> float:
     """Weighted sum of squares of residuals (2, N, 2), px²."""
     return float((weight[..., None] * residual**2).sum())
-
-
-def scaled_normal(
-    problem: Problem, scene: Scene, J: FloatArray, weight: FloatArray, first: int, least: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Normal matrix from a first parameter on, its diagonal at most one and the gauge tied; its units."""
-    A = problem.normal(J, weight)[first:, first:]
-    scale = np.maximum(least, np.sqrt(np.maximum(np.diagonal(A), 1e-300)))
-    A = A / np.outer(scale, scale)
-    if first == 0:
-        G = np.linalg.qr(scale[:, None] * gauge(problem, scene))[0]
-        A += G @ G.T
-    return A, scale
 
 
 def _step(problem: Problem, here: _Expansion, damping: float) -> FloatArray | None:
@@ -375,7 +367,7 @@ def _step(problem: Problem, here: _Expansion, damping: float) -> FloatArray | No
         return np.concatenate([held, step / here.scale])
 
     velocity = descent(here.residual)
-    probe = problem.residual(retract(problem, here.scene, _PROBE * whole(velocity)))
+    probe = problem.residual(problem.retract(here.scene, _PROBE * whole(velocity)))
     bend = (2.0 / _PROBE) * ((probe - here.residual) / _PROBE - problem.change(here.J, whole(velocity)))
     if not np.isfinite(bend).all():
         return None

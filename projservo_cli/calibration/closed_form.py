@@ -3,17 +3,16 @@
 import numpy as np
 
 from projservo_cli.calibration.covariance import ProjectiveScene, isotropic
-from projservo_cli.calibration.epipolar import homogeneous, normalization
-from projservo_cli.calibration.readings import Readings, joint_trials, reference_pose
+from projservo_cli.calibration.epipolar import reconstruct
+from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.displacement import log_rotation, log_translation, normalize_displacement
-from projservo_cli.records import BoolArray, FloatArray, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 _LEAST_MARKERS = 5
 # Parallax off the best plane, in units of the pixel noise, below which a body is coplanar.
 _COPLANAR = 3.0
 # Trials whose angle has a smaller sine are too close to 0 or ±180° for equation (4) under noise.
 _LEAST_LEVER = 1e-3
-_WHITENINGS = 30
 
 
 def closed_form_operators(
@@ -26,7 +25,7 @@ def closed_form_operators(
 
     Raises WorkFailed if the trials do not determine the operators: which joint, and why.
     """
-    home = reference_pose(readings.q)
+    home = readings.home()
     if home is None:
         raise WorkFailed(
             "the closed_form method needs single-joint trials about one reference pose, and these poses move "
@@ -44,7 +43,7 @@ def closed_form_operators(
         )
     _require_space(P, M[home, known[home]], sigma_px)
     # The depth in the left camera is positive for all points: it orients them as a_inf would.
-    trials = joint_trials(readings.q, home)
+    trials = readings.trials(home)
     H_hat = np.array([_mean_operator(i, rows, M, home, readings, P[0, 2]) for i, rows in enumerate(trials)])
     a_inf = np.linalg.svd(np.hstack(list(H_hat)))[0][:, 3]
     sides = points @ a_inf
@@ -54,7 +53,7 @@ def closed_form_operators(
 
 
 def _mean_operator(
-    i: int, rows: list[int], M: FloatArray, home: int, readings: Readings, depth: FloatArray
+    i: int, rows: IntArray, M: FloatArray, home: int, readings: Readings, depth: FloatArray
 ) -> FloatArray:
     """Operator (4, 4) of joint i from its trials, the rows of M (K, m, 4) where it alone moved.
 
@@ -110,57 +109,3 @@ def _require_space(P: FloatArray, points: FloatArray, sigma_px: float) -> None:
             "the markers lie in one plane: a plane's motion does not determine a 4×4 homography; "
             "use refined, or move a marker off the plane"
         )
-
-
-def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Cameras (2, 3, 4) and points (N, 4) of corresponding pixels (N, 2) in an isotropic projective frame.
-
-    Points are of unit norm, with positive depth in both views where the data allow it.
-    """
-    T = np.stack([normalization(left), normalization(right)])
-    back = np.linalg.inv(T)
-    P = _canonical_pair(back[1].T @ F @ back[0])
-    # The right camera is known up to P' + e' vᵀ: a frame in which its left block is not singular.
-    points = _triangulate(P, homogeneous(left) @ T[0].T, homogeneous(right) @ T[1].T)
-    W = _isotropic_frame(points)
-    points = points @ W.T
-    P = back @ P @ np.linalg.inv(W)
-    depth = points @ P[:, 2].T
-    points = points * np.sign(depth[:, :1]) / np.linalg.norm(points, axis=1, keepdims=True)
-    P[1] *= np.sign(np.median(points @ P[1, 2]))
-    return P, points
-
-
-def _canonical_pair(F: FloatArray) -> FloatArray:
-    """Cameras (2, 3, 4) of a fundamental matrix, [I | 0] and [[e']× F | e'].
-
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., result 9.14.
-    """
-    e = np.linalg.svd(F)[0][:, 2]
-    right = np.hstack([np.cross(e[:, None], F, axis=0), e[:, None]])
-    return np.stack([np.hstack([np.eye(3), np.zeros((3, 1))]), right])
-
-
-def _triangulate(P: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Points (N, 4) of unit norm from linear equations in both views, homogeneous pixels (N, 3).
-
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
-    """
-    rows = np.concatenate(
-        [image[:, :2, None] * camera[2] - camera[:2] for camera, image in zip(P, (left, right), strict=True)],
-        axis=1,
-    )
-    return np.linalg.svd(rows)[2][:, 3]
-
-
-def _isotropic_frame(points: FloatArray) -> FloatArray:
-    """Frame change W (4, 4) after which points (N, 4) of unit norm have a multiple of I as second moment.
-
-    Without it one coordinate is a thousand times another and every linear method after it fails.
-    """
-    W = np.eye(4)
-    for _ in range(_WHITENINGS):
-        moved = points @ W.T
-        moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
-        W = np.linalg.inv(np.linalg.cholesky(4.0 * moved.T @ moved / len(moved))) @ W
-    return W

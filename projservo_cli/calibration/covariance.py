@@ -1,15 +1,16 @@
-"""The projective frame of the result, the covariance in it, and how far predictions from it may err."""
+"""The projective frame of the result, and the covariance in it."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import Problem, Scene, carried, derivative, gauge, generators
-from projservo_cli.calibration.prediction import CAMERA, marker_pixels, prediction_derivative
-from projservo_cli.calibration.readings import MOST_REACHES, REACH_M, REACH_RAD, Readings
-from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Model
+from projservo_cli.calibration.adjustment import Problem, Scene
+from projservo_cli.calibration.prediction import CAMERA
+from projservo_cli.calibration.readings import ON_A_LINE
+from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
+# Least distance of the markers from their best line, in units of its own noise.
+_OFF_LINE = 5.0
 # A direction whose singular value is this share of the largest is open.
 _OPEN_DIRECTION = 1e-10
 _A_INF = np.array([0.0, 0.0, 0.0, 1.0])
@@ -57,7 +58,7 @@ def isotropic(
 
 def projective(problem: Problem, scene: Scene) -> ProjectiveScene:
     """The adjusted scene in the isotropic projective frame of the points seen."""
-    return isotropic(scene.P, scene.H_hat, scene.M, _A_INF, carried(problem, scene)[1][0])
+    return isotropic(scene.P, scene.H_hat, scene.M, _A_INF, problem.carried(scene)[1][0])
 
 
 def spread_factor(problem: Problem, scene: Scene, used: BoolArray) -> FloatArray:
@@ -66,11 +67,11 @@ def spread_factor(problem: Problem, scene: Scene, used: BoolArray) -> FloatArray
     Singular values of J itself keep the weakest direction, which the normal matrix would lose.
     At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
     """
-    J = problem.dense(derivative(problem, scene)[1], used)
+    J = problem.dense(problem.derivative(scene)[1], used)
     scale = np.linalg.norm(J, axis=0)
     # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
     scale = np.where(scale > 0.0, scale, scale.max())
-    G = np.linalg.qr(scale[:, None] * gauge(problem, scene))[0]
+    G = np.linalg.qr(scale[:, None] * problem.gauge(scene))[0]
     free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
     _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
     # Robots of one or two joints leave more directions open than the gauge, none of which matters
@@ -103,7 +104,7 @@ def _output_derivative(problem: Problem, scene: Scene, result: ProjectiveScene) 
     for v in (0, 1):
         rows = slice(v * CAMERA, (v + 1) * CAMERA)
         J[rows, rows] = result.camera_scale[v] * np.kron(np.eye(3), back.T)
-    for i, B in enumerate(generators(scene, problem.readings.prismatic)):
+    for i, B in enumerate(scene.generators(problem.readings.prismatic)):
         turned = result.W @ (B @ scene.H_hat[i] - scene.H_hat[i] @ B) @ back
         rows = slice(2 * CAMERA + 16 * i, 2 * CAMERA + 16 * (i + 1))
         J[rows, problem.joint[i] : problem.joint[i + 1]] = turned.reshape(len(B), 16).T
@@ -129,7 +130,7 @@ def _output_gauge(result: ProjectiveScene) -> FloatArray:
     return np.asarray(np.linalg.svd(np.array(directions).T, full_matrices=False)[0])
 
 
-def marker_factor(result: ProjectiveScene, factor: FloatArray) -> FloatArray:
+def _marker_factor(result: ProjectiveScene, factor: FloatArray) -> FloatArray:
     """Factor (4 m, r) of the covariance of the markers as points, whatever frame and scale they are given."""
     first, m = result.P.size + result.H_hat_0.size, len(result.M)
     scales = np.zeros((first + 4 * m, m))
@@ -142,127 +143,14 @@ def marker_factor(result: ProjectiveScene, factor: FloatArray) -> FloatArray:
     return (factor - free @ (free.T @ factor))[first:]
 
 
-# Noise of predictions at the reach, in units of the pixel noise: above it a joint is weak.
-WEAK_NOISE = 3.0
-# Poses at which predictions are judged; how sure they stay below the bound; halvings of an empty range.
-_POSES, _SURE, _HALVINGS = 60, 0.99, 10
-# Frames of the trial motion that is advised; the least range of it, in reaches, and how often the
-# logarithm of the range between it and the farthest is halved: to a twentieth.
-_FRAMES, _LEAST_REACHES, _BISECTIONS = 8, 0.01, 7
+def require_off_line(result: ProjectiveScene, factor: FloatArray) -> None:
+    """Refuse a body that a factor (24 + 16 n + 4 m or more, r) of its covariance cannot tell from a line.
 
-
-@dataclass(frozen=True, eq=False)
-class Uncertainty:
-    """A calibration whose predictions err, judged in twice the image region in which markers were seen."""
-
-    model: Model  # projective robot and rig
-    M: FloatArray  # (m, 4) markers at the reference
-    factor: FloatArray  # (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel
-    readings: Readings  # what the calibration was made from
-
-    def shown(self, q: FloatArray) -> BoolArray:
-        """Which images (K, 2, m) at poses (K, n) lie in the region that counts."""
-        pixels = marker_pixels(self.model, self.M, q)
-        inside = np.empty(pixels.shape[:-1], dtype=np.bool_)
-        for v in (0, 1):
-            seen = self.readings.pixels[v][self.readings.seen[v]]
-            low, high = seen.min(axis=0), seen.max(axis=0)
-            wide = 0.5 * (high - low)
-            inside[:, v] = ((pixels[:, v] >= low - wide) & (pixels[:, v] <= high + wide)).all(axis=-1)
-        return inside
-
-    def spread(self, q: FloatArray, shown: BoolArray) -> FloatArray:
-        """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one."""
-        J = prediction_derivative(self.model, self.M, q)[shown]
-        return np.asarray(J.reshape(-1, len(self.factor)) @ self.factor)
-
-    def at(self, i: int, offsets: FloatArray) -> FloatArray:
-        """Poses (K, n) with joint i at offsets (K,) from the reference, rad or m."""
-        q = np.tile(self.model.q_reference, (len(offsets), 1))
-        q[:, i] += offsets
-        return q
-
-    def reach(self, i: int) -> float:
-        """Reach of joint i at which predictions are judged, rad or m."""
-        return REACH_M if self.model.joint_types[i] == PRISMATIC else REACH_RAD
-
-    def reach_spread(self, i: int) -> FloatArray:
-        """``spread`` with joint i at its reach, to either side; halved where no image would count."""
-        reach = self.reach(i)
-        for _ in range(_HALVINGS):
-            q = self.at(i, np.array([reach, -reach]))
-            shown = self.shown(q)
-            if shown.any():
-                break
-            reach *= 0.5
-        return self.spread(q, shown)
-
-
-def reach_noise(sure: Uncertainty) -> FloatArray:
-    """Noise of predicted images (n,) with each joint at its reach, in units of the pixel noise."""
-    rows = (sure.reach_spread(i) for i in range(len(sure.model.joint_types)))
-    return np.array([np.sqrt((T**2).sum() / max(len(T), 1)) for T in rows])
-
-
-def needed_spans(sure: Uncertainty, noise: FloatArray) -> FloatArray:
-    """Range (n,) of a trial motion of each joint of too much noise (n,) that would mend it, rad or m.
-
-    The trial is of eight frames about the reference, of this joint alone, beside the data there are;
-    information adds up. NaN for joints that are not weak or that no trial of sensible range mends.
+    A line is the span of two points; the markers must be off it by several times the noise of that distance.
     """
-    needed = np.full(len(noise), np.nan)
-    for i in np.flatnonzero(noise > WEAK_NOISE).tolist():
-        T = sure.reach_spread(i)
-        low, high = _LEAST_REACHES * sure.reach(i), MOST_REACHES * sure.reach(i)
-        if _noise_after(sure, i, high, T) > WEAK_NOISE:
-            continue
-        for _ in range(_BISECTIONS):
-            middle = float(np.sqrt(low * high))
-            if _noise_after(sure, i, middle, T) > WEAK_NOISE:
-                low = middle
-            else:
-                high = middle
-        needed[i] = high
-    return needed
-
-
-def _noise_after(sure: Uncertainty, i: int, span: float, T: FloatArray) -> float:
-    """Noise at the reach after a trial over a span: rms of T (I + Cᵀ C)⁻¹ Tᵀ, C the trial's ``spread``."""
-    q = sure.at(i, np.linspace(-0.5 * span, 0.5 * span, _FRAMES))
-    C = sure.spread(q, sure.shown(q))
-    root = np.asarray(np.linalg.qr(np.vstack([np.eye(C.shape[1]), C]), mode="r"))
-    left = np.linalg.solve(root.T, T.T)
-    return float(np.sqrt((left**2).sum() / max(len(T), 1)))
-
-
-def predicted_error(sure: Uncertainty) -> tuple[float, float]:
-    """Expected error of images at poses of all joints at once, and what 99 of 100 calibrations stay below.
-
-    Root mean squares of the Euclidean error per marker and view, in units of the pixel noise, over poses
-    drawn evenly within the ranges that the joints moved through; where no image would count, the ranges
-    are halved about the reference. No residual shows on which side of the expectation a calibration came
-    to lie: to first order the error of a maximum of the likelihood does not depend on what it leaves.
-    """
-    q = sure.readings.q
-    poses = np.random.default_rng(0).uniform(q.min(axis=0), q.max(axis=0), (_POSES, q.shape[1]))
-    for _ in range(_HALVINGS):
-        shown = sure.shown(poses)
-        if shown.any():
-            break
-        poses = 0.5 * (poses + sure.model.q_reference)
-    spread = sure.spread(poses, shown)
-    variances = np.linalg.eigvalsh(spread.T @ spread) / max(int(shown.sum()), 1)
-    return float(np.sqrt(variances.sum())), float(np.sqrt(quantile(variances, _SURE)))
-
-
-def quantile(variances: FloatArray, probability: float) -> float:
-    """Quantile of a sum of squares of independent normal variables of variances (r,), by its three moments.
-
-    Source: M. J. Buckley, G. K. Eagleson, "An approximation to the distribution of quadratic forms in
-    normal random variables", Australian Journal of Statistics 30A, 1988.
-    """
-    mean, square, cube = (float((variances**power).sum()) for power in (1, 2, 3))
-    if cube == 0.0:
-        return mean
-    freedom = square**3 / cube**2
-    return mean + float(np.sqrt(square / freedom) * (chdtri(freedom, 1.0 - probability) - freedom))
+    U, extent, Vt = np.linalg.svd(result.M, full_matrices=False)
+    m = len(result.M)
+    across = np.eye(m) - U[:, :2] @ U[:, :2].T
+    noise = across @ (Vt[2:] @ _marker_factor(result, factor).reshape(m, 4, -1)).reshape(m, -1)
+    if extent[2] < _OFF_LINE * float(np.linalg.norm(noise)):
+        raise WorkFailed(ON_A_LINE)

@@ -6,13 +6,13 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import chdtri, fdtri
 
-from projservo_cli.calibration.adjustment import LEAST_DAMPING, derivative, minimize, prepare, scaled_normal
+from projservo_cli.calibration.adjustment import LEAST_DAMPING, prepare
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.fit import RAYLEIGH, Solution, cauchy, least_squares, median_px
+from projservo_cli.calibration.fit import Solution, follow
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.lens import FIRST, straight_views, within
-from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
 
 _COEFFICIENTS = 2 * LENS
 # A lens is suspected where it explains this share of the squared residuals and chance, with its tail
@@ -23,19 +23,6 @@ _LEAST_CHI2 = 1e-20
 _DECISIVE_SHARE = 0.5
 # Coefficients that noise alone exceeds with this probability show no lens.
 _NO_LENS_TAIL = 0.01
-# Share of readings that may lie outside the images: they are outliers.
-_STRAYS = 0.01
-
-
-def require_size(readings: Readings, size: tuple[int, int]) -> None:
-    """Refuse an image size, width and height in px, that does not hold 99 of 100 pixels seen."""
-    seen = readings.pixels[readings.seen]
-    if np.mean(((seen >= -0.5) & (seen <= np.array(size) - 0.5)).all(axis=1)) < 1.0 - _STRAYS:
-        low, high = np.percentile(seen, [1, 99], axis=0)
-        raise InputError(
-            f"image size {size[0]}x{size[1]} px: markers were seen at u from {low[0]:.0f} to {high[0]:.0f}, "
-            f"v from {low[1]:.0f} to {high[1]:.0f}; give the size of the images, width before height"
-        )
 
 
 def share_explained(solution: Solution, frame: ImageFrame) -> float:
@@ -48,17 +35,17 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     """
     if solution.scene.lens is not None:
         return 0.0
-    readings, agreement = solution.problem.readings, solution.agreement
-    poses = np.unique(readings.pose_of[agreement.used.any(axis=0)])
+    readings = solution.problem.readings
+    poses = np.unique(readings.pose_of[solution.used.any(axis=0)])
     K, d = poses.size, _COEFFICIENTS
     if d + 1 >= K:
         return 0.0
     columns = _cleared_columns(solution, frame)
-    scores = (columns * agreement.residual).sum(axis=(1, 3))
+    scores = (columns * solution.residual).sum(axis=(1, 3))
     by_pose = np.stack([np.bincount(readings.pose_of, score)[poses] for score in scores])
     total = by_pose.sum(axis=1)
     flat = columns.reshape(d, -1)
-    share = float(total @ np.linalg.solve(flat @ flat.T, total)) / max(agreement.chi2, _LEAST_CHI2)
+    share = float(total @ np.linalg.solve(flat @ flat.T, total)) / max(solution.chi2, _LEAST_CHI2)
     square = float(total @ np.linalg.solve(K * np.cov(by_pose), total))
     chance = float(fdtri(d, K - d, 1.0 - _TAIL)) * d * (K - 1) / (K - d)
     return share if square > chance and share >= _LEAST_SHARE else 0.0
@@ -73,9 +60,9 @@ def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
     """Change of the images by k1, k2 of both views (4, 2, N, 2), less what other parameters can undo."""
     problem = prepare(solution.problem.readings, solution.problem.q_reference, lens=True)
     scene = dataclasses.replace(solution.scene, lens=_undistorted(frame))
-    weight = solution.agreement.used.astype(np.float64)
-    J = derivative(problem, scene)[1]
-    A, scale = scaled_normal(problem, scene, J, weight, 0, np.zeros(problem.size))
+    weight = solution.used.astype(np.float64)
+    J = problem.derivative(scene)[1]
+    A, scale = problem.scaled_normal(scene, J, weight, 0, np.zeros(problem.size))
     m = problem.lens
     undo = cho_solve(cho_factor(A[:m, :m] + LEAST_DAMPING * np.eye(m)), A[:m, m:])
     steps = np.vstack([-undo, np.eye(_COEFFICIENTS)]) / scale[:, None]
@@ -87,13 +74,10 @@ def with_lens(solution: Solution, frame: ImageFrame, epipolar: Epipolar) -> Solu
 
     Raises WorkFailed if the data do not determine the distortion.
     """
-    readings = solution.problem.readings
-    problem = prepare(readings, solution.problem.q_reference, lens=True)
+    problem = prepare(solution.problem.readings, solution.problem.q_reference, lens=True)
     scene = dataclasses.replace(solution.scene, lens=_undistorted(frame))
-    searched = minimize(problem, scene, cauchy(readings.seen), most=100)
-    level = median_px(searched.residual, readings.seen)
-    found = least_squares(problem, searched.scene, level / RAYLEIGH, epipolar)
-    if found is None or not _unfolded(found)[found.agreement.used].all():
+    found = follow(problem, scene, epipolar)
+    if found is None or not _unfolded(found)[found.used].all():
         raise WorkFailed(
             "the images do not determine the distortion of the lenses: record poses with markers all over "
             "both images, or calibrate without --lens"

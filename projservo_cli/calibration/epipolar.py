@@ -5,10 +5,11 @@ from, never a result. All of it is free in the adjustment, whose result is proje
 """
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares, minimize_scalar
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.readings import MAD, Readings
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
@@ -17,6 +18,7 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 OUTLIER = 5.0
 _SAMPLES = 500
 _PARAMETERS = 7  # of a fundamental matrix
+_TIGHT = 1e-14  # relative change of the loss, the parameters and the gradient at the end of its search
 # Least median distance of the right view from a homography of the left one, in units of the noise.
 _LEAST_PARALLAX = 3.0
 
@@ -36,7 +38,7 @@ class Epipolar:
 
     def within(self, left: FloatArray, right: FloatArray, deviations: float) -> BoolArray:
         """Which pixels (N, 2) obey the geometry to so many standard deviations."""
-        return np.abs(_sampson(self.F, homogeneous(left), homogeneous(right))) <= deviations * self.sigma_px
+        return np.abs(_sampson(self.F, _homogeneous(left), _homogeneous(right))) <= deviations * self.sigma_px
 
 
 def epipolar_geometry(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> Epipolar:
@@ -53,8 +55,8 @@ def epipolar_geometry(left: FloatArray, right: FloatArray, rng: np.random.Genera
             f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that rows "
             "hold the pixels of both views"
         )
-    T, T_ = normalization(left), normalization(right)
-    a, b = homogeneous(left) @ T.T, homogeneous(right) @ T_.T
+    T, T_ = _normalization(left), _normalization(right)
+    a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
     picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
     candidates = _eight_point(a[picks], b[picks])
     medians = np.median(np.abs(_sampson(candidates, a, b)), axis=1)
@@ -66,7 +68,7 @@ def epipolar_geometry(left: FloatArray, right: FloatArray, rng: np.random.Genera
     F = _refine(F, a, b, 2.0 * _deviation(_sampson(F, a, b), 1e-12))
     product = T_.T @ F @ T
     in_pixels: FloatArray = product / float(np.linalg.norm(product))
-    residual = _sampson(in_pixels, homogeneous(left), homogeneous(right))
+    residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right))
     inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
     if inlier.sum() <= _PARAMETERS:
         raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
@@ -85,12 +87,12 @@ def _deviation(r: FloatArray, least: float) -> float:
     return max(float(np.median(np.abs(r))) / MAD, least)
 
 
-def homogeneous(pixels: FloatArray) -> FloatArray:
+def _homogeneous(pixels: FloatArray) -> FloatArray:
     """Append a one to each row."""
     return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
 
 
-def normalization(pixels: FloatArray) -> FloatArray:
+def _normalization(pixels: FloatArray) -> FloatArray:
     """Similarity (3, 3) that brings pixels (N, 2) to zero median and unit mean absolute deviation.
 
     Source: R. Hartley, "In defense of the eight-point algorithm", PAMI 19(6), 1997, with medians.
@@ -141,58 +143,23 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) ->
 
     F = U diag(cos φ, sin φ, 0) Vᵀ; U and V turn by rotation vectors. Source of the parameters:
     A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters",
-    PAMI 26(3), 2004. Reweighted least squares with Levenberg's damping.
+    PAMI 26(3), 2004.
     """
     U, s, Vt = np.linalg.svd(F)
-    phi = float(np.arctan2(s[1], s[0]))
-    damping = 1e-6
-    loss = np.inf
-    for _ in range(100):
-        F = (U * np.array([np.cos(phi), np.sin(phi), 0.0])) @ Vt
-        r = _sampson(F, left, right)
-        new_loss = float(np.log1p((r / scale) ** 2).sum())
-        if new_loss <= loss:
-            settled = np.isfinite(loss) and loss - new_loss <= 1e-12 * loss
-            U_kept, Vt_kept, phi_kept, loss = U, Vt, phi, new_loss
-            if settled:
-                break
-            weight = 1.0 / (1.0 + (r / scale) ** 2)
-            J = _sampson_gradient(F, left, right).reshape(-1, 9) @ _tangents(U, phi, Vt).reshape(7, 9).T
-            A, g = (J.T * weight) @ J, (J.T * weight) @ r
-            damping = max(0.1 * damping, 1e-14)
-        else:
-            damping *= 100.0
-            if damping > 1e6:
-                break
-        x = -np.linalg.solve(A + damping * np.trace(A) * np.eye(7), g)
-        U, Vt, phi = U_kept @ _turn(x[:3]), _turn(x[3:6]).T @ Vt_kept, phi_kept + x[6]
-    result: FloatArray = (U_kept * np.array([np.cos(phi_kept), np.sin(phi_kept), 0.0])) @ Vt_kept
-    return result
+    phi = np.arctan2(s[1], s[0])
 
+    def turned(x: FloatArray) -> FloatArray:
+        turn, turn_ = Rotation.from_rotvec(x[:6].reshape(2, 3)).as_matrix()
+        product: FloatArray = (U @ turn * [np.cos(phi + x[6]), np.sin(phi + x[6]), 0.0]) @ turn_.T @ Vt
+        return product
 
-def _sampson_gradient(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Derivative of each Sampson distance by the entries of F, (N, 3, 3)."""
-    flat = np.array([1.0, 1.0, 0.0])
-    lines_right, lines_left = (left @ F.T) * flat, (right @ F) * flat
-    incidence, slope = (part[:, None, None] for part in _incidence_and_slope(F, left, right))
-    turn = lines_right[:, :, None] * left[:, None, :] + right[:, :, None] * lines_left[:, None, :]
-    result: FloatArray = (right[:, :, None] * left[:, None, :] - incidence / slope**2 * turn) / slope
-    return result
+    def distances(x: FloatArray) -> FloatArray:
+        return _sampson(turned(x), left, right)
 
-
-def _tangents(U: FloatArray, phi: float, Vt: FloatArray) -> FloatArray:
-    """Derivative of F by the turns of U and V and by φ, (7, 3, 3)."""
-    D = np.diag([np.cos(phi), np.sin(phi), 0.0])
-    turns = np.cross(np.eye(3), np.eye(3)[:, None])  # the matrices of the cross products with e_i
-    middle = [*(turns @ D), *(-D @ turns), np.diag([-np.sin(phi), np.cos(phi), 0.0])]
-    result: FloatArray = U @ np.array(middle) @ Vt
-    return result
-
-
-def _turn(w: FloatArray) -> FloatArray:
-    """Rotation (3, 3) near the identity by the Cayley map, which keeps it one however far it goes."""
-    S = 0.5 * np.cross(np.eye(3), w)
-    return np.asarray(np.linalg.solve(np.eye(3) - S, np.eye(3) + S), dtype=np.float64)
+    found = least_squares(
+        distances, np.zeros(7), "3-point", loss="cauchy", f_scale=scale, ftol=_TIGHT, xtol=_TIGHT, gtol=_TIGHT
+    )
+    return turned(found.x)
 
 
 def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
@@ -209,10 +176,65 @@ def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
     return distance
 
 
+def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Cameras (2, 3, 4) and points (N, 4) of corresponding pixels (N, 2) in an isotropic projective frame.
+
+    Points are of unit norm, with positive depth in both views where the data allow it.
+    """
+    T = np.stack([_normalization(left), _normalization(right)])
+    back = np.linalg.inv(T)
+    P = _canonical_pair(back[1].T @ F @ back[0])
+    # The right camera is known up to P' + e' vᵀ: a frame in which its left block is not singular.
+    points = _triangulate(P, _homogeneous(left) @ T[0].T, _homogeneous(right) @ T[1].T)
+    W = _isotropic_frame(points)
+    points = points @ W.T
+    P = back @ P @ np.linalg.inv(W)
+    depth = points @ P[:, 2].T
+    points = points * np.sign(depth[:, :1]) / np.linalg.norm(points, axis=1, keepdims=True)
+    P[1] *= np.sign(np.median(points @ P[1, 2]))
+    return P, points
+
+
+def _canonical_pair(F: FloatArray) -> FloatArray:
+    """Cameras (2, 3, 4) of a fundamental matrix, [I | 0] and [[e']× F | e'].
+
+    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., result 9.14.
+    """
+    e = np.linalg.svd(F)[0][:, 2]
+    right = np.hstack([np.cross(e[:, None], F, axis=0), e[:, None]])
+    return np.stack([np.hstack([np.eye(3), np.zeros((3, 1))]), right])
+
+
+def _triangulate(P: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Points (N, 4) of unit norm from linear equations in both views, homogeneous pixels (N, 3).
+
+    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
+    """
+    rows = np.concatenate(
+        [image[:, :2, None] * camera[2] - camera[:2] for camera, image in zip(P, (left, right), strict=True)],
+        axis=1,
+    )
+    return np.linalg.svd(rows)[2][:, 3]
+
+
+def _isotropic_frame(points: FloatArray) -> FloatArray:
+    """Frame change W (4, 4) after which points (N, 4) of unit norm have a multiple of I as second moment.
+
+    Without it one coordinate is a thousand times another and every linear method after it fails.
+    """
+    W = np.eye(4)
+    for _ in range(_WHITENINGS):
+        moved = points @ W.T
+        moved = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+        W = np.linalg.inv(np.linalg.cholesky(4.0 * moved.T @ moved / len(moved))) @ W
+    return W
+
+
+_WHITENINGS = 30
 # Focal lengths tried, in units of the image size: from a fisheye's centre to a long lens. Without an
 # image size the extent of the data stands in for it, which may be several times smaller.
 _SHORTEST, _LONGEST, _TRIALS = 0.4, 24.0, 28
-_GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
+_FINE = 0.01  # of the steps of the scan, to which minima are refined
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +273,7 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: i
     """Guessed reconstructions of the pairs seen by both cameras, best first, so many at most.
 
     The focal length is the one that keeps the distances between markers most constant over the
-    poses, each local minimum of a scan refined by golden section.
+    poses, each local minimum of a scan refined within its neighbours.
 
     Raises WorkFailed if no two markers were seen together at two poses.
     """
@@ -261,6 +283,9 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: i
     def guess(log_focal: float) -> Guess:
         found = guess_at(F, readings, frame, float(np.exp(log_focal)))
         return dataclasses.replace(found, spread=_distance_spread(found.points, pairs))
+
+    def spread_at(log_focal: float) -> float:
+        return guess(log_focal).spread
 
     grid = np.linspace(np.log(_SHORTEST), np.log(_LONGEST), _TRIALS)
     scan = [guess(x) for x in grid]
@@ -273,20 +298,12 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: i
     # A minimum at which the body changes its shape a lot more than at the best is none to start from.
     minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
-    return [_golden_section(guess, grid[i] - step, grid[i] + step, scan[i]) for i in minima]
-
-
-def _golden_section(guess: Callable[[float], Guess], low: float, high: float, best: Guess) -> Guess:
-    """Least spread between two logarithms of the focal length."""
-    for _ in range(12):
-        width = _GOLDEN * (high - low)
-        inner = [guess(high - width), guess(low + width)]
-        if inner[0].spread < inner[1].spread:
-            high = low + width
-        else:
-            low = high - width
-        best = min([best, *inner], key=lambda g: g.spread)
-    return best
+    found = []
+    for i in minima:
+        bounds = float(grid[i]) - step, float(grid[i]) + step
+        fine = minimize_scalar(spread_at, bounds=bounds, method="bounded", options={"xatol": _FINE * step})
+        found.append(min(scan[i], guess(fine.x), key=lambda g: g.spread))
+    return found
 
 
 def guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float) -> Guess:
@@ -302,7 +319,7 @@ def guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float)
     U, _, Vt = np.linalg.svd(K[1].T @ F @ K[0])
     U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    x, y = (np.linalg.solve(K[v], homogeneous(readings.pixels[v][readings.both]).T).T for v in (0, 1))
+    x, y = (np.linalg.solve(K[v], _homogeneous(readings.pixels[v][readings.both]).T).T for v in (0, 1))
     best = -1
     for R in (U @ W @ Vt, U @ W.T @ Vt):
         for t in (U[:, 2], -U[:, 2]):

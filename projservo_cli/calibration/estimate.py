@@ -9,64 +9,37 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration import distortion, outliers
-from projservo_cli.calibration.adjustment import Problem, Scene, prepare
+from projservo_cli.calibration.adjustment import Scene, prepare
 from projservo_cli.calibration.closed_form import closed_form_operators
 from projservo_cli.calibration.covariance import (
-    WEAK_NOISE,
     ProjectiveScene,
-    Uncertainty,
     covariance_factor,
-    needed_spans,
-    predicted_error,
     projective,
-    reach_noise,
+    require_off_line,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, epipolar_geometry, image_frame
 from projservo_cli.calibration.fit import (
     REFUSE_RATIO,
-    Agreement,
     Expected,
     Misfit,
     Solution,
-    Tell,
     determined,
     expected_noise,
     solve,
     solve_from,
-    tell_nobody,
 )
 from projservo_cli.calibration.outliers import Outliers
-from projservo_cli.calibration.quality import (
-    Joints,
-    require_determined,
-    require_joints_seen,
-    require_off_line,
-    verdict,
-)
-from projservo_cli.calibration.readings import (
-    Readings,
-    gather,
-    reference_joints,
-    require_images,
-    require_motion,
-)
-from projservo_cli.calibration.start import Nominal
-from projservo_cli.records import (
-    NO_LENS,
-    PRISMATIC,
-    REVOLUTE,
-    BoolArray,
-    Calibration,
-    FloatArray,
-    InputError,
-    Model,
-    Observation,
-)
+from projservo_cli.calibration.quality import WEAK_NOISE, judged_joints, verdict
+from projservo_cli.calibration.readings import Readings, gather, require_images, require_motion
+from projservo_cli.calibration.start import Nominal, Search, Tell
+from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation
 
 _METHODS = ("refined", "closed_form")
 # Fitted noise over the expected one from which on, though the fit passes, one joint may be to blame: it is
 # where its change leaves no more than this share.
 _DOUBTFUL_RATIO, _DOUBTFUL_SHARE = 2.0, 0.5
+# Share of readings that may lie outside the images: they are outliers.
+_STRAYS = 0.01
 
 
 def calibrate(
@@ -81,7 +54,7 @@ def calibrate(
     lens: bool = False,
     init: Nominal | None = None,
     fitted: Callable[[Solution, float], None] | None = None,
-    tell: Tell = tell_nobody,
+    tell: Tell = lambda what, done, total: None,
 ) -> Calibration:
     """Projective kinematics [RH00] section 2 from pixels and joint readings alone.
 
@@ -121,32 +94,40 @@ def calibrate(
             f"calibration method {method!r} estimates no lens: choose refined, or calibrate without"
         )
     begin = time.perf_counter()
+    solution = None
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
         readings = gather(observation, joint_types)
         require_motion(readings)
         if lens and image_size is not None:
-            distortion.require_size(readings, image_size)
+            _require_size(readings, image_size)
         require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
         epipolar = _rig(readings, rng)
         expect = partial(expected_noise, sigma_px=sigma_px, source=source)
         expected = expect(epipolar)
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
-        if method == "refined":
-            search = _Search(
-                prepare(readings, reference_joints(readings.q)),
-                epipolar,
-                image_frame(readings, image_size),
-                rng,
-            )
-            solution, expected, result = _most_likely(search, expect, lens, init, tell)
-        else:
+        if method == "closed_form":
             result = _closed_form(readings, epipolar, expected)
+        else:
+            problem = prepare(readings, readings.reference())
+            search = Search(problem, epipolar, image_frame(readings, image_size), rng, tell)
+            solution, expected, result = _most_likely(search, expect, lens, init)
         seconds = time.perf_counter() - begin
-        if method == "refined" and fitted is not None:
-            fitted(solution, expected.noise_px(solution.agreement))
+        if solution is not None and fitted is not None:
+            fitted(solution, expected.noise_px(solution))
     return dataclasses.replace(result, source=source, seconds=seconds)
+
+
+def _require_size(readings: Readings, size: tuple[int, int]) -> None:
+    """Refuse an image size, width and height in px, that does not hold 99 of 100 pixels seen."""
+    seen = readings.pixels[readings.seen]
+    if np.mean(((seen >= -0.5) & (seen <= np.array(size) - 0.5)).all(axis=1)) < 1.0 - _STRAYS:
+        low, high = np.percentile(seen, [1, 99], axis=0)
+        raise InputError(
+            f"image size {size[0]}x{size[1]} px: markers were seen at u from {low[0]:.0f} to {high[0]:.0f}, "
+            f"v from {low[1]:.0f} to {high[1]:.0f}; give the size of the images, width before height"
+        )
 
 
 def _rig(readings: Readings, rng: np.random.Generator) -> Epipolar:
@@ -154,47 +135,30 @@ def _rig(readings: Readings, rng: np.random.Generator) -> Epipolar:
     return epipolar_geometry(readings.pixels[0][readings.both], readings.pixels[1][readings.both], rng)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Search:
-    """What a search for the maximum likelihood works on."""
-
-    problem: Problem
-    epipolar: Epipolar
-    frame: ImageFrame
-    rng: np.random.Generator
-
-    def blame(self, most_px: float, tell: Tell) -> str:
-        """The joint whose change leaves no more than a noise, px, in words; empty if there is none."""
-        return outliers.blamed_joint(self.problem, self.epipolar, self.frame, most_px, self.rng, tell)
-
-
 def _most_likely(
-    search: _Search, expect: Callable[[Epipolar], Expected], lens: bool, init: Nominal | None, tell: Tell
+    search: Search, expect: Callable[[Epipolar], Expected], lens: bool, init: Nominal | None
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum likelihood, the noise it is measured by, and its record; a misfit names the joint if it can."""
-    problem, epipolar, frame, rng = search.problem, search.epipolar, search.frame, search.rng
-    expected = expect(epipolar)
-    anywhere = partial(solve, problem, epipolar, frame, rng, expected, tell)
+    expected = expect(search.epipolar)
     try:
-        solution, note = (
-            (anywhere(), "") if init is None else solve_from(init, problem, epipolar, expected, anywhere)
-        )
-        straight = epipolar
+        solution, note = (solve(search, expected), "") if init is None else solve_from(init, search, expected)
+        straight = search.epipolar
         if lens:
-            tell("calibration, lens", 0, 1)
-            solution = distortion.with_lens(solution, frame, epipolar)
-            straight = _rig(distortion.straight_readings(problem.readings, solution.scene.lens), rng)
+            search.tell("calibration, lens", 0, 1)
+            solution = distortion.with_lens(solution, search.frame, search.epipolar)
+            bent = search.problem.readings
+            straight = _rig(distortion.straight_readings(bent, solution.scene.lens), search.rng)
             expected = expect(straight)
-        result = _refined(solution, straight, expected, frame)
+        result = _refined(solution, straight, expected, search.frame)
     except Misfit as refused:
         # The joints of a simulation are as configured: their types and readings are not to blame.
-        cause = "" if expected.known else search.blame(REFUSE_RATIO * expected.sigma_px, tell)
+        cause = "" if expected.known else outliers.blamed_joint(search, REFUSE_RATIO * expected.sigma_px)
         if not cause:
             raise
         raise Misfit(f"{cause}; as given, {refused}") from None
     cause = ""
-    if not expected.known and expected.ratio(solution.agreement) > _DOUBTFUL_RATIO:
-        cause = search.blame(_DOUBTFUL_SHARE * solution.agreement.sigma_px, tell)
+    if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
+        cause = outliers.blamed_joint(search, _DOUBTFUL_SHARE * solution.sigma_px)
     advice = (*filter(None, (cause,)), *result.advice, *filter(None, (note,)))
     return solution, expected, dataclasses.replace(result, advice=advice)
 
@@ -203,19 +167,19 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     """Record of the maximum likelihood in its projective frame, with its covariance."""
     share = distortion.share_explained(whole, frame)
     solution, kept = determined(whole)
-    problem, scene, agreement = solution.problem, solution.scene, solution.agreement
-    refusal = expected.refusal(agreement)
-    if refusal is not None:
-        raise Misfit(refusal + distortion.hint(share))
-    found = outliers.explain(solution)
-    straight = distortion.straight_readings(problem.readings, scene.lens)
+    problem, scene = solution.problem, solution.scene
     try:
-        outliers.require_explained(straight, agreement.used, found, epipolar)
+        refusal = expected.refusal(solution)
+        if refusal is not None:
+            raise Misfit(refusal)
+        found = outliers.explain(solution)
+        straight = distortion.straight_readings(problem.readings, scene.lens)
+        outliers.require_explained(straight, solution.used, found, epipolar)
     except Misfit as refused:
         raise Misfit(f"{refused}{distortion.hint(share)}") from None
     result = projective(problem, scene)
-    factor = covariance_factor(problem, scene, agreement.used, result)
-    require_off_line(result, agreement.sigma_px * factor)
+    factor = covariance_factor(problem, scene, solution.used, result)
+    require_off_line(result, solution.sigma_px * factor)
     suspicion = "lens" if share else "joint readings"
     record = _record("refined", result, solution, expected, factor=factor, found=found, suspicion=suspicion)
     advice = (*record.advice, *distortion.lens_advice(record, share, frame.known))
@@ -229,11 +193,11 @@ def _closed_form(readings: Readings, epipolar: Epipolar, expected: Expected) -> 
     problem = prepare(readings.of_markers(known), q_reference)
     scene = Scene(result.P, result.H_hat_0, result.M)
     seen = problem.readings.seen
-    agreement = Agreement(problem.residual(scene), seen, 2 * int(np.count_nonzero(seen)) - problem.size)
+    dof = 2 * int(np.count_nonzero(seen)) - problem.size
     return _record(
         "closed_form",
         result,
-        Solution(problem, scene, agreement),
+        Solution(problem, scene, problem.residual(scene), seen, dof),
         expected,
         factor=None,
         found=outliers.none_explained(problem.readings),
@@ -256,45 +220,32 @@ def _record(
     ``factor`` is that of ``covariance_factor``, None for a method that has none; ``found`` explains readings
     left out, and ``suspicion`` is what may be to blame for more than pixel noise.
     """
-    problem, agreement = solution.problem, solution.agreement
-    readings, lens = problem.readings, solution.scene.lens
-    prismatic = readings.prismatic
+    problem, readings = solution.problem, solution.problem.readings
     # Residuals of a method without covariance are its own doing, not noise of the images.
-    sigma = expected.sigma_px if factor is None else expected.noise_px(agreement)
-    span = require_joints_seen(problem, solution.scene, sigma)
-    # NaN, not zero: a method without covariance does not claim certainty.
-    unknown = np.full(len(span), np.nan)
-    joints = Joints(prismatic, span, unknown, unknown)
-    size = result.P.size + result.H_hat_0.size + result.M.size
-    covariance = np.full((size, size), np.nan)
-    error = bound = None
-    if factor is not None:
-        types = np.where(prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
-        seen_through = NO_LENS if lens is None else lens
-        model = Model(result.P, result.H_hat_0, types, problem.q_reference, result.a_inf, seen_through)
-        sure = Uncertainty(model, result.M, factor, readings)
-        noise = reach_noise(sure)
-        joints = Joints(prismatic, span, noise, needed_spans(sure, noise))
-        require_determined(joints)
+    sigma = expected.sigma_px if factor is None else expected.noise_px(solution)
+    joints = judged_joints(solution, result, factor, sigma)
+    if factor is None:
+        size = result.P.size + result.H_hat_0.size + result.M.size
+        covariance = np.full((size, size), np.nan)
+    else:
         covariance = sigma**2 * (factor @ factor.T)
-        error, bound = (sigma * value for value in predicted_error(sure))
-    outlier = outliers.listed(readings, readings.seen & ~agreement.used & ~found.explained)
+    outlier = outliers.listed(readings, readings.seen & ~solution.used & ~found.explained)
     counts = (len(outlier), len(found.suspect), len(found.swapped))
-    usable, reason, advice = verdict(method, agreement, expected, joints, counts, suspicion)
-    operator_defect, trace_defect, plane_defect = _defects(result, prismatic)
-    used_rows = agreement.used.any(axis=0)
+    usable, reason, advice = verdict(method, solution, expected, joints, counts, suspicion)
+    operator_defect, trace_defect, plane_defect = _defects(result, readings.prismatic)
+    used_rows = solution.used.any(axis=0)
     return Calibration(
         method=method,
         source="",
-        joint_types="".join("P" if slides else "R" for slides in prismatic),
+        joint_types="".join("P" if slides else "R" for slides in readings.prismatic),
         usable=usable,
         reason=reason,
         advice=advice,
-        rms_px=agreement.rms_px,
+        rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
-        sigma_fitted_px=agreement.sigma_px,
-        chi2_per_dof=expected.ratio(agreement) ** 2,
-        dof=agreement.dof,
+        sigma_fitted_px=solution.sigma_px,
+        chi2_per_dof=expected.ratio(solution) ** 2,
+        dof=solution.dof,
         seconds=0.0,
         P=result.P,
         H_hat_0=result.H_hat_0,
@@ -303,7 +254,7 @@ def _record(
         marker=readings.marker,
         M=result.M,
         covariance=covariance,
-        excitation=span,
+        excitation=joints.span,
         weak=joints.noise > WEAK_NOISE,
         operator_defect=operator_defect,
         trace_defect=trace_defect,
@@ -316,9 +267,9 @@ def _record(
         swapped=np.concatenate(
             [readings.pose[found.swapped[:, :1]], readings.marker[found.swapped[:, 1:]]], axis=1
         ),
-        predicted_rms_px=error,
-        predicted_p99_px=bound,
-        lens=lens,
+        predicted_rms_px=None if joints.error is None else joints.error[0],
+        predicted_p99_px=None if joints.error is None else joints.error[1],
+        lens=solution.scene.lens,
     )
 
 

@@ -1,25 +1,15 @@
 """Fits: a robust search from each start, then least squares of the readings that count, and their noise."""
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import (
-    Fit,
-    Problem,
-    Scene,
-    Stalled,
-    Weighting,
-    gauge,
-    minimize,
-    prepare,
-)
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
+from projservo_cli.calibration.adjustment import Problem, Scene, Stalled, Weighting, minimize, prepare
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.readings import LEAST_SIGMA
-from projservo_cli.calibration.start import Nominal, starts
+from projservo_cli.calibration.start import Nominal, Search, starts
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 # Median of the length of a two-dimensional normal vector of unit deviation.
@@ -36,9 +26,11 @@ class Misfit(WorkFailed):
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
-    """What a fit leaves of the images."""
+class Solution:
+    """The problem solved, the scene found and what it leaves of the images."""
 
+    problem: Problem
+    scene: Scene
     residual: FloatArray  # (2, N, 2) predicted minus seen, px
     used: BoolArray  # (2, N) readings that count; the rest of those seen are outliers
     dof: int  # degrees of freedom
@@ -58,19 +50,10 @@ class Agreement:
         """Root mean square of the Euclidean residual per marker and view, px."""
         return float(np.sqrt(self.chi2 / max(int(self.used.sum()), 1)))
 
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """The problem solved, the scene found and what it leaves of the images."""
-
-    problem: Problem
-    scene: Scene
-    agreement: Agreement
-
     @property
     def typical_px(self) -> float:
         """Median residual over all readings seen, outliers included, px."""
-        return median_px(self.agreement.residual, self.problem.readings.seen)
+        return median_px(self.residual, self.problem.readings.seen)
 
 
 @dataclass(frozen=True)
@@ -82,38 +65,38 @@ class Expected:
     origin: str  # where it comes from, in words
     error: float  # its own standard error as a share of it, zero where it was given
 
-    def ratio(self, agreement: Agreement) -> float:
+    def ratio(self, solution: Solution) -> float:
         """Fitted over expected noise."""
-        return agreement.sigma_px / self.sigma_px
+        return solution.sigma_px / self.sigma_px
 
-    def noise_px(self, agreement: Agreement) -> float:
+    def noise_px(self, solution: Solution) -> float:
         """Noise a covariance is scaled by, px: the true one of a simulation, else never below the fitted."""
-        return self.sigma_px if self.known else max(self.sigma_px, agreement.sigma_px)
+        return self.sigma_px if self.known else max(self.sigma_px, solution.sigma_px)
 
-    def warns(self, agreement: Agreement) -> bool:
+    def warns(self, solution: Solution) -> bool:
         """Whether more than pixel noise is left: both noises come from finitely many residuals."""
-        error = float(np.hypot(self.error, 1.0 / np.sqrt(2.0 * max(agreement.dof, 1))))
-        return self.ratio(agreement) > min(WARN_RATIO, 1.0 + _WARN_ERRORS * error)
+        error = float(np.hypot(self.error, 1.0 / np.sqrt(2.0 * max(solution.dof, 1))))
+        return self.ratio(solution) > min(WARN_RATIO, 1.0 + _WARN_ERRORS * error)
 
-    def agrees(self, agreement: Agreement) -> bool:
+    def agrees(self, solution: Solution) -> bool:
         """Whether a fit leaves nothing but the expected noise, so that no other need be sought."""
         if self.known:
-            low, high = chi2_band(agreement.dof)
-            return low <= self.ratio(agreement) ** 2 <= high
-        return not self.warns(agreement)
+            low, high = chi2_band(solution.dof)
+            return low <= self.ratio(solution) ** 2 <= high
+        return not self.warns(solution)
 
-    def refusal(self, agreement: Agreement) -> str | None:
+    def refusal(self, solution: Solution) -> str | None:
         """Why a fit must not pass, or None where it may."""
-        ratio = self.ratio(agreement)
-        if self.known and not self.agrees(agreement):
-            low, high = chi2_band(agreement.dof)
+        ratio = self.ratio(solution)
+        if self.known and not self.agrees(solution):
+            low, high = chi2_band(solution.dof)
             return (
                 f"the fit does not describe the data: χ² per degree of freedom is {ratio**2:.4g} at "
                 f"{self.sigma_px:g} px of noise, expected within {low:.4g} and {high:.4g}"
             )
         if ratio > REFUSE_RATIO:
             return (
-                f"the fit does not describe the data: residuals of {agreement.sigma_px:.3g} px a coordinate "
+                f"the fit does not describe the data: residuals of {solution.sigma_px:.3g} px a coordinate "
                 f"are {ratio:.3g} times the {self.sigma_px:.3g} px {self.origin}; check the "
                 "joint readings, their units and types, and the marker numbers"
             )
@@ -144,7 +127,7 @@ _HOPELESS = 10.0
 # steps is not continued.
 _CRAWL, _PATIENCE = 0.01, 10
 # A step of the screws alone that moves the images by less than this fraction of the residual is the last.
-ROUGHLY = 1e-2
+_ROUGHLY = 1e-2
 
 
 def median_px(residual: FloatArray, mask: BoolArray) -> float:
@@ -152,7 +135,7 @@ def median_px(residual: FloatArray, mask: BoolArray) -> float:
     return float(np.median(np.linalg.norm(residual[mask], axis=1)))
 
 
-def cauchy(seen: BoolArray) -> Weighting:
+def _cauchy(seen: BoolArray) -> Weighting:
     """Weights of a Cauchy loss whose width follows the median residual of what was seen (2, N)."""
 
     def weighting(residual: FloatArray) -> FloatArray:
@@ -181,15 +164,28 @@ def _crawling(seen: BoolArray, far: float) -> Stalled:
     return stalled
 
 
-def robust_search(problem: Problem, scene: Scene, rows: BoolArray, epipolar: Epipolar) -> Fit:
-    """Screws alone, then everything, under a Cauchy loss over some readings (2, N).
+def follow(problem: Problem, scene: Scene, epipolar: Epipolar) -> Solution | None:
+    """The fit that a scene leads to: a robust search, then ``least_squares``."""
+    searched, level = _robust_search(problem, scene, problem.readings.seen, epipolar)
+    return least_squares(problem, searched, level / RAYLEIGH, epipolar)
+
+
+def _robust_search(
+    problem: Problem, scene: Scene, rows: BoolArray, epipolar: Epipolar
+) -> tuple[Scene, float]:
+    """Screws alone, then everything, under a Cauchy loss over some readings (2, N): scene, median px.
 
     Given up where the fit would be refused and hardly proceeds.
     """
-    weighting = cauchy(rows)
-    scene = minimize(problem, scene, weighting, cameras=False, most=20, settled_at=ROUGHLY).scene
+    scene = search_screws(problem, scene, rows, 20)
     far = REFUSE_RATIO * max(epipolar.sigma_px, LEAST_SIGMA)
-    return minimize(problem, scene, weighting, most=100, stalled=_crawling(rows, far))
+    fit = minimize(problem, scene, _cauchy(rows), most=100, stalled=_crawling(rows, far))
+    return fit.scene, median_px(fit.residual, rows)
+
+
+def search_screws(problem: Problem, scene: Scene, rows: BoolArray, most: int) -> Scene:
+    """The scene after so many steps of screws and markers alone, under a Cauchy loss over readings (2, N)."""
+    return minimize(problem, scene, _cauchy(rows), cameras=False, most=most, settled_at=_ROUGHLY).scene
 
 
 def least_squares(
@@ -204,7 +200,7 @@ def least_squares(
     if epipolar is not None and sigma > _HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA):
         seen = problem.readings.seen
         dof = _degrees_of_freedom(problem, scene, seen)
-        return Solution(problem, scene, Agreement(residual, seen, dof)) if dof > 0 else None
+        return Solution(problem, scene, residual, seen, dof) if dof > 0 else None
     used = _within(problem, residual, OUTLIER * max(sigma, 1e-9))
     for _ in range(_MASK_ROUNDS):
         fit = minimize(problem, scene, _fixed(used.astype(np.float64)))
@@ -219,7 +215,7 @@ def least_squares(
     _, depth = problem.pixels(scene)
     if not (np.sign(depth) == np.sign(depth.sum(axis=1))[:, None])[before].all():
         return None
-    return Solution(problem, scene, Agreement(fit.residual, before, dof))
+    return Solution(problem, scene, fit.residual, before, dof)
 
 
 def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:
@@ -233,7 +229,7 @@ def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:
 
 def _degrees_of_freedom(problem: Problem, scene: Scene, used: BoolArray) -> int:
     """Coordinates used minus the rank of their derivative."""
-    return 2 * int(np.count_nonzero(used)) - problem.size + len(gauge(problem, scene).T)
+    return 2 * int(np.count_nonzero(used)) - problem.size + len(problem.gauge(scene).T)
 
 
 def determined(solution: Solution) -> tuple[Solution, BoolArray]:
@@ -242,18 +238,18 @@ def determined(solution: Solution) -> tuple[Solution, BoolArray]:
     One reading is less than the three coordinates of a marker, and a few among many wrong ones agree by
     chance; either would spoil what is said about the body as a whole.
     """
-    problem, scene, agreement = solution.problem, solution.scene, solution.agreement
+    problem, scene = solution.problem, solution.scene
     readings = problem.readings
-    counts = readings.count_of(agreement.used)
+    counts = readings.count_of(solution.used)
     keep = counts >= np.maximum(2, _LEAST_SHARE * readings.count_of(readings.seen))
     if keep.all():
         return solution, keep
     rows = keep[readings.marker_of]
     smaller = prepare(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
     scene = Scene(scene.P, scene.H_hat, scene.M[keep], scene.lens)
-    used = agreement.used[:, rows]
+    used = solution.used[:, rows]
     dof = _degrees_of_freedom(smaller, scene, used)
-    return Solution(smaller, scene, Agreement(agreement.residual[:, rows], used, dof)), keep
+    return Solution(smaller, scene, solution.residual[:, rows], used, dof), keep
 
 
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a
@@ -266,56 +262,43 @@ _SEARCHES = 5
 # Relative difference of robust residuals below which two starts have ended at one place.
 _SAME_LEVEL = 1e-3
 
-Tell = Callable[[str, int, int], None]
 
-
-def tell_nobody(what: str, done: int, total: int) -> None:
-    """Show nothing of how far a search is."""
-
-
-def solve(
-    problem: Problem,
-    epipolar: Epipolar,
-    frame: ImageFrame,
-    rng: np.random.Generator,
-    expected: Expected,
-    tell: Tell = tell_nobody,
-) -> Solution:
+def solve(search: Search, expected: Expected) -> Solution:
     """Best fit over the starts; the first that leaves nothing but the expected noise ends the search.
 
-    ``tell`` hears before each start how many were tried, of at most how many.
+    Before each start it tells how many were tried, of at most how many.
 
     Raises Misfit if no start leads anywhere; WorkFailed if too little was seen to start from.
     """
+    problem, epipolar = search.problem, search.epipolar
     readings = problem.readings
     best: Solution | None = None
     trusted = np.ones(len(readings.q), dtype=bool)
     levels: list[float] = []
     for number, factors in enumerate(_FOCAL_FACTORS):
-        usable = readings.of_poses(trusted)
         rows = readings.seen & trusted[readings.pose_of]
-        tried = _told(starts(problem, usable, epipolar, frame, rng, factors), number, tell)
-        for scene in tried:
-            searched = robust_search(problem, scene, rows, epipolar)
-            level = median_px(searched.residual, rows)
+        scenes = islice(starts(search, readings.of_poses(trusted), factors), _SEARCHES)
+        for done, start in enumerate(scenes, number * _SEARCHES):
+            search.tell("calibration, starts", done, len(_FOCAL_FACTORS) * _SEARCHES)
+            scene, level = _robust_search(problem, start, rows, epipolar)
             # Different starts that end at one place need not be followed to the end twice.
             if any(abs(level - other) < _SAME_LEVEL * other for other in levels):
                 # Twice the same place and no gross misfit: more starts would not better it.
-                if best is not None and expected.ratio(best.agreement) <= REFUSE_RATIO:
+                if best is not None and expected.ratio(best) <= REFUSE_RATIO:
                     return best
                 continue
             levels.append(level)
-            found = least_squares(problem, searched.scene, level / RAYLEIGH, epipolar)
+            found = least_squares(problem, scene, level / RAYLEIGH, epipolar)
             if found is None:
                 continue
-            if expected.agrees(found.agreement):
+            if expected.agrees(found):
                 return found
             if best is None or found.typical_px < best.typical_px:
                 best = found
-            if factors != _FOCAL_FACTORS[0] and expected.refusal(best.agreement) is None:
+            if factors != _FOCAL_FACTORS[0] and expected.refusal(best) is None:
                 return best
         if best is not None:
-            if expected.refusal(best.agreement) is None:
+            if expected.refusal(best) is None:
                 return best
             # Wrong joint readings spoil the start: once the rest is roughly explained they stand out.
             before, trusted = trusted, _explained(best)
@@ -329,17 +312,10 @@ def solve(
     return best
 
 
-def _told(scenes: Iterator[Scene], number: int, tell: Tell) -> Iterator[Scene]:
-    """The first scenes of a pass, each told before it is searched from."""
-    for done, scene in enumerate(islice(scenes, _SEARCHES), number * _SEARCHES):
-        tell("calibration, starts", done, len(_FOCAL_FACTORS) * _SEARCHES)
-        yield scene
-
-
 def _explained(solution: Solution) -> BoolArray:
     """Poses (K,) whose median residual is within some times that of all."""
     readings = solution.problem.readings
-    distance = np.linalg.norm(solution.agreement.residual, axis=2)
+    distance = np.linalg.norm(solution.residual, axis=2)
     limit = _SPOILT * solution.typical_px
     result = np.ones(len(readings.q), dtype=bool)
     for k in np.unique(readings.pose_of):
@@ -348,22 +324,28 @@ def _explained(solution: Solution) -> BoolArray:
     return result
 
 
-def solve_from(
-    nominal: Nominal, problem: Problem, epipolar: Epipolar, expected: Expected, search: Callable[[], Solution]
-) -> tuple[Solution, str]:
-    """The fit that a given start leads to if it leaves the expected noise, else the best of it and a search.
+def solve_from(nominal: Nominal, search: Search, expected: Expected) -> tuple[Solution, str]:
+    """The fit that a given start leads to if it leaves the expected noise, else the best of it and ``solve``.
 
     With advice about the start where it did not lead there, else empty.
 
     Raises InputError if the start is one for other joints or markers; WorkFailed if neither leads anywhere.
     """
-    found = _from(nominal.scene(problem.readings, problem.q_reference), problem, epipolar)
-    if found is not None and expected.agrees(found.agreement):
+    problem = search.problem
+    found = None
+    scene = nominal.scene(problem.readings, problem.q_reference)
+    pixels, depth = problem.pixels(scene)
+    # A camera is given up to scale and sign: most points are to lie in front of it.
+    sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
+    scene = Scene(scene.P * sign[:, None, None], scene.H_hat, scene.M)
+    if np.isfinite(pixels).all() and ((depth * sign[:, None])[problem.readings.seen] > 0.0).all():
+        found = follow(problem, scene, search.epipolar)
+    if found is not None and expected.agrees(found):
         return found, ""
     try:
-        searched = search()
+        searched = solve(search, expected)
     except WorkFailed:
-        if found is None or expected.refusal(found.agreement) is not None:
+        if found is None or expected.refusal(found) is not None:
             raise
         return found, ""
     if found is not None and found.typical_px <= (1.0 + _SAME_LEVEL) * searched.typical_px:
@@ -377,13 +359,3 @@ def solve_from(
         f"{nominal.where} was no start: it {leads}; the search from the images alone was used, "
         "so check whether the file is about this robot and rig"
     )
-
-
-def _from(scene: Scene, problem: Problem, epipolar: Epipolar) -> Solution | None:
-    """The fit that a scene leads to, None where its points are not in front of both cameras."""
-    seen = problem.readings.seen
-    pixels, depth = problem.pixels(scene)
-    if not np.isfinite(pixels).all() or not (depth[seen] > 0.0).all():
-        return None
-    found = robust_search(problem, scene, seen, epipolar)
-    return least_squares(problem, found.scene, median_px(found.residual, seen) / RAYLEIGH, epipolar)

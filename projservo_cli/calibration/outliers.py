@@ -2,28 +2,17 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration.adjustment import Problem, Scene, joint_derivative, minimize, prepare
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, metric_guesses
-from projservo_cli.calibration.fit import (
-    RAYLEIGH,
-    ROUGHLY,
-    Misfit,
-    Solution,
-    Tell,
-    cauchy,
-    least_squares,
-    median_px,
-    robust_search,
-)
+from projservo_cli.calibration.adjustment import Problem, Scene, prepare
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
+from projservo_cli.calibration.fit import RAYLEIGH, Misfit, Solution, follow, median_px, search_screws
 from projservo_cli.calibration.prediction import displacements, image_points, moved_points
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.calibration.start import merged, placed
+from projservo_cli.calibration.start import Search, starts_of_changed
 from projservo_cli.geometry.lens import through
 from projservo_cli.records import NO_LENS, BoolArray, Calibration, FloatArray, IntArray, WorkFailed
 
@@ -54,8 +43,8 @@ def none_explained(readings: Readings) -> Outliers:
 
 def explain(solution: Solution) -> Outliers:
     """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings."""
-    problem, scene, used = solution.problem, solution.scene, solution.agreement.used
-    readings, sigma = problem.readings, solution.agreement.sigma_px
+    problem, scene, used = solution.problem, solution.scene, solution.used
+    readings, sigma = problem.readings, solution.sigma_px
     out = readings.seen & ~used
     swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
     suspects: list[tuple[int, int]] = []
@@ -115,7 +104,7 @@ def _corrected_level(pose: Problem, scene: Scene, joints: list[int]) -> float:
     seen = pose.readings.seen
     best = np.inf
     for _ in range(_STEPS):
-        pixels, J = joint_derivative(pose, scene)
+        pixels, J = pose.joint_derivative(scene)
         residual = np.where(seen[..., None], pixels - pose.readings.pixels, 0.0)
         level = median_px(residual, seen)
         if not np.isfinite(level) or level > 0.999 * best:
@@ -204,59 +193,53 @@ _FOLLOWED, _TURNS, _SCREW_STEPS = 2, 25, 8
 _SIMPLER = 0.1
 
 
-def _hypotheses(readings: Readings, q_reference: FloatArray) -> Iterator[tuple[str, Problem, float]]:
+def blamed_joint(search: Search, most_px: float) -> str:
+    """The one change of one joint with which the model does describe the data, in words; empty if none.
+
+    All changes are compared from one guessed metric frame; the best are followed to the maximum of the
+    likelihood and believed only where that passes as a calibration would and leaves no more than a noise, px.
+    """
+    changes = _hypotheses(search.problem.readings, search.problem.q_reference)
+    candidates = []
+    starts = starts_of_changed(search, (changed for _, changed, _ in changes), _TURNS)
+    try:
+        for done, ((words, changed, handicap), start) in enumerate(zip(changes, starts, strict=True)):
+            search.tell("calibration, joint at fault", done, len(changes))
+            if start is not None:
+                scene = search_screws(changed, start, changed.readings.seen, _SCREW_STEPS)
+                candidates.append((_level(changed, scene) + handicap, words, changed, scene))
+    except WorkFailed:
+        return ""
+    candidates.sort(key=lambda candidate: candidate[0])
+    for _, words, changed, scene in candidates[:_FOLLOWED]:
+        if _describes(changed, scene, search.epipolar, most_px):
+            return words
+    return ""
+
+
+def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, Problem, float]]:
     """Every joint of the other type, and every joint standing still.
 
     In words, with the problem as it then is, and by what share an equal one must leave less.
     """
+    found = []
     for i, slides in enumerate(readings.prismatic):
         flipped = readings.prismatic.copy()
         flipped[i] = not slides
         given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
         words = f"by the images joint {i + 1} is {fits}, not {given}: check --joints"
-        yield words, prepare(dataclasses.replace(readings, prismatic=flipped), q_reference), _SIMPLER
+        found.append(
+            (words, prepare(dataclasses.replace(readings, prismatic=flipped), q_reference), _SIMPLER)
+        )
     for i in range(len(q_reference) if len(q_reference) > 1 else 0):
-        moves = "stands still while its readings move: check that they are its own"
+        words = (
+            f"by the images joint {i + 1} stands still while its readings move: check that they are its own"
+        )
         fewer = dataclasses.replace(
             readings, q=np.delete(readings.q, i, axis=1), prismatic=np.delete(readings.prismatic, i)
         )
-        yield f"by the images joint {i + 1} {moves}", prepare(fewer, np.delete(q_reference, i)), 0.0
-
-
-def blamed_joint(
-    problem: Problem,
-    epipolar: Epipolar,
-    frame: ImageFrame,
-    most_px: float,
-    rng: np.random.Generator,
-    tell: Tell,
-) -> str:
-    """The one change of one joint with which the model does describe the data, in words; empty if none.
-
-    All changes are compared in one guessed metric frame, which owes nothing to the joints; the best are
-    followed to the maximum of the likelihood and believed only where that passes as a calibration would
-    and leaves no more than a noise, px.
-    """
-    try:
-        guess = metric_guesses(epipolar.F, problem.readings, frame, keep=1)[0]
-    except WorkFailed:
-        return ""
-    alignment = merged(guess, problem.readings)
-    weighting = cauchy(problem.readings.seen)
-    candidates = []
-    changes = list(_hypotheses(problem.readings, problem.q_reference))
-    for done, (words, changed, handicap) in enumerate(changes):
-        tell("calibration, joint at fault", done, len(changes))
-        for start in placed(changed, changed.readings, guess, alignment, rng, 1, _TURNS):
-            scene = minimize(
-                changed, start, weighting, cameras=False, most=_SCREW_STEPS, settled_at=ROUGHLY
-            ).scene
-            candidates.append((_level(changed, scene) + handicap, words, changed, scene))
-    candidates.sort(key=lambda candidate: candidate[0])
-    for _, words, changed, scene in candidates[:_FOLLOWED]:
-        if _describes(changed, scene, epipolar, most_px):
-            return words
-    return ""
+        found.append((words, prepare(fewer, np.delete(q_reference, i)), 0.0))
+    return found
 
 
 def _level(problem: Problem, scene: Scene) -> float:
@@ -267,14 +250,11 @@ def _level(problem: Problem, scene: Scene) -> float:
 
 def _describes(problem: Problem, scene: Scene, epipolar: Epipolar, most_px: float) -> bool:
     """Whether a scene leads to a fit that leaves little noise and little out."""
-    readings = problem.readings
-    searched = robust_search(problem, scene, readings.seen, epipolar)
-    sigma = median_px(searched.residual, readings.seen) / RAYLEIGH
-    found = least_squares(problem, searched.scene, sigma, epipolar)
-    if found is None or found.agreement.sigma_px > most_px:
+    found = follow(problem, scene, epipolar)
+    if found is None or found.sigma_px > most_px:
         return False
     try:
-        require_explained(readings, found.agreement.used, none_explained(readings), epipolar)
+        require_explained(problem.readings, found.used, none_explained(problem.readings), epipolar)
     except WorkFailed:
         return False
     return True

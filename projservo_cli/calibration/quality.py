@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
+from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import Problem, Scene, derivative, joint_derivative, prepare
-from projservo_cli.calibration.covariance import WEAK_NOISE, ProjectiveScene, marker_factor, spread_factor
-from projservo_cli.calibration.fit import WARN_RATIO, Agreement, Expected, Solution, least_squares
-from projservo_cli.calibration.prediction import distance_statistics
+from projservo_cli.calibration.adjustment import Problem, Scene, prepare
+from projservo_cli.calibration.covariance import ProjectiveScene, spread_factor
+from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, least_squares
+from projservo_cli.calibration.prediction import distance_statistics, marker_pixels, prediction_derivative
 from projservo_cli.calibration.readings import (
-    ON_A_LINE,
+    MOST_REACHES,
     REACH_M,
     REACH_RAD,
     Readings,
@@ -20,14 +21,149 @@ from projservo_cli.calibration.readings import (
     require_motion,
     require_moved,
 )
-from projservo_cli.records import BoolArray, CrossValidation, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import (
+    NO_LENS,
+    PRISMATIC,
+    REVOLUTE,
+    BoolArray,
+    CrossValidation,
+    FloatArray,
+    InputError,
+    IntArray,
+    Model,
+    WorkFailed,
+)
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 _UNDETERMINED_NOISE = 1000.0
 # Share of sightings beyond which outliers are what limits a fit.
 _MOST_OUTLIERS = 0.05
-# Least distance of the markers from their best line, in units of its own noise.
-_OFF_LINE = 5.0
+
+
+# Noise of predictions at the reach, in units of the pixel noise: above it a joint is weak.
+WEAK_NOISE = 3.0
+# Poses at which predictions are judged; how sure they stay below the bound; halvings of an empty range.
+_POSES, _SURE, _HALVINGS = 60, 0.99, 10
+# Frames of the trial motion that is advised; the least range of it, in reaches, and how often the
+# logarithm of the range between it and the farthest is halved: to a twentieth.
+_FRAMES, _LEAST_REACHES, _BISECTIONS = 8, 0.01, 7
+
+
+@dataclass(frozen=True, eq=False)
+class _Uncertainty:
+    """A calibration whose predictions err, judged in twice the image region in which markers were seen."""
+
+    model: Model  # projective robot and rig
+    M: FloatArray  # (m, 4) markers at the reference
+    factor: FloatArray  # (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel
+    readings: Readings  # what the calibration was made from
+
+    def shown(self, q: FloatArray) -> BoolArray:
+        """Which images (K, 2, m) at poses (K, n) lie in the region that counts."""
+        pixels = marker_pixels(self.model, self.M, q)
+        inside = np.empty(pixels.shape[:-1], dtype=np.bool_)
+        for v in (0, 1):
+            seen = self.readings.pixels[v][self.readings.seen[v]]
+            low, high = seen.min(axis=0), seen.max(axis=0)
+            wide = 0.5 * (high - low)
+            inside[:, v] = ((pixels[:, v] >= low - wide) & (pixels[:, v] <= high + wide)).all(axis=-1)
+        return inside
+
+    def spread(self, q: FloatArray, shown: BoolArray) -> FloatArray:
+        """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one."""
+        J = prediction_derivative(self.model, self.M, q)[shown]
+        return np.asarray(J.reshape(-1, len(self.factor)) @ self.factor)
+
+    def at(self, i: int, offsets: FloatArray) -> FloatArray:
+        """Poses (K, n) with joint i at offsets (K,) from the reference, rad or m."""
+        q = np.tile(self.model.q_reference, (len(offsets), 1))
+        q[:, i] += offsets
+        return q
+
+    def reach(self, i: int) -> float:
+        """Reach of joint i at which predictions are judged, rad or m."""
+        return REACH_M if self.model.joint_types[i] == PRISMATIC else REACH_RAD
+
+    def reach_spread(self, i: int) -> FloatArray:
+        """``spread`` with joint i at its reach, to either side; halved where no image would count."""
+        reach = self.reach(i)
+        for _ in range(_HALVINGS):
+            q = self.at(i, np.array([reach, -reach]))
+            shown = self.shown(q)
+            if shown.any():
+                break
+            reach *= 0.5
+        return self.spread(q, shown)
+
+
+def _reach_noise(sure: _Uncertainty) -> FloatArray:
+    """Noise of predicted images (n,) with each joint at its reach, in units of the pixel noise."""
+    rows = (sure.reach_spread(i) for i in range(len(sure.model.joint_types)))
+    return np.array([np.sqrt((T**2).sum() / max(len(T), 1)) for T in rows])
+
+
+def _needed_spans(sure: _Uncertainty, noise: FloatArray) -> FloatArray:
+    """Range (n,) of a trial motion of each joint of too much noise (n,) that would mend it, rad or m.
+
+    The trial is of eight frames about the reference, of this joint alone, beside the data there are;
+    information adds up. NaN for joints that are not weak or that no trial of sensible range mends.
+    """
+    needed = np.full(len(noise), np.nan)
+    for i in np.flatnonzero(noise > WEAK_NOISE).tolist():
+        T = sure.reach_spread(i)
+        low, high = _LEAST_REACHES * sure.reach(i), MOST_REACHES * sure.reach(i)
+        if _noise_after(sure, i, high, T) > WEAK_NOISE:
+            continue
+        for _ in range(_BISECTIONS):
+            middle = float(np.sqrt(low * high))
+            if _noise_after(sure, i, middle, T) > WEAK_NOISE:
+                low = middle
+            else:
+                high = middle
+        needed[i] = high
+    return needed
+
+
+def _noise_after(sure: _Uncertainty, i: int, span: float, T: FloatArray) -> float:
+    """Noise at the reach after a trial over a span: rms of T (I + Cᵀ C)⁻¹ Tᵀ, C the trial's ``spread``."""
+    q = sure.at(i, np.linspace(-0.5 * span, 0.5 * span, _FRAMES))
+    C = sure.spread(q, sure.shown(q))
+    root = np.asarray(np.linalg.qr(np.vstack([np.eye(C.shape[1]), C]), mode="r"))
+    left = np.linalg.solve(root.T, T.T)
+    return float(np.sqrt((left**2).sum() / max(len(T), 1)))
+
+
+def _predicted_error(sure: _Uncertainty) -> tuple[float, float]:
+    """Expected error of images at poses of all joints at once, and what 99 of 100 calibrations stay below.
+
+    Root mean squares of the Euclidean error per marker and view, in units of the pixel noise, over poses
+    drawn evenly within the ranges that the joints moved through; where no image would count, the ranges
+    are halved about the reference. No residual shows on which side of the expectation a calibration came
+    to lie: to first order the error of a maximum of the likelihood does not depend on what it leaves.
+    """
+    q = sure.readings.q
+    poses = np.random.default_rng(0).uniform(q.min(axis=0), q.max(axis=0), (_POSES, q.shape[1]))
+    for _ in range(_HALVINGS):
+        shown = sure.shown(poses)
+        if shown.any():
+            break
+        poses = 0.5 * (poses + sure.model.q_reference)
+    spread = sure.spread(poses, shown)
+    variances = np.linalg.eigvalsh(spread.T @ spread) / max(int(shown.sum()), 1)
+    return float(np.sqrt(variances.sum())), float(np.sqrt(_quantile(variances, _SURE)))
+
+
+def _quantile(variances: FloatArray, probability: float) -> float:
+    """Quantile of a sum of squares of independent normal variables of variances (r,), by its three moments.
+
+    Source: M. J. Buckley, G. K. Eagleson, "An approximation to the distribution of quadratic forms in
+    normal random variables", Australian Journal of Statistics 30A, 1988.
+    """
+    mean, square, cube = (float((variances**power).sum()) for power in (1, 2, 3))
+    if cube == 0.0:
+        return mean
+    freedom = square**3 / cube**2
+    return mean + float(np.sqrt(square / freedom) * (chdtri(freedom, 1.0 - probability) - freedom))
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,13 +175,46 @@ class Joints:
     # (n,) predicted noise of images at its reach, in units of the pixel noise; NaN where unknown
     noise: FloatArray
     needed: FloatArray  # (n,) range of a trial motion that would determine it, rad or m, NaN where none does
+    # expected error of images at poses of all joints at once and its 99th percentile, px; None where unknown
+    error: tuple[float, float] | None
 
     def advice(self, i: int) -> str:
         """How far to move joint i."""
         return describe_joint(i, float(self.span[i]), bool(self.prismatic[i]), float(self.needed[i]))
 
 
-def require_joints_seen(problem: Problem, scene: Scene, sigma_px: float) -> FloatArray:
+def judged_joints(
+    solution: Solution, result: ProjectiveScene, factor: FloatArray | None, sigma_px: float
+) -> Joints:
+    """What the data say of each joint, by a factor of ``covariance_factor`` (None without) and a noise, px.
+
+    Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
+    """
+    problem, readings = solution.problem, solution.problem.readings
+    span = _require_joints_seen(problem, solution.scene, sigma_px)
+    if factor is None:
+        # NaN, not zero: a method without covariance does not claim certainty.
+        unknown = np.full(len(span), np.nan)
+        return Joints(readings.prismatic, span, unknown, unknown, None)
+    types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
+    lens = NO_LENS if solution.scene.lens is None else solution.scene.lens
+    model = Model(result.P, result.H_hat_0, types, problem.q_reference, result.a_inf, lens)
+    sure = _Uncertainty(model, result.M, factor, readings)
+    noise = _reach_noise(sure)
+    error, bound = _predicted_error(sure)
+    joints = Joints(
+        readings.prismatic, span, noise, _needed_spans(sure, noise), (sigma_px * error, sigma_px * bound)
+    )
+    i = int(np.argmax(noise))
+    if noise[i] > _UNDETERMINED_NOISE:
+        raise WorkFailed(
+            f"joint {i + 1} is not determined: near the reference its images would be wrong by "
+            f"{noise[i]:.3g} times the pixel noise; {joints.advice(i)}"
+        )
+    return joints
+
+
+def _require_joints_seen(problem: Problem, scene: Scene, sigma_px: float) -> FloatArray:
     """Ranges (n,) of the joints; refuse one that moves no image over it, by velocities at the reference."""
     readings = problem.readings
     span = require_motion(readings)
@@ -58,39 +227,16 @@ def require_joints_seen(problem: Problem, scene: Scene, sigma_px: float) -> Floa
         pixels=np.zeros((2, m, 2)),
         seen=np.ones((2, m), dtype=np.bool_),
     )
-    rate = joint_derivative(prepare(once, problem.q_reference), scene)[1]
+    rate = prepare(once, problem.q_reference).joint_derivative(scene)[1]
     motion = np.linalg.norm(rate, axis=2).mean(axis=(0, 1)) * span
     i = int(np.argmin(motion))
     require_moved(i, float(span[i]), bool(readings.prismatic[i]), float(motion[i]), sigma_px)
     return span
 
 
-def require_determined(joints: Joints) -> None:
-    """Refuse a joint whose operator the data leave open, the worst of them."""
-    i = int(np.argmax(joints.noise))
-    if joints.noise[i] > _UNDETERMINED_NOISE:
-        raise WorkFailed(
-            f"joint {i + 1} is not determined: near the reference its images would be wrong by "
-            f"{joints.noise[i]:.3g} times the pixel noise; {joints.advice(i)}"
-        )
-
-
-def require_off_line(result: ProjectiveScene, factor: FloatArray) -> None:
-    """Refuse a body that a factor (24 + 16 n + 4 m or more, r) of its covariance cannot tell from a line.
-
-    A line is the span of two points; the markers must be off it by several times the noise of that distance.
-    """
-    U, extent, Vt = np.linalg.svd(result.M, full_matrices=False)
-    m = len(result.M)
-    across = np.eye(m) - U[:, :2] @ U[:, :2].T
-    noise = across @ (Vt[2:] @ marker_factor(result, factor).reshape(m, 4, -1)).reshape(m, -1)
-    if extent[2] < _OFF_LINE * float(np.linalg.norm(noise)):
-        raise WorkFailed(ON_A_LINE)
-
-
 def verdict(
     method: str,
-    agreement: Agreement,
+    solution: Solution,
     expected: Expected,
     joints: Joints,
     left_out: tuple[int, int, int],
@@ -102,12 +248,12 @@ def verdict(
     suspicion of what may be to blame for more than pixel noise. The closed form is kept for comparison: it
     returns what it finds, marked so, for residuals above the noise are its own doing.
     """
-    sigma, warned = agreement.sigma_px, expected.warns(agreement)
+    sigma, warned = solution.sigma_px, expected.warns(solution)
     outliers, suspects, swaps = left_out
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
     if method != "refined" and warned:
         short = f"the {method} method explains the images only to {sigma:.3g} px a coordinate"
-        return False, f"{short}, {expected.ratio(agreement):.3g} times {wanted}: use refined", ()
+        return False, f"{short}, {expected.ratio(solution):.3g} times {wanted}: use refined", ()
     weak = np.flatnonzero(joints.noise > WEAK_NOISE)
     advice = [joints.advice(int(i)) for i in weak]
     limit = "noise"
@@ -116,11 +262,11 @@ def verdict(
     elif weak.size:
         few = joints.span[weak] < np.where(joints.prismatic[weak], REACH_M, REACH_RAD)
         limit = "amplitude" if few.any() else "geometry"
-    elif outliers > _MOST_OUTLIERS * agreement.used.shape[1]:
+    elif outliers > _MOST_OUTLIERS * solution.used.shape[1]:
         limit = "outliers"
     reason = f"residuals of {sigma:.3g} px a coordinate agree with {wanted}"
     if warned:
-        left = f"residuals of {sigma:.3g} px a coordinate are {expected.ratio(agreement):.3g} times {wanted}"
+        left = f"residuals of {sigma:.3g} px a coordinate are {expected.ratio(solution):.3g} times {wanted}"
         reason = f"more than pixel noise is left: {left}"
         if "joint readings" in suspicion:
             advice.append("look for joint readings that lag behind the images")
@@ -245,13 +391,13 @@ def _predicted(
     problem = prepare(training.of_markers(known), q_reference, lens is not None)
     require_motion(problem.readings)
     scene = Scene(solution.scene.P, solution.scene.H_hat, solution.scene.M[known], lens)
-    found = least_squares(problem, scene, solution.agreement.sigma_px)
+    found = least_squares(problem, scene, solution.sigma_px)
     if found is None:
         raise WorkFailed(_OPEN)
-    factor = spread_factor(problem, found.scene, found.agreement.used)
+    factor = spread_factor(problem, found.scene, found.used)
     place = held_out[whole.pose_of] & known[whole.marker_of]
     test = prepare(whole.of_poses(held_out).of_markers(known), q_reference, lens is not None)
-    pixels, J = derivative(test, found.scene)
+    pixels, J = test.derivative(found.scene)
     spread = test.dense(J, np.ones_like(test.readings.seen)) @ factor
     variance = (spread**2).sum(axis=1).reshape(pixels.shape)
     # A direction the other poses leave open would stay where the whole fit put it.
@@ -259,7 +405,7 @@ def _predicted(
         raise WorkFailed(_OPEN)
     difference, error = np.zeros((2, *whole.seen.shape, 2))
     difference[:, place], error[:, place] = test.readings.pixels - pixels, sigma_px * np.sqrt(1.0 + variance)
-    return solution.agreement.used & place, difference, error
+    return solution.used & place, difference, error
 
 
 def _compared(rms: float | None, expected: float | None, failed: int) -> str:

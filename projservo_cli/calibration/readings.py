@@ -66,6 +66,32 @@ class Readings:
         """How many readings of a mask (2, N) each marker has, (m,)."""
         return np.bincount(self.marker_of, mask.sum(axis=0), self.marker.size).astype(np.int64)
 
+    def home(self) -> int | None:
+        """Row of q from which all others differ in at most one joint: the pose of single-joint trials."""
+        q = self.q
+        changed = (np.abs(q[:, None] - q[None]) > SAME_READING).sum(axis=2)
+        candidates = np.flatnonzero((changed <= 1).all(axis=1))
+        if candidates.size == 0:
+            return None
+        # With trials of a single joint every row qualifies: the one in the middle moves least.
+        travel = np.abs(q[:, None] - q[None]).sum(axis=(1, 2))
+        return int(candidates[np.argmin(travel[candidates])])
+
+    def trials(self, home: int) -> list[IntArray]:
+        """Rows of q in which each joint differs from the reference, an array a joint."""
+        moved = np.abs(self.q - self.q[home]) > SAME_READING
+        return [np.flatnonzero(column) for column in moved.T]
+
+    def reference(self) -> FloatArray:
+        """Joints (n,) the model is written about: the reference of trials, else the most central pose."""
+        row = self.home()
+        if row is None:
+            span = np.ptp(self.q, axis=0)
+            deviation = (self.q - np.median(self.q, axis=0)) / np.where(span > 0.0, span, 1.0)
+            row = int(np.argmin((deviation**2).sum(axis=1)))
+        result: FloatArray = self.q[row].copy()
+        return result
+
 
 def gather(observation: Observation, joint_types: str) -> Readings:
     """Flatten an observation into the list of what was seen; one letter a joint, R or P.
@@ -116,34 +142,6 @@ def _require_shapes(observation: Observation) -> None:
             f"images of shape {observation.images.shape}: expected {(K, 2, m, 2)} for {K} poses, two views, "
             f"{m} markers and two coordinates"
         )
-
-
-def reference_pose(q: FloatArray) -> int | None:
-    """Row of q (K, n) from which all others differ in at most one joint: the pose of single-joint trials."""
-    changed = (np.abs(q[:, None] - q[None]) > SAME_READING).sum(axis=2)
-    candidates = np.flatnonzero((changed <= 1).all(axis=1))
-    if candidates.size == 0:
-        return None
-    # With trials of a single joint every row qualifies: the one in the middle moves least.
-    travel = np.abs(q[:, None] - q[None]).sum(axis=(1, 2))
-    return int(candidates[np.argmin(travel[candidates])])
-
-
-def joint_trials(q: FloatArray, home: int) -> list[list[int]]:
-    """Rows of q (K, n) in which each joint differs from the reference, a list a joint."""
-    moved = np.abs(q - q[home]) > SAME_READING
-    return [np.flatnonzero(moved[:, i]).tolist() for i in range(q.shape[1])]
-
-
-def reference_joints(q: FloatArray) -> FloatArray:
-    """Joints (n,) the model is written about: the reference of trials (K, n), else the most central pose."""
-    row = reference_pose(q)
-    if row is None:
-        span = np.ptp(q, axis=0)
-        deviation = (q - np.median(q, axis=0)) / np.where(span > 0.0, span, 1.0)
-        row = int(np.argmin((deviation**2).sum(axis=1)))
-    result: FloatArray = q[row].copy()
-    return result
 
 
 # Reach at which predictions are judged, rad and m.
@@ -290,12 +288,12 @@ def _require_moving(readings: Readings, sigma: float) -> None:
             f"the images stand still within {limit:.3g} px although the joint readings move: check that the "
             "robot moved, and that images and readings belong together"
         )
-    home = reference_pose(readings.q)
+    home = readings.home()
     if home is None:
         return
-    for i, rows in enumerate(joint_trials(readings.q, home)):
+    for i, rows in enumerate(readings.trials(home)):
         poses = np.zeros(len(readings.q), dtype=bool)
-        poses[[home, *rows]] = True
+        poses[np.append(rows, home)] = True
         square = _squared_path(readings.of_poses(poses))
         # Noise alone has the variance of both coordinates.
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf

@@ -3,13 +3,13 @@
 Or from what is known of a robot and its rig beforehand, which is tried and never trusted.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.adjustment import Problem, Scene, cross_matrix, prepare
+from projservo_cli.calibration.adjustment import Problem, Scene, cross_matrix
 from projservo_cli.calibration.epipolar import Epipolar, Guess, ImageFrame, guess_at, metric_guesses
 from projservo_cli.calibration.readings import MAD, SAME_READING, Readings
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
@@ -24,13 +24,27 @@ from projservo_cli.records import (
     WorkFailed,
 )
 
+Tell = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What a search for the maximum likelihood works on."""
+
+    problem: Problem
+    epipolar: Epipolar
+    frame: ImageFrame
+    rng: np.random.Generator
+    tell: Tell  # told what is done, how much of it, and of how much
+
+
 # Shared markers that carry an alignment: four resist one wrong marker, three are the least.
 _SAFE, _LEAST = 4, 3
 _ROUNDS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class _Alignment:
     """The body in its own frame and its rigid motion to each pose."""
 
     body: FloatArray  # (m, 3) markers, NaN where never merged
@@ -39,7 +53,7 @@ class Alignment:
     merged: BoolArray  # (K,) poses whose rotation is known
 
 
-def merged(guess: Guess, readings: Readings) -> Alignment:
+def _merged(guess: Guess, readings: Readings) -> _Alignment:
     """Body and poses from the points of a guessed reconstruction, those both views saw."""
     both = readings.both
     shape = (len(readings.q), readings.marker.size)
@@ -49,7 +63,7 @@ def merged(guess: Guess, readings: Readings) -> Alignment:
     return _merge(points, seen)
 
 
-def _merge(points: FloatArray, seen: BoolArray) -> Alignment:
+def _merge(points: FloatArray, seen: BoolArray) -> _Alignment:
     """Grow the body from the fullest pose until nothing is added, from points (K, m, 3) where seen (K, m)."""
     K = len(seen)
     points = np.where(seen[..., None], points, 0.0)
@@ -71,7 +85,7 @@ def _merge(points: FloatArray, seen: BoolArray) -> Alignment:
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
             body = _median_body(local, seen & found[:, None])
             grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
-    return Alignment(body, R, t, found)
+    return _Alignment(body, R, t, found)
 
 
 def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -137,12 +151,12 @@ _WIDTH = 0.05
 
 
 def _rotation_axes(
-    alignment: Alignment,
+    alignment: _Alignment,
     q: FloatArray,
     prismatic: BoolArray,
     rng: np.random.Generator,
     keep: int,
-    steps: int = _TURNS,
+    steps: int,
 ) -> list[FloatArray]:
     """Sets of axes (n, 3) that explain the rotations at joint values (K, n), the distinct minima, best first.
 
@@ -326,44 +340,44 @@ def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> Fl
 _FOCAL_MINIMA, _AXIS_MINIMA = 3, 3
 
 
-def starts(
-    problem: Problem,
-    readings: Readings,
-    epipolar: Epipolar,
-    frame: ImageFrame,
-    rng: np.random.Generator,
-    factors: tuple[float, ...],
-) -> Iterator[Scene]:
+def starts(search: Search, readings: Readings, factors: tuple[float, ...]) -> Iterator[Scene]:
     """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each.
 
     The readings are those of the problem, perhaps at some of its poses.
     """
-    guesses = metric_guesses(epipolar.F, readings, frame, _FOCAL_MINIMA)
+    F, frame = search.epipolar.F, search.frame
+    guesses = metric_guesses(F, readings, frame, _FOCAL_MINIMA)
     for factor in factors:
         for best in guesses:
-            guess = best if factor == 1.0 else guess_at(epipolar.F, readings, frame, factor * best.focal)
-            alignment = merged(guess, readings)
+            guess = best if factor == 1.0 else guess_at(F, readings, frame, factor * best.focal)
+            alignment = _merged(guess, readings)
             if int(np.isfinite(alignment.body[:, 0]).sum()) < _LEAST:
                 raise WorkFailed(
                     "no three markers are seen together by both cameras: more must be seen at once"
                 )
-            yield from placed(problem, readings, guess, alignment, rng)
+            q = search.problem.q
+            axes = _rotation_axes(alignment, q, readings.prismatic, search.rng, _AXIS_MINIMA, _TURNS)
+            yield from filter(_finite, (_place(w, guess, readings, q) for w in axes))
 
 
-def placed(
-    problem: Problem,
-    readings: Readings,
-    guess: Guess,
-    alignment: Alignment,
-    rng: np.random.Generator,
-    keep: int = _AXIS_MINIMA,
-    steps: int = _TURNS,
-) -> Iterator[Scene]:
-    """Scenes of a guessed metric frame, one for each set of axes that explains its rotations."""
-    for w in _rotation_axes(alignment, problem.q, readings.prismatic, rng, keep, steps):
-        scene = _place(w, guess, readings, problem.q)
-        if np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all():
-            yield scene
+def starts_of_changed(search: Search, changes: Iterable[Problem], steps: int) -> Iterator[Scene | None]:
+    """A start for each of some problems that differ from the one searched in their joints; None without one.
+
+    All in one guessed metric frame, which owes nothing to the joints, after some steps of the axes.
+
+    Raises WorkFailed if no two markers were seen together at two poses.
+    """
+    readings = search.problem.readings
+    guess = metric_guesses(search.epipolar.F, readings, search.frame, keep=1)[0]
+    alignment = _merged(guess, readings)
+    for changed in changes:
+        axes = _rotation_axes(alignment, changed.q, changed.readings.prismatic, search.rng, 1, steps)
+        yield next(filter(_finite, (_place(w, guess, changed.readings, changed.q) for w in axes)), None)
+
+
+def _finite(scene: Scene) -> bool:
+    """Whether the axes had places."""
+    return bool(np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all())
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,8 +418,4 @@ class Nominal:
         column = {int(number): j for j, number in enumerate(self.marker)}
         M = self.M[[column[int(number)] for number in readings.marker]]
         M = M @ forward_kinematics(model, q_reference).T
-        scene = Scene(self.P, joint_operators(model, q_reference), M)
-        # A camera is given up to scale and sign: most points are to lie in front of it.
-        _, depth = prepare(readings, q_reference).pixels(scene)
-        sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
-        return Scene(self.P * sign[:, None, None], scene.H_hat, scene.M)
+        return Scene(self.P, joint_operators(model, q_reference), M)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict, residual_statistics
-from projservo_cli.calibration.adjustment import Scene, derivative, prepare
+from projservo_cli.calibration.adjustment import Scene, prepare
 from projservo_cli.calibration.covariance import (
     covariance_factor,
     isotropic,
@@ -17,7 +17,7 @@ from projservo_cli.calibration.covariance import (
     spread_factor,
 )
 from projservo_cli.calibration.prediction import prediction_derivative
-from projservo_cli.calibration.readings import gather, reference_joints, reference_pose
+from projservo_cli.calibration.readings import gather
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, Model, Observation
 from tests.calibration.bound import Bound
@@ -123,7 +123,7 @@ def test_covariance_is_that_of_the_parameters():
     result = projective(problem, scene)
     model = Model(result.P, result.H_hat_0, np.array([0, 1, 0]), robot.q_reference, result.a_inf)
     predicted = prediction_derivative(model, result.M, q)
-    J = problem.dense(derivative(problem, scene)[1], readings.seen)
+    J = problem.dense(problem.derivative(scene)[1], readings.seen)
     direct = J @ spread_factor(problem, scene, readings.seen)
     chained = predicted @ covariance_factor(problem, scene, readings.seen, result)
     chained = chained[readings.pose_of, :, readings.marker_of].transpose(1, 0, 2, 3).reshape(direct.shape)
@@ -159,9 +159,13 @@ def test_residual_statistics_count_what_they_skip():
         predict(calibration, q[:, :2])
 
 
+def readings_at(robot, q):
+    return gather(robot.observe(q, 0.0, np.random.default_rng(0)), robot.joint_types)
+
+
 def test_reference_is_the_pose_all_trials_share():
     robot = random_robot("RRR", np.random.default_rng(3))
     q = trials(robot, frames=4)
     shuffled = q[np.random.default_rng(0).permutation(len(q))]
-    assert np.array_equal(reference_joints(shuffled), robot.q_reference)
-    assert reference_pose(around(robot, 20, np.random.default_rng(1))) is None
+    assert np.array_equal(readings_at(robot, shuffled).reference(), robot.q_reference)
+    assert readings_at(robot, around(robot, 20, np.random.default_rng(1))).home() is None

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.calibration.closed_form import reconstruct
-from projservo_cli.calibration.epipolar import epipolar_geometry
+from projservo_cli.calibration.epipolar import epipolar_geometry, reconstruct
 from projservo_cli.geometry.stereo import fundamental_matrix
 from projservo_cli.records import WorkFailed
 from tests.calibration.simulated_robot import rig

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import adjustment, calibrate, predict, prediction_variance
+from projservo_cli.calibration import calibrate, predict, prediction_variance
 from projservo_cli.calibration.adjustment import Scene, prepare
 from projservo_cli.calibration.readings import gather
 from projservo_cli.records import InputError, WorkFailed
@@ -61,18 +61,18 @@ def test_derivative_agrees_with_central_differences(robot):
     )
     problem = prepare(readings, robot.q_reference, lens=True)
     scene = Scene(robot.cameras, robot.twists, robot.markers, LENS)
-    _, J = adjustment.derivative(problem, scene)
+    _, J = problem.derivative(scene)
     dense = problem.dense(J, np.ones(J.shape[:2], dtype=bool))
     scale = np.linalg.norm(dense, axis=0)
     for k in range(problem.size):
         # As without a lens: a step that moves the images by 1e-2 px; truncation and round-off < 1e-6.
         step = 0.05 / scale[k] * np.eye(problem.size)[k]
-        ahead, behind = (problem.residual(adjustment.retract(problem, scene, s)) for s in (step, -step))
+        ahead, behind = (problem.residual(problem.retract(scene, s)) for s in (step, -step))
         numeric = (ahead - behind).ravel() / (2.0 * step[k])
         assert np.abs(numeric - dense[:, k]).max() < 1e-6 * scale[k]
-    gauge = adjustment.gauge(problem, scene)
+    gauge = problem.gauge(scene)
     assert np.abs(dense @ gauge).max() < 1e-10 * np.abs(dense).max()
-    pixels, by_joint = adjustment.joint_derivative(problem, scene)
+    pixels, by_joint = problem.joint_derivative(scene)
     for i in range(len(robot.joint_types)):
         dq = 1e-5 * np.eye(len(robot.joint_types))[i]
         ahead, behind = (dataclasses.replace(problem, q=problem.q + d).pixels(scene)[0] for d in (dq, -dq))

@@ -86,12 +86,12 @@ def test_the_same_optimum_as_from_the_images_alone(robot, observation, alone, wr
 def test_the_reference_of_the_file_may_be_any_pose(robot, observation, written):
     """The truth about another reference predicts the images of all poses without any fit."""
     from projservo_cli.calibration.adjustment import prepare
-    from projservo_cli.calibration.readings import gather, reference_joints
+    from projservo_cli.calibration.readings import gather
 
     values = described(robot, observation)
     readings = gather(observation, "RPRR")
     nominal = read_nominal(written(values))
-    home = reference_joints(readings.q)
+    home = readings.reference()
     for q_reference in (home, home + np.array([0.3, 0.1, -0.5, 0.8])):
         scene = nominal.scene(readings, q_reference)
         pixels, depth = prepare(readings, q_reference).pixels(scene)
