@@ -1,6 +1,5 @@
 """The command ``projservo``: one group whose stages chain, and what becomes of errors: exit codes."""
 
-import _thread
 import difflib
 import inspect
 import io
@@ -225,4 +224,4 @@ def _interrupt() -> None:
     if os.name == "posix":
         os.kill(os.getpid(), signal.SIGINT)
     else:
-        _thread.interrupt_main()
+        signal.raise_signal(signal.SIGINT)
