@@ -112,8 +112,7 @@ class ImageModel(Calibration):
 
 def image_model(calibration: Calibration) -> ImageModel:
     """A calibration with its functions."""
-    fields = dataclasses.fields(calibration)
-    return ImageModel(**{field.name: getattr(calibration, field.name) for field in fields})
+    return ImageModel(**vars(calibration))
 
 
 @dataclasses.dataclass(frozen=True)

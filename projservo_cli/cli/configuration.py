@@ -11,12 +11,15 @@ from projservo_cli.records import InputError
 from projservo_cli.store import Run, load, run_path
 
 _RESULTS = Path("results")
-_TEXTS = (  # options whose value is text, not YAML, and their keys
-    ("data", "data", "table"),
-    ("joints", "data", "joints"),
-    ("joint_unit", "data", "joint_unit"),
-    ("init", "calibration", "init"),
-)
+_KEYS = {  # that options stand for
+    "data": ("data", "table"),
+    "joints": ("data", "joints"),
+    "joint_unit": ("data", "joint_unit"),
+    "noise_px": ("data", "noise_px"),
+    "init": ("calibration", "init"),
+    "cross_validate": ("calibration", "cross_validate"),
+    "lens": ("calibration", "lens"),
+}
 
 
 def resolve(options: Mapping[str, Any]) -> tuple[Config, Run]:
@@ -86,23 +89,17 @@ def shipped(name: str = "paper.yaml") -> Path:
 def given_overrides(options: Mapping[str, Any]) -> list[Override]:
     """Options that stand for keys of the configuration, then ``--set``, then ``--speed-scale``."""
     found = []
-    for name, *key in _TEXTS:
-        if (given := options.get(name)) is not None:
-            value = os.path.abspath(given) if name in ("data", "init") else given
-            found.append(Override(f"{_flag(name)} {given}", tuple(key), value))
-    for name, where in (("noise_px", "data.noise_px"), ("cross_validate", "calibration.cross_validate")):
-        if (given := options.get(name)) is not None:
-            found.append(Override.parse(f"{where}={given}", f"{_flag(name)} {given}"))
-    if options.get("lens"):
-        found.append(Override("--lens", ("calibration", "lens"), True))
+    for name, key in _KEYS.items():
+        given = options.get(name)
+        if given is None or given is False:
+            continue
+        flag = f"--{name.replace('_', '-')}" + ("" if given is True else f" {given}")
+        value = os.path.abspath(given) if key[1] in ("table", "init") else given
+        found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024
         sides = size.lower().replace("x", ", ")
         found.append(Override.parse(f"data.image_size_px=[{sides}]", f"--image-size {size}"))
     found += map(Override.parse, options["sets"])
     if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
-        found.append(Override.parse(f"plant.speed_scale={scale}", f"--speed-scale {scale}"))
+        found.append(Override(f"--speed-scale {scale}", ("plant", "speed_scale"), scale))
     return found
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"

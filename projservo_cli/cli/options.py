@@ -30,7 +30,7 @@ joint_unit = click.option(
 )
 dry_run = click.option("-n", "--dry-run", is_flag=True, help="Say what would be done, do nothing.")
 speed_scale = click.option(
-    "--speed-scale", metavar="S", help="Scale every command by S, above 0 and at most 1."
+    "--speed-scale", metavar="S", type=float, help="Scale every command by S, above 0 and at most 1."
 )
 
 
@@ -100,7 +100,7 @@ _OF_STAGES = (
     click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     joint_unit,
-    click.option("--noise-px", metavar="S", help="Pixel noise of the table. Default: estimated."),
+    click.option("--noise-px", metavar="S", type=float, help="Pixel noise of the table. Default: estimated."),
     click.option("--lens", is_flag=True, help="Estimate radial lens distortion, two coefficients a camera."),
     click.option(
         "--image-size",

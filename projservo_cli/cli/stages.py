@@ -28,7 +28,10 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
     "calibrate", epilog="Example: projservo calibrate --data trials.csv --joints RRPRRR -o results/mine"
 )
 @click.option(
-    "--cross-validate", metavar="K", help="Predict the poses in K parts, each from a fit to the others."
+    "--cross-validate",
+    metavar="K",
+    type=int,
+    help="Predict the poses in K parts, each from a fit to the others.",
 )
 @click.option(
     "--init",

@@ -149,12 +149,8 @@ class ScrewJoint(_Joint):
             yield (axis,), f"must be of unit length for a joint of type {self.type}, it is {length:g}"
         if self.type == "P" and math.hypot(*self.w) > TOLERANCE:
             yield ("w",), "must be zero for a joint of type P"
-        if self.type == "R" and abs(_dot(self.w, self.v)) > TOLERANCE:
+        if self.type == "R" and abs(np.dot(self.w, self.v)) > TOLERANCE:
             yield ("v",), "must be orthogonal to w: a revolute joint has no pitch"
-
-
-def _dot(u: Sequence[float], v: Sequence[float]) -> float:
-    return sum(a * b for a, b in zip(u, v, strict=True))
 
 
 def _rigid(T: Matrix44, info: ValidationInfo) -> Matrix44:
@@ -245,18 +241,12 @@ class Camera(Section):
         elif missing:
             told = f" (missing: {', '.join(missing)})" if given else ""
             yield (), f"give matrix, or all of {', '.join(wanted)}{told}"
+        elif self.position_m == self.target_m:
+            yield ("target_m",), "is the position of the camera; it must look somewhere"
         else:
-            yield from _blind(self.position_m, self.target_m, self.up)
-
-
-def _blind(position: Any, target: Any, up: Vector3) -> Iterator[Finding]:
-    """A camera that looks nowhere, or along what is up in its image."""
-    sight = [b - a for a, b in zip(position, target, strict=True)]
-    length, height = math.hypot(*sight), math.hypot(*up)
-    if length == 0:
-        yield ("target_m",), "is the position of the camera; it must look somewhere"
-    elif height == 0 or abs(_dot(sight, up)) > (1 - 1e-9) * length * height:
-        yield ("up",), "must not be zero or along the line of sight"
+            sight, up = np.array(self.target_m) - np.array(self.position_m), np.array(self.up)
+            if abs(sight @ up) >= (1 - 1e-9) * np.linalg.norm(sight) * np.linalg.norm(up):
+                yield ("up",), "must not be zero or along the line of sight"
 
 
 class Rig(Section):

@@ -13,9 +13,7 @@ def refuse(answer, message):
 def test_bad_configurations_and_tables(projservo, stages, tmp_path):
     """What else is refused in them is tested where they are read."""
     (tmp_path / "c.yaml").write_text("seed: 1\nseed: 2\n", encoding="utf-8")
-    refuse(
-        projservo("calibrate", "-c", "c.yaml", "--json"), "projservo: c.yaml:2:1: seed: the key stands here"
-    )
+    refuse(projservo("calibrate", "-c", "c.yaml", "--json"), "projservo: c.yaml:2:1: seed: the key")
     (tmp_path / "bad.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n1,0,1,2\n")
     answer = projservo("calibrate", "--data", "bad.csv", "-o", "out", "--json", "-q")
     refuse(answer, f"{tmp_path / 'bad.csv'}:2: 4 cells")
@@ -27,6 +25,10 @@ OPTIONS = {
     "no such configuration": (["-c", "none.yaml"], "none.yaml: cannot be read"),
     "no such table": (["--data", "none.csv"], "none.csv: cannot be read"),
     "joints of other letters": ([*RECORDED, "--joints", "RX"], "--joints RX: data.joints: 'RX' must be"),
+    "no noise at all": (
+        [*RECORDED, "--noise-px", "0"],
+        "--noise-px 0.0: data.noise_px: must be greater than 0",
+    ),
     "joints without a table": ([*SIMULATED, "--joints", "RR"], "--joints RR: data.table: is missing"),
     "override of nothing": ([*SIMULATED, "--set", "sed=1"], "--set sed=1: sed: unknown key; did you mean"),
     "a file for a folder": ([*SIMULATED, "-o", "t.csv/out"], "t.csv/out"),
