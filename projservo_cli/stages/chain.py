@@ -36,22 +36,17 @@ def make(
 ) -> tuple[Run, list[str]]:
     """Make one result and put it into the run file.
 
-    step, config, run : what to make, from what.
     laws : names of the runs a report is about; others may be stored, of other settings perhaps.
-    progress : told how far the stage is.
-    Returns tuple: The run with it, and the names of results dropped because they were made from older ones.
-    Raises InputError, WorkFailed what the stage raises; the run file is then as it was.
+    Returns the run with it, and the names of results dropped because they were made from older ones. Raises
+    InputError, WorkFailed as the stage does; the run file is then as it was.
     """
     run = replace(run, configuration=to_yaml(config))
     records = _records(step, config, run, laws, progress)
     result = Result(step.key, run.configuration, provenance.collect(seed=config.seed), step.inputs, records)
-    after = [name for name in run.results if _stage_of(name) > STAGES.index(step.stage)]
+    place = STAGES.index(step.stage)
+    after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
     results = {name: stored for name, stored in run.results.items() if name not in after}
     return save(replace(run, results={**results, step.name: result})), after
-
-
-def _stage_of(name: str) -> int:
-    return STAGES.index(name.split("/")[0])
 
 
 def _records(step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress) -> dict[str, Any]:

@@ -60,11 +60,9 @@ def steps_for(
 ) -> list[Step]:
     """All results that the named stages consist of or need, in the order of making.
 
-    config : Config.
-    run : Run, what is stored so far; possibly nothing.
-    named : sequence of str, stages the user asked for.
-    laws : sequence of str, laws instead of ``control.laws``.
-    force : bool, make the named stages even where they are up to date.
+    run : what is stored so far; possibly nothing.
+    laws : instead of ``control.laws``.
+    force : make the named stages even where they are up to date.
     Raises InputError when a file cannot be read, a law has none of the modes of ``control.mode``, or a
     recorded calibration would be replaced by a simulated one without ``force``.
     """

@@ -81,9 +81,9 @@ def _make(
     calibrations = folder.calibrations(design)
 
     def part(first: int, last: int) -> Part:
-        cell, draw = np.divmod(np.arange(first, last), design.sweep.runs)
-        pairs = set(zip(cell.tolist(), (draw % design.sweep.calibrations).tolist(), strict=True))
-        keys = {design.calibration_key(*pair) for pair in pairs}
+        at = design.placed(np.arange(first, last))
+        pairs = zip(at["cell"].tolist(), at["calibration"].tolist(), strict=True)
+        keys = {design.calibration_key(*pair) for pair in set(pairs)}
         return Part(design, first, last, {key: calibrations[key] for key in keys})
 
     threads = _shares_settings(design)
