@@ -26,7 +26,6 @@ from projservo_cli.calibration.fit import (
     determined,
     expected_noise,
     solve,
-    solve_from,
 )
 from projservo_cli.calibration.outliers import Outliers
 from projservo_cli.calibration.quality import WEAK_NOISE, judged_joints, verdict
@@ -141,7 +140,7 @@ def _most_likely(
     """Maximum likelihood, the noise it is measured by, and its record; a misfit names the joint if it can."""
     expected = expect(search.epipolar)
     try:
-        solution, note = (solve(search, expected), "") if init is None else solve_from(init, search, expected)
+        solution, note = solve(search, expected, init)
         straight = search.epipolar
         if lens:
             search.tell("calibration, lens", 0, 1)
@@ -172,9 +171,8 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
         refusal = expected.refusal(solution)
         if refusal is not None:
             raise Misfit(refusal)
-        found = outliers.explain(solution)
         straight = distortion.straight_readings(problem.readings, scene.lens)
-        outliers.require_explained(straight, solution.used, found, epipolar)
+        found = outliers.explain(solution, straight, epipolar)
     except Misfit as refused:
         raise Misfit(f"{refused}{distortion.hint(share)}") from None
     result = projective(problem, scene)
@@ -183,8 +181,15 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     suspicion = "lens" if share else "joint readings"
     record = _record("refined", result, solution, expected, factor=factor, found=found, suspicion=suspicion)
     advice = (*record.advice, *distortion.lens_advice(record, share, frame.known))
-    record = dataclasses.replace(record, advice=advice)
-    return outliers.with_lost_markers(record, whole.problem.readings, kept)
+    if kept.all():
+        return dataclasses.replace(record, advice=advice)
+    readings = whole.problem.readings
+    lost = outliers.listed(readings, readings.seen & ~kept[readings.marker_of])
+    names = ", ".join(str(number) for number in readings.marker[~kept])
+    seldom = f"hardly any reading of marker {names} fits: it is not part of the model; see it more often"
+    outlier = np.concatenate([record.outlier, lost])
+    outlier = outlier[np.lexsort(outlier.T[::-1])]
+    return dataclasses.replace(record, outlier=outlier, advice=(*advice, seldom))
 
 
 def _closed_form(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:
@@ -200,7 +205,7 @@ def _closed_form(readings: Readings, epipolar: Epipolar, expected: Expected) -> 
         Solution(problem, scene, problem.residual(scene), seen, dof),
         expected,
         factor=None,
-        found=outliers.none_explained(problem.readings),
+        found=Outliers.nothing(problem.readings),
         suspicion="lens or joint readings",
     )
 

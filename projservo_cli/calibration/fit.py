@@ -263,7 +263,46 @@ _SEARCHES = 5
 _SAME_LEVEL = 1e-3
 
 
-def solve(search: Search, expected: Expected) -> Solution:
+def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[Solution, str]:
+    """The best fit, and advice about a given start where it did not lead there, else empty.
+
+    From a start the fit it leads to, if that leaves the expected noise, else the best of it and a search from
+    the images alone.
+
+    Raises InputError if the start is one for other joints or markers; WorkFailed if neither leads anywhere.
+    """
+    if nominal is None:
+        return _solve_from_images(search, expected), ""
+    problem, found = search.problem, None
+    scene = nominal.scene(problem.readings, problem.q_reference)
+    pixels, depth = problem.pixels(scene)
+    # A camera is given up to scale and sign: most points are to lie in front of it.
+    sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
+    scene = Scene(scene.P * sign[:, None, None], scene.H_hat, scene.M)
+    if np.isfinite(pixels).all() and ((depth * sign[:, None])[problem.readings.seen] > 0.0).all():
+        found = follow(problem, scene, search.epipolar)
+    if found is not None and expected.agrees(found):
+        return found, ""
+    try:
+        searched = _solve_from_images(search, expected)
+    except WorkFailed:
+        if found is None or expected.refusal(found) is not None:
+            raise
+        return found, ""
+    if found is not None and found.typical_px <= (1.0 + _SAME_LEVEL) * searched.typical_px:
+        return found, ""
+    leads = (
+        "does not put the markers in front of both cameras"
+        if found is None
+        else f"leads to residuals of {found.typical_px:.3g} px instead of {searched.typical_px:.3g} px"
+    )
+    return searched, (
+        f"{nominal.where} was no start: it {leads}; the search from the images alone was used, "
+        "so check whether the file is about this robot and rig"
+    )
+
+
+def _solve_from_images(search: Search, expected: Expected) -> Solution:
     """Best fit over the starts; the first that leaves nothing but the expected noise ends the search.
 
     Before each start it tells how many were tried, of at most how many.
@@ -322,40 +361,3 @@ def _explained(solution: Solution) -> BoolArray:
         here = readings.pose_of == k
         result[k] = np.median(distance[:, here][readings.seen[:, here]]) <= limit
     return result
-
-
-def solve_from(nominal: Nominal, search: Search, expected: Expected) -> tuple[Solution, str]:
-    """The fit that a given start leads to if it leaves the expected noise, else the best of it and ``solve``.
-
-    With advice about the start where it did not lead there, else empty.
-
-    Raises InputError if the start is one for other joints or markers; WorkFailed if neither leads anywhere.
-    """
-    problem = search.problem
-    found = None
-    scene = nominal.scene(problem.readings, problem.q_reference)
-    pixels, depth = problem.pixels(scene)
-    # A camera is given up to scale and sign: most points are to lie in front of it.
-    sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
-    scene = Scene(scene.P * sign[:, None, None], scene.H_hat, scene.M)
-    if np.isfinite(pixels).all() and ((depth * sign[:, None])[problem.readings.seen] > 0.0).all():
-        found = follow(problem, scene, search.epipolar)
-    if found is not None and expected.agrees(found):
-        return found, ""
-    try:
-        searched = solve(search, expected)
-    except WorkFailed:
-        if found is None or expected.refusal(found) is not None:
-            raise
-        return found, ""
-    if found is not None and found.typical_px <= (1.0 + _SAME_LEVEL) * searched.typical_px:
-        return found, ""
-    leads = (
-        "does not put the markers in front of both cameras"
-        if found is None
-        else f"leads to residuals of {found.typical_px:.3g} px instead of {searched.typical_px:.3g} px"
-    )
-    return searched, (
-        f"{nominal.where} was no start: it {leads}; the search from the images alone was used, "
-        "so check whether the file is about this robot and rig"
-    )

@@ -34,15 +34,18 @@ class Outliers:
     swapped: IntArray  # (W, 3) row of the pose, index of the marker that was read and of the one it is
     explained: BoolArray  # (2, N) readings that these explain
 
+    @classmethod
+    def nothing(cls, readings: Readings) -> "Outliers":
+        """No explanation of anything."""
+        rows = np.zeros((0, 3), dtype=np.int64)
+        return cls(rows[:, :2], rows, np.zeros_like(readings.seen))
 
-def none_explained(readings: Readings) -> Outliers:
-    """No explanation of anything."""
-    nothing = np.zeros((0, 3), dtype=np.int64)
-    return Outliers(nothing[:, :2], nothing, np.zeros_like(readings.seen))
 
+def explain(solution: Solution, straight: Readings, epipolar: Epipolar) -> Outliers:
+    """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings.
 
-def explain(solution: Solution) -> Outliers:
-    """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings."""
+    Raises Misfit where too much is left, by the readings as projective cameras would have seen them.
+    """
     problem, scene, used = solution.problem, solution.scene, solution.used
     readings, sigma = problem.readings, solution.sigma_px
     out = readings.seen & ~used
@@ -60,7 +63,9 @@ def explain(solution: Solution) -> Outliers:
         suspects += [(int(k), i) for i in joints]
         if joints:
             explained[:, here] |= out[:, here]
-    return Outliers(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
+    found = Outliers(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
+    _require_explained(straight, used, found, epipolar)
+    return found
 
 
 def _swaps(problem: Problem, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
@@ -119,13 +124,11 @@ def _corrected_level(pose: Problem, scene: Scene, joints: list[int]) -> float:
     return best
 
 
-def require_explained(readings: Readings, used: BoolArray, found: Outliers, epipolar: Epipolar) -> None:
+def _require_explained(readings: Readings, used: BoolArray, found: Outliers, epipolar: Epipolar) -> None:
     """Refuse a fit that leaves out too many sightings both views agree on, or poses for their joint readings.
 
     Errors of detection break the epipolar geometry; what obeys it and still does not fit speaks
-    against the model of the robot. Readings are those that projective cameras would have seen.
-
-    Raises Misfit if the model of the robot, not single errors, is at odds with the data.
+    against the model of the robot.
     """
     both = readings.both
     out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
@@ -152,19 +155,6 @@ def listed(readings: Readings, out: BoolArray) -> IntArray:
         [readings.pose[readings.pose_of[rows]], readings.marker[readings.marker_of[rows]], view], axis=1
     )
     return found[np.lexsort(found.T[::-1])].astype(np.int64)
-
-
-def with_lost_markers(record: Calibration, readings: Readings, kept: BoolArray) -> Calibration:
-    """Record that also lists the readings of markers (m,) that could not be kept, and says so."""
-    if kept.all():
-        return record
-    lost = listed(readings, readings.seen & ~kept[readings.marker_of])
-    outlier = np.concatenate([record.outlier, lost])
-    names = ", ".join(str(number) for number in readings.marker[~kept])
-    advice = f"hardly any reading of marker {names} fits: it is not part of the model; see it more often"
-    return dataclasses.replace(
-        record, outlier=outlier[np.lexsort(outlier.T[::-1])], advice=(*record.advice, advice)
-    )
 
 
 def findings(calibration: Calibration) -> dict[str, Any]:
@@ -254,7 +244,7 @@ def _describes(problem: Problem, scene: Scene, epipolar: Epipolar, most_px: floa
     if found is None or found.sigma_px > most_px:
         return False
     try:
-        require_explained(problem.readings, found.used, none_explained(problem.readings), epipolar)
+        _require_explained(problem.readings, found.used, Outliers.nothing(problem.readings), epipolar)
     except WorkFailed:
         return False
     return True

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from projservo_cli.calibration.prediction import marker_pixels, prediction_derivative
-from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, Observation, WorkFailed
 
 # Poses drawn to choose from, and to judge by; draws before giving up, in batches.
 _CANDIDATES, _TARGETS = 300, 150
@@ -113,7 +113,8 @@ def _seen(
     rows: list[FloatArray] = []
     for _ in range(_BATCHES):
         q = rng.uniform(region.low, region.high, (_BATCH, len(region.low)))
-        seen = _inside(marker_pixels(model, M, q), region.image)
+        pixels, (low, high) = marker_pixels(model, M, q), region.image.swapaxes(0, 1)[:, :, None]
+        seen = ((pixels >= low) & (pixels <= high)).all(axis=-1)  # none that is NaN, behind the camera
         enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
         if enough.size:
             J = prediction_derivative(model, M, q[enough]) @ factor
@@ -131,10 +132,3 @@ def _seen(
             "cameras as far as the calibration can tell; make it better with single-joint trials first"
         )
     return np.array(poses), np.array(rows)
-
-
-def _inside(pixels: FloatArray, image: FloatArray) -> BoolArray:
-    """Which pixels (K, 2, m, 2) lie within the image; none that is NaN, behind the camera, does."""
-    inside = (pixels >= image[:, None, 0]) & (pixels <= image[:, None, 1])
-    result: BoolArray = np.asarray(inside.all(axis=-1))
-    return result

@@ -47,14 +47,8 @@ def fitted(shared_data, tmp_path_factory):
     found = {}
     for lens in (False, True):
         folder = tmp_path_factory.mktemp("motoman")
-        words = [
-            "calibrate",
-            "--data",
-            str(shared_data / "motoman" / "arm2_train.csv"),
-            "-o",
-            str(folder),
-            "-q",
-        ]
+        table = shared_data / "motoman" / "arm2_train.csv"
+        words = ["calibrate", "--data", str(table), "-o", str(folder), "-q"]
         assert cli.run([*words, *(["--lens", "--image-size", "6000x4000"] if lens else [])]) == 0
         found[lens] = store.load(folder).calibration
     return found
@@ -132,27 +126,22 @@ def half(tables):
     return some(tables[0], slice(1, None, 2))
 
 
-def test_shifted_readings_are_listed(tables, half):
-    observation, wrong = damage.shifted(half, 0.15, SIGMA)
+def shifted(train):
+    return damage.shifted(train, 0.15, SIGMA)
+
+
+@pytest.mark.parametrize("spoil", [shifted, damage.exchanged, damage.misread])
+def test_wrong_readings_are_listed(tables, half, spoil):
+    observation, wrong = spoil(half)
     calibration = fit(observation)
     assert held_out(calibration, tables)["median_px"] <= 0.70
-    found = damage.listed(calibration)[0]
-    assert len(wrong & found) >= 0.97 * len(wrong)
-    assert len(found - wrong) <= 0.01 * np.isfinite(half.images[..., 0]).sum()
-
-
-def test_exchanged_numbers_are_listed(tables, half):
-    observation, wrong = damage.exchanged(half)
-    calibration = fit(observation)
-    assert held_out(calibration, tables)["median_px"] <= 0.70
-    assert damage.listed(calibration)[1] == wrong
-
-
-def test_wrong_joint_readings_are_listed(tables, half):
-    observation, wrong = damage.misread(half)
-    calibration = fit(observation)
-    assert held_out(calibration, tables)["median_px"] <= 0.70
-    found = damage.listed(calibration)[2]
-    assert found <= wrong
-    # A pose with three wrong joints or few markers is left out without a culprit.
-    assert len(found) >= 0.8 * len(wrong)
+    readings, numbers, joints = damage.listed(calibration)
+    if spoil is shifted:
+        assert len(wrong & readings) >= 0.97 * len(wrong)
+        assert len(readings - wrong) <= 0.01 * np.isfinite(half.images[..., 0]).sum()
+    elif spoil is damage.exchanged:
+        assert numbers == wrong
+    else:
+        assert joints <= wrong
+        # A pose with three wrong joints or few markers is left out without a culprit.
+        assert len(joints) >= 0.8 * len(wrong)

@@ -94,19 +94,6 @@ def test_noise_free_tables_are_explained_to_their_rounding(held_out, robot, meth
     assert store.load("out").calibration.method == method
 
 
-def test_the_methods_are_two(held_out, shared_data):
-    q = read_table(shared_data / "ur5" / "validation.csv").q
-    images, usable = {}, {}
-    for method in NOISE_FREE:
-        calibration, _ = held_out("ur5", "0.5", "--set", f"calibration.method={method}")
-        images[method] = predict(store.load("out").calibration, q)
-        usable[method] = calibration["usable"]
-    # Only maximum likelihood reaches the noise; the closed form says that it does not.
-    assert usable == {"refined": True, "closed_form": False}
-    apart = np.linalg.norm(images["refined"] - images["closed_form"], axis=-1)
-    assert np.median(apart) > 1.0
-
-
 def test_noise_that_was_given_judges_the_fit(answer, shared_data):
     table = shared_data / "ur5" / "trials_0.5px.csv"
 

@@ -5,27 +5,12 @@ import dataclasses
 import numpy as np
 
 
-def shifted(observation, share, sigma, seed=0, *, both=False):
-    """A share of the readings shifted by up to ±50 px, and which of them by more than 5σ.
-
-    Parameters
-    ----------
-    sigma : noise of the readings, px.
-    both : half of the shifted readings are both views of a marker, each shifted by itself.
-    """
+def shifted(observation, share, sigma, seed=0):
+    """A share of the readings shifted by up to ±50 px, and which of them by more than 5σ; σ in px."""
     rng = np.random.default_rng(seed)
     images, wrong = observation.images.copy(), set()
-    seen = np.isfinite(images[..., 0])
-    count = int(share * seen.sum())
-    chosen = np.zeros_like(seen)
-    if both:
-        pairs = np.argwhere(seen.all(axis=1))
-        for k, j in pairs[rng.choice(len(pairs), count // 4, replace=False)]:
-            chosen[k, :, j] = True
-    left = np.argwhere(seen & ~chosen.any(axis=1, keepdims=True))
-    for k, v, j in left[rng.choice(len(left), count - int(chosen.sum()), replace=False)]:
-        chosen[k, v, j] = True
-    for k, v, j in np.argwhere(chosen):
+    seen = np.argwhere(np.isfinite(images[..., 0]))
+    for k, v, j in seen[rng.choice(len(seen), int(share * len(seen)), replace=False)]:
         shift = rng.uniform(-50.0, 50.0, 2)
         images[k, v, j] += shift
         if np.abs(shift).max() > 5.0 * sigma:
@@ -45,11 +30,11 @@ def exchanged(train, seed=0):
     return dataclasses.replace(train, images=images), wrong
 
 
-def misread(train, seed=0):
-    """A twentieth of the joint readings off by 0.3 rad, and which."""
+def misread(train, share=0.05, seed=0):
+    """A share of the joint readings off by 0.3 rad, and which."""
     rng = np.random.default_rng(seed)
     q, wrong = train.q.copy(), set()
-    for k, i in np.argwhere(rng.random(q.shape) < 0.05):
+    for k, i in np.argwhere(rng.random(q.shape) < share):
         q[k, i] += rng.choice([-0.3, 0.3])
         wrong.add((int(train.pose[k]), int(i) + 1))
     return dataclasses.replace(train, q=q), wrong

@@ -20,26 +20,20 @@ class Robot:
     markers: FloatArray
     q_reference: FloatArray
 
-    def images(self, q: FloatArray) -> FloatArray:
-        """Noise-free pixels (K, 2, m, 2) at joint readings (K, n)."""
-        result = np.empty((len(q), 2, len(self.markers), 2))
+    def projected(self, q: FloatArray) -> FloatArray:
+        """Homogeneous image points (K, 2, 3, m) at joint readings (K, n), the third the depths in m."""
+        result = np.empty((len(q), 2, 3, len(self.markers)))
         for k, row in enumerate(q):
             T = np.eye(4)
             for twist, amount in zip(self.twists, row - self.q_reference, strict=True):
                 T = T @ expm(twist * amount)
-            m = self.cameras @ T @ self.markers.T
-            result[k] = np.swapaxes(m[:, :2] / m[:, 2:], 1, 2)
+            result[k] = self.cameras @ T @ self.markers.T
         return result
 
-    def depths(self, q: FloatArray) -> FloatArray:
-        """Depths (K, 2, m) of the markers in both cameras, m."""
-        result = np.empty((len(q), 2, len(self.markers)))
-        for k, row in enumerate(q):
-            T = np.eye(4)
-            for twist, amount in zip(self.twists, row - self.q_reference, strict=True):
-                T = T @ expm(twist * amount)
-            result[k] = self.cameras[:, 2] @ T @ self.markers.T
-        return result
+    def images(self, q: FloatArray) -> FloatArray:
+        """Noise-free pixels (K, 2, m, 2) at joint readings (K, n)."""
+        m = self.projected(q)
+        return np.swapaxes(m[:, :, :2] / m[:, :, 2:], 2, 3)
 
     def observe(self, q: FloatArray, sigma: float, rng: np.random.Generator) -> Observation:
         """Observation with normal noise; the numbers of poses and markers have gaps on purpose."""

@@ -1,5 +1,7 @@
 """The vectorised forward model, its derivatives, and the search: against differences, scipy, the kernels."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,14 +14,17 @@ from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian
 from projservo_cli.records import Model
 from tests.calibration.simulated_robot import Robot, around, random_robot
 
+LENS = np.array([[640.0, 512.0, 640.0, -0.06, 0.01], [640.0, 512.0, 640.0, 0.03, -0.01]])
 
-def problem_of(robot: Robot, count: int = 5, unseen: float = 0.0):
+
+def problem_of(robot: Robot, count: int = 5, unseen: float = 0.0, lens=None):
     rng = np.random.default_rng(1)
     observation = robot.observe(around(robot, count, rng), 0.0, rng)
     if unseen:
         observation.images[rng.random(observation.images.shape[:3]) < unseen] = np.nan
     readings = gather(observation, robot.joint_types)
-    return prepare(readings, robot.q_reference), Scene(robot.cameras, robot.twists, robot.markers)
+    problem = prepare(readings, robot.q_reference, lens is not None)
+    return problem, Scene(robot.cameras, robot.twists, robot.markers, lens)
 
 
 def full_jacobian(problem, J):
@@ -35,11 +40,13 @@ def test_forward_model_agrees_with_matrix_exponentials(types):
     assert np.abs(problem.residual(scene)).max() < 1e-9
 
 
+@pytest.mark.parametrize("lens", [None, LENS])
 @pytest.mark.parametrize("types", ["RPR", "RRP", "PPR"])
-def test_derivative_agrees_with_central_differences(types):
+def test_derivatives_agree_with_central_differences(types, lens):
     robot = random_robot(types, np.random.default_rng(4), markers=4)
-    problem, scene = problem_of(robot)
-    _, J = problem.derivative(scene)
+    problem, scene = problem_of(robot, lens=lens)
+    pixels, J = problem.derivative(scene)
+    assert np.array_equal(pixels, problem.pixels(scene)[0])
     analytic = full_jacobian(problem, J)
     scale = np.linalg.norm(analytic, axis=0)
     for k in range(problem.size):
@@ -49,11 +56,16 @@ def test_derivative_agrees_with_central_differences(types):
         ahead, behind = (problem.residual(problem.retract(scene, s)) for s in (step, -step))
         numeric = (ahead - behind).ravel() / (2.0 * step[k])
         assert np.abs(numeric - analytic[:, k]).max() < 1e-6 * scale[k]
+    _, by_joint = problem.joint_derivative(scene)
+    for i in range(len(types)):
+        dq = 1e-5 * np.eye(len(types))[i]
+        ahead, behind = (dataclasses.replace(problem, q=problem.q + d).pixels(scene)[0] for d in (dq, -dq))
+        assert np.abs((ahead - behind) / 2e-5 - by_joint[..., i]).max() < 1e-4
 
 
 def test_gauge_directions_change_no_image():
-    for types, dimension in (("RRR", 9), ("RPR", 8)):
-        problem, scene = problem_of(random_robot(types, np.random.default_rng(5)))
+    for types, dimension, lens in (("RRR", 9, None), ("RPR", 8, None), ("RRPR", 8, LENS)):
+        problem, scene = problem_of(random_robot(types, np.random.default_rng(5)), lens=lens)
         _, J = problem.derivative(scene)
         G = problem.gauge(scene)
         assert G.shape[1] == dimension

@@ -20,7 +20,6 @@ from projservo_cli.calibration.prediction import prediction_derivative
 from projservo_cli.calibration.readings import gather
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, Model, Observation
-from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
 
 
@@ -100,17 +99,6 @@ def test_frame_does_not_depend_on_the_frame_it_comes_from():
     )
     for one, other in ((first.P, second.P), (first.H_hat_0, second.H_hat_0), (first.M, second.M)):
         assert np.allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(one).max())
-
-
-def test_markers_may_come_and_go():
-    robot, observation = noisy("RRRRRR", poses=lambda r: around(r, 60, np.random.default_rng(3)))
-    rng = np.random.default_rng(0)
-    observation.images[rng.random((60, 2, 10)) < 0.3] = np.nan  # each view loses its own
-    calibration = calibrate(observation, "RRRRRR", sigma_px=0.5)
-    q = around(robot, 60, np.random.default_rng(99))
-    error = predict(calibration, q) - robot.images(q)
-    limit = Bound(robot, observation.q, q).mean_square() / 0.7
-    assert np.sqrt(np.mean(error**2)) < 1.5 * 0.5 * np.sqrt(limit)
 
 
 def test_covariance_is_that_of_the_parameters():

@@ -5,9 +5,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from projservo_cli.calibration import calibrate, predict, prediction_variance
-from projservo_cli.records import Observation
-from projservo_cli.tables import read_table
-from tests.calibration.bound import Bound, robot_of
+from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 SIGMA = 0.5
@@ -81,35 +79,3 @@ def test_noise_is_estimated_from_the_images_alone():
     # One epipolar residual a pair, 250 pairs minus 7: 4.5 % of a draw; four standard errors of the mean.
     assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * 0.045 / np.sqrt(len(ratio)))
     assert np.abs(np.array(ratio) - 1.0).max() < 5.0 * 0.045
-
-
-@pytest.mark.volume
-def test_an_arm_of_another_lab_is_known_to_the_cramer_rao_bound(shared_data, reference_truth):
-    name, count = "stanford", 4
-    robot = robot_of(reference_truth(name))
-    table = read_table(shared_data / name / "trials_0.0px.csv", robot.joint_types)
-    validation = read_table(shared_data / name / "validation.csv", robot.joint_types)
-    truth = validation.images
-    assert np.abs(robot.images(validation.q) - truth).max() < 2e-6
-    bound = Bound(robot, table.q, validation.q)
-    assert bound.rank == expected_rank(robot)
-    errors, stated, ratio = [], [], []
-    for seed in range(count):
-        noise = SIGMA * np.random.default_rng(100 + seed).standard_normal(table.images.shape)
-        noisy = Observation(table.pose, table.marker, table.q, table.images + noise)
-        calibration = calibrate(noisy, robot.joint_types, sigma_px=SIGMA)
-        assert calibration.usable
-        assert calibration.dof == bound.coordinates - bound.rank - 2 * len(calibration.outlier)
-        errors.append(np.mean((predict(calibration, validation.q) - truth) ** 2))
-        stated.append(prediction_variance(calibration, validation.q).mean())
-        ratio.append(calibration.chi2_per_dof)
-    limit = SIGMA**2 * bound.mean_square()
-    rms = np.sqrt(np.mean(errors) / limit)
-    again = np.random.default_rng(0).integers(0, len(errors), (2000, len(errors)))
-    spread = np.sqrt(np.array(errors)[again].mean(axis=1) / limit).std()
-    assert rms <= 1.10 + 2.0 * spread
-    # Better than the bound by more than chance would mean that the bound, or the test, is wrong.
-    assert rms**2 >= 1.0 - 4.0 * bound.relative_error(len(errors))
-    np.testing.assert_allclose(stated, limit, rtol=0.02)
-    # Mean of all χ² per degree of freedom: four standard errors.
-    assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (count * calibration.dof)))

@@ -62,13 +62,6 @@ def agree(one, other, q):
     assert one.chi2_per_dof == pytest.approx(other.chi2_per_dof, rel=1e-9)
 
 
-def test_the_file_is_the_robot_it_describes(robot, observation, written):
-    found = read_nominal(written(described(robot, observation)))
-    np.testing.assert_allclose(found.H_hat, robot.twists, atol=1e-12)
-    np.testing.assert_array_equal(found.P, robot.cameras)
-    np.testing.assert_allclose(found.M, robot.markers, atol=1e-15)
-
-
 def test_the_same_optimum_as_from_the_images_alone(robot, observation, alone, written):
     values = described(robot, observation)
     rng = np.random.default_rng(1)

@@ -215,29 +215,21 @@ def test_quantiles_between_which_a_simulated_run_must_lie(tail):
     assert f"{outside * edge:g} px" in message
 
 
-def test_ratios_at_which_a_recorded_run_is_warned_of_and_refused():
-    observation = seen(SMALL)
-    fitted = calibrate(observation, "RRR", sigma_px=SIGMA, source="recorded").sigma_fitted_px
-    for ratio, warned in ((0.5, False), (1.14, False), (1.16, True), (2.99, True)):
-        calibration = calibrate(observation, "RRR", sigma_px=fitted / ratio, source="recorded")
-        assert calibration.usable
-        assert ("more than pixel noise" in calibration.reason) == warned
-        assert calibration.chi2_per_dof == pytest.approx(ratio**2, rel=1e-6)
-    assert "3.01 times" in refusal(observation, "RRR", sigma_px=fitted / 3.01)
-
-
-def test_much_data_warn_of_less():
-    """Four standard errors of the fitted noise, of which 3,000 degrees of freedom know one to 1.3 %."""
-    robot = random_robot("RRR", np.random.default_rng(1), markers=10)
-    observation = seen(robot, trials(robot, 25))
-    fitted = calibrate(observation, "RRR", sigma_px=SIGMA, source="recorded")
-    limit = 1.0 + 4.0 / np.sqrt(2.0 * fitted.dof)
-    assert 1.04 < limit < 1.06
-    for ratio, warned in ((0.999 * limit, False), (1.001 * limit, True)):
-        given = fitted.sigma_fitted_px / ratio
+@pytest.mark.parametrize(("markers", "frames"), [(6, 4), (10, 25)])
+def test_ratios_at_which_a_recorded_run_is_warned_of_and_refused(markers, frames):
+    """1.15, or four standard errors of the fitted noise, of which much data know one to 1.3 %."""
+    robot = random_robot("RRR", np.random.default_rng(1), markers)
+    observation = seen(robot, trials(robot, frames))
+    found = calibrate(observation, "RRR", sigma_px=SIGMA, source="recorded")
+    limit = min(1.15, 1.0 + 4.0 / np.sqrt(2.0 * found.dof))
+    assert (limit < 1.06) == (frames > 4)
+    for ratio, warned in ((0.5, False), (0.999 * limit, False), (1.001 * limit, True), (2.99, True)):
+        given = found.sigma_fitted_px / ratio
         calibration = calibrate(observation, "RRR", sigma_px=given, source="recorded")
         assert calibration.usable
         assert ("more than pixel noise" in calibration.reason) == warned
+        assert calibration.chi2_per_dof == pytest.approx(ratio**2, rel=1e-6)
+    assert "3.01 times" in refusal(observation, "RRR", sigma_px=found.sigma_fitted_px / 3.01)
 
 
 # A face of four, of three markers, and a plate of eight: the motion makes up for what the body lacks.

@@ -32,18 +32,6 @@ def found(mechanism, H_hat, first, second):
     return unique, q_hat, as_array(H)
 
 
-def translation_along(H_hat, A_1, A_2):
-    return found(translation_mechanism, H_hat, A_1, A_2 - A_1)
-
-
-def rotation_about(H_hat, A_1, A_2):
-    return found(rotation_mechanism, H_hat, A_1, A_2)
-
-
-def rotation_within(H_hat, a, A):
-    return found(planar_mechanism, H_hat, a, A)
-
-
 def plane_through(M):
     """Plane through three points, by the null vector of NumPy."""
     return np.linalg.svd(M[:3])[2][3]
@@ -69,7 +57,7 @@ def check_rotation(H):
 @pytest.mark.parametrize("seed", [None, 1, 2])
 def test_translation_keeps_every_plane_through_its_line(types, seed):
     H_hat, a_inf, A, G = setting(types, seed)
-    mechanism = translation_along(H_hat, A[0], A[1])
+    mechanism = found(translation_mechanism, H_hat, A[0], A[1] - A[0])
     q_hat, H = check(mechanism, H_hat, a_inf)
     assert np.linalg.norm(q_hat) == pytest.approx(1.0, abs=1e-14)
     assert np.abs(H @ H).max() < 1e-11
@@ -88,7 +76,7 @@ def test_translation_keeps_every_plane_through_its_line(types, seed):
 @pytest.mark.parametrize("seed", [None, 1, 2])
 def test_revolution_keeps_its_axis(types, seed):
     H_hat, a_inf, A, G = setting(types, seed)
-    mechanism = rotation_about(H_hat, A[0], A[2])
+    mechanism = found(rotation_mechanism, H_hat, A[0], A[2])
     _, H = check(mechanism, H_hat, a_inf)
     check_rotation(H)
     for t in (0.0, 1.0, 0.3, -7.0):
@@ -108,7 +96,7 @@ def test_planar_revolution_keeps_its_plane_and_its_point(types, seed, inside):
     H_hat, a_inf, A, G = setting(types, seed)
     a = plane_through(A)
     center = A[0] if inside else G @ [0.1, 0.1, 1.2, 1.0]
-    mechanism = rotation_within(H_hat, a, center)
+    mechanism = found(planar_mechanism, H_hat, a, center)
     _, H = check(mechanism, H_hat, a_inf)
     check_rotation(H)
     assert np.abs(H @ center).max() < 1e-11
@@ -123,34 +111,34 @@ def test_mechanisms_do_not_depend_on_the_frame():
     wanted = None
     for seed in (None, 1, 2, 3):
         H_hat, _, A, _ = setting("RRRRRR", seed)
-        found = np.array(
+        motions = np.array(
             [
-                translation_along(H_hat, A[0], A[1])[1],
-                rotation_about(H_hat, A[0], A[2])[1],
-                rotation_within(H_hat, plane_through(A), A[0])[1],
+                found(translation_mechanism, H_hat, A[0], A[1] - A[0])[1],
+                found(rotation_mechanism, H_hat, A[0], A[2])[1],
+                found(planar_mechanism, H_hat, plane_through(A), A[0])[1],
             ]
         )
-        found *= np.sign(found[:, :1])
-        wanted = found if wanted is None else wanted
-        assert found == pytest.approx(wanted, abs=1e-10)
+        motions *= np.sign(motions[:, :1])
+        wanted = motions if wanted is None else wanted
+        assert motions == pytest.approx(wanted, abs=1e-10)
 
 
 def test_a_redundant_arm_has_no_unique_motion():
     model = arm("RRRRRRR")
     H_hat = joint_operators(model, model.q_reference + 0.2)
-    assert not translation_along(H_hat, face()[0], face()[1])[0]
-    assert not rotation_about(H_hat, face()[0], face()[1])[0]
-    assert not rotation_within(H_hat, plane_through(face()), face()[0])[0]
+    assert not found(translation_mechanism, H_hat, face()[0], face()[1] - face()[0])[0]
+    assert not found(rotation_mechanism, H_hat, face()[0], face()[1])[0]
+    assert not found(planar_mechanism, H_hat, plane_through(face()), face()[0])[0]
 
 
 def test_a_gantry_cannot_rotate():
     """Six translations: the kernel of (9) holds no rotation that could be scaled to radians."""
     H_hat = np.array([prismatic(axis) for axis in np.eye(3)])
-    assert not rotation_about(H_hat, face()[0], face()[1])[0]
+    assert not found(rotation_mechanism, H_hat, face()[0], face()[1])[0]
 
 
 def test_two_joints_on_one_axis_are_a_singularity():
     model = arm()
     H_hat = model.H_hat_0.copy()
     H_hat[4] = -H_hat[2]
-    assert not translation_along(H_hat, face()[0], face()[1])[0]
+    assert not found(translation_mechanism, H_hat, face()[0], face()[1] - face()[0])[0]
