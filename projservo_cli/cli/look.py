@@ -93,6 +93,7 @@ def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bo
 @click.argument("run", type=option.PATH)
 @option.output("DIR", "Folder to write. Default: csv beside run.h5.")
 @option.force("Replace what is there.")
+@click.option("--to", type=click.Choice(["csv"]), default="csv", help="Kind of files.", expose_value=False)
 @option.told
 def export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:
     """Write all arrays of a run as CSV tables.
