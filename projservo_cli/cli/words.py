@@ -114,7 +114,8 @@ def _of_report(value: dict[str, Any], detailed: bool) -> Iterator[str]:
     holding = sum(claim["holds"] is True for claim in claims)
     held = f"; {holding} of {len(claims)} claims hold" if claims else ""
     but = "; it does not hold that" if told and not detailed else ""
-    yield f"report: {len(value['figures'])} files of figures{held}{but}"
+    count = len(value["figures"])
+    yield f"report: {count} file{'s' * (count != 1)} of figures{held}{but}"
     words = {True: "holds", False: "does not hold", None: "not measured"}
     for claim in told:
         if detailed:
