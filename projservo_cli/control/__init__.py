@@ -1,31 +1,19 @@
 """Control laws: one file a law, one contract, one if-chain.
 
-Run files and tables know a law by its name, compiled code by the code in its file. A law is added by its
-file and by its lines here.
+Run files and tables know a law by its name, compiled code by its place in ``records.LAWS``. A law is added
+there, by its file, and by its lines here.
 """
 
 from projservo_cli.control import blockwise, direct_three, direct_two, euclidean_points, exact, stacked
 from projservo_cli.control.law import LOST, Gains, State, aim, go_on
 from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.lens import bends, straight
-from projservo_cli.records import POINT_LAWS, FloatArray, Model
+from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.trajectory import following
 
-_DIRECT_THREE, _DIRECT_TWO, _STACKED = direct_three.CODE, direct_two.CODE, stacked.CODE
-_BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = blockwise.CODE, euclidean_points.CODE, exact.CODE
-CODES = {
-    "direct_three": _DIRECT_THREE,
-    "direct_two": _DIRECT_TWO,
-    "stacked": _STACKED,
-    "blockwise": _BLOCKWISE,
-    "euclidean_points": _EUCLIDEAN_POINTS,
-    "exact": _EXACT,
-}
-if len(set(CODES.values())) < len(CODES):
-    raise ValueError(f"each law needs a code of its own: {CODES}")
-LAWS = tuple(CODES)
-BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)  # laws that can measure with the body
+CODES = {law: code for code, law in enumerate(LAWS)}
+_DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = CODES.values()
 
 
 @internal

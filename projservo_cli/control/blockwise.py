@@ -5,8 +5,6 @@ from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
-CODE = 3
-
 
 @merged
 def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:

@@ -6,8 +6,6 @@ from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 
-CODE = 4
-
 
 @merged
 def euclidean_points(

@@ -8,7 +8,6 @@ forward kinematics alone, [RH00] eqs. (6), (19); no metric quantity enters.
 import math
 from typing import NamedTuple
 
-from projservo_cli.control.direct_two import single_rotation
 from projservo_cli.control.law import (
     MOST_PARTS,
     OK,
@@ -17,6 +16,7 @@ from projservo_cli.control.law import (
     State,
     follow,
     partitioned,
+    single_rotation,
     speed_share,
     translation_rate,
 )
@@ -29,8 +29,6 @@ from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.trajectory import following, planned_step
-
-CODE = 5
 
 # A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
 # by about 0.1 mm from the path of a robot of a metre's size.

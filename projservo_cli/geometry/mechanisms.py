@@ -31,8 +31,8 @@ from projservo_cli.geometry.kernels import (
     least_squares,
     orthogonalize,
 )
-from projservo_cli.geometry.kinematics import joint_operators, operators_at
-from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
+from projservo_cli.geometry.kinematics import invariant_rotations, joint_operators, operators_at
+from projservo_cli.records import FloatArray, IntArray, Model
 
 # A kernel vector whose operator is smaller than this share of its terms moves nothing.
 _NULL_MOTION = 1e-9
@@ -203,8 +203,6 @@ def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     return True, multiple(nu, H)
 
 
-# Forms that the joints keep up to this share of the largest change are kept.
-_INVARIANT = 1e-6
 # Once more with what rounding left of a solution by normal equations.
 _PASSES = 2
 
@@ -229,36 +227,6 @@ def span_of(model: Model, A: FloatArray) -> Span:
     H_hat = np.concatenate([shifts, turns])
     dual = np.linalg.pinv(H_hat.reshape(COORDINATES, 16).T)
     return Span(np.ascontiguousarray(H_hat), np.ascontiguousarray(dual))
-
-
-def invariant_rotations(actions: FloatArray) -> FloatArray:
-    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints keep.
-
-    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
-    where few joints leave it open, the one nearest to the identity, which does as well for these joints.
-
-    Raises WorkFailed if no metric is kept.
-    """
-    basis = np.array([_symmetric(i, j) for i in range(3) for j in range(i, 3)])
-    changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
-    _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T, full_matrices=True)
-    sizes = np.r_[sizes, np.zeros(6 - len(sizes))]
-    kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
-    Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
-    if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
-        raise WorkFailed(
-            "the joints keep no metric of the calibrated frame: calibrate anew, or measure point by point "
-            "with control.observation: points"
-        )
-    C = np.linalg.cholesky(Q).T
-    return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])
-
-
-def _symmetric(i: int, j: int) -> FloatArray:
-    """Symmetric 3×3 matrix of unit norm with entries at i, j and j, i."""
-    S = np.zeros((3, 3))
-    S[i, j] = S[j, i] = 1.0
-    return S / np.linalg.norm(S)
 
 
 def in_span(span: Span, model: Model, q: FloatArray, q_hat: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.loop.compiled import Log
+from projservo_cli.loop.step import Log
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import Plant, pose_after
 from projservo_cli.task.face import center_of

@@ -13,8 +13,8 @@ from projservo_cli.geometry.jit import composed, njit
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.lens import straight
 from projservo_cli.geometry.mechanisms import OWN, Span
-from projservo_cli.loop.compiled import Log, new_log, run
-from projservo_cli.loop.step import CONVERGED, RUNNING, Limits
+from projservo_cli.loop.compiled import run
+from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
 from projservo_cli.loop.summary import Ends, Summary, summary
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.robots.simulated import Plant

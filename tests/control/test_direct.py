@@ -2,15 +2,14 @@
 
 import inspect
 import math
-import runpy
 from importlib import import_module
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.control import CODES, LAWS, exact, stacked
 from projservo_cli.control.law import TAU, TAU_AFFINE, THETA_P, THETA_R, THETA_S
+from projservo_cli.records import LAWS
 from tests.samples import frame, operators, pixels, poe, revolute
 from tests.scene import GAINS, STEP, Run, limits, scene
 
@@ -150,19 +149,9 @@ def test_a_marker_as_center(center):
 
 
 def test_laws_are_given_images_joints_and_a_model_and_nothing_else():
-    """Each law has its file, its function of the same name and its code, in whatever order."""
-    codes = {}
+    """Each law has its file and its function of the same name."""
     for law in LAWS:
         module = import_module(f"projservo_cli.control.{law}")
         function = getattr(module, law)
         parameters = inspect.signature(getattr(function, "py_func", function)).parameters
         assert list(parameters) == ["model", "task", "gains", "s", "q", "state"]
-        codes[law] = module.CODE
-    assert codes == CODES
-    assert len(set(codes.values())) == len(codes)
-
-
-def test_two_laws_of_one_code_are_refused(monkeypatch):
-    monkeypatch.setattr(stacked, "CODE", exact.CODE)
-    with pytest.raises(ValueError, match="a code of its own"):
-        runpy.run_module("projservo_cli.control.__init__", run_name="again")
