@@ -176,7 +176,7 @@ def reset(state: State) -> None:
     state.clock[0] = 0.0
 
 
-@njit
+@internal
 def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> bool:
     """Measure the face, with the body or point by point, and move the operators to the current joints.
 

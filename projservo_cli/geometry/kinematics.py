@@ -11,12 +11,12 @@ from projservo_cli.geometry.displacement import (
     translation,
     turned,
 )
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import through
 from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model, WorkFailed
 
 
-@njit
+@internal
 def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
     """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
     if joint_type == PRISMATIC:
@@ -114,7 +114,7 @@ def image_velocity(P: FloatArray, M: FloatArray, M_dot: FloatArray) -> tuple[flo
     return u, v, (d[0] - u * d[2]) / m[2], (d[1] - v * d[2]) / m[2]
 
 
-@njit
+@inline
 def row(P: FloatArray, i: int, A: tuple[float, float, float, float]) -> float:
     """Product of row i of a camera with a point, [RH00] eq. (1)."""
     return (float(P[i, 0]) * A[0] + float(P[i, 1]) * A[1]) + (float(P[i, 2]) * A[2] + float(P[i, 3]) * A[3])

@@ -22,7 +22,7 @@ from projservo_cli.geometry.algebra import (
     sub,
     vec,
 )
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import (
     COORDINATES,
     RANK_TOLERANCE,
@@ -138,7 +138,7 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
     return _moving(work, q_hat)
 
 
-@njit
+@internal
 def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Revolution around the axis through two points, [RH00] eq. (9), scaled to radians."""
     operators = work.basis
@@ -237,13 +237,14 @@ def in_span(span: Span, model: Model, q: FloatArray, q_hat: FloatArray) -> Float
     return np.asarray(H_hat.reshape(len(q_hat), 16) @ span.dual.T)
 
 
-@njit
+@internal
 def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     """Joint motion of a displacement with coordinates ξ (6,), from the operators in ``work.H_hat``.
 
     Of least norm with more than six joints, of least squares with fewer. False at a singularity.
     """
-    n = q_hat.shape[0]
+    # Not the constant, for which the compiler would make the functions called anew.
+    n, rows = q_hat.shape[0], work.J.shape[0]
     for i in range(n):
         for a in range(COORDINATES):
             total = 0.0
@@ -255,12 +256,12 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
             work.rhs[a] = xi[a]
             for i in range(n):
                 work.B[i, a] = work.J[a, i]
-        return least_squares(work.B, COORDINATES, n, q_hat, work.pivot, work.z, work.rhs)
+        return least_squares(work.B, rows, n, q_hat, work.pivot, work.z, work.rhs)
     for i in range(n):
         q_hat[i] = 0.0
         for a in range(COORDINATES):
             work.B[a, i] = work.J[a, i]
-    first, _, last = orthogonalize(work.B, n, COORDINATES, work.norms, work.z, work.pivot, work.rhs, False)
+    first, _, last = orthogonalize(work.B, n, rows, work.norms, work.z, work.pivot, work.rhs, False)
     if not last > RANK_TOLERANCE * first:
         return False
     for _ in range(_PASSES):
@@ -281,7 +282,7 @@ def _add_least_norm(work: Work, xi: FloatArray, q_hat: FloatArray) -> None:
         for i in range(k):
             total -= work.B[i, k] * z[i]
         z[k] = total * work.B[k, k]
-    back_substitute(work.B, COORDINATES, z)
+    back_substitute(work.B, work.J.shape[0], z)
     for k in range(COORDINATES):
         a = work.pivot[k]
         for i in range(n):

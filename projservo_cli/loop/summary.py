@@ -78,7 +78,7 @@ def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, e
     )
 
 
-@njit
+@internal
 def _effort(log: Log, steps: int, period: float) -> float:
     """Integral of the squared joint velocities, rad²/s and m²/s added."""
     total = 0.0
@@ -88,7 +88,7 @@ def _effort(log: Log, steps: int, period: float) -> float:
     return total * period
 
 
-@njit
+@internal
 def _distance(A: Vec4, B: Vec4) -> float:
     """Distance of two metric points, m."""
     way = sub(A, B)

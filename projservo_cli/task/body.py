@@ -204,7 +204,7 @@ def _displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
     return mul(H, twist_exponential(X))
 
 
-@merged
+@njit
 def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: Until, normal: FloatArray) -> Fit:
     """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
 
