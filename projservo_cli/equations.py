@@ -186,7 +186,7 @@ REGISTER = (
     _entry(
         "23",
         "Direct control directTWO",
-        "control.direct_two.direct_two control.direct_two.rotation_about_center",
+        "control.direct_two.direct_two control.law.rotation_about_center",
         "control/test_direct.py::test_one_rotation_decays_at_the_rate_of_its_gain "
         "control/test_direct.py::test_any_ratio_converges",
         "Sign as in (20): q̇ = λ_t τ q̂_t + λ_s θ_s q̂_s.",

@@ -200,8 +200,12 @@ class CrossValidation:
     )
 
 
+# All laws built in; compiled code knows each by its place here.
+LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact")
 METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
-POINT_LAWS = ("stacked", "blockwise", "euclidean_points")  # laws that need the points of the face themselves
+# Laws that need the points of the face themselves, and those that can measure with the body.
+POINT_LAWS = ("stacked", "blockwise", "euclidean_points")
+BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)
 
 
 def signed(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:

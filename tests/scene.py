@@ -9,8 +9,8 @@ from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, new_state
 from projservo_cli.geometry.lens import bent
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.loop.compiled import new_log, run
-from projservo_cli.loop.step import VERDICTS, Limits
+from projservo_cli.loop.compiled import run
+from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.task.body import body_of

@@ -19,7 +19,7 @@ _EXTRAS = ("view", "animation")
 def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
     """Laws for the completion of a shell."""
     del context, parameter
-    from projservo_cli.control import LAWS
+    from projservo_cli.records import LAWS
 
     return [law for law in LAWS if law.startswith(incomplete)]
 
@@ -206,7 +206,7 @@ def _extras(options: Mapping[str, Any]) -> list[str]:
 
 def _law_names(names: Sequence[str]) -> tuple[str, ...]:
     """The laws of ``--law``, each once, registered names as the classes they stand for."""
-    from projservo_cli.control import LAWS
+    from projservo_cli.records import LAWS
     from projservo_cli.robots import plugins
 
     found = {name: name if name in LAWS else plugins.target_of("law", name) for name in names}

@@ -40,7 +40,7 @@ from projservo_cli.config.robot import (
     Vector3,
     Whole,
 )
-from projservo_cli.records import MODES, REPLAN
+from projservo_cli.records import LAWS, MODES, REPLAN
 from projservo_cli.robots import plugins
 
 
@@ -87,8 +87,6 @@ class Disturbance(Section):
 
 
 def _law(name: str) -> str:
-    from projservo_cli.control import LAWS  # brings the compiler: only where a law is named
-
     target = name if name in LAWS else plugins.target_of("law", name)
     if target is None and ":" in name:
         raise ValueError("must be module:Class, such as my_laws:Law")
@@ -112,16 +110,7 @@ _TARGET = {"type": "string", "pattern": plugins.TARGET}
 
 
 # A registered name is stored as the class it stands for, so that a run can be read where it is not installed.
-class _LawSchema:
-    """JSON schema of the name of a law."""
-
-    def __get_pydantic_json_schema__(self, schema: object, handler: object) -> dict[str, Any]:
-        from projservo_cli.control import LAWS
-
-        return {"anyOf": [{"enum": list(LAWS)}, _TARGET]}
-
-
-Law = Annotated[str, AfterValidator(_law), _LawSchema()]
+Law = Annotated[str, AfterValidator(_law), WithJsonSchema({"anyOf": [{"enum": list(LAWS)}, _TARGET]})]
 PlantClass = Annotated[str, AfterValidator(_plant), WithJsonSchema({"type": "string"})]
 
 

@@ -1,14 +1,14 @@
 """Control laws: one file a law, one contract, one if-chain.
 
 Run files and tables know a law by its name, compiled code by the code in its file. A law is added by its
-file and by its lines here.
+file, its lines here, and its name among ``records.LAWS``, whose order means nothing to compiled code.
 """
 
 from projservo_cli.control import blockwise, direct_three, direct_two, euclidean_points, exact, stacked
 from projservo_cli.control.law import LOST, Gains, State, aim, go_on
 from projservo_cli.geometry.jit import internal
 from projservo_cli.geometry.lens import bends, straight
-from projservo_cli.records import POINT_LAWS, FloatArray, Model
+from projservo_cli.records import LAWS, FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.trajectory import following
 
@@ -22,10 +22,8 @@ CODES = {
     "euclidean_points": _EUCLIDEAN_POINTS,
     "exact": _EXACT,
 }
-if len(set(CODES.values())) < len(CODES):
-    raise ValueError(f"each law needs a code of its own: {CODES}")
-LAWS = tuple(CODES)
-BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)  # laws that can measure with the body
+if set(CODES) != set(LAWS) or len(set(CODES.values())) < len(CODES):
+    raise ValueError(f"each of {', '.join(LAWS)} needs a code of its own: {CODES}")
 
 
 @internal

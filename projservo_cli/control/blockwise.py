@@ -20,7 +20,8 @@ def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArr
     for i in range(n):
         state.q_dot[i] = 0.0
     for view in range(2):
-        put_view(model, task, s, state, view, 0)
+        # Not a constant, for which the compiler would make the function anew.
+        put_view(model, task, s, state, view, 0 * view)
         rows = 2 * state.A.shape[0]
         if not pseudo_inverse(state, rows, state.newton):
             return SINGULAR

@@ -8,7 +8,6 @@ forward kinematics alone, [RH00] eqs. (6), (19); no metric quantity enters.
 import math
 from typing import NamedTuple
 
-from projservo_cli.control.direct_two import single_rotation
 from projservo_cli.control.law import (
     MOST_PARTS,
     OK,
@@ -17,6 +16,7 @@ from projservo_cli.control.law import (
     State,
     follow,
     partitioned,
+    single_rotation,
     speed_share,
     translation_rate,
 )

@@ -88,13 +88,16 @@ def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
 class _Internal(CPUDispatcher):
     """A compiled function whose machine code takes no arguments from Python.
 
-    Python would call into nowhere; its calls go by way of a compiled caller instead, made at the first.
+    Python would call into nowhere; its calls go by way of a compiled caller instead, made at the first, or
+    are interpreted where the function is small.
     """
 
     _caller: Callable[..., Any] | None = None
 
     def __call__(self, *arguments: Any) -> Any:
         """Call from Python; ``arguments`` and what is returned are those of the function."""
+        if "forceinline" in self.targetoptions:
+            return self.py_func(*arguments)
         if self._caller is None:
             # Kept in no cache: another process would not find it, for it is known by the function it holds.
             self._caller = numba.njit(**{**_OPTIONS, "cache": False})(lambda *values: self(*values))
@@ -106,10 +109,16 @@ def internal(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]
 
     To take a record of a hundred arrays from Python would be a fifth of its compilation.
     """
+    return _part(function)
+
+
+def _part(function: Callable[_Params, _Result], **given: Any) -> Callable[_Params, _Result]:
+    """An ``_Internal`` with further options of the compiler."""
     if not COMPILED:
         return function
     options = {name: value for name, value in _OPTIONS.items() if name != "cache"}
-    dispatcher = _Internal(function, targetoptions={**options, "nopython": True, "no_cpython_wrapper": True})
+    options |= {"nopython": True, "no_cpython_wrapper": True, **given}
+    dispatcher = _Internal(function, targetoptions=options)
     if _OPTIONS["cache"]:
         dispatcher.enable_caching()
     return cast(Callable[_Params, _Result], dispatcher)
@@ -131,8 +140,8 @@ def composed(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]
 
 
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
-    """Compile a small helper that is always merged into its caller by the optimiser."""
-    return cast(Callable[_Params, _Result], numba.njit(**_OPTIONS, forceinline=True)(function))
+    """Compile a small helper that the optimiser merges into its callers; Python interprets it."""
+    return _part(function, forceinline=True)
 
 
 def merged(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:

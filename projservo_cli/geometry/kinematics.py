@@ -11,12 +11,12 @@ from projservo_cli.geometry.displacement import (
     translation,
     turned,
 )
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import through
-from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
+from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model, WorkFailed
 
 
-@njit
+@internal
 def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
     """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
     if joint_type == PRISMATIC:
@@ -114,7 +114,7 @@ def image_velocity(P: FloatArray, M: FloatArray, M_dot: FloatArray) -> tuple[flo
     return u, v, (d[0] - u * d[2]) / m[2], (d[1] - v * d[2]) / m[2]
 
 
-@njit
+@inline
 def row(P: FloatArray, i: int, A: tuple[float, float, float, float]) -> float:
     """Product of row i of a camera with a point, [RH00] eq. (1)."""
     return (float(P[i, 0]) * A[0] + float(P[i, 1]) * A[1]) + (float(P[i, 2]) * A[2] + float(P[i, 3]) * A[3])
@@ -150,3 +150,37 @@ def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArra
             for i in range(H_hat.shape[0]):
                 _, _, J[view, k, 0, i], J[view, k, 1, i] = image_velocity(P[view], M[k], H_hat[i] @ M[k])
     return J
+
+
+# Forms that the joints keep up to this share of the largest change are kept.
+_INVARIANT = 1e-6
+
+
+def invariant_rotations(actions: FloatArray) -> FloatArray:
+    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints keep.
+
+    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
+    where few joints leave it open, the one nearest to the identity, which does as well for these joints.
+
+    Raises WorkFailed if no metric is kept.
+    """
+    basis = np.array([_symmetric(i, j) for i in range(3) for j in range(i, 3)])
+    changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
+    _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T, full_matrices=True)
+    sizes = np.r_[sizes, np.zeros(6 - len(sizes))]
+    kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
+    Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
+    if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
+        raise WorkFailed(
+            "the joints keep no metric of the calibrated frame: calibrate anew, or measure point by point "
+            "with control.observation: points"
+        )
+    C = np.linalg.cholesky(Q).T
+    return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])
+
+
+def _symmetric(i: int, j: int) -> FloatArray:
+    """Symmetric 3×3 matrix of unit norm with entries at i, j and j, i."""
+    S = np.zeros((3, 3))
+    S[i, j] = S[j, i] = 1.0
+    return S / np.linalg.norm(S)

@@ -22,7 +22,7 @@ from projservo_cli.geometry.algebra import (
     sub,
     vec,
 )
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import (
     COORDINATES,
     RANK_TOLERANCE,
@@ -31,8 +31,8 @@ from projservo_cli.geometry.kernels import (
     least_squares,
     orthogonalize,
 )
-from projservo_cli.geometry.kinematics import joint_operators, operators_at
-from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
+from projservo_cli.geometry.kinematics import invariant_rotations, joint_operators, operators_at
+from projservo_cli.records import FloatArray, IntArray, Model
 
 # A kernel vector whose operator is smaller than this share of its terms moves nothing.
 _NULL_MOTION = 1e-9
@@ -138,7 +138,7 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
     return _moving(work, q_hat)
 
 
-@njit
+@internal
 def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Revolution around the axis through two points, [RH00] eq. (9), scaled to radians."""
     operators = work.basis
@@ -203,8 +203,6 @@ def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     return True, multiple(nu, H)
 
 
-# Forms that the joints keep up to this share of the largest change are kept.
-_INVARIANT = 1e-6
 # Once more with what rounding left of a solution by normal equations.
 _PASSES = 2
 
@@ -231,36 +229,6 @@ def span_of(model: Model, A: FloatArray) -> Span:
     return Span(np.ascontiguousarray(H_hat), np.ascontiguousarray(dual))
 
 
-def invariant_rotations(actions: FloatArray) -> FloatArray:
-    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints keep.
-
-    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
-    where few joints leave it open, the one nearest to the identity, which does as well for these joints.
-
-    Raises WorkFailed if no metric is kept.
-    """
-    basis = np.array([_symmetric(i, j) for i in range(3) for j in range(i, 3)])
-    changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
-    _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T, full_matrices=True)
-    sizes = np.r_[sizes, np.zeros(6 - len(sizes))]
-    kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
-    Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
-    if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
-        raise WorkFailed(
-            "the joints keep no metric of the calibrated frame: calibrate anew, or measure point by point "
-            "with control.observation: points"
-        )
-    C = np.linalg.cholesky(Q).T
-    return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])
-
-
-def _symmetric(i: int, j: int) -> FloatArray:
-    """Symmetric 3×3 matrix of unit norm with entries at i, j and j, i."""
-    S = np.zeros((3, 3))
-    S[i, j] = S[j, i] = 1.0
-    return S / np.linalg.norm(S)
-
-
 def in_span(span: Span, model: Model, q: FloatArray, q_hat: FloatArray) -> FloatArray:
     """Coordinates (k, 6) in the span of joint motions q̂ (k, n) at the joints q (n,); q̂ for six joints."""
     if len(span.H_hat) == 0:
@@ -269,13 +237,14 @@ def in_span(span: Span, model: Model, q: FloatArray, q_hat: FloatArray) -> Float
     return np.asarray(H_hat.reshape(len(q_hat), 16) @ span.dual.T)
 
 
-@njit
+@internal
 def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
     """Joint motion of a displacement with coordinates ξ (6,), from the operators in ``work.H_hat``.
 
     Of least norm with more than six joints, of least squares with fewer. False at a singularity.
     """
-    n = q_hat.shape[0]
+    # Not the constant, for which the compiler would make the functions called anew.
+    n, rows = q_hat.shape[0], work.J.shape[0]
     for i in range(n):
         for a in range(COORDINATES):
             total = 0.0
@@ -287,12 +256,12 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
             work.rhs[a] = xi[a]
             for i in range(n):
                 work.B[i, a] = work.J[a, i]
-        return least_squares(work.B, COORDINATES, n, q_hat, work.pivot, work.z, work.rhs)
+        return least_squares(work.B, rows, n, q_hat, work.pivot, work.z, work.rhs)
     for i in range(n):
         q_hat[i] = 0.0
         for a in range(COORDINATES):
             work.B[a, i] = work.J[a, i]
-    first, _, last = orthogonalize(work.B, n, COORDINATES, work.norms, work.z, work.pivot, work.rhs, False)
+    first, _, last = orthogonalize(work.B, n, rows, work.norms, work.z, work.pivot, work.rhs, False)
     if not last > RANK_TOLERANCE * first:
         return False
     for _ in range(_PASSES):
@@ -313,7 +282,7 @@ def _add_least_norm(work: Work, xi: FloatArray, q_hat: FloatArray) -> None:
         for i in range(k):
             total -= work.B[i, k] * z[i]
         z[k] = total * work.B[k, k]
-    back_substitute(work.B, COORDINATES, z)
+    back_substitute(work.B, work.J.shape[0], z)
     for k in range(COORDINATES):
         a = work.pivot[k]
         for i in range(n):

@@ -3,8 +3,6 @@
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
 from projservo_cli.geometry.algebra import mat, put_mat
@@ -18,6 +16,7 @@ from projservo_cli.loop.step import (
     RUNNING,
     Instant,
     Limits,
+    Log,
     finite,
     image_error,
     limit_speed,
@@ -28,56 +27,9 @@ from projservo_cli.loop.step import (
     tolerance,
     verdict_at,
 )
-from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.records import FloatArray, Model
 from projservo_cli.robots.simulated import Plant, knock, observe, pose_after, read_joints, rig_distance
 from projservo_cli.task.face import Task
-
-
-class Log(NamedTuple):
-    """What a run records at each instant; one row more than commands."""
-
-    q: FloatArray  # (k, n) true joints, rad or m
-    read: FloatArray  # (k, n) joint readings, which is what the law is given
-    H: FloatArray  # (k, 4, 4) true displacement of the face from the reference
-    s: FloatArray  # (k, 2, m, 2) measured pixels of the face and, after them, of the pins
-    hidden: FloatArray  # (k, 2) 1 where a view is self-occluded
-    error: FloatArray  # (k,) image error of the face as it is seen, px rms per marker and view
-    # (k,) image error by which the run ends: of the body where it is measured, else as seen
-    judged: FloatArray
-    errors: FloatArray  # (k, 5) control errors of the law
-    q_dot: FloatArray  # (k, n) commanded joint velocities after the limit; zero where none was sent
-    factor: FloatArray  # (k,) factor of the joint-speed limit
-    path: FloatArray  # (k, parts + 1, n) joints at the ends of the parts of each step
-    parts: IntArray  # (k,) parts each step was sent in; 0 where the joints went straight to the end
-    fit: FloatArray  # (k, 3) what measuring with the body left, as in the state of the law
-    # (4,) first instant outside an image, first beyond a joint limit, the joint that passed one or stopped
-    # the run at its own, and how often visibility limited the translation; −1 for never
-    events: FloatArray
-    M: FloatArray
-    scratch: FloatArray  # M, scratch: (m, 4) and (4, n), at least (4, 2), workspaces of the simulated robot
-
-
-def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
-    """Empty log for n joints, m markers seen, at most ``max_steps`` commands and ``parts`` parts of one."""
-    rows = max_steps + 1
-    return Log(
-        np.zeros((rows, n)),
-        np.zeros((rows, n)),
-        np.zeros((rows, 4, 4)),
-        np.zeros((rows, 2, m, 2)),
-        np.zeros((rows, 2)),
-        np.zeros(rows),
-        np.zeros(rows),
-        np.full((rows, errors), np.nan),
-        np.zeros((rows, n)),
-        np.ones(rows),
-        np.zeros((rows, parts + 1, n)),
-        np.zeros(rows, dtype=np.int64),
-        np.full((rows, 3), np.nan),
-        np.full(4, -1.0),
-        np.zeros((m, 4)),
-        np.zeros((4, max(n, 2))),
-    )
 
 
 @njit

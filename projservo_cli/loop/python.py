@@ -12,7 +12,6 @@ from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, State, new_
 from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.geometry.mechanisms import span_of
-from projservo_cli.loop.compiled import Log, new_log
 from projservo_cli.loop.step import (
     DISTURBED,
     FAILED,
@@ -23,9 +22,11 @@ from projservo_cli.loop.step import (
     RUNNING,
     Instant,
     Limits,
+    Log,
     finite,
     image_error,
     limit_speed,
+    new_log,
     on_plateau,
     outside,
     shorten,

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.loop.compiled import Log
+from projservo_cli.loop.step import Log
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import Plant, pose_after
 from projservo_cli.task.face import center_of
@@ -78,7 +78,7 @@ def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, e
     )
 
 
-@njit
+@internal
 def _effort(log: Log, steps: int, period: float) -> float:
     """Integral of the squared joint velocities, rad²/s and m²/s added."""
     total = 0.0
@@ -88,7 +88,7 @@ def _effort(log: Log, steps: int, period: float) -> float:
     return total * period
 
 
-@njit
+@internal
 def _distance(A: Vec4, B: Vec4) -> float:
     """Distance of two metric points, m."""
     way = sub(A, B)

@@ -13,8 +13,8 @@ from projservo_cli.geometry.jit import composed, njit
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.lens import straight
 from projservo_cli.geometry.mechanisms import OWN, Span
-from projservo_cli.loop.compiled import Log, new_log, run
-from projservo_cli.loop.step import CONVERGED, RUNNING, Limits
+from projservo_cli.loop.compiled import run
+from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
 from projservo_cli.loop.summary import Ends, Summary, summary
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.robots.simulated import Plant
@@ -29,7 +29,7 @@ from projservo_cli.task.face import (
     new_task,
     put_task,
 )
-from projservo_cli.task.partition import Parts, no_parts, partition
+from projservo_cli.task.partition import Parts, no_parts, partition, partition_now
 from projservo_cli.task.target import Bench, new_bench, put_body_task
 
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
@@ -84,7 +84,7 @@ def begin(
     return status, parts, True
 
 
-@composed
+@njit
 def _first_parts(
     model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
 ) -> tuple[int, Parts]:
@@ -107,7 +107,7 @@ def _in_better_sense(
     """The parts of a task that was partitioned, with its half turn in the better sense, and if it arrives."""
     sense, arrives = _half_turn_sense(model, task, state.A, q_start, state.q_hat[2], stage)
     state.memory.rotation[1] = sense * state.q_hat[2]
-    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    parts = partition_now(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
     return parts, arrives
 
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.control import BODY_LAWS
 from projservo_cli.files import replacing
-from projservo_cli.records import FloatArray, IntArray, Trace
+from projservo_cli.records import BODY_LAWS, FloatArray, IntArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.material import CLASSICAL, VIEWS, title

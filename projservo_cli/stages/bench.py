@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control import CODES, LAWS
+from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
-from projservo_cli.loop.compiled import Job, many_steps, new_log
+from projservo_cli.loop.compiled import Job, many_steps
 from projservo_cli.loop.compiled import run as run_compiled
 from projservo_cli.loop.python import bind, bound_command
-from projservo_cli.loop.step import Limits
-from projservo_cli.records import FloatArray
+from projservo_cli.loop.step import Limits, new_log
+from projservo_cli.records import LAWS, FloatArray
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
 from projservo_cli.stages.world import joints_of, truth_of

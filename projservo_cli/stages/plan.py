@@ -9,10 +9,10 @@ from scipy.optimize import least_squares
 from projservo_cli.control.law import State, new_state
 from projservo_cli.geometry.algebra import vec
 from projservo_cli.geometry.displacement import as_array, composed_angle
-from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.geometry.mechanisms import joint_motion, span_of
+from projservo_cli.geometry.mechanisms import span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
 from projservo_cli.stages.scenario import Scenario, Shown, scenario_of
@@ -216,15 +216,13 @@ def rehearses(profile: str) -> bool:
 
 
 def _joint_motions(state: State) -> FloatArray:
-    """Joint motions t, r, p (3, n) of a partitioned task; zero for one that the joints cannot make."""
-    q_hat = np.zeros((3, len(state.q_dot)))
-    if len(state.work.span.H_hat) == 0:
-        q_hat[:] = state.q_hat[:3]
-        return q_hat
-    for row in range(3):
-        if not joint_motion(state.work, state.q_hat[row], q_hat[row]):
-            q_hat[row] = 0.0
-    return q_hat
+    """Joint motions t, r, p (3, n) of a partitioned task; zero where the joints are singular."""
+    work = state.work
+    if len(work.span.H_hat) == 0:
+        return state.q_hat[:3].copy()
+    J = work.span.dual @ work.H_hat.reshape(-1, 16).T
+    q_hat, _, rank, _ = np.linalg.lstsq(J, state.q_hat[:3].T, rcond=RANK_TOLERANCE)
+    return np.asarray(q_hat.T if rank == min(J.shape) else np.zeros_like(q_hat.T))
 
 
 # What noise and calibration may leave of images that the joints can reach, px rms per marker and view.

@@ -12,12 +12,19 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration import predict
-from projservo_cli.control import BODY_LAWS
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.step import Limits
 from projservo_cli.loop.summary import Ends
-from projservo_cli.records import METRIC_LAWS, Calibration, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.records import (
+    BODY_LAWS,
+    METRIC_LAWS,
+    Calibration,
+    FloatArray,
+    InputError,
+    Model,
+    WorkFailed,
+)
 from projservo_cli.robots.simulated import NEVER, NO_PINS, Disturbance, Plant
 from projservo_cli.robots.truth import METRIC_A_INF
 from projservo_cli.stages.world import (

@@ -10,11 +10,10 @@ import numpy as np
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, Gains, new_state
 from projservo_cli.geometry.mechanisms import in_span, span_of
-from projservo_cli.loop.compiled import new_log
 from projservo_cli.loop.compiled import run as run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw
 from projservo_cli.loop.python import run as run_in_python
-from projservo_cli.loop.step import VERDICTS
+from projservo_cli.loop.step import VERDICTS, new_log
 from projservo_cli.records import (
     REPLAN,
     Calibration,

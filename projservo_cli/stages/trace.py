@@ -7,8 +7,7 @@ import numpy as np
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.loop.compiled import Log
-from projservo_cli.loop.step import Limits, plateau_stretch, tolerance
+from projservo_cli.loop.step import Limits, Log, plateau_stretch, tolerance
 from projservo_cli.loop.summary import MM, Summary, path_deviation, summary
 from projservo_cli.records import REPLAN, FloatArray, Trace
 from projservo_cli.robots.simulated import Plant

@@ -11,11 +11,11 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
-from projservo_cli.control import BODY_LAWS, CODES
+from projservo_cli.control import CODES
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.step import RUNNING, VERDICTS
 from projservo_cli.loop.trial import NUMBERS, VERDICT, Setting, new_desk, trials
-from projservo_cli.records import Calibration, FloatArray, IntArray, Trace, WorkFailed
+from projservo_cli.records import BODY_LAWS, Calibration, FloatArray, IntArray, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of

@@ -26,7 +26,7 @@ from projservo_cli.geometry.algebra import (
 from projservo_cli.geometry.displacement import twist_exponential
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
-from projservo_cli.geometry.mechanisms import invariant_rotations
+from projservo_cli.geometry.kinematics import invariant_rotations
 from projservo_cli.records import BoolArray, FloatArray, Model
 
 Vec3 = tuple[float, float, float]
@@ -204,7 +204,7 @@ def _displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
     return mul(H, twist_exponential(X))
 
 
-@merged
+@njit
 def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: Until, normal: FloatArray) -> Fit:
     """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
 

@@ -22,7 +22,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.displacement import incidence_angles, rotation
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,
     Work,
@@ -74,8 +74,8 @@ def no_parts() -> Parts:
     return Parts(False, 0.0, 0.0, 0.0, NO_OPERATOR, NO_OPERATOR, NO_OPERATOR, nothing, nothing, nothing)
 
 
-@njit
-def clear(q_hat: FloatArray) -> None:
+@merged
+def _clear(q_hat: FloatArray) -> None:
     """Set a joint motion to zero."""
     for i in range(q_hat.shape[0]):
         q_hat[i] = 0.0
@@ -107,7 +107,7 @@ def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tu
     """
     D = sub(A_cs, A_c)
     if dot(D, D) <= COINCIDENT * COINCIDENT * dot(A_cs, A_cs):
-        clear(q_hat)
+        _clear(q_hat)
         return True, 0.0, NO_OPERATOR
     found, H_t = translation_mechanism(work, A_c, D, q_hat)
     a_cs = axpy(-dot(D, A_cs) / dot(A_cs, A_cs), A_cs, D)
@@ -138,7 +138,7 @@ def onto_plane_part(
     D = axpy(-dot(D, A_c) / dot(A_c, A_c), A_c, D)
     if dot(D, D) <= COINCIDENT * COINCIDENT:
         if same >= 0.0:
-            clear(q_hat)
+            _clear(q_hat)
             return True, 0.0, NO_OPERATOR
         first = sub(vec(A[task.order[0]]), A_c)
         if dot(first, first) <= COINCIDENT * COINCIDENT * dot(A_c, A_c):
@@ -242,7 +242,7 @@ def _within_plane_part(
     return True, theta, H_p
 
 
-@njit
+@internal
 def partition(
     work: Work, task: Task, A: FloatArray, A_t: FloatArray, A_r: FloatArray, q_hat: FloatArray, memory: Memory
 ) -> Parts:
@@ -281,3 +281,11 @@ def partition(
             memory.rotation[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]
             memory.rotation[1, i] = q_hat[2, i] if theta_p >= 0.0 else -q_hat[2, i]
     return Parts(found, tau, theta_r, theta_p, H_t, H_r, H_p, a, a_t, A_c)
+
+
+@njit
+def partition_now(
+    work: Work, task: Task, A: FloatArray, A_t: FloatArray, A_r: FloatArray, q_hat: FloatArray, memory: Memory
+) -> Parts:
+    """The same for callers in Python: what laws need none of, and takes long to compile."""
+    return partition(work, task, A, A_t, A_r, q_hat, memory)

@@ -25,7 +25,7 @@ from projservo_cli.task.face import (
     put_task,
     require_found,
 )
-from projservo_cli.task.partition import Memory, clear, partition
+from projservo_cli.task.partition import Memory, partition_now
 from projservo_cli.task.trajectory import turned
 
 # A fit ends where a step moves the images by less than this, px rms a coordinate.
@@ -105,9 +105,8 @@ def put_body_task(
         return UNSEEN_START if ended == TOO_FEW else MISFIT_START, views
     operators_at(model, q_start, bench.work.H_hat)
     carry(task.body, H_start, bench.A)
-    for row in range(2):
-        clear(bench.memory.rotation[row])
-    parts = partition(bench.work, task, bench.A, bench.A_t, bench.A_r, bench.q_hat, bench.memory)
+    bench.memory.rotation[:] = 0.0
+    parts = partition_now(bench.work, task, bench.A, bench.A_t, bench.A_r, bench.q_hat, bench.memory)
     if not parts.found:
         return NOT_UNIQUE, 0
     turn = turned(parts.H_r, parts.H_p, parts.theta_r, parts.theta_p)

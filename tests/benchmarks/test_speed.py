@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.control import LAWS
 from projservo_cli.loop.compiled import run
+from projservo_cli.records import LAWS
 from projservo_cli.stages import bench
 from tests.known import configured
 

@@ -7,8 +7,7 @@ import yaml
 
 from projservo_cli.config import Config, digest, load_config, to_yaml
 from projservo_cli.config.yaml_source import Document
-from projservo_cli.control import LAWS
-from projservo_cli.records import InputError
+from projservo_cli.records import LAWS, InputError
 from tests.conftest import SHIPPED
 
 GOOD = """\

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.control import CODES, LAWS, command
+from projservo_cli.control import CODES, command
 from projservo_cli.control.law import new_state
 from projservo_cli.loop.python import bind, bound_command
+from projservo_cli.records import LAWS
 from projservo_cli.stages.bench import Case
 
 CONFIG = Path(__file__).parents[2] / "configs" / "paper.yaml"

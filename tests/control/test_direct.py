@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.control import CODES, LAWS, exact, stacked
+from projservo_cli.control import CODES, exact, stacked
 from projservo_cli.control.law import TAU, TAU_AFFINE, THETA_P, THETA_R, THETA_S
+from projservo_cli.records import LAWS
 from tests.samples import frame, operators, pixels, poe, revolute
 from tests.scene import GAINS, STEP, Run, limits, scene
 

@@ -6,8 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import prediction_derivative
-from projservo_cli.control import LAWS
-from projservo_cli.records import METRIC_LAWS, MODES_OF, Calibration, name_of
+from projservo_cli.records import LAWS, METRIC_LAWS, MODES_OF, Calibration, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
 from projservo_cli.stages import calibrate, studies

@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.displacement import as_mat
-from projservo_cli.geometry.kinematics import backward, forward_kinematics, joint_operators
+from projservo_cli.geometry.kinematics import (
+    backward,
+    forward_kinematics,
+    invariant_rotations,
+    joint_operators,
+)
 from projservo_cli.geometry.mechanisms import (
     in_span,
-    invariant_rotations,
     joint_motion,
     reach,
     span_of,

@@ -8,8 +8,7 @@ import json
 
 import numpy as np
 
-from projservo_cli.control import LAWS
-from projservo_cli.records import MODES_OF
+from projservo_cli.records import LAWS, MODES_OF
 from tests.control.following import Followed
 from tests.samples import frame
 from tests.scene import GAINS, Run, limits, scene, with_pins

@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES, LAWS
+from projservo_cli.control import CODES
 from projservo_cli.control.law import reset
 from projservo_cli.geometry.algebra import vec
 from projservo_cli.loop.compiled import run as run_loop
 from projservo_cli.loop.step import RUNNING
 from projservo_cli.loop.summary import path_along, path_deviation
+from projservo_cli.records import LAWS
 from tests.samples import displacement, pixels, poe
 from tests.scene import GAINS, STEP, Run, limits, scene
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES, LAWS
+from projservo_cli.control import CODES
 from projservo_cli.geometry.lens import bent
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.python import run as run_python
-from projservo_cli.records import METRIC_LAWS, NO_LENS
+from projservo_cli.records import LAWS, METRIC_LAWS, NO_LENS
 from projservo_cli.robots.simulated import AnalyticPlant
 from tests.samples import frame
 from tests.scene import GAINS, STEP, Run, limits, with_pins

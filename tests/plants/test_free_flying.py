@@ -14,8 +14,8 @@ from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, new_state
 from projservo_cli.geometry.displacement import IDENTITY, as_array
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.loop.compiled import new_log, run
-from projservo_cli.loop.step import VERDICTS, Limits
+from projservo_cli.loop.compiled import run
+from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FREE, Model
 from projservo_cli.robots.simulated import Plant, pose_after
 from projservo_cli.robots.truth import METRIC_A_INF, twist

@@ -6,7 +6,7 @@ from projservo_cli.control.law import new_state
 from projservo_cli.geometry.displacement import as_array
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
-from projservo_cli.task.partition import partition
+from projservo_cli.task.partition import partition_now
 from tests.samples import arm, displacement, in_frame, operators, pixels
 
 SQUARE = np.array(
@@ -59,7 +59,7 @@ class Split:
         self.state.work.H_hat[:] = operators(self.model, q)
         memory = self.state.memory if memory is None else memory
         s = self.state
-        self.parts = partition(s.work, self.task, self.A, s.A_t, s.A_r, s.q_hat, memory)
+        self.parts = partition_now(s.work, self.task, self.A, s.A_t, s.A_r, s.q_hat, memory)
         self.memory = memory
         self.q_hat = s.q_hat[:3].copy()
         self.H_hat = [as_array(H) for H in (self.parts.H_t, self.parts.H_r, self.parts.H_p)]
