@@ -12,7 +12,7 @@ import pytest
 from projservo_cli.records import CrossValidation, Report
 from projservo_cli.report.page import calibration_words, number, short, write_comparison, write_page
 from projservo_cli.report.values import PAGE_FILE, stage_object
-from projservo_cli.stages import report
+from projservo_cli.stages import steps
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from tests.fake_records import fake
@@ -151,8 +151,8 @@ def test_the_same_run_gives_the_same_bytes(run):
 
 
 def test_a_report_misses_a_file_that_was_deleted(run, tmp_path):
-    assert not report.missing(run)
-    assert report.missing(dataclasses.replace(run, path=tmp_path / "run.h5"))
+    assert not steps.missing(run)
+    assert steps.missing(dataclasses.replace(run, path=tmp_path / "run.h5"))
 
 
 HOSTILE = "<script>alert(1)</script>\"'&{{ 7*7 }}"
