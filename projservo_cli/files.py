@@ -17,10 +17,11 @@ _TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<machine>[0-9a-f]{8})\.(?P<process>
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
     """Yield a temporary neighbour of ``path`` that takes its place when the block succeeds.
 
-    The new content is on the disk before the old name points to it. When the block raises, the
+    The new content is on the disk before the old name points to it, unless it need not be ``lasting``: what
+    can be made again at any time need not wait for the disk. When the block raises, the
     temporary file is removed and whatever stood at ``path`` before stays.
 
     Raises InputError when the folder cannot be made or written to, or the disk is full.
@@ -32,10 +33,12 @@ def replacing(path: Path) -> Iterator[Path]:
     try:
         with _told(path):
             yield temporary
-            _synchronise(temporary)
+            if lasting:
+                _synchronise(temporary)
             temporary.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
             temporary.replace(path)
-            _synchronise(path.parent)
+            if lasting:
+                _synchronise(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
 

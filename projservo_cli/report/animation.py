@@ -62,8 +62,7 @@ def frames(
             panels.append(_Panel(panel, trace.s[:, view, order], trace.self_occluded[:, view]))
     looks = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
     looks["face hidden from this camera"] = _BEHIND
-    handles = [style.line_handle(label, **look) for label, look in looks.items()]
-    style.legend_below(figure, handles, 4 if len(traces) > 2 else 2)
+    style.legend_below(figure, looks, 4 if len(traces) > 2 else 2)
     clock = figure.suptitle("time 00.00 s", fontsize=9)
     style.arrange(figure)
     for seconds in at:

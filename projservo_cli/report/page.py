@@ -4,8 +4,6 @@ import base64
 import json
 import math
 import os
-import re
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -135,92 +133,9 @@ def _law_words(trace: Mapping[str, Any]) -> str:
     return f"{text}."
 
 
-_SVG = "{http://www.w3.org/2000/svg}"
-_HREF = "{http://www.w3.org/1999/xlink}href"
-_SHAPES = ("path", "use", "rect", "circle", "ellipse", "line", "polyline", "polygon", "image")
-_ELEMENTS = frozenset((*_SHAPES, "svg", "g", "defs", "clipPath", "pattern"))
-_PLACES = ("x", "y", "width", "height", "cx", "cy", "r", "rx", "ry", "x1", "x2", "y1", "y2", "points", "d")
-_PAINTS = ("style", "fill", "stroke", "opacity", "clip-path", "transform", "patternUnits")
-_ATTRIBUTES = frozenset((*_PLACES, *_PAINTS, "id", "href", "preserveAspectRatio"))
-_PICTURE = "data:image/png;base64,"
-_REFERENCE = re.compile(r"url\(#([\w.:-]+)\)")
-
-
-def inline(svg: bytes, prefix: str, alt: str) -> Markup | None:
-    """An SVG image to stand within HTML; None where the file is not one.
-
-    Only shapes and what paints them are kept, so that the file of a stranger can neither run a
-    script nor fetch anything; references lead to names that start with ``prefix``.
-
-    svg : content of the file.
-    prefix : unlike those of all other images of the page.
-    alt : what the image shows, for those who do not see it.
-    """
-    try:
-        root = ET.fromstring(svg)
-    except ET.ParseError:
-        return None
-    if root.tag != f"{_SVG}svg" or "viewBox" not in root.attrib:
-        return None
-    view = " ".join(root.attrib["viewBox"].split())
-    used = _references(root)
-    _clean(root, prefix, used)
-    root.attrib.clear()
-    root.attrib.update({"viewBox": view, "role": "img", "aria-label": alt})
-    return Markup(ET.tostring(root, encoding="unicode"))
-
-
-def _references(root: ET.Element) -> set[str]:
-    """Names that something in the image refers to."""
-    found: set[str] = set()
-    for element in root.iter():
-        for name, value in element.attrib.items():
-            if name in (_HREF, "href") and value.startswith("#"):
-                found.add(value[1:])
-            elif "url(" in value:
-                found.update(_REFERENCE.findall(value))
-    return found
-
-
-def _clean(element: ET.Element, prefix: str, used: set[str]) -> None:
-    element.tag = element.tag.removeprefix(_SVG)
-    element.text = element.tail = None
-    kept = {}
-    for name, value in element.attrib.items():
-        name = "href" if name == _HREF else name
-        text = _attribute(name, value, prefix, used)
-        if text is not None:
-            kept[name] = text
-    element.attrib.clear()
-    element.attrib.update(kept)
-    for child in list(element):
-        tag: Any = child.tag  # of a comment it is a function
-        if isinstance(tag, str) and tag.startswith(_SVG) and tag.removeprefix(_SVG) in _ELEMENTS:
-            _clean(child, prefix, used)
-        else:
-            element.remove(child)
-
-
-def _attribute(name: str, value: str, prefix: str, used: set[str]) -> str | None:
-    """The value of an attribute as the page has it; None where it is to go."""
-    if name not in _ATTRIBUTES:
-        return None
-    value = " ".join(value.split())
-    if name == "id":
-        return prefix + value if value in used else None
-    if name == "href":
-        return f"#{prefix}{value[1:]}" if value.startswith("#") else _picture_vector(value)
-    changed = _REFERENCE.sub(rf"url(#{prefix}\1)", value)
-    foreign = _REFERENCE.sub("", value).lower()
-    return None if any(sign in foreign for sign in ("url", "@", "\\", "expression")) else changed
-
-
-def _picture_vector(value: str) -> str | None:
-    return value.replace(" ", "") if value.startswith(_PICTURE) else None
-
-
 SECTIONS = ("calibration", "plan", "control")
 _MOST_BYTES = 20_000_000  # of a file; figures have some 100,000
+_TYPES = {"svg": "image/svg+xml", "png": "image/png"}  # that a page can show, the best first
 
 
 class _Picture(NamedTuple):
@@ -255,34 +170,33 @@ def _section(spec: FigureSpec) -> str:
 
 
 def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> _Picture:
-    drawing = None
-    for kind in ("svg", "png"):
-        content = _content(directory, _file(spec, kind)) if kind in kinds and drawing is None else None
-        if content is not None:
-            drawing = _drawn(content, kind, f"{prefix}{spec.name}-", spec.alt or spec.title)
+    images = (
+        _drawing(directory / _file(spec, kind), kind, spec.alt or spec.title)
+        for kind in _TYPES
+        if kind in kinds
+    )
+    drawing = next((image for image in images if image is not None), None)
     links = [(kind.upper(), folder + _file(spec, kind)) for kind in kinds]
     if (directory / _file(spec, "csv")).is_file():
         links.insert(0, ("numbers (CSV)", folder + _file(spec, "csv")))
-    digits = "".join(c for c in spec.name.partition("_")[0] if c.isdigit())
-    return _Picture(
-        f"{prefix}{spec.name}", str(int(digits or 0)), spec.title, spec.paper, drawing, tuple(links)
-    )
+    number = str(int(spec.name.partition("_")[0].removeprefix("fig")))
+    return _Picture(f"{prefix}{spec.name}", number, spec.title, spec.paper, drawing, tuple(links))
 
 
-def _content(directory: Path, name: str) -> bytes | None:
-    """Content of a figure; None where it is none, or one that a link takes from elsewhere."""
-    path = directory / name
+def _drawing(path: Path, kind: str, alt: str) -> Markup | None:
+    """A figure as an image within the page; None where there is no file in the folder of the run.
+
+    A browser runs no script of an image and fetches nothing for it, SVG included (HTML, section 4.8.3):
+    files may come from strangers.
+    """
     try:
-        return path.read_bytes() if inside(path, directory) and path.stat().st_size <= _MOST_BYTES else None
+        content = path.read_bytes() if inside(path, path.parents[1]) else None
     except OSError:
+        content = None
+    if content is None or len(content) > _MOST_BYTES:
         return None
-
-
-def _drawn(content: bytes, kind: str, prefix: str, alt: str) -> Markup | None:
-    if kind == "svg":
-        return inline(content, prefix, alt)
     data = base64.b64encode(content).decode()
-    return Markup('<img src="data:image/png;base64,{}" alt="{}">').format(data, alt)
+    return Markup('<img src="data:{};base64,{}" alt="{}">').format(_TYPES[kind], data, alt)
 
 
 # What may lie beside the page, and what the page calls it.

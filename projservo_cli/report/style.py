@@ -7,7 +7,7 @@ same bytes in SVG, PDF and PNG.
 import hashlib
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -54,6 +54,11 @@ CURVES: tuple[tuple[str, Any, str], ...] = (
 # How the face at the start and at the goal look in every figure.
 START: Look = {"color": BLACK, "linewidth": 1.4}
 GOAL: Look = {"color": BLUE, "linestyle": (0, (5, 1.5))}
+SHARES: dict[str, Look] = {  # equal shares lie on one another: the wider shows beneath
+    r"$\mu_t$": {"color": SKY, "linewidth": 3.0},
+    r"$\mu_r$": {"color": BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
+    r"$\mu_p$": {"color": VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
+}
 
 _RC: Any = {
     "font.family": "DejaVu Sans",
@@ -103,21 +108,31 @@ def new_figure(height: float, width: float = WIDTH) -> "Figure":
     """Empty figure of a size in inches whose parts arrange themselves."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import TightLayoutEngine
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    # Without a rectangle it measures each part once; with one, or "constrained", twice, which takes 0.6 s.
+    layout: Any = TightLayoutEngine(pad=0.5, rect=None)  # type: ignore[arg-type]
+    figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
 
 def arrange(figure: "Figure") -> None:
     """Arrange the parts of a figure once, so that every format shows the same."""
-    engine = figure.get_layout_engine()
+    engine: Any = figure.get_layout_engine()
     if engine is None:
         return
     images: list[Any] = [axes for axes in figure.axes if axes.get_label() == IMAGE]
     for axes in images:  # matplotlib calls it for each size that it tries, before it looks at tick labels
         axes.apply_aspect = partial(_equal_scales, axes, axes.get_xlim(), axes.get_ylim())
+    height = figure.get_figheight()
+    legend = sum(below.get_window_extent().y1 for below in figure.legends) / figure.dpi
+    figure.set_figheight(height - legend)  # the engine leaves a legend no room, and measures twice in a part
     engine.execute(figure)
+    figure.set_figheight(height)
+    share, edges = 1.0 - legend / height, figure.subplotpars
+    if legend:
+        figure.subplots_adjust(bottom=1.0 - share * (1.0 - edges.bottom), top=1.0 - share * (1.0 - edges.top))
     for axes in images:
         axes.apply_aspect()
     figure.set_layout_engine()  # with an engine, even one that does nothing, saving draws twice
@@ -172,16 +187,16 @@ def pixels(figure: "Figure") -> npt.NDArray[np.uint8]:
     return np.array(canvas.buffer_rgba(), dtype=np.uint8)[:, :, :3]
 
 
-def legend_below(figure: "Figure", handles: Any, columns: int) -> None:
-    """Put one legend for the whole figure below all axes, where it covers no data."""
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns)
-
-
-def line_handle(label: str, **look: Any) -> Any:
-    """Entry of a legend that stands for a line or a marker."""
+def legend_below(figure: "Figure", looks: Mapping[str, Look], columns: int) -> None:
+    """Put one legend for the whole figure below all axes; an entry is a line, or a patch if it has a face."""
     from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
 
-    return Line2D([], [], label=label, **look)
+    handles = [
+        Patch(label=label, **look) if "facecolor" in look else Line2D([], [], label=label, **look)
+        for label, look in looks.items()
+    ]
+    figure.legend(handles=handles, loc="lower center", ncols=columns)
 
 
 def curve(index: int, *, marker: bool = False) -> Look:
@@ -193,10 +208,7 @@ def curve(index: int, *, marker: bool = False) -> Look:
 
 def image_axes(axes: "Axes", title: str) -> None:
     """Axes in pixels of an image with equal scales; the view widens to fill its panel."""
-    axes.set_title(title)
-    axes.set_xlabel("u (px)")
-    axes.set_ylabel("v (px)")
-    axes.set_label(IMAGE)
+    axes.set(title=title, xlabel="u (px)", ylabel="v (px)", label=IMAGE)
 
 
 def frame_pixels(axes: "Axes", pixels: FloatArray, margin: float = 0.06) -> None:

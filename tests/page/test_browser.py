@@ -20,12 +20,15 @@ A4_PX = 680  # width of the text of a page of paper, 180 mm
 # Boxes of all figures, and whether their lines are drawn; elements that reach beyond the page, but those
 # within what scrolls by itself.
 FIGURES = """() => [...document.querySelectorAll("figure")].map(figure => {
-  const box = figure.querySelector("svg, img").getBoundingClientRect();
-  const wide = path => path.getBoundingClientRect().width > 20;
-  return [box.left, box.right, box.width, box.height, [...figure.querySelectorAll("svg path")].some(wide)];
+  const image = figure.querySelector("img"), box = image.getBoundingClientRect();
+  const canvas = Object.assign(document.createElement("canvas"), {width: 200, height: 200});
+  const context = canvas.getContext("2d");
+  context.drawImage(image, 0, 0, 200, 200);
+  const dark = context.getImageData(0, 0, 200, 200).data.filter((value, k) => k % 4 == 0 && value < 128);
+  return [box.left, box.right, box.width, box.height, dark.length > 20];
 })"""
 BEYOND = """width => [...document.querySelectorAll("body *")]
-  .filter(e => e.getBoundingClientRect().right > width + 1 && !e.closest("svg, .scene")
+  .filter(e => e.getBoundingClientRect().right > width + 1 && !e.closest(".scene")
     && !(e.parentElement.closest(".wide, pre") && getComputedStyle(e.parentElement.closest(".wide, pre"))
          .overflowX === "auto"))
   .map(e => `${e.tagName} ${e.className} ${e.textContent.trim().slice(0, 40)}`)"""

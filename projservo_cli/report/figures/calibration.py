@@ -1,12 +1,12 @@
 """Diagnostics of a calibration: what the fit leaves of the images, and what the data determine."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration import predict, prediction_variance
-from projservo_cli.records import BoolArray, Calibration, CrossValidation, FloatArray, Observation
+from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
 
@@ -52,12 +52,13 @@ def _data(fit: Fit) -> Data:
         "parameters": np.array(len(calibration.covariance)),
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
-        **(
-            _by_pose(used, residual, prediction_variance(calibration, observation.q))
-            if fit.held_out is None
-            else _by_pose_held_out(fit.held_out)
-        ),
     }
+    if fit.held_out is None:
+        result |= _by_pose(used, residual, prediction_variance(calibration, observation.q))
+    else:  # from fits that have not seen the pose; predicted with the noise of the held-out reading
+        held_out = fit.held_out
+        predictable: BoolArray = np.asarray(np.isfinite(held_out.residual).all(axis=-1))
+        result |= _by_pose(predictable, held_out.residual, held_out.predicted**2)
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
     for v, view in enumerate(VIEWS):
         others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
@@ -113,15 +114,6 @@ def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Dat
     }
 
 
-def _by_pose_held_out(held_out: CrossValidation) -> Data:
-    """Predicted and actual error of each pose from fits that have not seen it, as of ``_by_pose``.
-
-    The predicted one has the noise of the held-out reading in it.
-    """
-    predicted = np.asarray(np.isfinite(held_out.residual).all(axis=-1))
-    return _by_pose(predicted, held_out.residual, held_out.predicted**2)
-
-
 def information(covariance: FloatArray) -> FloatArray:
     """Eigenvalues of the information matrix, falling: the covariance's that are not zero, inverted.
 
@@ -174,8 +166,6 @@ def magnification(residual: FloatArray, extent: float) -> float:
 )
 def _draw(data: Data, figure: "Figure") -> None:
     """Residuals over both images; their histogram and error of each pose; excitation and information."""
-    from matplotlib.patches import Patch
-
     panels = figure.subplots(3, 2, height_ratios=(1.15, 1.0, 0.9))
     for axes, view in zip(panels[0], VIEWS, strict=True):
         _arrows(axes, data, view)
@@ -183,15 +173,15 @@ def _draw(data: Data, figure: "Figure") -> None:
     _poses(panels[1, 1], data)
     _excitation(panels[2, 0], data)
     _spectrum(panels[2, 1], data)
-    handles: list[Any] = [
-        style.line_handle(f"residual, {data['factor']:,g} times", **_RESIDUAL),
-        style.line_handle("reading left out", **_LEFT_OUT),
-        style.line_handle("noise model", **_MODEL),
-        style.line_handle("residual of a pose", color=style.BLUE, marker="o", linestyle="none"),
-        style.line_handle("95 % of poses in the model", color=style.PALE, linewidth=6),
-        Patch(label="weak joint", **_WEAK),
-    ]
-    style.legend_below(figure, handles, 3)
+    looks: dict[str, style.Look] = {
+        f"residual, {data['factor']:,g} times": _RESIDUAL,
+        "reading left out": _LEFT_OUT,
+        "noise model": _MODEL,
+        "residual of a pose": {"color": style.BLUE, "marker": "o", "linestyle": "none"},
+        "95 % of poses in the model": {"color": style.PALE, "linewidth": 6},
+        "weak joint": _WEAK,
+    }
+    style.legend_below(figure, looks, 3)
 
 
 def _arrows(axes: "Axes", data: Data, view: str) -> None:
@@ -227,9 +217,8 @@ def _histogram(axes: "Axes", data: Data) -> None:
     )
     x = np.linspace(-widest, widest, 401)
     axes.plot(x, np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)), **_MODEL)
-    axes.set_title(f"noise model {sigma:.3g} px, χ²/dof {float(data['chi2_per_dof']):.3g}")
-    axes.set_xlabel("residual (px)")
-    axes.set_ylabel("density (1/px)")
+    title = f"noise model {sigma:.3g} px, χ²/dof {float(data['chi2_per_dof']):.3g}"
+    axes.set(title=title, xlabel="residual (px)", ylabel="density (1/px)")
 
 
 def _poses(axes: "Axes", data: Data) -> None:
@@ -237,9 +226,11 @@ def _poses(axes: "Axes", data: Data) -> None:
     predicted, residual = data["pose_predicted_px"], data["pose_residual_px"]
     sigma = float(data["sigma_px"])
     held_out = bool(data["held_out"])
-    axes.set_title("each pose, held out" if held_out else "each pose, in the fit (not held out)")
-    axes.set_xlabel("predicted error with noise (px)" if held_out else "predicted error (px)")
-    axes.set_ylabel("rms residual (px)")
+    axes.set(
+        title="each pose, held out" if held_out else "each pose, in the fit (not held out)",
+        xlabel="predicted error with noise (px)" if held_out else "predicted error (px)",
+        ylabel="rms residual (px)",
+    )
     if not np.isfinite(predicted).all():
         return _without_covariance(axes)
     most = 1.06 * float(predicted.max(initial=0.0))
@@ -281,9 +272,8 @@ def _excitation(axes: "Axes", data: Data) -> None:
 def _spectrum(axes: "Axes", data: Data) -> None:
     """Information along each direction that the images determine, falling; the last is the worst."""
     values = data["information"]
-    axes.set_title(f"information, {len(values)} of {int(data['parameters'])} directions free")
-    axes.set_xlabel("direction (best to worst)")
-    axes.set_ylabel("eigenvalue (1)")
+    title = f"information, {len(values)} of {int(data['parameters'])} directions free"
+    axes.set(title=title, xlabel="direction (best to worst)", ylabel="eigenvalue (1)")
     if not values.size:
         return _without_covariance(axes)
     axes.plot(np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8)
@@ -293,6 +283,5 @@ def _spectrum(axes: "Axes", data: Data) -> None:
 
 def _without_covariance(axes: "Axes") -> None:
     """Say why a panel is empty."""
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
     axes.text(0.5, 0.5, "the method has no covariance", ha="center", va="center", transform=axes.transAxes)

@@ -19,7 +19,6 @@ from projservo_cli.report.material import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # Share of the largest deviation of the best run below which nothing is drawn.
@@ -30,6 +29,16 @@ _WHIRL = np.pi
 # Modes whose largest distances differ by more than this are shown on a logarithmic scale, down to a share
 # of the least of them.
 _WIDE, _LEAST_OF_MODES = 10.0, 0.02
+_WAY, _OFF = "way along the straight line (mm)", "distance from it (mm)"
+_OPERATORS = ("true", "calibrated")
+_LIMITED: style.Look = {"color": style.SKY, "linewidth": 2.4}
+# Largest deviations by operators and limit, both 0 or 1.
+_MAXIMA: dict[tuple[int, int], style.Look] = {
+    (0, 0): {"color": style.BLACK, "marker": "o"},
+    (0, 1): {"color": style.BLACK, "marker": "^", "linestyle": (0, (4, 1.5))},
+    (1, 0): {"color": style.VERMILION, "marker": "s", "fillstyle": "none"},
+    (1, 1): {"color": style.VERMILION, "marker": "v", "fillstyle": "none", "linestyle": (0, (4, 1.5))},
+}
 
 
 def drift_tables(studies: Studies | None) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -41,7 +50,7 @@ def drift_tables(studies: Studies | None) -> tuple[FloatArray, FloatArray, BoolA
     shape = (len(DIRECT), 2, 2, len(gains))
     drift, at_samples, converged = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.bool_)
     for (law, operators, limited, gain), trace in sweep.items():
-        where = DIRECT.index(law), int(operators == "calibrated"), int(limited), gains.index(gain)
+        where = DIRECT.index(law), _OPERATORS.index(operators), int(limited), gains.index(gain)
         converged[where] = trace.verdict == "converged"
         if trace.center_deviation_mm is not None and trace.center_deviation_at_samples_mm is not None:
             drift[where] = trace.center_deviation_mm
@@ -87,63 +96,34 @@ def _draw(data: Data, figure: "Figure") -> None:
     """One row a law: left the paths, right the largest deviation over the gain."""
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
+    looks = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
     for row, law in enumerate(DIRECT):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
         least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
-        for i, path in enumerate(paths):
+        for path, look in zip(paths, looks, strict=True):
             way, off = path.T
-            axes[row, 0].plot(way, np.maximum(off, least), **_path_look(i, len(gains)))
+            axes[row, 0].plot(way, np.maximum(off, least), **look)
         axes[row, 0].set_title(f"{TITLES[law]}: path of the centre, calibrated operators")
-        axes[row, 0].set_xlabel("way along the straight line (mm)")
-        axes[row, 0].set_ylabel("distance from it (mm)")
+        axes[row, 0].set(xlabel=_WAY, ylabel=_OFF)
         style.log_scale(axes[row, 0])
         axes[row, 0].set_ylim(bottom=least)
-        for operators, color in enumerate((style.BLACK, style.VERMILION)):
-            for limited, line in enumerate(("-", (0, (4, 1.5)))):
-                marker = "os"[operators] if not limited else "^v"[operators]
-                axes[row, 1].plot(
-                    gains,
-                    data["drift_mm"][row, operators, limited],
-                    color=color,
-                    linestyle=line,
-                    marker=marker,
-                    fillstyle="none" if operators else "full",
-                    markersize=4.5 if operators else 3.0,
-                )
+        for (operators, limited), look in _MAXIMA.items():
+            size = 4.5 if operators else 3.0  # an empty marker shows around a full one
+            axes[row, 1].plot(gains, data["drift_mm"][row, operators, limited], markersize=size, **look)
         axes[row, 1].set_xscale("log")
         axes[row, 1].set_xticks(gains, [f"{gain:g}" for gain in gains])
         axes[row, 1].minorticks_off()
         style.log_scale(axes[row, 1])
-        axes[row, 1].set_title(f"{TITLES[law]}: largest distance")
-        axes[row, 1].set_xlabel("gain per step (1)")
-        axes[row, 1].set_ylabel("largest distance (mm)")
-    handles = _handles(gains, float(data["step_limit_deg"]))
+        labels = {"xlabel": "gain per step (1)", "ylabel": "largest distance (mm)"}
+        axes[row, 1].set(title=f"{TITLES[law]}: largest distance", **labels)
+    limit = f"{float(data['step_limit_deg']):g}° per step"
+    legend = {f"gain {gain:g} per step": look for gain, look in zip(gains, looks, strict=False)}
+    legend[f"{gains.max():g} and {limit}"] = _LIMITED
+    for (operators, limited), look in _MAXIMA.items():
+        legend[f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"] = look
     if any(data[f"whirls_{law}_{i}"] for law in DIRECT for i in range(len(gains) + 1)):
-        handles.append(style.line_handle("chords: steps over 180°", color=style.BLACK, linewidth=0))
-    style.legend_below(figure, handles, 4)
-
-
-def _path_look(i: int, gains: int) -> dict[str, Any]:
-    if i == gains:  # the limited run
-        return {"color": style.SKY, "linewidth": 2.4}
-    return style.curve(i)
-
-
-def _handles(gains: FloatArray, limit: float) -> list[Any]:
-    paths = [style.line_handle(f"gain {gain:g} per step", **style.curve(i)) for i, gain in enumerate(gains)]
-    paths.append(
-        style.line_handle(f"{gains.max():g} and {limit:g}° per step", **_path_look(len(gains), len(gains)))
-    )
-    maxima = [
-        ("true, no limit", style.BLACK, "-", "o", "full"),
-        (f"true, {limit:g}° per step", style.BLACK, (0, (4, 1.5)), "^", "full"),
-        ("calibrated, no limit", style.VERMILION, "-", "s", "none"),
-        (f"calibrated, {limit:g}° per step", style.VERMILION, (0, (4, 1.5)), "v", "none"),
-    ]
-    return paths + [
-        style.line_handle(label, color=color, linestyle=line, marker=marker, fillstyle=fill)
-        for label, color, line, marker, fill in maxima
-    ]
+        legend["chords: steps over 180°"] = {"color": style.BLACK, "linewidth": 0}
+    style.legend_below(figure, legend, 4)
 
 
 def drift_rows(report: Report) -> list[dict[str, Any]]:
@@ -158,7 +138,7 @@ def drift_rows(report: Report) -> list[dict[str, Any]]:
         rows.append(
             {
                 "law": DIRECT[law],
-                "operators": ("true", "calibrated")[operators],
+                "operators": _OPERATORS[operators],
                 "limit_deg_per_step": report.step_limit_deg if limited else None,
                 "gain_per_step": float(report.gain_per_step[gain]),
                 **{name: value if np.isfinite(value) else None for name, value in values.items()},
@@ -195,17 +175,9 @@ def _draw_modes(data: Data, figure: "Figure") -> None:
     for i, name in enumerate(names):
         way, off = data[f"path_mm_{name}"].T
         axes.plot(way, off, **style.curve(i))
-    axes.set_title("path of the centre")
-    axes.set_xlabel("way along the straight line (mm)")
-    axes.set_ylabel("distance from it (mm)")
-    _log_where_wide(axes, [data[f"path_mm_{name}"][:, 1] for name in names])
-    handles = [style.line_handle(title(name), **style.curve(i)) for i, name in enumerate(names)]
-    style.legend_below(figure, handles, 2)
-
-
-def _log_where_wide(axes: "Axes", values: list[Any]) -> None:
-    """Logarithmic scale where the runs differ much at their largest."""
-    most = [float(np.max(value)) for value in values]
+    axes.set(title="path of the centre", xlabel=_WAY, ylabel=_OFF)
+    style.legend_below(figure, {title(name): style.curve(i) for i, name in enumerate(names)}, 2)
+    most = [float(data[f"path_mm_{name}"][:, 1].max()) for name in names]
     if min(most) > 0.0 and max(most) > _WIDE * min(most):
         style.log_scale(axes)
         axes.set_ylim(bottom=_LEAST_OF_MODES * min(most))

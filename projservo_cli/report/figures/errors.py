@@ -1,6 +1,6 @@
 """Figs. 9 and 10 of [RH00]: the control errors of directTWO and directTHREE."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +16,12 @@ from projservo_cli.report.material import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 # What is drawn of an error on a logarithmic scale: five decades below its start.
 _DECADES = 1e-5
+_FAINT: style.Look = {"linewidth": 0.8, "alpha": 0.55}
+_DOTTED = (0, (1, 1.2))
 
 
 def _data_two(material: Material) -> Data:
@@ -64,27 +65,20 @@ def _draw_two(data: Data, figure: "Figure") -> None:
         t = data[f"t_s_{name}"]
         for column in range(2):
             axes[0, column].plot(t, data[f"tau_affine_{name}"], **look)
-            axes[0, column].plot(t, data[f"tau_{name}"], **(look | {"linewidth": 0.8, "alpha": 0.55}))
+            axes[0, column].plot(t, data[f"tau_{name}"], **look, **_FAINT)
             axes[1, column].plot(t, data[f"theta_s_deg_{name}"], **look)
-    _log(axes[0, 1], 100.0)
-    _log(axes[1, 1], float(data["theta_s_deg_free"][0]))
+    for panel, start in zip(axes[:, 1], (100.0, float(data["theta_s_deg_free"][0])), strict=True):
+        style.log_scale(panel)
+        panel.set_ylim(max(start, 1e-3) * _DECADES, max(start, 1e-3) * 3.0)
     for column, title in enumerate(("linear scale", "logarithmic scale")):
-        axes[0, column].set_title(f"directTWO, {title}")
-        axes[0, column].set_ylabel(r"$\tau$ (% of its start)")
-        axes[1, column].set_ylabel(r"$\theta_s$ (deg)")
-        axes[1, column].set_xlabel("time (s)")
-    faint: style.Look = {"linewidth": 0.8, "alpha": 0.55}
-    handles = [
-        style.line_handle("no limit", **looks["free"]),
-        style.line_handle(f"{data['step_limit_deg']:g}° per step", **looks["limited"]),
-        style.line_handle(r"thin: $\tau$ of the unit-norm kernel (8)", color=style.BLACK, **faint),
-    ]
-    style.legend_below(figure, handles, 3)
-
-
-def _log(axes: "Axes", start: float) -> None:
-    style.log_scale(axes)
-    axes.set_ylim(max(start, 1e-3) * _DECADES, max(start, 1e-3) * 3.0)
+        axes[0, column].set(title=f"directTWO, {title}", ylabel=r"$\tau$ (% of its start)")
+        axes[1, column].set(xlabel="time (s)", ylabel=r"$\theta_s$ (deg)")
+    legend: dict[str, style.Look] = {
+        "no limit": looks["free"],
+        f"{data['step_limit_deg']:g}° per step": looks["limited"],
+        r"thin: $\tau$ of the unit-norm kernel (8)": {"color": style.BLACK, **_FAINT},
+    }
+    style.legend_below(figure, legend, 3)
 
 
 def _data_three(material: Material) -> Data:
@@ -133,30 +127,16 @@ def _draw_three(data: Data, figure: "Figure") -> None:
     axes = figure.subplots(2, 2, sharex=True)
     t, t_metric = data["t_s"], data["t_s_metric"]
     t_common = max(t, t_metric, key=len)
-    translation: list[tuple[str, FloatArray, FloatArray, dict[str, Any]]] = [
-        (r"true distance", t, data["distance"], {"color": style.SKY, "linewidth": 3.2}),
-        (r"$\tau$, scale fixed through $a_\infty$", t, data["tau_affine"], {"color": style.BLACK}),
-        (
-            r"$\tau$, unit-norm kernel (8), projective",
-            t,
-            data["tau"],
-            {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
-        ),
-        (
-            r"$\tau$, unit-norm kernel (8), Euclidean",
-            t_metric,
-            data["tau_metric"],
-            {"color": style.BLACK, "linestyle": (0, (1, 1.2))},
-        ),
-    ]
-    for _, time, values, look in translation:
-        axes[0, 0].plot(time, values, **look)
-    for label, name, look in (
-        (r"scale fixed through $a_\infty$", "tau_affine", translation[1][3]),
-        ("unit-norm kernel (8)", "tau", translation[2][3]),
-    ):
-        del label
-        axes[0, 1].plot(t, np.abs(data[name] - data["distance"]), **look)
+    looks: dict[str, style.Look] = {
+        "distance": {"color": style.SKY, "linewidth": 3.2},
+        "tau_affine": {"color": style.BLACK},
+        "tau": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
+        "tau_metric": {"color": style.BLACK, "linestyle": _DOTTED},
+    }
+    for name, look in looks.items():
+        axes[0, 0].plot(t_metric if name == "tau_metric" else t, data[name], **look)
+    for name in ("tau_affine", "tau"):
+        axes[0, 1].plot(t, np.abs(data[name] - data["distance"]), **looks[name])
     angles = (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s"))
     for name, color, marker in angles:
         axes[1, 0].plot(t, data[f"{name}_deg"], color=color)
@@ -164,41 +144,25 @@ def _draw_three(data: Data, figure: "Figure") -> None:
         axes[1, 0].plot(
             t_metric, data[f"{name}_deg_metric"], marker, color=color, fillstyle="none", markevery=every
         )
-        for kind, line in (("calibrated", "-"), ("true", (0, (1, 1.2)))):
+        for kind, line in (("calibrated", "-"), ("true", _DOTTED)):
             difference = data[f"{name}_difference_deg_{kind}"]
             axes[1, 1].plot(t_common[: len(difference)], difference, color=color, linestyle=line)
-    _floor(axes[0, 1], 1e-4)
-    _floor(axes[1, 1], 1e-15)
-    _label_three(axes)
-    handles = [style.line_handle(label, **look) for label, _, _, look in translation]
-    handles += [
-        style.line_handle(r"$\theta_r$, projective model", color=style.BLACK),
-        style.line_handle(r"$\theta_p$, projective model", color=style.VERMILION),
-        style.line_handle(
-            r"$\theta_r$, $\theta_p$, Euclidean",
-            color=style.BLACK,
-            marker="o",
-            linestyle="none",
-            fillstyle="none",
-        ),
-        style.line_handle("dotted difference: true operators", color=style.BLACK, linestyle=(0, (1, 1.2))),
-    ]
-    style.legend_below(figure, handles, 2)
-
-
-def _floor(axes: "Axes", least: float) -> None:
-    style.log_scale(axes)
-    axes.set_ylim(bottom=least)
-
-
-def _label_three(axes: Any) -> None:
-    axes[0, 0].set_title("directTHREE: translation error")
-    axes[0, 0].set_ylabel(r"$\tau$ (% of its start)")
-    axes[0, 1].set_title("its difference from the true distance")
-    axes[0, 1].set_ylabel("difference (% of the start)")
-    axes[1, 0].set_title("rotation errors")
-    axes[1, 0].set_ylabel("angle (deg)")
-    axes[1, 1].set_title("projective less Euclidean model")
-    axes[1, 1].set_ylabel("difference (deg)")
-    for panel in axes[1]:
-        panel.set_xlabel("time (s)")
+    for panel, least in zip(axes[:, 1], (1e-4, 1e-15), strict=True):
+        style.log_scale(panel)
+        panel.set_ylim(bottom=least)
+    axes[0, 0].set(title="directTHREE: translation error", ylabel=r"$\tau$ (% of its start)")
+    axes[0, 1].set(title="its difference from the true distance", ylabel="difference (% of the start)")
+    axes[1, 0].set(title="rotation errors", xlabel="time (s)", ylabel="angle (deg)")
+    axes[1, 1].set(title="projective less Euclidean model", xlabel="time (s)", ylabel="difference (deg)")
+    points: style.Look = {"color": style.BLACK, "marker": "o", "linestyle": "none", "fillstyle": "none"}
+    legend = {
+        "true distance": looks["distance"],
+        r"$\tau$, scale fixed through $a_\infty$": looks["tau_affine"],
+        r"$\tau$, unit-norm kernel (8), projective": looks["tau"],
+        r"$\tau$, unit-norm kernel (8), Euclidean": looks["tau_metric"],
+        r"$\theta_r$, projective model": {"color": style.BLACK},
+        r"$\theta_p$, projective model": {"color": style.VERMILION},
+        r"$\theta_r$, $\theta_p$, Euclidean": points,
+        "dotted difference: true operators": {"color": style.BLACK, "linestyle": _DOTTED},
+    }
+    style.legend_below(figure, legend, 2)

@@ -26,6 +26,14 @@ if TYPE_CHECKING:
 _OUTSIDE = 0.15
 _BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
 _PANEL_WIDTH = 2.9  # inches, of one of two panels beside one another
+_BORDER: style.Look = {"color": style.GREY, "linewidth": 0.8}
+_LOOKS: dict[str, style.Look] = {
+    "start": style.START,
+    "goal": style.GOAL,
+    "path of a marker": {"color": style.BLACK, "linewidth": 0.9},
+    "face hidden from this camera": {"color": style.ORANGE, "linewidth": 4.0, "alpha": 0.6},
+    "plateau of the image error": {"color": style.VERMILION, "linewidth": 2.0, "marker": "s"},
+}
 
 
 def _data_classical(material: Material) -> Data:
@@ -83,23 +91,22 @@ def _draw_classical(data: Data, figure: "Figure") -> None:
             title = f"{name} camera" if view else f"{TITLES[law]}: {data[f'verdict_{law}']}"
             style.image_axes(panel, title)
             _frame(panel, np.concatenate([s.reshape(-1, 2), goal]), data["image_size"])
-    handles = _classical_handles()
-    handles += [style.line_handle("end of the run", color=style.BLACK, marker="x", linestyle="none")]
+    looks = {**_LOOKS, "end of the run": {"color": style.BLACK, "marker": "x", "linestyle": "none"}}
     every = near_pixels(np.concatenate(shown), data["image_size"]) / data["image_size"]
     if (np.abs(every - 0.5) > 0.5 - _BORDER_SHOWN).any():
-        handles += [style.line_handle("border of the image", color=style.GREY, linewidth=0.8)]
-    style.legend_below(figure, handles, 4)
+        looks["border of the image"] = _BORDER
+    style.legend_below(figure, looks, 4)
 
 
 def _draw_paths(axes: "Axes", s: FloatArray, hidden: FloatArray, plateau: FloatArray) -> None:
+    path, behind, still = [*_LOOKS.values()][2:]
     for k in range(s.shape[1]):
         stretch = np.where(hidden[:, None], s[:, k], np.nan)
-        axes.plot(*stretch.T, color=style.ORANGE, linewidth=4.0, alpha=0.6, solid_capstyle="butt")
-        axes.plot(*s[:, k].T, color=style.BLACK, linewidth=0.9)
+        axes.plot(*stretch.T, solid_capstyle="butt", **behind)
+        axes.plot(*s[:, k].T, **path)
         if plateau[0] >= 0:
             first, last = plateau
-            axes.plot(*s[first : last + 1, k].T, color=style.VERMILION, linewidth=2.0)
-            axes.plot(*s[first, k], marker="s", color=style.VERMILION, markersize=3.5)
+            axes.plot(*s[first : last + 1, k].T, markevery=[0], **still)
 
 
 def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
@@ -107,25 +114,14 @@ def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
     style.frame_pixels(axes, near_pixels(pixels, size))
     border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
     limits = axes.get_xlim(), axes.get_ylim()
-    axes.plot(*style.closed(border).T, color=style.GREY, linewidth=0.8)
-    axes.set_xlim(limits[0])
-    axes.set_ylim(limits[1])
+    axes.plot(*style.closed(border).T, **_BORDER)
+    axes.set(xlim=limits[0], ylim=limits[1])
 
 
 def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
     """Pixels (k, 2) that were measured, none farther outside the image than is drawn."""
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     return np.clip(seen, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)
-
-
-def _classical_handles() -> list[object]:
-    return [
-        style.line_handle("start", **style.START),
-        style.line_handle("goal", **style.GOAL),
-        style.line_handle("path of a marker", color=style.BLACK, linewidth=0.9),
-        style.line_handle("face hidden from this camera", color=style.ORANGE, linewidth=4, alpha=0.6),
-        style.line_handle("plateau of the image error", color=style.VERMILION, linewidth=2, marker="s"),
-    ]
 
 
 def _data_direct(material: Material) -> Data:
@@ -150,7 +146,7 @@ def _draw_direct(data: Data, figure: "Figure") -> None:
     every = np.concatenate([data[f"s_{law}"].reshape(-1, 2) for law in DIRECT])
     figure.set_figheight(_PANEL_WIDTH * style.aspect(every) + 1.05)
     axes = figure.subplots(1, 2)
-    looks = (
+    looks: tuple[style.Look, ...] = (
         {"color": style.BLACK, "linewidth": 1.1},
         {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.5))},
     )
@@ -165,9 +161,8 @@ def _draw_direct(data: Data, figure: "Figure") -> None:
         style.face(axes[view], data["s_star"][view], style.GOAL)
         style.frame_pixels(axes[view], np.concatenate(shown))
         style.image_axes(axes[view], f"{name} camera")
-    handles = [style.line_handle(TITLES[law], **look) for law, look in zip(DIRECT, looks, strict=True)]
-    handles += _classical_handles()[:2]
-    style.legend_below(figure, handles, 4)
+    legend: dict[str, style.Look] = {TITLES[law]: look for law, look in zip(DIRECT, looks, strict=True)}
+    style.legend_below(figure, legend | {"start": style.START, "goal": style.GOAL}, 4)
 
 
 def _data_errors(material: Material) -> Data:
@@ -199,6 +194,8 @@ def _draw_errors(data: Data, figure: "Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick."""
     axes = figure.subplots(1, 2, sharey=True)
     t = data["t_s"]
+    thick: style.Look = {"color": style.GREY, "linewidth": 3.0, "alpha": 0.6}
+    thin: style.Look = {"color": style.BLACK, "linewidth": 0.9}
     for view, name in enumerate(VIEWS):
         e = data["e"][:, view]
         for k in range(e.shape[1]):
@@ -206,20 +203,13 @@ def _draw_errors(data: Data, figure: "Figure") -> None:
             axes[view].plot(t, e[:, k, 0], **look)
             axes[view].plot(t, e[:, k, 1], linestyle=(0, (3, 1.2)), **look)
         center = data["center_e"][:, view]
-        axes[view].plot(t, center[:, 0], color=style.GREY, linewidth=3.0, alpha=0.6)
-        axes[view].plot(t, center[:, 1], color=style.GREY, linewidth=3.0, alpha=0.6, linestyle=(0, (2, 1)))
-        axes[view].set_title(f"{name} camera, {data['law']}")
-        axes[view].set_xlabel("time (s)")
+        axes[view].plot(t, center[:, 0], **thick)
+        axes[view].plot(t, center[:, 1], linestyle=(0, (2, 1)), **thick)
+        axes[view].set(title=f"{name} camera, {data['law']}", xlabel="time (s)")
     axes[0].set_ylabel("image error $s - s_*$ (px)")
-    handles = [
-        style.line_handle(f"marker {number}", **_marker_look(k)) for k, number in enumerate(data["marker"])
-    ]
-    handles += [
-        style.line_handle("centre", color=style.GREY, linewidth=3.0, alpha=0.6),
-        style.line_handle("u", color=style.BLACK, linewidth=0.9),
-        style.line_handle("v", color=style.BLACK, linewidth=0.9, linestyle=(0, (3, 1.2))),
-    ]
-    style.legend_below(figure, handles, min(len(handles), 8))
+    looks = {f"marker {number}": _marker_look(k) for k, number in enumerate(data["marker"])}
+    looks |= {"centre": thick, "u": thin, "v": thin | {"linestyle": (0, (3, 1.2))}}
+    style.legend_below(figure, looks, min(len(looks), 8))
 
 
 def _marker_look(k: int) -> style.Look:

@@ -1,6 +1,6 @@
 """Fig. 12 of [RH00]: joint trajectories without and with the joint-speed limit."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -41,14 +41,8 @@ def _data(material: Material) -> Data:
 def _draw(data: Data, figure: "Figure") -> None:
     """Left without, right with the limit; joints above, their steps below, per kind of joint."""
     prismatic = data["prismatic"]
-    kinds = [
-        (chosen, unit)
-        for chosen, unit in (
-            (np.flatnonzero(~prismatic).tolist(), "deg"),
-            (np.flatnonzero(prismatic).tolist(), "mm"),
-        )
-        if len(chosen)
-    ]
+    both = ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))
+    kinds = [(chosen.tolist(), unit) for chosen, unit in both if len(chosen)]
     figure.set_figheight(figure.get_figheight() * (0.25 + 0.75 * len(kinds)))
     axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
     limit = float(data["step_limit_deg"])
@@ -67,16 +61,10 @@ def _draw(data: Data, figure: "Figure") -> None:
                 steps.set_ylabel(f"step ({unit} per period)")
         axes[0, column].set_title(f"directTHREE, {title}")
         axes[-1, column].set_xlabel("time (s)")
-    for row in range(0, len(axes), 2):
-        _share(axes[row])
-    handles: list[Any] = [style.line_handle(f"$q_{i + 1}$", **style.curve(i)) for i in range(len(prismatic))]
-    handles.append(style.line_handle("limit", color=style.GREY, linewidth=0.8))
-    style.legend_below(figure, handles, min(len(handles), 7))
-
-
-def _share(row: Any) -> None:
-    """One vertical scale for a row of axes, where both sides are to be compared."""
-    low = min(panel.get_ylim()[0] for panel in row)
-    high = max(panel.get_ylim()[1] for panel in row)
-    for panel in row:
-        panel.set_ylim(low, high)
+    for row in axes[::2]:  # both sides are to be compared
+        limits = [panel.get_ylim() for panel in row]
+        for panel in row:
+            panel.set_ylim(np.min(limits), np.max(limits))
+    looks = {f"$q_{i + 1}$": style.curve(i) for i in range(len(prismatic))}
+    looks["limit"] = {"color": style.GREY, "linewidth": 0.8}
+    style.legend_below(figure, looks, min(len(looks), 7))

@@ -78,17 +78,14 @@ def _draw(data: Data, figure: "Figure") -> None:
         style.image_axes(axes[view, 0], f"{name} camera")
     _draw_control_errors(axes[0, 1], data)
     _draw_image_errors(axes[1, 1], data)
-    handles = [
-        style.line_handle(str(data[f"verdict_{law}"]), **look)
-        for law, look in zip(_LAWS, _LOOKS, strict=True)
-    ]
-    handles += [
-        style.line_handle(f"centre under {TITLES[_LAWS[0]]}", **_CENTER),
-        style.line_handle("face at the start", **style.START),
-        style.line_handle("face at the goal", **style.GOAL),
-        style.line_handle("face hidden from the camera", **_HIDDEN),
-    ]
-    style.legend_below(figure, handles, 2)
+    looks = {str(data[f"verdict_{law}"]): look for law, look in zip(_LAWS, _LOOKS, strict=True)}
+    looks |= {
+        f"centre under {TITLES[_LAWS[0]]}": _CENTER,
+        "face at the start": style.START,
+        "face at the goal": style.GOAL,
+        "face hidden from the camera": _HIDDEN,
+    }
+    style.legend_below(figure, looks, 2)
 
 
 def _shown(data: Data, view: int) -> FloatArray:
@@ -116,10 +113,8 @@ def _draw_control_errors(axes: "Axes", data: Data) -> None:
             t = data["period_s"] * np.arange(len(values))
             axes.plot(t, values, label=label, **style.curve(index))
     style.log_scale(axes)
-    axes.set_ylim(_LEAST_PERCENT, 200.0)
-    axes.set_title(f"control errors, {TITLES[_LAWS[0]]}")
-    axes.set_xlabel("time (s)")
-    axes.set_ylabel("error (% of its start)")
+    title = f"control errors, {TITLES[_LAWS[0]]}"
+    axes.set(title=title, xlabel="time (s)", ylabel="error (% of its start)", ylim=(_LEAST_PERCENT, 200.0))
     axes.legend(loc="upper right")
 
 
@@ -130,6 +125,4 @@ def _draw_image_errors(axes: "Axes", data: Data) -> None:
         axes.plot(t, np.where(hidden, e, np.nan), **_HIDDEN)
         axes.plot(t, e, **look)
     style.log_scale(axes)
-    axes.set_title("image errors, both laws")
-    axes.set_xlabel("time (s)")
-    axes.set_ylabel("rms (px)")
+    axes.set(title="image errors, both laws", xlabel="time (s)", ylabel="rms (px)")

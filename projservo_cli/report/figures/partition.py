@@ -83,15 +83,15 @@ def _draw(data: Data, figure: "Figure") -> None:
     _translation(axes[0], data)
     _onto_plane(axes[1], data)
     _within_plane(axes[2], data)
-    handles = [
-        style.line_handle("start $A$", **style.START),
-        style.line_handle("goal $A_*$", **style.GOAL),
-        style.line_handle("goal less translation $A_t$", **_SHIFTED),
-        style.line_handle("less rotation onto the plane $A_r$", **_TURNED),
-        style.line_handle("paths of the markers", **_PATH),
-        style.line_handle(r"axis of $\hat H_r$", **_AXIS),
-    ]
-    style.legend_below(figure, handles, 3)
+    looks = {
+        "start $A$": style.START,
+        "goal $A_*$": style.GOAL,
+        "goal less translation $A_t$": _SHIFTED,
+        "less rotation onto the plane $A_r$": _TURNED,
+        "paths of the markers": _PATH,
+        r"axis of $\hat H_r$": _AXIS,
+    }
+    style.legend_below(figure, looks, 3)
 
 
 def _translation(axes: "Axes", data: Data) -> None:

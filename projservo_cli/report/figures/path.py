@@ -20,11 +20,6 @@ _TICKS = 11  # points at equal steps of σ on the path
 _WIDE = 4.0  # margins beyond are drawn in powers of ten
 LABEL = 0.05  # room that the number on a contour needs, in shares
 
-_SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider shows beneath
-    r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
-    r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
-    r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
-}
 _REGIONS: dict[str, style.Look] = {  # hatched, so that they differ in grey too
     "margin": {"facecolor": style.GREY, "hatch": ""},
     "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
@@ -80,7 +75,7 @@ def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     result = np.empty((2, len(mu), len(mu)))
     for i, share in enumerate(mu):
         there = M + share * plan.tau * (M @ plan.H_hat[0].T)
-        m = np.einsum("vij,rpmj->vrpmi", P, there)
+        m = there @ P.swapaxes(1, 2)[:, None, None]
         uv = through(lens[:, None, None, None], m[..., :2] / m[..., 2:])
         least = np.minimum(uv + 0.5, material.plant.image_size - 0.5 - uv).min(axis=(-1, -2))
         front = (m[..., 2] * depth[:, None, None] > 0.0).all(axis=-1)
@@ -103,27 +98,24 @@ def _draw(data: Data, figure: "Figure") -> None:
     for view, name in enumerate(VIEWS):
         _map(axes[0, view], data, view)
         axes[0, view].set_title(f"{name} camera, {data['profile']} profile")
-    handles = [
-        _region("hidden from this camera", "margin"),
-        _region(r"outside this image at every $\mu_p$", "border_px"),
-        style.line_handle(r"path, at tenths of $\sigma$", color=style.VERMILION, marker="o"),
-    ]
-    handles += _lines(axes[1, 0], data["sigma"], data["mu"], _SHARES)
+    for panel, name, lines in zip(axes[1], ("mu", "along"), (style.SHARES, _MARGINS), strict=True):
+        for column, look in zip(data[name].T, lines.values(), strict=True):
+            panel.plot(data["sigma"], column, **look)
+        panel.set_xlabel(r"path parameter $\sigma$ (1)")
     axes[1, 0].set_ylabel(r"share $\mu$ (1)")
-    handles += _lines(axes[1, 1], data["sigma"], data["along"], _MARGINS)
     axes[1, 1].axhline(0.0, color=style.BLACK, linewidth=0.6)
     if np.nanmax(data["along"]) > _WIDE:  # conditioning may grow a hundredfold
         axes[1, 1].set_yscale("symlog", linthresh=1.0)
         axes[1, 1].yaxis.set_major_formatter("{x:g}")
     axes[1, 1].set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
     axes[1, 1].set_ylabel("margin (1)")
-    style.legend_below(figure, handles, 4)
-
-
-def _region(label: str, name: str) -> Any:
-    from matplotlib.patches import Patch
-
-    return Patch(label=label, alpha=0.6, edgecolor=style.BLACK, linewidth=0.0, **_REGIONS[name])
+    region: style.Look = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
+    looks: dict[str, style.Look] = {
+        "hidden from this camera": region | _REGIONS["margin"],
+        r"outside this image at every $\mu_p$": region | _REGIONS["border_px"],
+        r"path, at tenths of $\sigma$": {"color": style.VERMILION, "marker": "o"},
+    }
+    style.legend_below(figure, {**looks, **style.SHARES, **_MARGINS}, 4)
 
 
 def _map(axes: "Axes", data: Data, view: int) -> None:
@@ -149,10 +141,8 @@ def _map(axes: "Axes", data: Data, view: int) -> None:
     tenths = np.linspace(0.0, 1.0, _TICKS)
     sigma = data["sigma"]
     axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), "o", color=style.VERMILION)
-    axes.set_xlim(-0.02, 1.02)
-    axes.set_ylim(-0.02, 1.02)
-    axes.set_xlabel(r"translation $\mu_t$ (1)")
-    axes.set_ylabel(r"turn onto the plane $\mu_r$ (1)")
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+    axes.set(xlabel=r"translation $\mu_t$ (1)", ylabel=r"turn onto the plane $\mu_r$ (1)")
 
 
 def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
@@ -165,12 +155,3 @@ def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
         if room.max() > LABEL:
             places.append(piece[room.argmax()])
     return places
-
-
-def _lines(axes: "Axes", sigma: FloatArray, columns: FloatArray, looks: dict[str, style.Look]) -> list[Any]:
-    """Draw columns (s, k) over σ; returns the entries of the legend."""
-    axes.set_xlabel(r"path parameter $\sigma$ (1)")
-    return [
-        axes.plot(sigma, column, label=name, **look)[0]
-        for column, (name, look) in zip(columns.T, looks.items(), strict=True)
-    ]

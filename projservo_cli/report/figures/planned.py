@@ -131,28 +131,14 @@ def _draw(data: Data, figure: "Figure") -> None:
             va="bottom",
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8},
         )
-    for i, (label, look) in enumerate(_looks()):
-        shares.plot(sigma, data["mu"][:, i], label=label, **look)
+    for column, look in zip(data["mu"].T, style.SHARES.values(), strict=True):
+        shares.plot(sigma, column, **look)
     shares.set_ylabel(r"share $\mu$ (1)")
     shares.tick_params(labelbottom=False)
-    for view, name in enumerate(VIEWS):
-        margins.plot(sigma, data["margin"][:, view], label=f"{name} camera", **style.curve(3 - view))
+    cameras = {f"{name} camera": style.curve(3 - view) for view, name in enumerate(VIEWS)}
+    for column, look in zip(data["margin"].T, cameras.values(), strict=True):
+        margins.plot(sigma, column, **look)
     margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
-    margins.set_xlabel(r"path parameter $\sigma$ (1)")
-    margins.set_ylabel("margin $a\\cdot O$\n(start = 1)")
-    handles = shares.get_legend_handles_labels()[0] + margins.get_legend_handles_labels()[0]
-    handles.append(
-        style.line_handle("first marker of the face", color=style.BLACK, marker="o", linestyle="none")
-    )
-    style.legend_below(figure, handles, 6)
-
-
-def _looks() -> list[tuple[str, style.Look]]:
-    names = (r"$\mu_t$", r"$\mu_r$", r"$\mu_p$")
-    widths = (3.0, 1.8, 1.0)  # equal shares lie on one another: the wider shows beneath
-    colors = (style.SKY, style.BLACK, style.VERMILION)
-    styles = ("-", (0, (4, 2)), (0, (1, 1)))
-    return [
-        (name, {"linewidth": width, "color": color, "linestyle": line})
-        for name, width, color, line in zip(names, widths, colors, styles, strict=True)
-    ]
+    margins.set(xlabel=r"path parameter $\sigma$ (1)", ylabel="margin $a\\cdot O$\n(start = 1)")
+    first: style.Look = {"color": style.BLACK, "marker": "o", "linestyle": "none"}
+    style.legend_below(figure, {**style.SHARES, **cameras, "first marker of the face": first}, 6)

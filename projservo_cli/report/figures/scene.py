@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 
 # Length of the drawn viewing pyramids, as a share of the distance to the face.
 _PYRAMID = 0.16
+_CAMERAS: dict[str, style.Look] = {
+    "left camera": {"color": style.BLUE, "linewidth": 1.0},
+    "right camera": {"color": style.ORANGE, "linewidth": 1.0},
+}
 
 
 def _data(material: Material) -> Data:
@@ -24,7 +28,7 @@ def _data(material: Material) -> Data:
     plant, robot, plan = material.plant, material.robot, material.plan
     start = forward_kinematics(plant.model, plan.q_start)
     face = plant.M[plant.order]
-    result = {
+    result: Data = {
         "robot": skeleton(
             joint_operators(plant.model, plan.q_start), robot.joint_types, (start @ robot.base_tool)[:3, 3]
         ),
@@ -100,43 +104,40 @@ def _draw(data: Data, figure: "Figure") -> None:
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
-    axes.plot(*data["robot"].T, "o-", color=style.BLACK, linewidth=2.0, markersize=4)
-    for i, color in enumerate((style.BLUE, style.ORANGE)):
-        apex, corners = data["pyramids"][i, 0], style.closed(data["pyramids"][i, 1:])
-        axes.plot(*corners.T, color=color, linewidth=1.0)
+    robot: style.Look = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
+    axes.plot(*data["robot"].T, **robot)
+    for pyramid, look in zip(data["pyramids"], _CAMERAS.values(), strict=True):
+        corners = style.closed(pyramid[1:])
+        axes.plot(*corners.T, **look)
         for corner in corners[:-1]:
-            axes.plot(*np.stack([apex, corner]).T, color=color, linewidth=1.0)
-    axes.plot(*style.closed(data["face_start"]).T, color=style.BLACK, linewidth=1.4)
-    handles = [
-        style.line_handle("robot at the start", color=style.BLACK, linewidth=2.0, marker="o", markersize=4),
-        style.line_handle("face at the start", color=style.BLACK, linewidth=1.4),
-        style.line_handle("left camera", color=style.BLUE, linewidth=1.0),
-        style.line_handle("right camera", color=style.ORANGE, linewidth=1.0),
-    ]
+            axes.plot(*np.stack([pyramid[0], corner]).T, **look)
+    axes.plot(*style.closed(data["face_start"]).T, **style.START)
+    looks = {"robot at the start": robot, "face at the start": style.START}
     shown = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
     if "face_goal" in data:
-        goal = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
+        goal: style.Look = {"color": style.VERMILION, "linestyle": (0, (3, 1))}
         axes.plot(*style.closed(data["face_goal"]).T, **goal)
-        line = {"color": style.GREY, "linestyle": (0, (1, 1))}
+        line: style.Look = {"color": style.GREY, "linestyle": (0, (1, 1))}
         axes.plot(*data["line"].T, **line)
-        handles.insert(2, style.line_handle("face at the goal", **goal))
-        handles.insert(3, style.line_handle("straight line of the centre", **line))
+        looks |= {"face at the goal": goal, "straight line of the centre": line}
         shown.append(data["face_goal"])
     extent = _frame(axes, np.concatenate(shown), data["cameras"].mean(axis=0))
     figure.set_layout_engine()
-    figure.legend(handles=handles, loc="lower center", ncols=3)
+    style.legend_below(figure, looks | _CAMERAS, 3)
     _fit(axes, figure, extent)
 
 
 def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
     """Equal scales on all axes, seen from the side of the rig; returns the extent (3, 2) shown, m."""
+    from matplotlib.ticker import MultipleLocator
+
     low, high = points.min(axis=0), points.max(axis=0)
     pad = 0.05 * (high - low).max()
     extent = np.stack([low - pad, high + pad], axis=1)
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
         getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
-        getattr(axes, f"{name}axis").set_major_locator(_locator(0.25 if b - a < 0.75 else 0.5))
+        getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(0.25 if b - a < 0.75 else 0.5))
     axes.tick_params(pad=0)
     towards = rig - points.mean(axis=0)
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
@@ -164,9 +165,3 @@ def _fit(axes: Any, figure: "Figure", extent: FloatArray) -> None:
         middle += off / figure.bbox.size
     axes.set_box_aspect(size, zoom=zoom)
     axes.set_position((*(middle - 0.5 * side), *side))
-
-
-def _locator(step: float) -> Any:
-    from matplotlib.ticker import MultipleLocator
-
-    return MultipleLocator(step)

@@ -20,19 +20,15 @@ def draw_success(data: Data, figure: "Figure") -> None:
     """
     axes = figure.add_subplot()
     laws = _laws(data, ".rate")
-    handles = []
+    looks = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
     span = max(float(np.ptp(data[f"{law}.x"])) for law in laws) or 1.0
     for i, law in enumerate(laws):
         x, rate = data[f"{law}.x"], data[f"{law}.rate"]
         beside = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
-        look = style.curve(i, marker=True)
         reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
-        axes.errorbar(x + beside, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **look)
-        handles.append(style.line_handle(law, **look))
-    axes.set_ylim(-3, 103)
-    axes.set_xlabel(str(data["label"]))
-    axes.set_ylabel("converged (%), bars: 95 %")
-    style.legend_below(figure, handles, min(3, len(handles)))
+        axes.errorbar(x + beside, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **looks[law])
+    axes.set(xlabel=str(data["label"]), ylabel="converged (%), bars: 95 %", ylim=(-3, 103))
+    style.legend_below(figure, looks, min(3, len(laws)))
 
 
 def draw_basin(data: Data, figure: "Figure") -> None:
@@ -40,6 +36,7 @@ def draw_basin(data: Data, figure: "Figure") -> None:
 
     ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
     """
+    figure.set_layout_engine("constrained")  # leaves the scale of colours its room
     laws = _laws(data, ".share")
     columns = min(3, len(laws))
     panels = figure.subplots(
@@ -50,8 +47,7 @@ def draw_basin(data: Data, figure: "Figure") -> None:
     for axes, law in zip(panels, laws, strict=False):
         mesh = axes.pcolormesh(x, y, 100.0 * data[f"{law}.share"], vmin=0, vmax=100)
         axes.grid(visible=False)
-        axes.set_facecolor(style.PALE)  # where no run can begin
-        axes.set_title(law)
+        axes.set(title=law, facecolor=style.PALE)  # pale where no run can begin
         axes.set_xticks(data["x"][:: max(1, len(data["x"]) // 5)])
         axes.set_yticks(data["y"][:: max(1, len(data["y"]) // 5)])
     for axes in panels[len(laws) :]:
@@ -67,16 +63,12 @@ def draw_final_errors(data: Data, figure: "Figure") -> None:
     ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
     """
     axes = figure.add_subplot()
-    handles = []
-    for i, law in enumerate(_laws(data, ".error")):
-        look = style.curve(i)
+    looks = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
+    for law, look in looks.items():
         axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **look)
-        handles.append(style.line_handle(law, **look))
-    axes.set_xscale("log")
-    axes.set_ylim(-3, 103)
-    axes.set_xlabel("distance of the centre from the goal at the end (mm)")
-    axes.set_ylabel("runs within it (%)")
-    style.legend_below(figure, handles, min(3, len(handles)))
+    axes.set(xlabel="distance of the centre from the goal at the end (mm)", ylabel="runs within it (%)")
+    axes.set(xscale="log", ylim=(-3, 103))
+    style.legend_below(figure, looks, min(3, len(looks)))
 
 
 def _laws(data: Data, ending: str) -> list[str]:

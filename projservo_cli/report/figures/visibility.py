@@ -59,6 +59,9 @@ _SENSES: tuple[style.Look, ...] = (
     {"color": style.BLUE, "linestyle": "-"},
     {"color": style.VERMILION, "linestyle": (0, (5, 1.5))},
 )
+_HIDDEN: style.Look = {"color": style.GREY, "linewidth": 4, "alpha": 0.5}
+_ZERO: style.Look = {"color": style.BLACK, "marker": "D", "linestyle": "none", "fillstyle": "none"}
+_MARGIN = "margin $a\\cdot O$\n(start = 1)"
 
 
 @registered(
@@ -79,19 +82,12 @@ def _draw(data: Data, figure: "Figure") -> None:
         _angle(axes[1, view], data, view)
         _translation(axes[2, view], data, view)
     senses = data["theta_deg"][:, -1]
-    handles = [
-        style.line_handle("face at the start", **style.START),
-        *(
-            style.line_handle(rf"sense $\theta_r$ = {style.signed(angle)}°", **look)
-            for angle, look in zip(senses, _SENSES, strict=True)
-        ),
-        style.line_handle("hidden from this camera", color=style.GREY, linewidth=4, alpha=0.5),
-        style.line_handle(
-            r"$\theta_0^\pm$, $\tau_0$", color=style.BLACK, marker="D", linestyle="none", fillstyle="none"
-        ),
-        style.line_handle("end of the motion", color=style.BLACK, marker="s", linestyle="none"),
-    ]
-    style.legend_below(figure, handles, 3)
+    looks = {"face at the start": style.START}
+    for angle, look in zip(senses, _SENSES, strict=True):
+        looks[rf"sense $\theta_r$ = {style.signed(angle)}°"] = look
+    looks |= {"hidden from this camera": _HIDDEN, r"$\theta_0^\pm$, $\tau_0$": _ZERO}
+    looks["end of the motion"] = {"color": style.BLACK, "marker": "s", "linestyle": "none"}
+    style.legend_below(figure, looks, 3)
 
 
 def _images(axes: "Axes", data: Data, view: int) -> None:
@@ -101,7 +97,7 @@ def _images(axes: "Axes", data: Data, view: int) -> None:
         for k in range(images.shape[2]):
             path = images[i, :, k]
             hidden = np.where(seen[:, None], np.nan, path)
-            axes.plot(*hidden.T, color=style.GREY, linewidth=4, alpha=0.5, solid_capstyle="butt")
+            axes.plot(*hidden.T, solid_capstyle="butt", **_HIDDEN)
             axes.plot(*path.T, linewidth=0.9, **look)
         style.face(axes, images[i, -1], look)
     style.face(axes, images[0, 0], style.START, fill=True)
@@ -111,31 +107,28 @@ def _images(axes: "Axes", data: Data, view: int) -> None:
 def _angle(axes: "Axes", data: Data, view: int) -> None:
     for i, look in enumerate(_SENSES):
         theta, margin = data["theta_deg"][i], data["theta_margin"][i, :, view]
-        axes.plot(theta, np.where(margin > 0, np.nan, margin), color=style.GREY, linewidth=4, alpha=0.5)
+        axes.plot(theta, np.where(margin > 0, np.nan, margin), **_HIDDEN)
         axes.plot(theta, margin, **look)
         axes.plot(theta[-1:], margin[-1:], "s", color=look["color"])
     low, high = data["theta_deg"].min(), data["theta_deg"].max()
     zeros = (data["theta_0_deg"][view][:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
     zeros = zeros[(zeros >= low) & (zeros <= high)]
-    axes.plot(zeros, np.zeros_like(zeros), "D", color=style.BLACK, fillstyle="none")
+    axes.plot(zeros, np.zeros_like(zeros), **_ZERO)
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
     changes = " and ".join(f"{style.signed(angle)}°" for angle in data["theta_0_deg"][view])
     known = np.isfinite(data["theta_0_deg"][view]).all()
     axes.set_title(rf"$\theta_0^\pm$ = {changes}" if known else r"visibility never changes")
-    axes.set_xlabel(r"$\theta_r$ (deg)")
-    axes.set_ylabel("margin $a\\cdot O$\n(start = 1)")
+    axes.set(xlabel=r"$\theta_r$ (deg)", ylabel=_MARGIN)
 
 
 def _translation(axes: "Axes", data: Data, view: int) -> None:
     share, margin = data["tau_share"], data["tau_margin"][:, view]
-    axes.plot(share, np.where(margin > 0, np.nan, margin), color=style.GREY, linewidth=4, alpha=0.5)
+    axes.plot(share, np.where(margin > 0, np.nan, margin), **_HIDDEN)
     axes.plot(share, margin, color=style.BLACK)
     axes.plot([1.0], np.interp([1.0], share, margin), "s", color=style.BLACK)
-    axes.plot(data["tau_0_share"][view : view + 1], [0.0], "D", color=style.BLACK, fillstyle="none")
+    axes.plot(data["tau_0_share"][view : view + 1], [0.0], **_ZERO)
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
     tau_0 = data["tau_0_share"][view]
     known = np.isfinite(tau_0)
     axes.set_title(rf"$\tau_0$ = {style.signed(tau_0, 2)} $\tau$" if known else r"visibility never changes")
-    axes.set_xlim(share[0], share[-1])
-    axes.set_xlabel(r"translation as share of $\tau$ (1)")
-    axes.set_ylabel("margin $a\\cdot O$\n(start = 1)")
+    axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)", ylabel=_MARGIN)
