@@ -158,13 +158,17 @@ def _figure(motion: Motion) -> Any:
             trace.visible = number == 0  # a list of all runs chooses another
             traces.append(trace)
         shown = [True] * len(still) + [k // 4 == number for k in range(4 * len(motion.runs))]
-        changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": _play(own)}
+        buttons = [
+            {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
+            {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
+        ]
+        changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": buttons}
         reach[name] = _extent(motion, run)
         changed |= {f"scene.{axis}axis.range": limits for axis, limits in reach[name].items()}
         menu.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
     first = menu[0]["args"][1]
     left = {"x": 0.0, "xanchor": "left"}
-    playing: dict[str, Any] = {"type": "buttons", "direction": "left", "showactive": False}
+    playing = {"type": "buttons", "direction": "left", "showactive": False}
     playing["buttons"] = first["updatemenus[1].buttons"]
     layout = {
         "height": _HEIGHT,
@@ -185,7 +189,7 @@ def _figure(motion: Motion) -> Any:
 
 def _scene(motion: Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
     """Axes of equal scales, seen from beside the way from the face to the cameras."""
-    axis: dict[str, Any] = {"backgroundcolor": "#ffffff", "gridcolor": style.PALE, "showbackground": False}
+    axis = {"gridcolor": style.PALE, "showbackground": False}
     towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
     azimuth = float(np.arctan2(towards[1], towards[0])) - np.radians(58.0)
     eye = {"x": _EYE * np.cos(azimuth), "y": _EYE * np.sin(azimuth), "z": 0.5 * _EYE}
@@ -223,13 +227,6 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
         "ticklen": 0,
         "minorticklen": 0,
     }
-
-
-def _play(own: list[str]) -> list[dict[str, Any]]:
-    return [
-        {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
-        {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
-    ]
 
 
 def _still(go: Any, motion: Motion) -> Iterator[Any]:

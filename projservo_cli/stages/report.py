@@ -34,7 +34,7 @@ from projservo_cli.stages.studies import (
     metric_plan,
     run_studies,
 )
-from projservo_cli.stages.world import Truth, has_task, truth_of
+from projservo_cli.stages.world import has_task, truth_of
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from projservo_cli.task.face import cyclic_order
@@ -199,24 +199,19 @@ def require(config: "Config", wanted: Sequence[str]) -> None:
         raise InputError(f"--{wanted[0]}: {text}")
     if "view" in wanted:
         plotly()
-        _metric(config)
-
-
-def _metric(config: "Config") -> Truth:
-    """Robot, rig and markers in metres; an InputError says what there is instead."""
-    try:
-        return truth_of(config)
-    except InputError as error:
-        raise InputError(
-            "--view: images alone give a robot only up to a projective frame, which has no metres to draw; "
-            f"{error}, or use --animation, which shows what the cameras saw"
-        ) from error
+        try:
+            truth_of(config)
+        except InputError as error:
+            raise InputError(
+                "--view: images alone give a robot only up to a projective frame, which has no metres to "
+                f"draw; {error}, or use --animation, which shows what the cameras saw"
+            ) from error
 
 
 def view(run: "Run", progress: Progress = silent) -> Path:
     """Write the 3D view of a run into its folder; a WorkFailed says that no run has a step to show."""
     config = load_config(run.path, text=run.configuration)
-    truth, traces = _metric(config), _moved(run)
+    truth, traces = truth_of(config), _moved(run)
     plant = plant_of(config, truth, run.plan.q_start)
     joints = "simulated joints" if config.plant.use is None else "joints that the robot itself reported"
     known = f"Robot, rig and face as the configuration describes them, moved by the {joints}."

@@ -47,21 +47,15 @@ def drawn_texts(figure, monkeypatch):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_text_is_clipped_by_the_figure(figures, name, monkeypatch):
+def test_no_text_is_clipped_by_the_figure_or_lies_on_another(figures, name, monkeypatch):
     figure = figures[name]
     found = drawn_texts(figure, monkeypatch)
     assert len(found) > 5
-    for text, extent in found:
+    for i, (text, extent) in enumerate(found):
         low, high = extent.get_points()
         # half a pixel of anti-aliasing may stand over
         assert (low >= -0.5).all(), f"{text!r} at {extent}"
         assert (high <= figure.bbox.get_points()[1] + 0.5).all(), f"{text!r} at {extent}"
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_text_lies_on_another(figures, name, monkeypatch):
-    found = drawn_texts(figures[name], monkeypatch)
-    for i, (text, extent) in enumerate(found):
         for other, place in found[:i]:
             shared = extent.intersection(extent, place)
             # boxes hold the leading of a line: a pixel or two in common is no touching ink
@@ -69,13 +63,12 @@ def test_no_text_lies_on_another(figures, name, monkeypatch):
             assert not clash, f"{text!r} on {other!r}"
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_legend_covers_no_axes(figures, name):
-    figure = figures[name]
-    legend = figure.legends[0].get_window_extent()
-    for axes in figure.axes:
-        if name != "fig03_scene":  # its axes fill the figure; what is drawn in them is tested below
-            assert not axes.get_window_extent().overlaps(legend)
+def test_legend_covers_no_axes(figures):
+    for name, figure in figures.items():
+        legend = figure.legends[0].get_window_extent()
+        for axes in figure.axes:
+            # the axes of the scene fill the figure; what is drawn in them is tested below
+            assert name == "fig03_scene" or not axes.get_window_extent().overlaps(legend), name
 
 
 def test_scene_stands_above_its_legend(figures):
@@ -90,12 +83,9 @@ def test_scene_stands_above_its_legend(figures):
     assert (shown <= figure.bbox.get_points()[1]).all()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_axes_have_units(figures, name):
-    for axes in figures[name].axes:
-        labels = [axes.get_xlabel(), axes.get_ylabel()]
-        if hasattr(axes, "get_zlabel"):
-            labels.append(axes.get_zlabel())
+def test_axes_have_units(figures):
+    for axes in (axes for figure in figures.values() for axes in figure.axes):
+        labels = [axes.get_xlabel(), axes.get_ylabel(), getattr(axes, "get_zlabel", str)()]
         for label in labels:
             assert not label or ("(" in label and ")" in label), label
 
@@ -132,12 +122,6 @@ def test_outlines_that_clip_have_the_same_names_wherever_they_are_in_memory(figu
 def test_names_follow_the_numbers_of_the_paper():
     # 0 the overview, 13 the calibration, 14 the path, 15 the modes
     assert [int(name[3:5]) for name in NAMES] == list(range(16))
-
-
-def test_curves_differ_without_their_colour():
-    looks = [(str(style.curve(i)["linestyle"]), style.curve(i, marker=True)["marker"]) for i in range(6)]
-    assert len({line for line, _ in looks}) == 6
-    assert len({marker for _, marker in looks}) == 6
 
 
 def test_importing_figures_does_not_import_matplotlib():

@@ -21,9 +21,6 @@ def test_decay_factors_of_a_geometric_sequence_end_above_the_least_value():
 def test_fitted_rate_is_the_gain_of_a_loop_that_takes_its_share_each_period():
     # exact but for the rounding of logarithms
     assert measures.fitted_rate(geometric(3.0, 1 - 2.5 * 0.04, 60), 5, 1e-4, 0.04) == pytest.approx(2.5, 1e-9)
-
-
-def test_fitted_rate_of_too_few_values_is_undefined():
     assert np.isnan(measures.fitted_rate(geometric(3.0, 0.5, 3), 2, 1e-4, 0.04))
 
 
@@ -42,9 +39,6 @@ def test_gap_of_parallel_paths_is_their_distance_whatever_their_sampling():
     second = np.stack([v, np.full(101, 3.0)], axis=1)[:, None]
     np.testing.assert_allclose(measures.path_gap(first, second), [3.0], rtol=1e-14)
     np.testing.assert_allclose(measures.path_gap(second, first), [3.0], rtol=1e-14)
-
-
-def test_gap_sees_what_only_one_path_does():
     straight = np.array([[0.0, 0.0], [10.0, 0.0]])
     detour = np.array([[0.0, 0.0], [5.0, 4.0], [10.0, 0.0]])
     assert measures.path_gap(straight, detour) == pytest.approx(4.0, 1e-14)

@@ -17,9 +17,9 @@ VOID = {"meta", "br", "img", "link", "hr", "input"}
 MADE = {"argv": ["projservo", "servo"], "host": "here", "projservo": "0.1.0", "date": "2026-01-02"}
 
 
-def stored(folder, *overrides):
+def stored(folder, *overrides, material=None):
     """A run file as the stages before the report leave it."""
-    material = case()[2]
+    material = material or case()[2]
     config = configured("paper", f"stop.max_steps={SHORT}", *overrides)
     fit = {"calibration": material.calibration, "observation": material.observation}
     results = {

@@ -4,15 +4,15 @@ import json
 import numpy as np
 import pytest
 
-from projservo_cli.config import to_yaml
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.claims import claims_of, composition_claim
 from projservo_cli.report.figures.drift import drift_tables
 from projservo_cli.report.material import DIRECT
 from projservo_cli.stages import report, steps, studies
 from projservo_cli.store import Result, Run, load, save
-from tests.figures.cases import GAINS, PERIODS_S, SHORT, SPECS, case
+from tests.figures.cases import GAINS, PERIODS_S, SPECS, case
 from tests.known import configured
+from tests.page.conftest import stored
 
 
 def changed(material, **traces):
@@ -41,18 +41,6 @@ def few(monkeypatch):
     )
 
 
-def stored(tmp_path, material, *overrides):
-    """A run file as the stages before leave it."""
-    config = configured("paper", f"stop.max_steps={SHORT}", *overrides)
-    fit = {"calibration": material.calibration, "observation": material.observation}
-    results = {
-        "calibrate": Result("k", "", {}, {}, fit),
-        "plan": Result("k", "", {}, {}, {"": material.plan}),
-        **{f"servo/{law}": Result("k", "", {}, {}, {"": t}) for law, t in material.traces.items()},
-    }
-    return Run(tmp_path / "run.h5", to_yaml(config), results)
-
-
 @pytest.mark.usefixtures("few")
 def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatch):
     specs = tuple(SPECS[name] for name in ("fig01_partition", "fig04_classical", "fig08_drift"))
@@ -63,7 +51,7 @@ def test_a_report_writes_what_it_says_and_fits_the_run_file(tmp_path, monkeypatc
     stale.write_text("of an earlier report")
     (tmp_path / "figures" / "fig01_partition.pdf").write_text("of an earlier report")
     steps = []
-    run = stored(tmp_path, material, "report.formats=[png]")
+    run = stored(tmp_path, "report.formats=[png]", material=material)
     record = report.run(run, tmp_path, progress=lambda *step: steps.append(step))
     assert not stale.exists()
     assert not (tmp_path / "figures" / "fig01_partition.pdf").exists()
@@ -145,14 +133,14 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
 
 def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
     """Studies, and the comparison of both sides of equation (22)."""
-    config, bench, material = case()
+    config, bench, _ = case()
 
     def fail(*_, **__):
         raise WorkFailed("the task\ncannot be partitioned")
 
     monkeypatch.setattr(report, "run_studies", fail)
     left_out = []
-    run = stored(tmp_path, material)
+    run = stored(tmp_path)
     made = report.material_of(run, bench, left_out, lambda *_: None)
     assert made.studies is None
     assert left_out == [{"what": "studies", "reason": "the task cannot be partitioned"}]
@@ -175,7 +163,7 @@ def test_which_laws_must_converge_outdates_the_page_that_says_so_and_no_run(tmp_
 
 
 def test_a_report_needs_a_plan(tmp_path):
-    run = stored(tmp_path, case()[2])
+    run = stored(tmp_path)
     run = dataclasses.replace(run, results={"calibrate": run.results["calibrate"]})
     with pytest.raises(InputError, match="holds no plan"):
         report.run(run, tmp_path)
@@ -227,18 +215,6 @@ def test_periods_at_which_no_loop_survives_are_left_out():
     assert extra.periods == (0.04,)
 
 
-def test_claims_are_rows_with_a_number_and_a_verdict():
-    _, _, material = case()
-    claims = claims_of(material, (np.array([1.0, 0.1]), np.array([0.5, 0.005])))
-    assert len({claim.claim for claim in claims}) == len(claims) >= 24
-    for claim in claims:
-        assert claim.measured
-        assert claim.criterion
-        assert claim.source.startswith(("section", "eq."))
-        assert claim.holds in (True, False, None)
-        assert "nan" not in claim.measured
-
-
 def test_a_claim_follows_its_number():
     material = case()[2]
     trace = material.traces["direct_three"]
@@ -262,7 +238,12 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         "Euclidean points: runs through self-occlusion, then converges",
     )
     claims = claims_of(material, report.composition(bench, config, []))
-    assert all(claim.holds is not None for claim in claims)
+    assert len({claim.claim for claim in claims}) == len(claims) >= 24
+    for claim in claims:
+        assert claim.holds is not None
+        assert claim.criterion
+        assert claim.source.startswith(("section", "eq."))
+        assert "nan" not in claim.measured
     assert {
         "No self-occlusion under direct control",
         "The block-wise law does not converge",

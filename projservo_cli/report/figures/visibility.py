@@ -6,7 +6,6 @@ import numpy as np
 
 from projservo_cli.geometry.displacement import exp_rotation
 from projservo_cli.geometry.kinematics import project
-from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Material, registered
 from projservo_cli.task.face import cyclic_order
@@ -28,11 +27,12 @@ def _data(material: Material) -> Data:
     O = plan.optical_center
     start = O @ plan.a
     arcs = np.stack([np.linspace(0.0, sense, _ARC_POINTS) for sense in plan.sense])
-    images = np.empty((2, _ARC_POINTS, 2, len(plan.A), 2))
+    images, theta_margin = np.empty((2, _ARC_POINTS, 2, len(plan.A), 2)), np.empty((2, _ARC_POINTS, 2))
     for i, arc in enumerate(arcs):
         for j, theta in enumerate(arc):
             H = exp_rotation(plan.H_hat[1], theta)
             images[i, j] = project(material.calibrated.P, plan.A[order] @ H.T, material.calibrated.lens)
+            theta_margin[i, j] = O @ (exp_rotation(plan.H_hat[1], -theta).T @ plan.a) / start
     tau_0 = plan.tau_0 / plan.tau if plan.tau > 0 else np.full(2, np.nan)
     used = tau_0[np.isfinite(tau_0)]
     reach = np.concatenate([[-0.2, 1.2], 1.1 * used[np.abs(used) < 5]])
@@ -43,16 +43,10 @@ def _data(material: Material) -> Data:
         "tau_margin": 1.0 - share[:, None] * rate,
         "tau_0_share": tau_0,
         "theta_deg": np.degrees(arcs),
-        "theta_margin": _margins(plan.a, plan.H_hat[1], O, arcs) / start,
+        "theta_margin": theta_margin,
         "theta_0_deg": np.degrees(plan.theta_0),
         "images": images,
     }
-
-
-def _margins(a: FloatArray, H_hat: FloatArray, O: FloatArray, theta: FloatArray) -> FloatArray:
-    """Margin (…, 2) of the plane carried by H(θ)⁻ᵀ, for both optical centres."""
-    values = [exp_rotation(H_hat, -angle).T @ a @ O.T for angle in theta.ravel()]
-    return np.array(values).reshape(*theta.shape, 2)
 
 
 _SENSES: tuple[style.Look, ...] = (
