@@ -9,7 +9,7 @@ from projservo_cli.cli.words import summary
 from projservo_cli.records import WorkFailed
 from projservo_cli.report.values import scalars
 from projservo_cli.stages import calibrate, plan, servo
-from tests.control.tracking import runs
+from tests.control.tracking import run_of
 from tests.known import configured
 
 pytestmark = pytest.mark.volume
@@ -19,7 +19,7 @@ SEEDS = (1, 5)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_centre_keeps_to_its_line_and_arrives_in_time(seed):
     """At 0.5 px in the trials and in the loop."""
-    run = runs(seed, ["exact_track"])["exact_track"]
+    run = run_of(seed)
     assert run.verdict == "converged"
     assert run.on_the_line
     assert run.in_time
@@ -29,7 +29,7 @@ def test_the_centre_keeps_to_its_line_and_arrives_in_time(seed):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_shown_often_enough_the_true_goal_is_reached(seed):
     """One image of the goal tells its place to 0.96 mm rms at best; sixteen to a quarter of that."""
-    run = runs(seed, ["exact_track"], ["noise.shown_frames=16"])["exact_track"]
+    run = run_of(seed, "noise.shown_frames=16")
     assert run.on_the_line
     assert run.in_time
     assert run.at_true_goal

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError
-from projservo_cli.stages.plan import Profile, Shown, demands_of, plan_task
+from projservo_cli.stages.plan import Profile, demands_of, plan_task
+from projservo_cli.stages.scenario import Shown
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.tasks import STRATA, random_tasks
