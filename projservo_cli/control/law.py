@@ -287,7 +287,7 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
     return OK, parts
 
 
-@internal
+@merged
 def follow(state: State) -> bool:
     """Joint velocity ``q_dot`` of the velocity ``xi_dot``; False where the joints cannot make it."""
     if state.work.span.H_hat.shape[0] == 0:

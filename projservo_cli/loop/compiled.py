@@ -6,7 +6,7 @@ from typing import NamedTuple
 from projservo_cli.control import command
 from projservo_cli.control.law import LOST, SINGULAR, Gains, State
 from projservo_cli.geometry.algebra import mat, put_mat
-from projservo_cli.geometry.jit import internal, njit
+from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import beyond_limits, start_pose
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
@@ -151,7 +151,7 @@ def run(
     return PLATEAU if on_plateau(log.judged, last, limits.plateau_steps) else MAX_STEPS, last
 
 
-@internal
+@merged
 def _begin_row(log: Log, k: int) -> None:
     """Make the row of an instant say that nothing was measured nor commanded."""
     for i in range(log.errors.shape[1]):

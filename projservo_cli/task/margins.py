@@ -122,8 +122,9 @@ def view_at(reaching: Reaching, mu: FloatArray) -> Seen:
     M = reaching.A @ np.swapaxes(H_d, 1, 2)
     images = np.moveaxis(project(model.P, M, model.lens), 0, 1)
     depth, at_start = M @ model.P[:, 2].T, reaching.A @ model.P[:, 2].T
-    shown = np.isfinite(images).all(axis=3) & np.swapaxes(depth * at_start > 1e-9 * at_start**2, 1, 2)
-    border = np.minimum(images + 0.5, reaching.demands.image_size - 0.5 - images).min(axis=3)
+    u_v = np.minimum(images + 0.5, reaching.demands.image_size - 0.5 - images)
+    border = np.minimum(u_v[..., 0], u_v[..., 1])
+    shown = np.isfinite(border) & np.swapaxes(depth * at_start > 1e-9 * at_start**2, 1, 2)
     return Seen(H_d, images, visibility, np.where(shown, border, BEHIND).min(axis=2))
 
 

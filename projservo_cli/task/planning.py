@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from projservo_cli.geometry.algebra import apply, mat, sub, vec
+from projservo_cli.geometry.algebra import mat, vec
 from projservo_cli.geometry.displacement import wrap
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 from projservo_cli.task.margins import (
@@ -114,16 +114,13 @@ def turning_sense(reaching: Reaching) -> float:
         return theta
     senses = (theta, theta - math.copysign(2.0 * math.pi, theta))
     inside = [0, 0]
-    H_t, H_r, a = mat(reaching.H_hat[0]), mat(reaching.H_hat[1]), vec(reaching.a)
-    for row in reaching.O:
-        O = vec(row)
-        drift = apply(H_t, O)
-        moved = sub(O, (tau * drift[0], tau * drift[1], tau * drift[2], tau * drift[3]))
-        sign = math.copysign(1.0, float(reaching.a @ row))
-        middle = [
-            math.atan2(sign * c_s, sign * c_c)
-            for _, c_s, c_c in (margin_coefficients(a, H_r, O), margin_coefficients(a, H_r, moved))
-        ]
+    H_r, a = mat(reaching.H_hat[1]), vec(reaching.a)
+    for O in reaching.O:
+        sign = math.copysign(1.0, float(reaching.a @ O))
+        middle = []
+        for center in (O, O - tau * (reaching.H_hat[0] @ O)):
+            _, c_s, c_c = margin_coefficients(a, H_r, vec(center))
+            middle.append(math.atan2(sign * c_s, sign * c_c))
         end = middle[0] + wrap(middle[1] - middle[0])
         for i, sense in enumerate(senses):
             inside[i] += abs(sense - end) < 0.5 * math.pi

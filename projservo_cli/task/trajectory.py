@@ -50,17 +50,12 @@ def turned(H_r: Mat4, H_p: Mat4, theta_r: float, theta_p: float) -> Mat4:
     return mul(rotation(H_r, mul(H_r, H_r), theta_r), rotation(H_p, mul(H_p, H_p), theta_p))
 
 
-@merged
-def _rotated(H_hat: FloatArray, amplitudes: FloatArray, mu_r: float, mu_p: float) -> Mat4:
-    """Rotations of the planned displacement at shares μ_r, μ_p of the angles, [RH00] eqs. (17), (18)."""
-    return turned(mat(H_hat[1]), mat(H_hat[2]), mu_r * float(amplitudes[1]), mu_p * float(amplitudes[2]))
-
-
 @njit
 def displaced(H_hat: FloatArray, amplitudes: FloatArray, mu_t: float, mu_r: float, mu_p: float) -> Mat4:
     """Planned displacement at shares of the parts, [RH00] eqs. (17), (18)."""
     shift = translation(mat(H_hat[0]), mu_t * float(amplitudes[0]))
-    return mul(shift, _rotated(H_hat, amplitudes, mu_r, mu_p))
+    theta_r, theta_p = mu_r * float(amplitudes[1]), mu_p * float(amplitudes[2])
+    return mul(shift, turned(mat(H_hat[1]), mat(H_hat[2]), theta_r, theta_p))
 
 
 def trajectory_displacement(

@@ -45,26 +45,18 @@ def arc_minimum(c_0: float, c_s: float, c_c: float, theta: float) -> float:
 
 
 @merged
-def _translation_limit(a: Vec4, H_t: Mat4, O: Vec4) -> tuple[bool, float]:
-    """Amplitude τ_0 at which a translated face changes visibility, [RH00] eq. (11) on the optical centre."""
-    rate = dot(a, apply(H_t, O))
-    if rate == 0.0:
-        return False, 0.0
-    return True, dot(a, O) / rate
-
-
-@merged
 def limited_translation(a: Vec4, H_t: Mat4, amount: float, delta: float, task: Task) -> float:
     """Amplitude of a pure translation kept within δ τ_0 of both cameras, [RH00] section 4.2.
 
-    ``amount`` ≥ 0 is the amplitude wanted; the most conservative camera decides.
+    ``amount`` ≥ 0 is the amplitude wanted; the most conservative camera decides. A translated face changes
+    visibility at τ_0, [RH00] eq. (11) on the optical centre.
     """
     for view in range(2):
         O = vec(task.O[view])
-        found, tau_0 = _translation_limit(a, H_t, O)
-        seen = task.visible[view] * dot(a, O) > 0.0
-        if found and seen and tau_0 > 0.0 and amount > delta * tau_0:
-            amount = delta * tau_0
+        rate = dot(a, apply(H_t, O))
+        tau_0 = dot(a, O) / rate if rate != 0.0 else 0.0
+        if task.visible[view] * dot(a, O) > 0.0 and tau_0 > 0.0:
+            amount = min(amount, delta * tau_0)
     return amount
 
 

@@ -1,41 +1,42 @@
 """Following the plan of the paper's task, a half turn: a calibrated robot, with and without noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config
+from projservo_cli.cli.words import summary
+from projservo_cli.records import WorkFailed
+from projservo_cli.report.values import scalars
 from projservo_cli.stages import calibrate, plan, servo
-from tests.conftest import ROOT
-from tests.control.tracking import runs
+from tests.control.tracking import run_of
+from tests.known import configured
 
-SEEDS = (1, 2, 5, 10)
+pytestmark = pytest.mark.volume
+SEEDS = (1, 5)
 
 
-@pytest.mark.volume
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_centre_keeps_to_its_line_and_arrives_in_time(seed):
-    """At 0.5 px in the trials and in the loop; ``tests.control.tracking`` runs a hundred seeds."""
-    run = runs(seed, ["exact_track"])["exact_track"]
+    """At 0.5 px in the trials and in the loop."""
+    run = run_of(seed)
     assert run.verdict == "converged"
     assert run.on_the_line
     assert run.in_time
     assert run.occluded == 0
 
 
-@pytest.mark.volume
 @pytest.mark.parametrize("seed", SEEDS)
 def test_shown_often_enough_the_true_goal_is_reached(seed):
     """One image of the goal tells its place to 0.96 mm rms at best; sixteen to a quarter of that."""
-    run = runs(seed, ["exact_track"], ["noise.shown_frames=16"])["exact_track"]
+    run = run_of(seed, "noise.shown_frames=16")
     assert run.on_the_line
     assert run.in_time
     assert run.at_true_goal
 
 
-@pytest.mark.volume
-@pytest.mark.parametrize("noise", [0.0, 0.5])
-def test_image_track_turns_without_hiding_where_the_plain_law_hides(noise):
-    config = load_config(ROOT / "configs" / "paper.yaml", [f"noise.servo_px={noise}"])
+def test_image_track_turns_without_hiding_where_the_plain_law_hides():
+    config = configured("paper", "noise.servo_px=0.5")
     _, calibration, _ = calibrate.run(config)
     planned = plan.run(config, calibration)
     plain, following = (
@@ -48,11 +49,10 @@ def test_image_track_turns_without_hiding_where_the_plain_law_hides(noise):
     assert following.first_outside_image == following.first_beyond_limit == -1
 
 
-@pytest.mark.volume
 @pytest.mark.parametrize("arm", ["ur5", "stanford", "coupled"])
 def test_other_arms_follow_their_plans(arm):
     settings = ["trajectory.profile=constrained", "control.prismatic_speed_limit_m_s=0.5"]
-    config = load_config(ROOT / "configs" / f"{arm}.yaml", settings)
+    config = configured(arm, *settings)
     _, calibration, _ = calibrate.run(config)
     planned = plan.run(config, calibration)
     assert planned.time[-1] == planned.duration
@@ -64,3 +64,32 @@ def test_other_arms_follow_their_plans(arm):
     assert trace.planned_s == planned.duration
     # An image error of a hundredth of a pixel is reached some time after the plan has.
     assert planned.duration <= trace.steps * trace.period <= planned.duration + 4.0
+
+
+@pytest.fixture(scope="module")
+def lost():
+    """The task of paper.yaml with a plan that no joints can follow to its end."""
+    config = configured("paper", "control.mode=track", "noise.servo_px=0.0")
+    _, calibration, _ = calibrate.run(config)
+    found = plan.run(config, calibration)
+    q = found.q.copy()
+    q[-5:] = np.nan
+    return config, calibration, replace(found, q=q, feasible=False, reason="too near to something")
+
+
+def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
+    config, calibration, planned = lost
+    trace, alone = (servo.run(config, calibration, planned, name) for name in ("exact_track", "exact"))
+    assert (trace.verdict, trace.mode, trace.planned_s) == ("converged", "track", None)
+    assert trace.unplanned == "no joints can follow the plan: too near to something"
+    assert alone.unplanned == ""
+    np.testing.assert_array_equal(trace.q, alone.q)
+    words = " ".join(" ".join(summary("servo", {"laws": [scalars(trace)]})).split())
+    assert "driven without a plan: no joints can follow the plan: too near to something" in words
+
+
+def test_a_law_may_be_refused_to_go_without_a_plan(lost):
+    _, calibration, planned = lost
+    refusing = configured("paper", "control.without_plan=refuse")
+    with pytest.raises(WorkFailed, match=r"cannot follow the planned motion.*control\.without_plan replan"):
+        servo.run(refusing, calibration, planned, "exact_track")

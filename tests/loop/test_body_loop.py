@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES, command
-from projservo_cli.control.law import LOST, new_state
 from tests.samples import frame
-from tests.scene import GAINS, Run, limits, scene, with_pins
+from tests.scene import Run, limits, scene, with_pins
 
 LAWS = ("direct_three", "direct_two", "exact")
 
@@ -88,13 +86,3 @@ def test_a_marker_beyond_the_image_is_unseen_if_it_is_a_pin():
     assert (v[:, :, 4:] > 499.5).any()
     assert (np.isnan(run.log.s[0, :, 4:, 1]) == (v[0, :, 4:] > 499.5)).all()
     assert np.isfinite(run.log.s[:, :, :4]).all()
-
-
-def test_laws_that_need_points_say_that_they_are_lost():
-    sc = with_pins(scene())
-    s = sc.images(sc.q_start)
-    s[1, 2] = np.nan
-    state = new_state(6, 4)
-    for law in ("stacked", "blockwise", "direct_three"):
-        status = command(CODES[law], sc.model, sc.task(), GAINS, s, sc.q_start, state)
-        assert status == LOST

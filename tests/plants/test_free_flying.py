@@ -76,12 +76,11 @@ def test_perturbed_twin_takes_the_steps_of_the_reference(law, steps):
 
 def test_blockwise_diverges():
     """Straight away from the face, which stays in sight: ten times the distance within some 20 steps."""
-    for perturbation in (0.0, 1e-3):
-        verdict, taken, log = drive("blockwise", perturbation)
-        M, _ = task_of_reference(perturbation)
-        assert verdict == "diverged"
-        assert (log.H[taken] @ M[4])[2] > 10.0
-        assert not log.hidden[: taken + 1].any()
+    verdict, taken, log = drive("blockwise", 1e-3)
+    M, _ = task_of_reference(1e-3)
+    assert verdict == "diverged"
+    assert (log.H[taken] @ M[4])[2] > 10.0
+    assert not log.hidden[: taken + 1].any()
 
 
 def test_stacked_goes_through_occlusion():

@@ -199,7 +199,7 @@ def test_the_fit_does_not_depend_on_the_frame(rng):
         assert after == pytest.approx(found[0][1], rel=1e-8)
 
 
-def draws(count, rng, prediction=0.0):
+def draws(count, rng, prediction):
     """Errors (count, 6) of one-shot fits, their Fisher information by finite differences, and the fits."""
     model, M, _ = seen_from(None)
     body = body_of(model, M)
@@ -216,7 +216,7 @@ def draws(count, rng, prediction=0.0):
     errors, after = np.empty((count, 6)), np.empty(count)
     back = np.linalg.inv(H)
     for i in range(count):
-        guess = poe(model, q + prediction * rng.normal(size=6)) if prediction else H
+        guess = poe(model, q + prediction * rng.normal(size=6))
         fit = fitted(model, body, clean + SIGMA * rng.normal(size=clean.shape), guess)
         X = back @ as_array(fit.H) - np.eye(4)  # the logarithm but for its square, 1e-6
         errors[i, :3] = body.D[:, :3] @ (X @ body.M.mean(axis=0))[:3]
@@ -234,20 +234,11 @@ def efficiency(errors, F):
     return np.array([whole, *(rms / limit)])
 
 
-def test_the_fit_is_efficient_and_its_residual_has_the_right_size(rng):
-    errors, F, after = draws(300, rng)
-    # The relative error of an rms of 300 draws of three coordinates is 0.04 at most if one dominates.
-    assert efficiency(errors, F) == pytest.approx(np.ones(3), abs=0.13)
-    dof = 40 - COORDINATES
-    assert np.mean(after) / SIGMA**2 == pytest.approx(dof, abs=4 * math.sqrt(2 * dof / 300))
-
-
 @pytest.mark.volume
-@pytest.mark.parametrize("prediction", [0.0, 0.01], ids=["true prediction", "off by 0.6°"])
-def test_ten_thousand_draws_reach_the_bound(prediction):
-    errors, F, _ = draws(10_000, np.random.default_rng(5), prediction)
-    found = efficiency(errors, F)
-    print(f"rms over the Cramér–Rao bound: six coordinates {found[0]:.4f}, position {found[1]:.4f}, "
-          f"rotation {found[2]:.4f}")  # fmt: skip
-    assert (found <= 1.05).all()
+def test_the_fit_reaches_the_bound_and_its_residual_has_the_right_size():
+    """Three thousand draws, predicted 0.6° off; the relative error of an rms is a fiftieth."""
+    errors, F, after = draws(3_000, np.random.default_rng(5), 0.01)
+    assert (efficiency(errors, F) <= 1.06).all()
     assert np.abs(errors.mean(axis=0) * np.sqrt(np.diag(F))).max() < 0.1  # hardly a bias
+    dof = 40 - COORDINATES
+    assert np.mean(after) / SIGMA**2 == pytest.approx(dof, rel=4 * math.sqrt(2 / dof / 3_000))
