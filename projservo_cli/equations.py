@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Entry:
+class _Entry:
     """One equation, or a statement of a section where the number starts with ``§``."""
 
     number: str
@@ -17,10 +17,10 @@ class Entry:
     erratum: str  # what is wrong in print, and what is right; empty where nothing is
 
 
-def _entry(number: str, title: str, functions: str, tests: str = "", erratum: str = "") -> Entry:
+def _entry(number: str, title: str, functions: str, tests: str = "", erratum: str = "") -> _Entry:
     """An entry from names separated by spaces, below the package and the folder of tests."""
     run = tuple(f"projservo_cli.{name}" for name in functions.split())
-    return Entry(number, title, run, tuple(f"tests/{name}" for name in tests.split()), erratum)
+    return _Entry(number, title, run, tuple(f"tests/{name}" for name in tests.split()), erratum)
 
 
 REGISTER = (

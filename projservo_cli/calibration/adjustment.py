@@ -276,7 +276,7 @@ Stalled = Callable[[FloatArray], bool]
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class _Fit:
     """A scene, and how well it explains the images."""
 
     scene: Scene  # the model
@@ -304,7 +304,7 @@ def minimize(
     most: int = 200,
     settled_at: float = SETTLED,
     stalled: Stalled = lambda residual: False,
-) -> Fit:
+) -> _Fit:
     """Weighted least squares from a scene over all parameters, or with the cameras held.
 
     Weights (2, N) come from residuals (2, N, 2) anew after each accepted step, and ``stalled``, told the
@@ -341,7 +341,7 @@ def minimize(
             damping *= 10.0
         if settled or damping > _MOST_DAMPING:
             break
-    return Fit(scene, residual, _cost(weight, residual))
+    return _Fit(scene, residual, _cost(weight, residual))
 
 
 def _cost(weight: FloatArray, residual: FloatArray) -> float:

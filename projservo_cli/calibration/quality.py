@@ -167,7 +167,7 @@ def _quantile(variances: FloatArray, probability: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Joints:
+class _Joints:
     """What the data say of each joint."""
 
     prismatic: BoolArray  # (n,) types
@@ -185,7 +185,7 @@ class Joints:
 
 def judged_joints(
     solution: Solution, result: ProjectiveScene, factor: FloatArray | None, sigma_px: float
-) -> Joints:
+) -> _Joints:
     """What the data say of each joint, by a factor of ``covariance_factor`` (None without) and a noise, px.
 
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
@@ -195,14 +195,14 @@ def judged_joints(
     if factor is None:
         # NaN, not zero: a method without covariance does not claim certainty.
         unknown = np.full(len(span), np.nan)
-        return Joints(readings.prismatic, span, unknown, unknown, None)
+        return _Joints(readings.prismatic, span, unknown, unknown, None)
     types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
     lens = NO_LENS if solution.scene.lens is None else solution.scene.lens
     model = Model(result.P, result.H_hat_0, types, problem.q_reference, result.a_inf, lens)
     sure = _Uncertainty(model, result.M, factor, readings)
     noise = _reach_noise(sure)
     error, bound = _predicted_error(sure)
-    joints = Joints(
+    joints = _Joints(
         readings.prismatic, span, noise, _needed_spans(sure, noise), (sigma_px * error, sigma_px * bound)
     )
     i = int(np.argmax(noise))
@@ -238,7 +238,7 @@ def verdict(
     method: str,
     solution: Solution,
     expected: Expected,
-    joints: Joints,
+    joints: _Joints,
     left_out: tuple[int, int, int],
     suspicion: str,
 ) -> tuple[bool, str, tuple[str, ...]]:

@@ -16,7 +16,7 @@ _SIGNS = np.array([[1.0, -1.0, 1.0], [-1.0, 1.0, -1.0], [1.0, -1.0, 1.0]])
 
 
 @merged
-def plane_of(P: FloatArray, l0: float, l1: float, l2: float) -> Vec4:
+def _plane_of(P: FloatArray, l0: float, l1: float, l2: float) -> Vec4:
     """Plane Pᵀ l that a camera sees as the line l."""
     return (
         float(P[0, 0]) * l0 + float(P[1, 0]) * l1 + float(P[2, 0]) * l2,
@@ -75,7 +75,9 @@ def triangulate(
     x -= step * k0
     y -= step * k1
     M = meet(
-        plane_of(P[0], 1.0, 0.0, -u), plane_of(P[0], 0.0, 1.0, -v), plane_of(P[1], -k1, k0, k1 * x - k0 * y)
+        _plane_of(P[0], 1.0, 0.0, -u),
+        _plane_of(P[0], 0.0, 1.0, -v),
+        _plane_of(P[1], -k1, k0, k1 * x - k0 * y),
     )
     w = dot(vec(a_inf), M)
     if w * w <= 1e-28 * dot(M, M) or not w * w > 0.0:

@@ -103,7 +103,7 @@ class LoopLaw(Protocol):
         """
 
 
-class LoopPlant(Protocol):
+class _LoopPlant(Protocol):
     """What the Python loop asks of a plant."""
 
     plant: Plant  # the truth, or what the calibration takes for it: image size, joint limits
@@ -162,7 +162,7 @@ class BuiltInLaw:
 
 
 def run(
-    law: LoopLaw, plant: LoopPlant, s_star: FloatArray, period: float, limits: Limits, scale: float = 1.0
+    law: LoopLaw, plant: _LoopPlant, s_star: FloatArray, period: float, limits: Limits, scale: float = 1.0
 ) -> tuple[int, int, Log]:
     """Drive a law on a plant to its verdict.
 
@@ -201,7 +201,7 @@ def run(
 class _Run:
     """A run as far as it has come: the law on the plant, and what is logged of them."""
 
-    def __init__(self, law: LoopLaw, plant: LoopPlant, s_star: FloatArray, limits: Limits, log: Log) -> None:
+    def __init__(self, law: LoopLaw, plant: _LoopPlant, s_star: FloatArray, limits: Limits, log: Log) -> None:
         self.law, self.plant, self.s_star, self.limits, self.log = law, plant, s_star, limits, log
         self.first_distance, self.first_error, self.waited = math.nan, math.nan, 0
 

@@ -200,14 +200,14 @@ class _Opened(NamedTuple):
     theta_p: float
 
 
-class Desk(NamedTuple):
+class _Desk(NamedTuple):
     """Workspace for the runs of a setting, one after the other."""
 
     measuring: _Measuring  # of the task and the run
     stage: _Stage  # for half turns
 
 
-def new_desk(setting: Setting, shown: int) -> Desk:
+def new_desk(setting: Setting, shown: int) -> _Desk:
     """Workspace for a setting in which so many markers are shown at the start and at the goal.
 
     Raises WorkFailed if the face has fewer than three markers.
@@ -227,7 +227,7 @@ def new_desk(setting: Setting, shown: int) -> Desk:
         new_state(n, m, observed),
         new_log(n, observed, setting.limits.max_steps, len(ERRORS), parts),
     )
-    return Desk(measuring, new_stage(setting.model, m, setting.lower, setting.upper))
+    return _Desk(measuring, new_stage(setting.model, m, setting.lower, setting.upper))
 
 
 @composed
@@ -265,7 +265,7 @@ def _open(setting: Setting, shown: FloatArray, desk: _Measuring) -> _Opened:
     return _Opened(status, parts.theta_r, parts.theta_p)
 
 
-def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: Desk, numbers: FloatArray) -> None:
+def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: _Desk, numbers: FloatArray) -> None:
     """Runs, one after the other: measure the task, partition it, drive the law to its verdict, and sum up.
 
     shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.

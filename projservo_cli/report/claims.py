@@ -33,7 +33,7 @@ from projservo_cli.report.material import (
 )
 
 
-class Claim(NamedTuple):
+class _Claim(NamedTuple):
     """One claim of the paper, where it stands, its measure in words, when it holds, and whether it does.
 
     ``holds`` is None where it could not be measured.
@@ -62,7 +62,7 @@ _VISIBLE_PX = 1.0
 _SCALE_TOLERANCE = 2.0
 
 
-def _control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
+def _control_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     """Claims of section 6 about Figs. 9 to 11."""
     for law in DIRECT:
         yield from _exponential(material, studies, law)
@@ -70,7 +70,7 @@ def _control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
         studies.own[DIRECT[0], kind, False] for kind in ("true", "twin", "calibrated")
     )
     same, also = _model_difference(twin, metric), _model_difference(calibrated, metric)
-    yield Claim(
+    yield _Claim(
         "Projective and Euclidean models give the same θ_r and θ_p",
         "section 6, Fig. 10",
         f"largest difference {same:.2g}° with true operators, {also:.2g}° with calibrated ones",
@@ -80,7 +80,7 @@ def _control_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     yield from _scale(material, calibrated)
     trace = studies.own[DIRECT[1], "calibrated", False]
     start, task = math.degrees(trace.theta_s[0]), math.degrees(true_rotation(trace))
-    yield Claim(
+    yield _Claim(
         "θ_s starts at the overall rotation of the task, 180° in the paper",
         "section 6, Fig. 9",
         f"{start:.3f}°; true rotation " + ("unknown" if math.isnan(task) else f"{task:.3f}°"),
@@ -104,7 +104,7 @@ def _decay_ranges(material: Material, trace: Trace) -> dict[str, tuple[float, fl
     return {name: (float(r.min()), float(r.max()), len(r)) for name, r in ratios.items() if len(r)}
 
 
-def _exponential(material: Material, studies: Studies, law: str) -> Iterator[Claim]:
+def _exponential(material: Material, studies: Studies, law: str) -> Iterator[_Claim]:
     trace = studies.own[law, "calibrated", True]
     if not np.isfinite(trace.goal_pose).all():
         return
@@ -130,7 +130,7 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[Cla
             f"{ranges['distance'][2]} and {ranges['theta_s'][2]} steps"
         )
     )
-    yield Claim(
+    yield _Claim(
         f"{TITLES[law]}: the control errors decay exponentially",
         "section 6, Figs. 9 and 10",
         measured,
@@ -153,13 +153,13 @@ def _model_difference(trace: Trace, metric: Trace) -> float:
     )
 
 
-def _scale(material: Material, trace: Trace) -> Iterator[Claim]:
+def _scale(material: Material, trace: Trace) -> Iterator[_Claim]:
     if not np.isfinite(trace.goal_pose).all() or trace.tau[0] == 0:
         return
     distance = percent(center_distance(material, trace))
     off = float(np.abs(percent(trace.tau) - distance).max())
     affine = float(np.abs(percent(trace.tau_affine) - distance).max())
-    yield Claim(
+    yield _Claim(
         "The difference of τ from its Euclidean truth is only apparent, a matter of scale",
         "section 6, Fig. 10",
         f"largest difference {off:.3g} % of the start with the unit-norm kernel of (8), {affine:.2g} % "
@@ -169,10 +169,10 @@ def _scale(material: Material, trace: Trace) -> Iterator[Claim]:
     )
 
 
-def _image_error(trace: Trace, factor: float) -> Iterator[Claim]:
+def _image_error(trace: Trace, factor: float) -> Iterator[_Claim]:
     e = trace.s - trace.s_star
     rise, off = coordinate_rise(e), off_exponential(e, factor)
-    yield Claim(
+    yield _Claim(
         "The image error does not decay exponentially",
         "section 6, Fig. 11",
         f"a marker coordinate is up to {off.max():.0f} px away from an exponential decay",
@@ -180,7 +180,7 @@ def _image_error(trace: Trace, factor: float) -> Iterator[Claim]:
         bool(off.max() > _VISIBLE_PX),
     )
     rising = int((rise > _VISIBLE_PX).sum())
-    yield Claim(
+    yield _Claim(
         "The image error does not even decay monotonically",
         "section 6, Fig. 11",
         f"{rising} of {rise.size} marker coordinates rise again, by up to {rise.max():.0f} px",
@@ -195,7 +195,7 @@ _EQUAL_M = 1e-9
 _SAMPLING = 1e-3
 
 
-def _drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
+def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     """Claims of sections 5.2, 6 and 7 about drift; none where the goal pose is unknown."""
     drift = drift_tables(studies)[0]
     if not np.isfinite(drift).all():
@@ -203,14 +203,14 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     gains = ", ".join(f"{gain:g}" for gain in studies.gains)
     for i, law in enumerate(DIRECT):
         free, limited = drift[i, 0]
-        yield Claim(
+        yield _Claim(
             f"{TITLES[law]}: the drift falls with the gain",
             "section 6, Fig. 8",
             f"{_listed(free)} mm at gains {gains} per step; calibrated {_listed(drift[i, 1, 0])} mm",
             "strictly, with true operators and no limit",
             bool((np.diff(free[np.argsort(studies.gains)]) > 0).all()),
         )
-        yield Claim(
+        yield _Claim(
             f"{TITLES[law]}: the drift falls with a limit of {studies.step_limit_deg:g}° per step",
             "section 6, Fig. 8",
             f"{_listed(limited)} mm at the same gains; calibrated {_listed(drift[i, 1, 1])} mm",
@@ -219,7 +219,7 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
             bool((limited <= free * (1 + _SAMPLING)).all() and limited[0] < free[0]),
         )
     own = [float(studies.own[law, "true", False].center_deviation_mm or 0.0) for law in DIRECT]
-    yield Claim(
+    yield _Claim(
         "directTWO is free of the bias of directTHREE: it drifts less",
         "section 5.2",
         f"at the configured gains without limit directTHREE {own[0]:.3g} mm, directTWO {own[1]:.3g} mm",
@@ -230,7 +230,7 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[Claim]:
     yield _joints(material, studies.own[DIRECT[0], "true", False])
 
 
-def _rate(studies: Studies, revolute: BoolArray) -> Iterator[Claim]:
+def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
     """Drift over the period; the longest turn in a step says how far apart the samples can be."""
     periods = np.array(studies.periods)
     for law in DIRECT:
@@ -243,7 +243,7 @@ def _rate(studies: Studies, revolute: BoolArray) -> Iterator[Claim]:
         sweep = ", ".join(f"{1e3 * period:g}" for period in periods)
         steps = np.diff(studies.rate[law, max(studies.periods)].q[:, revolute], axis=0)
         turn = np.degrees(np.abs(steps).max(initial=0.0))
-        yield Claim(
+        yield _Claim(
             f"{TITLES[law]}: the drift is typical of low control rates",
             "section 7",
             f"{_listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
@@ -253,7 +253,7 @@ def _rate(studies: Studies, revolute: BoolArray) -> Iterator[Claim]:
         )
 
 
-def _joints(material: Material, trace: Trace) -> Claim:
+def _joints(material: Material, trace: Trace) -> _Claim:
     """Second-order share of each joint in the deviation of the first step."""
     line = material.goal_center(trace) - trace.center[0]
     line = line / max(float(np.linalg.norm(line)), np.finfo(float).tiny)
@@ -264,7 +264,7 @@ def _joints(material: Material, trace: Trace) -> Claim:
     ranking = np.argsort(-np.abs(parts))
     shares = ", ".join(f"q{i + 1} {1e3 * parts[i]:+.2f}" for i in ranking)
     fastest = ", ".join(f"q{i + 1}" for i in np.argsort(-np.abs(joint_step))[:2])
-    return Claim(
+    return _Claim(
         "The initially high velocities of q1 and q3 cause the drift",
         "section 6, Fig. 12",
         f"second-order contributions to the first step's deviation of {first:.2f} mm: {shares} mm; "
@@ -274,7 +274,7 @@ def _joints(material: Material, trace: Trace) -> Claim:
     )
 
 
-def composition_claim(lambdas: FloatArray, distance: FloatArray) -> Claim:
+def composition_claim(lambdas: FloatArray, distance: FloatArray) -> _Claim:
     """Whether both sides of [RH00] eq. (22) agree, and to which order they do.
 
     lambdas : (k,) shares of the task; distance : (k,) of the centre between both sides, m.
@@ -285,7 +285,7 @@ def composition_claim(lambdas: FloatArray, distance: FloatArray) -> Claim:
         slope = np.polyfit(np.log(lambdas[small]), np.log(distance[small]), 1)[0]
         order = f"; difference ∝ λ^{slope:.2f}"
     shares = ", ".join(f"{share:g}" for share in lambdas)
-    return Claim(
+    return _Claim(
         "exp(λτ Ĥ_t) exp(λθ Ĥ_s) = exp(λτ Ĥ_t + λθ Ĥ_s)",
         "eq. (22), section 5.2",
         f"the centre differs by {_listed(1e3 * distance)} mm at λ = {shares}{order}",
@@ -300,11 +300,11 @@ _SMALL_SHARE = 0.01
 _LEVEL_SHARE = 0.02
 
 
-def _classical(material: Material) -> Iterator[Claim]:
+def _classical(material: Material) -> Iterator[_Claim]:
     """Claims of section 6 about the classical laws that were run."""
     trace = material.traces.get("blockwise")
     if trace is not None:
-        yield Claim(
+        yield _Claim(
             "The block-wise law does not converge",
             "section 6, Fig. 4",
             f"{trace.verdict} after {trace.steps} steps: {trace.reason}",
@@ -317,7 +317,7 @@ def _classical(material: Material) -> Iterator[Claim]:
             if way is None
             else f"; centre {1e3 * way[-1]:.0f} mm from the goal, {1e3 * way[0]:.0f} at the start"
         )
-        yield Claim(
+        yield _Claim(
             "The block-wise law diverges towards infinity",
             "section 6",
             trace.verdict + grown,
@@ -329,9 +329,9 @@ def _classical(material: Material) -> Iterator[Claim]:
             yield from _escape(law, material.traces[law], material.plateau_steps)
 
 
-def _escape(law: str, trace: Trace, window: int) -> Iterator[Claim]:
+def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
     left, right = trace.self_occluded_steps_left, trace.self_occluded_steps_right
-    yield Claim(
+    yield _Claim(
         f"{TITLES[law]}: runs through self-occlusion, then converges",
         "section 6, Fig. 4",
         f"{left} and {right} self-occluded steps in the left and right camera; {trace.verdict}",
@@ -343,7 +343,7 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[Claim]:
     if stretch is not None:
         level = float(trace.stop_error[stretch[0]])
         measured = f"{stretch[1] - stretch[0]} steps from step {stretch[0]} at {level:.0f} px"
-    yield Claim(
+    yield _Claim(
         f"{TITLES[law]}: stands still in a local minimum before it converges",
         "section 6, Fig. 4",
         f"{measured}; {trace.verdict}",
@@ -352,11 +352,11 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[Claim]:
     )
 
 
-def _planned(material: Material) -> Iterator[Claim]:
+def _planned(material: Material) -> Iterator[_Claim]:
     """Claims of sections 4.3 and 6 about the planned motion."""
     plan = material.plan
     miss = float(np.linalg.norm(plan.s[-1] - plan.s_star, axis=-1).max())
-    yield Claim(
+    yield _Claim(
         "The planned trajectory avoids self-occlusion",
         "sections 4.3 and 6, Figs. 5 and 6",
         f"least margin {plan.margin.min():.3f} of the start's; ends {miss:.2g} px from the goal images",
@@ -365,7 +365,7 @@ def _planned(material: Material) -> Iterator[Claim]:
     )
 
 
-def _direct(material: Material) -> Iterator[Claim]:
+def _direct(material: Material) -> Iterator[_Claim]:
     """Claims of sections 4.2 and 6 about what the cameras see under direct control."""
     traces = {law: material.traces[law] for law in DIRECT if law in material.traces}
     if traces:
@@ -374,7 +374,7 @@ def _direct(material: Material) -> Iterator[Claim]:
             for law, trace in traces.items()
         ]
         total = sum(t.self_occluded_steps_left + t.self_occluded_steps_right for t in traces.values())
-        yield Claim(
+        yield _Claim(
             "No self-occlusion under direct control",
             "sections 4.2 and 7",
             f"self-occluded steps: {'; '.join(counts)}",
@@ -384,7 +384,7 @@ def _direct(material: Material) -> Iterator[Claim]:
     if len(traces) == len(DIRECT):
         gap = float(path_gap(*(trace.s for trace in traces.values())).max())
         diagonal = float(np.linalg.norm(material.plant.image_size))
-        yield Claim(
+        yield _Claim(
             "The image paths of directTHREE and directTWO differ very little",
             "section 6, Fig. 7",
             f"largest distance between both paths {gap:.1f} px",
@@ -395,10 +395,10 @@ def _direct(material: Material) -> Iterator[Claim]:
         yield _level(material, traces[DIRECT[0]])
 
 
-def _level(material: Material, trace: Trace) -> Claim:
+def _level(material: Material, trace: Trace) -> _Claim:
     image = center_image(material, trace)
     travel, variation = np.ptp(image, axis=0).T
-    return Claim(
+    return _Claim(
         "The centre moves horizontally in the images: its ordinate stays constant",
         "section 6, Fig. 11",
         f"ordinate varies by {variation[0]:.1f} and {variation[1]:.1f} px while the abscissa travels "
@@ -408,7 +408,7 @@ def _level(material: Material, trace: Trace) -> Claim:
     )
 
 
-def claims_of(material: Material, eq22: tuple[FloatArray, FloatArray] | None) -> list[Claim]:
+def claims_of(material: Material, eq22: tuple[FloatArray, FloatArray] | None) -> list[_Claim]:
     """All claims that this run can speak about, in the order of the paper.
 
     material : records, truth and extra runs.

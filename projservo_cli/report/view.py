@@ -51,7 +51,7 @@ _AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "tran
 _PLAYING = _AT_ONCE | {"frame": {"duration": _FRAME_MS, "redraw": True}, "fromcurrent": True}
 
 
-class Driven(NamedTuple):
+class _Driven(NamedTuple):
     """One run at the k instants shown, in m."""
 
     verdict: str
@@ -63,19 +63,19 @@ class Driven(NamedTuple):
     markers: FloatArray  # (k, p, 3)
 
 
-class Motion(NamedTuple):
+class _Motion(NamedTuple):
     """What stands still in the view, in m in the frame of the robot's base, and the runs by name."""
 
     cameras: FloatArray  # (2, 5, 3) optical centre and image corners of both viewing pyramids
     start: FloatArray  # (m, 3) corners of the face
     goal: FloatArray | None  # the same, None where only images of the goal are known
     planned: FloatArray  # (s, 3) centre of the face along the joints of the plan, as far as they follow it
-    runs: Mapping[str, Driven]
+    runs: Mapping[str, _Driven]
 
 
 def motion(
     robot: Robot, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
-) -> Motion:
+) -> _Motion:
     """What the view shows of runs with a step at least; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
     start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
@@ -83,7 +83,7 @@ def motion(
     goal = (face @ np.linalg.solve(robot.base_tool.T, goals[0].T))[:, :3] if goals else None
     planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
     runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
-    return Motion(pyramids(plant, start), start, goal, planned, runs)
+    return _Motion(pyramids(plant, start), start, goal, planned, runs)
 
 
 def instants(q: FloatArray) -> IntArray:
@@ -100,7 +100,7 @@ def instants(q: FloatArray) -> IntArray:
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 
-def _driven(robot: Robot, plant: Plant, markers: FloatArray, trace: Trace) -> Driven:
+def _driven(robot: Robot, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
     shown = instants(trace.q)
     places = []
     for q in trace.q[shown]:
@@ -110,7 +110,7 @@ def _driven(robot: Robot, plant: Plant, markers: FloatArray, trace: Trace) -> Dr
     moved = (np.stack(kind) for kind in zip(*places, strict=True))
     seconds, path = trace.period * shown.astype(np.float64), _centers(plant, trace.q)
     verdict = f"{trace.verdict}, {trace.steps} steps"
-    return Driven(verdict, seconds, trace.self_occluded[shown], path, *moved)
+    return _Driven(verdict, seconds, trace.self_occluded[shown], path, *moved)
 
 
 def _centers(plant: Plant, q: FloatArray) -> FloatArray:
@@ -128,7 +128,7 @@ def plotly() -> Any:
     return plotly.graph_objects
 
 
-def write_view(path: Path, motion: Motion, *, name: str, known: str) -> None:
+def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
     """Write the view of a run of a name beside its report; ``known`` says where the picture comes from."""
     scene = _figure(motion).to_html(
         full_html=False,
@@ -143,7 +143,7 @@ def write_view(path: Path, motion: Motion, *, name: str, known: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
-def _figure(motion: Motion) -> Any:
+def _figure(motion: _Motion) -> Any:
     """The view as a figure of plotly: what stands still, then four traces a run, and a frame an instant."""
     go = plotly()
     still = [*_still(go, motion)]
@@ -187,7 +187,7 @@ def _figure(motion: Motion) -> Any:
     return go.Figure(traces, layout, frames)
 
 
-def _scene(motion: Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
+def _scene(motion: _Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
     """Axes of equal scales, seen from beside the way from the face to the cameras."""
     axis = {"gridcolor": style.PALE, "showbackground": False}
     towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
@@ -199,7 +199,7 @@ def _scene(motion: Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
     return scene
 
 
-def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
+def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     """Range of each coordinate that a run keeps to, so that the scene stands still while the robot moves."""
     points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
     points += [] if motion.goal is None else [motion.goal]
@@ -210,7 +210,7 @@ def _extent(motion: Motion, run: Driven) -> dict[str, list[float]]:
     return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
 
 
-def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
+def _slider(run: _Driven, own: list[str]) -> dict[str, Any]:
     """A step for each instant; what it is labelled with stands above the slider."""
     steps = []
     for frame, seconds, hidden in zip(own, run.seconds, run.hidden, strict=True):
@@ -229,7 +229,7 @@ def _slider(run: Driven, own: list[str]) -> dict[str, Any]:
     }
 
 
-def _still(go: Any, motion: Motion) -> Iterator[Any]:
+def _still(go: Any, motion: _Motion) -> Iterator[Any]:
     for pyramid, name, color in zip(motion.cameras, VIEWS, _CAMERAS, strict=True):
         apex, corners = pyramid[:1], style.closed(pyramid[1:])
         edges = np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
@@ -242,7 +242,7 @@ def _still(go: Any, motion: Motion) -> Iterator[Any]:
         yield _line(go, motion.planned[dots], "planned path", style.PURPLE)
 
 
-def _moving(go: Any, run: Driven, k: int) -> tuple[Any, Any, Any]:
+def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
     """Robot, face and markers at one of the instants."""
     robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
     robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})

@@ -59,7 +59,7 @@ class SimulatedRobot:
 
 
 @dataclass
-class Recording:
+class _Recording:
     """A table in the making."""
 
     path: Path  # of the table
@@ -93,7 +93,7 @@ class Recording:
 
 def prepare(
     config: "Config", path: Path, *, motions: JointList | None = None, force: bool = False
-) -> Recording:
+) -> _Recording:
     """What there is to record, and what of it the table holds already.
 
     motions : further poses after the trial motions, numbered on.
@@ -114,13 +114,13 @@ def prepare(
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
     key = digest(config, DEPENDS_ON)[:16]
-    recording = Recording(path, key, targets, np.array(numbers, dtype=np.int64))
+    recording = _Recording(path, key, targets, np.array(numbers, dtype=np.int64))
     if path.exists() and not force:
         _resume(recording)
     return recording
 
 
-def _resume(recording: Recording) -> None:
+def _resume(recording: _Recording) -> None:
     """Take over the poses of an interrupted recording."""
     path, remedy = recording.path, "choose another --output, or replace it with --force"
     if recording_of(path) != recording.key:
@@ -139,7 +139,7 @@ def _resume(recording: Recording) -> None:
 
 def record(
     config: "Config",
-    recording: Recording,
+    recording: _Recording,
     robot: Robot | None = None,
     *,
     progress: Progress = silent,
@@ -176,7 +176,7 @@ def record(
             recording.save()
 
 
-def simulated(config: "Config", recording: Recording) -> SimulatedRobot:
+def simulated(config: "Config", recording: _Recording) -> SimulatedRobot:
     """The robot of a configuration at its reference, with the noise that ``calibrate`` would add."""
     truth = truth_of(config)
     rng = generator(calibration_seed(config), CALIBRATION_NOISE)

@@ -72,7 +72,7 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
     if scenario.truth is None:
         assert isinstance(plan, Plan)
         run = _drive_own_robot(scenario, plan, law, replans)
-    elif isinstance(plan, Plan) and not in_compiled_loop(scenario.config, law):
+    elif isinstance(plan, Plan) and not _in_compiled_loop(scenario.config, law):
         controller = _law_for(scenario, plan, law, replans)
         noise = scenario.noise_of(law, scenario.config.seed, scenario.limits.max_steps + 1)
         simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
@@ -82,7 +82,7 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
     return run._replace(law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
 
 
-def in_compiled_loop(config: "Config", law: str) -> bool:
+def _in_compiled_loop(config: "Config", law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
     return law in CODES and config.plant.speed_scale == 1.0
 
@@ -90,7 +90,7 @@ def in_compiled_loop(config: "Config", law: str) -> bool:
 def sense_is_enough(config: "Config", name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
-    return mode == REPLAN and in_compiled_loop(config, law)
+    return mode == REPLAN and _in_compiled_loop(config, law)
 
 
 def _drive_compiled(

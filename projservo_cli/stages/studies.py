@@ -97,7 +97,7 @@ def comparison_of(config: "Config", calibration: Calibration, plan: Plan) -> Com
     return Comparison(scenario, models, plan.rotation_sense())
 
 
-def with_gain(gains: Gains, gain_per_step: float) -> Gains:
+def _with_gain(gains: Gains, gain_per_step: float) -> Gains:
     """Gains of the direct laws such that each step takes one share of all errors."""
     gain = gain_per_step / gains.period
     return gains._replace(gain_t=gain, gain_r=gain, gain_p=gain, gain_s=gain, ratio_rp=1.0)
@@ -133,7 +133,7 @@ def run_studies(
     sweep, by_model, rate = {}, {}, {}
     for done, (law, operators, limited, gain) in enumerate(sweep_cases):
         progress("studies", done, total)
-        trace = bench.run(law, operators, with_gain(own, gain), limited=limited)
+        trace = bench.run(law, operators, _with_gain(own, gain), limited=limited)
         sweep[law, operators, limited, gain] = trace
     for done, (law, operators, limited) in enumerate(own_cases, len(sweep)):
         progress("studies", done, total)

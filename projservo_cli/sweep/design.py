@@ -79,7 +79,7 @@ def sample(distribution: Distribution, rng: np.random.Generator) -> Any:
     return distribution.choice[int(uniform * len(distribution.choice))]
 
 
-class Axis(NamedTuple):
+class _Axis(NamedTuple):
     """One dimension of the grid: its name, the keys it sets, its values."""
 
     name: str
@@ -87,7 +87,7 @@ class Axis(NamedTuple):
     values: tuple[Any, ...]
 
 
-class Numbers(NamedTuple):
+class _Numbers(NamedTuple):
     """Where run number ``run`` stands: its cell, its number in the cell, and those of what it shares."""
 
     run: int
@@ -105,14 +105,14 @@ class Design:
     bases: tuple[tuple[str, str], ...]  # name and resolved YAML of each base
 
     @cached_property
-    def axes(self) -> tuple[Axis, ...]:
+    def axes(self) -> tuple[_Axis, ...]:
         """Dimensions of the grid, the last one running fastest; there is always one of laws."""
-        found = [Axis(BASE, (), tuple(name for name, _ in self.bases))] if len(self.bases) > 1 else []
+        found = [_Axis(BASE, (), tuple(name for name, _ in self.bases))] if len(self.bases) > 1 else []
         for name, axis in self.sweep.grid.items():
-            found.append(Axis(name, self.sweep.keys_of(name), axis.values))
+            found.append(_Axis(name, self.sweep.keys_of(name), axis.values))
         if all(LAW not in axis.keys for axis in found):
             control = load_config("base", text=self.bases[0][1]).control
-            found.append(Axis(LAW, (LAW,), names_of(control.laws, control.mode)))
+            found.append(_Axis(LAW, (LAW,), names_of(control.laws, control.mode)))
         return tuple(found)
 
     @cached_property
@@ -138,14 +138,14 @@ class Design:
         text = json.dumps([values, self.recipe["bases"]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
-    def numbers(self, run: int) -> Numbers:
+    def numbers(self, run: int) -> _Numbers:
         """Where a run stands; an InputError where there is none."""
         if not 0 <= run < self.total:
             raise InputError(f"run {run}: the sweep {self.sweep.name} has runs 0 to {self.total - 1}")
-        return Numbers(run, *(int(number[0]) for number in self.placed(np.array([run])).values()))
+        return _Numbers(run, *(int(number[0]) for number in self.placed(np.array([run])).values()))
 
     def placed(self, runs: IntArray) -> dict[str, IntArray]:
-        """Where runs (k,) stand, by the names of ``Numbers`` after the first."""
+        """Where runs (k,) stand, by the names of ``_Numbers`` after the first."""
         cell, draw = np.divmod(runs, self.sweep.runs)
         tasks = self.sweep.tasks
         return {

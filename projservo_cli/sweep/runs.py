@@ -111,7 +111,7 @@ class Part:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
+class _Made:
     """Rows of a part, and the traces that are kept."""
 
     first: int
@@ -120,7 +120,7 @@ class Made:
     traces: dict[int, Trace]
 
 
-def run_part(part: Part) -> Made:
+def run_part(part: Part) -> _Made:
     """Make the runs of a part; the same on any machine of one kind, whatever ran before.
 
     Raises InputError if a drawn value is not one that its key takes.
@@ -149,7 +149,7 @@ def run_part(part: Part) -> Made:
                 _put(table, np.array([run - part.first]), row)
                 if trace is not None:
                     traces[run] = trace
-    return Made(part.first, part.last, table, traces)
+    return _Made(part.first, part.last, table, traces)
 
 
 def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:

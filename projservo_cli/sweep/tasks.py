@@ -19,7 +19,7 @@ MOST_DRAWS = 20_000_000
 
 
 @dataclass(frozen=True, eq=False)
-class RandomTasks:
+class _RandomTasks:
     """Tasks, one of each stratum in turn while there are any."""
 
     q_start: FloatArray
@@ -28,7 +28,7 @@ class RandomTasks:
     angle: FloatArray
 
 
-def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator) -> RandomTasks:
+def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator) -> _RandomTasks:
     """Draw tasks.
 
     truth : robot, rig and markers.
@@ -63,7 +63,7 @@ def random_tasks(truth: Truth, q_front: FloatArray, count: int, rng: np.random.G
                 found[stratum].append((start, goal, angle))
     tasks = [tasks[k] for k in range(max(quota)) for tasks in found if k < len(tasks)]
     starts, goals, angles = (np.array(column) for column in zip(*tasks, strict=True))
-    return RandomTasks(starts, goals, angles)
+    return _RandomTasks(starts, goals, angles)
 
 
 def _poses(truth: Truth, q: FloatArray) -> FloatArray:

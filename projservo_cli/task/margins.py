@@ -69,7 +69,7 @@ class Reaching(NamedTuple):
     q_start: FloatArray  # (n,) joints at the start, rad or m
 
 
-class Seen(NamedTuple):
+class _Seen(NamedTuple):
     """What both cameras have of the face at s instants."""
 
     H_d: FloatArray  # (s, 4, 4) planned displacement
@@ -82,7 +82,7 @@ class Seen(NamedTuple):
 class Along(NamedTuple):
     """Margins along a path of s instants."""
 
-    view: Seen  # what both cameras have of the face
+    view: _Seen  # what both cameras have of the face
     q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
     limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
     condition: FloatArray  # (s,) reciprocal conditions of the image Jacobian, NaN likewise
@@ -114,7 +114,7 @@ def _put_displaced(reaching: Reaching, mu: FloatArray, H_d: FloatArray, visibili
             visibility[i, view] = visibility_margin(reaching, view, mu[i, 0], mu[i, 1])
 
 
-def view_at(reaching: Reaching, mu: FloatArray) -> Seen:
+def view_at(reaching: Reaching, mu: FloatArray) -> _Seen:
     """What both cameras have of the face at the shares mu (s, 3)."""
     model = reaching.model
     H_d, visibility = np.empty((len(mu), 4, 4)), np.empty((len(mu), 2))
@@ -125,7 +125,7 @@ def view_at(reaching: Reaching, mu: FloatArray) -> Seen:
     u_v = np.minimum(images + 0.5, reaching.demands.image_size - 0.5 - images)
     border = np.minimum(u_v[..., 0], u_v[..., 1])
     shown = np.isfinite(border) & np.swapaxes(depth * at_start > 1e-9 * at_start**2, 1, 2)
-    return Seen(H_d, images, visibility, np.where(shown, border, BEHIND).min(axis=2))
+    return _Seen(H_d, images, visibility, np.where(shown, border, BEHIND).min(axis=2))
 
 
 def image_margin(distance: FloatArray, demands: Demands) -> FloatArray:
