@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES, command
+from projservo_cli.control import CODES
 from projservo_cli.control.law import LOST, OK, new_state
 from projservo_cli.geometry.kinematics import image_jacobian
+from projservo_cli.loop.python import bind, bound_command
 from tests.samples import frame, operators, poe
 from tests.scene import GAINS, scene
 
@@ -20,9 +21,9 @@ def instant(types, m, seed):
     return sc, q, sc.images(q), sc.plant.M @ poe(sc.model, q).T
 
 
-def commanded(law, sc, s, q, G=None, gains=GAINS):
+def commanded(law, sc, s, q, G=None):
     state = new_state(len(q), s.shape[1])
-    status = command(CODES[law], sc.seen(G), sc.task(G), gains, s, q, state)
+    status = bound_command(bind(CODES[law], sc.seen(G), sc.task(G), GAINS, state), s, q)
     return status, state.q_dot
 
 
@@ -72,7 +73,7 @@ def test_laws_need_no_metric_frame(law, types):
         assert q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
     scaled = sc.model._replace(P=sc.model.P * np.array([-3.0, 1e-3])[:, None, None])
     state = new_state(6, 4)
-    command(CODES[law], scaled, sc.task(), GAINS, s, q, state)
+    bound_command(bind(CODES[law], scaled, sc.task(), GAINS, state), s, q)
     assert state.q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
 
 

@@ -144,10 +144,6 @@ class Silent(Wrong):
     answer = None
 
 
-class Infinite(Wrong):
-    answer = (np.inf,) * 6
-
-
 class Raising(ByImage):
     def __call__(self, s, q):
         return [][0]

@@ -31,7 +31,7 @@ def off_line(center):
     return np.linalg.norm(off - np.outer(off @ way, way), axis=1)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.5, 0.97])
+@pytest.mark.parametrize("share", [0.02, 0.5])
 def test_exact_goes_along_its_path_to_the_limit(share):
     sc, gains = narrowed(share)
     stopped = Run(sc, "exact", gains, limits(**STOP))
@@ -49,8 +49,7 @@ def test_exact_goes_along_its_path_to_the_limit(share):
     assert share < 0.1 or off_line(bent.center).max() > 1e-6
 
 
-@pytest.mark.parametrize("law", ["exact", "direct_two", "stacked"])
-@pytest.mark.parametrize("sigma", [0.0, 0.3])
+@pytest.mark.parametrize(("law", "sigma"), [("exact", 0.3), ("direct_two", 0.0)])
 def test_both_loops_end_at_the_limit_alike(law, sigma, rng):
     sc, gains = narrowed()
     bounds = limits(max_steps=200, **STOP)

@@ -24,7 +24,6 @@ def unseen(gone, steps=60):
     [
         (range(5, 9), 4, "max steps", 60),
         (range(5, 9), 3, "markers lost", 8),
-        (range(5, 9), 0, "markers lost", 5),
         ([0, 1], 2, "max steps", 60),
         ([2, 3, 5, 6, 8, 9], 2, "max steps", 60),  # only those in a row count
         (range(58, 61), 9, "markers lost", 60),

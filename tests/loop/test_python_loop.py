@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, OK
-from projservo_cli.loop.python import BuiltInLaw, run
+from projservo_cli.control.law import ERRORS, OK, new_state
+from projservo_cli.loop.python import BuiltInLaw, bind, bound_command, run
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.records import LAWS, InputError
 from projservo_cli.robots.simulated import AnalyticPlant
@@ -112,6 +112,19 @@ def test_both_loops_end_alike(bounds):
     verdict, steps, log = in_python(sc, "direct_three", bounds, noise)
     assert (VERDICTS[verdict], steps) == (compiled.verdict, compiled.steps)
     assert same(log.events[:3], compiled.log.events[:3])
+
+
+def test_a_bound_law_keeps_its_arrays_alive_and_sees_their_changes():
+    sc, task, state = scene(), scene().task(), new_state(6, 4)
+    s_star = task.s_star
+    bound = bind(CODES["stacked"], sc.model, task, GAINS, state)
+    del task
+    bound_command(bound, sc.s_start, sc.q_start)
+    before = state.q_dot.copy()
+    s_star += 5.0
+    bound_command(bound, sc.s_start, sc.q_start)
+    assert before.any()
+    assert not np.array_equal(before, state.q_dot)
 
 
 class Towards:

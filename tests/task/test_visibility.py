@@ -244,39 +244,6 @@ def test_sight_counts_more_than_the_sense_of_the_step_before(theta):
     assert chosen(a, a_t, H_hat, theta, blind, against_previous=False) == theta
 
 
-def test_two_cameras_that_want_different_senses():
-    """Each camera alone would turn the face its own way; both together take the better worst case."""
-    found = 0
-    for seed in range(400):
-        a, a_t, H_hat, theta, task = sense_case(seed)
-        if math.pi - theta < 0.5:
-            continue
-        alone = [
-            chosen(a, a_t, H_hat, theta, task._replace(O=task.O[[v, v]], visible=task.visible[[v, v]]))
-            for v in (0, 1)
-        ]
-        if alone[0] == alone[1]:
-            continue
-        found += 1
-        senses = (theta, theta - 2 * math.pi)
-        margins = [arc_margins(a, H_hat, t, task) for t in senses]
-        lost = [(m <= 0).sum() for m in margins]
-        best = int(np.argmin(lost)) if lost[0] != lost[1] else int(np.argmax([m.min() for m in margins]))
-        assert chosen(a, a_t, H_hat, theta, task) == senses[best]
-        if found == 2:
-            break
-    assert found > 0
-
-
-def test_the_sense_of_a_visible_turn_is_the_shorter():
-    A = face()
-    task = make_task(arm(), A, A)
-    a = plane_of(A)
-    for theta in (0.1, 0.5):
-        H_hat = revolute([0.02, -0.03, 1.4], [1, 0, 0])
-        assert chosen(a, carried(a, expm(theta * H_hat)), H_hat, theta, task) == theta
-
-
 def test_the_mirrored_rig_mirrors_nothing_in_the_sense():
     """The sense is a property of the scene: the same in every projective frame."""
     for seed in range(20):
