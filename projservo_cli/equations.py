@@ -216,7 +216,7 @@ REGISTER = (
         "task/test_visibility.py::test_neutral_about_any_axis_through_the_optical_center "
         "task/test_visibility.py::test_neutral_within_the_plane_of_the_face "
         "task/test_visibility.py::test_the_optical_axis_itself_is_not_neutral "
-        "task/test_visibility.py::test_two_cameras_that_want_different_senses",
+        "task/test_visibility.py::test_sense_of_the_turn_by_brute_force",
         "Translation along the optical axis changes visibility unless the ray passes through the face's "
         "point. Neutral, for one camera each: translation along that ray in front of the camera or "
         "parallel to the face, any rotation about an axis through the optical centre, and Ĥ_p.",
