@@ -162,3 +162,23 @@ def test_a_body_that_cannot_be_known_says_what_to_set():
     stretch = np.repeat(np.outer(across, across)[None], 6, axis=0)
     with pytest.raises(WorkFailed, match=r"control\.observation: points"):
         scenario_of(example.config, replace(calibration, H_hat_0=stretch))
+
+
+class Careless:
+    """A law that writes to all it is given."""
+
+    def __init__(self, setup):
+        for values in (setup.s_start, setup.s_star, setup.plan.q, setup.plan.H_hat):
+            values[:] = 0.0
+
+    def __call__(self, s, q):
+        return np.zeros_like(q)
+
+
+def test_what_a_law_writes_to_is_not_what_other_laws_are_given():
+    example, calibration, planned = noisy("stop.max_steps=1", "noise.servo_px=0")
+    before = scenario_of(example.config, calibration).ends.s_star.copy(), planned.q.copy()
+    servo.run(example.config, calibration, planned, f"{__name__}:Careless")
+    assert np.array_equal(scenario_of(example.config, calibration).ends.s_star, before[0])
+    assert np.array_equal(planned.q, before[1])
+    assert before[0].all()
