@@ -176,7 +176,7 @@ REGISTER = (
     _entry(
         "22",
         "Translation and rotation at once",
-        "control.direct_two.direct_two control.exact.desired",
+        "control.direct_two.direct_two control.exact.exact",
         "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit "
         "control/test_exact.py::test_the_centre_keeps_to_its_line",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "
@@ -186,7 +186,7 @@ REGISTER = (
     _entry(
         "23",
         "Direct control directTWO",
-        "control.direct_two.direct_two control.law.rotation_about_center",
+        "control.direct_two.direct_two control.law.single_rotation",
         "control/test_direct.py::test_one_rotation_decays_at_the_rate_of_its_gain "
         "control/test_direct.py::test_any_ratio_converges",
         "Sign as in (20): q̇ = λ_t τ q̂_t + λ_s θ_s q̂_s.",

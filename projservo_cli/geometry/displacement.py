@@ -15,22 +15,24 @@ LEAST_SINE = 1e-6
 
 
 @inline
-def rotation(H_hat: Mat4, H_hat_squared: Mat4, theta: float) -> Mat4:
+def rotation(H_hat: Mat4, theta: float) -> Mat4:
     """Projective rotation I + sin θ Ĥ + (1 − cos θ) Ĥ² of [RH00] eq. (4), θ in rad."""
-    sine, versine = sine_and_versine(theta)
-    return turned(H_hat, H_hat_squared, sine, versine)
-
-
-@inline
-def sine_and_versine(theta: float) -> tuple[float, float]:
-    """The coefficients sin θ and 1 − cos θ of [RH00] eq. (4), from half the angle, θ in rad."""
     half = math.sin(0.5 * theta)
-    return 2.0 * half * math.cos(0.5 * theta), 2.0 * half * half
+    return _turned(H_hat, mul(H_hat, H_hat), 2.0 * half * math.cos(0.5 * theta), 2.0 * half * half)
 
 
 @inline
-def turned(H_hat: Mat4, H_hat_squared: Mat4, sine: float, versine: float) -> Mat4:
-    """Sum I + sin θ Ĥ + (1 − cos θ) Ĥ²; with −sin θ its inverse."""
+def rotation_and_inverse(H_hat: Mat4, theta: float) -> tuple[Mat4, Mat4]:
+    """Projective rotation of [RH00] eq. (4), θ in rad, and its inverse."""
+    half = math.sin(0.5 * theta)
+    sine, versine = 2.0 * half * math.cos(0.5 * theta), 2.0 * half * half
+    squared = mul(H_hat, H_hat)
+    return _turned(H_hat, squared, sine, versine), _turned(H_hat, squared, -sine, versine)
+
+
+@inline
+def _turned(H_hat: Mat4, H_hat_squared: Mat4, sine: float, versine: float) -> Mat4:
+    """Sum I + sin θ Ĥ + (1 − cos θ) Ĥ²."""
     H = combine(sine, H_hat, versine, H_hat_squared)
     return (
         1.0 + H[0], H[1], H[2], H[3],
@@ -48,13 +50,7 @@ def translation(H_hat: Mat4, tau: float) -> Mat4:
 
 def exp_rotation(H_hat: FloatArray, theta: float) -> FloatArray:
     """Projective rotation (4, 4) of a revolute operator (4, 4) by an angle, rad: [RH00] eq. (4)."""
-    H = as_mat(H_hat)
-    return as_array(rotation(H, mul(H, H), float(theta)))
-
-
-def exp_translation(H_hat: FloatArray, tau: float) -> FloatArray:
-    """Projective translation (4, 4) of a prismatic operator (4, 4), τ in m for a joint: [RH00] eq. (5)."""
-    return as_array(translation(as_mat(H_hat), float(tau)))
+    return as_array(rotation(as_mat(H_hat), float(theta)))
 
 
 def log_rotation(H: FloatArray, theta: float) -> FloatArray:
@@ -136,7 +132,7 @@ def twist_exponential(X: Mat4) -> Mat4:
 
 
 @njit
-def wrap(theta: float) -> float:
+def _wrap(theta: float) -> float:
     """Equal angle in (−π, π], rad."""
     turns = math.floor((theta + math.pi) / (2.0 * math.pi))
     wrapped = theta - 2.0 * math.pi * turns
@@ -159,7 +155,7 @@ def incidence_angles(p_0: float, p_s: float, p_c: float) -> tuple[bool, float, f
         return False, 0.0, 0.0
     middle = math.atan2(p_s, p_c)
     spread = math.acos(-p_0 / amplitude)
-    return True, wrap(middle + spread), wrap(middle - spread)
+    return True, _wrap(middle + spread), _wrap(middle - spread)
 
 
 @njit
@@ -191,19 +187,3 @@ def composed_operator(H_r: Mat4, H_p: Mat4, cbh_a: float, cbh_b: float, cbh_c: f
     bracket = combine(1.0, mul(H_r, H_p), -1.0, mul(H_p, H_r))
     H = combine(cbh_a, H_r, cbh_b, H_p)
     return True, combine(1.0 / sine, H, cbh_c / sine, bracket)
-
-
-def compose_rotations(
-    H_hat_r: FloatArray, H_hat_p: FloatArray, theta_r: float, theta_p: float
-) -> tuple[float, FloatArray]:
-    """Angle θ_s in [0, 2π), rad, and operator (4, 4) of the rotation exp(θ_r Ĥ_r) exp(θ_p Ĥ_p).
-
-    For axes that are perpendicular and meet: [RH00] eqs. (24), (25) as corrected.
-
-    Raises WorkFailed if the composition is the identity, which has no axis.
-    """
-    theta_s, a, b, c = composed_angle(float(theta_r), float(theta_p))
-    found, H_s = composed_operator(as_mat(H_hat_r), as_mat(H_hat_p), a, b, c)
-    if not found:
-        raise WorkFailed("two rotations by 0° compose to the identity, which has no axis")
-    return theta_s, as_array(H_s)

@@ -7,9 +7,8 @@ from projservo_cli.geometry.displacement import (
     IDENTITY,
     as_array,
     rotation,
-    sine_and_versine,
+    rotation_and_inverse,
     translation,
-    turned,
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import through
@@ -18,10 +17,12 @@ from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model, W
 
 @internal
 def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
-    """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
+    """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5); none of a free-flying rig's twists."""
+    if joint_type == FREE:
+        return IDENTITY
     if joint_type == PRISMATIC:
         return translation(H_hat, q)
-    return rotation(H_hat, mul(H_hat, H_hat), q)
+    return rotation(H_hat, q)
 
 
 @njit
@@ -42,14 +43,6 @@ def backward(model: Model, q: FloatArray) -> Mat4:
         amount = float(q[i]) - float(model.q_reference[i])
         H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], -amount), H)
     return H
-
-
-@merged
-def start_pose(model: Model, q: FloatArray) -> Mat4:
-    """Displacement at the first joints; a free-flying rig starts at its reference."""
-    if model.joint_types[0] == FREE:
-        return IDENTITY
-    return forward(model, q)
 
 
 @njit
@@ -74,10 +67,9 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
             H = mul(H, translation(operator, amount))
             H_inverse = mul(translation(operator, -amount), H_inverse)
         else:
-            squared = mul(operator, operator)
-            sine, versine = sine_and_versine(amount)
-            H = mul(H, turned(operator, squared, sine, versine))
-            H_inverse = mul(turned(operator, squared, -sine, versine), H_inverse)
+            turn, turn_back = rotation_and_inverse(operator, amount)
+            H = mul(H, turn)
+            H_inverse = mul(turn_back, H_inverse)
     return H
 
 
@@ -86,15 +78,6 @@ def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
     """First joint outside its limits, or −1."""
     for i in range(q.shape[0]):
         if not lower[i] <= q[i] <= upper[i]:
-            return i
-    return -1
-
-
-@merged
-def blocked_joint(q: FloatArray, q_next: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
-    """First joint that a motion from q to q_next takes beyond a limit, or farther beyond it; else −1."""
-    for i in range(q.shape[0]):
-        if q_next[i] > max(q[i], upper[i]) or q_next[i] < min(q[i], lower[i]):
             return i
     return -1
 

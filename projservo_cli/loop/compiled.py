@@ -4,10 +4,10 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.control import command
-from projservo_cli.control.law import LOST, SINGULAR, Gains, State
+from projservo_cli.control.law import LOST, SINGULAR, Gains, Law, State
 from projservo_cli.geometry.algebra import mat, put_mat
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kinematics import beyond_limits, start_pose
+from projservo_cli.geometry.kinematics import beyond_limits, forward
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
     MARKERS_LOST,
@@ -63,7 +63,7 @@ def run(
     for i in range(n):
         log.q[0, i] = q_start[i]
         log.read[0, i] = q_start[i]
-    put_mat(log.H[0], start_pose(plant.model, q_start))
+    put_mat(log.H[0], forward(plant.model, q_start))
     first_distance = 0.0
     first_error = math.nan
     waited = 0
@@ -95,7 +95,7 @@ def run(
         singular = False
         sound = True
         if in_front:
-            status = command(code, model, task, gains, s, log.read[k], state)
+            status = command(Law(code, model, task, gains), s, log.read[k], state)
             seen = status != LOST
             singular = status == SINGULAR
             sound = finite(state.q_dot)
@@ -191,7 +191,8 @@ class Job(NamedTuple):
 def many_steps(job: Job) -> float:
     """Measure, partition, command and limit, once in each state of a log: the cost of steps."""
     total = 0.0
+    law = Law(job.code, job.model, job.task, job.gains)
     for k in range(job.log.s.shape[0]):
-        command(job.code, job.model, job.task, job.gains, job.log.s[k], job.log.q[k], job.state)
+        command(law, job.log.s[k], job.log.q[k], job.state)
         total += limit_speed(job.state.q_dot, job.limits.speed)
     return total

@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, combine, dot, mat, mul, put_vec, vec
 from projservo_cli.geometry.displacement import as_array, as_mat, twist_exponential
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.geometry.kinematics import forward, row, start_pose
+from projservo_cli.geometry.kinematics import forward, row
 from projservo_cli.geometry.lens import bend
 from projservo_cli.records import FREE, FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
@@ -178,7 +178,7 @@ class AnalyticPlant:
         self.plant = plant
         self.noise = noise
         self.q = np.array(q_start, dtype=np.float64)
-        self.H = as_array(start_pose(plant.model, self.q))
+        self.H = as_array(forward(plant.model, self.q))
         self.reading = self.q.copy()
         self.shown: list[FloatArray] = []
         self.observations = 0

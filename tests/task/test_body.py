@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli.geometry.displacement import as_array, as_mat
-from projservo_cli.geometry.kernels import COORDINATES, solve_normal
+from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import (
     MOST_STEPS,
