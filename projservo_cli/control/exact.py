@@ -14,8 +14,8 @@ from projservo_cli.control.law import (
     SINGULAR,
     Gains,
     State,
-    follow,
     partitioned,
+    put_joint_velocity,
     single_rotation,
     speed_share,
     translation_rate,
@@ -75,7 +75,7 @@ def _first_order(step: _Step, state: State) -> float:
     """
     for i in range(state.xi_dot.shape[0]):
         state.xi_dot[i] = step.tau * state.q_hat[0, i] + step.theta * step.sense * state.q_hat[3, i]
-    if not follow(state):
+    if not put_joint_velocity(state):
         return math.nan
     most = 0.0
     for i in range(state.q_dot.shape[0]):

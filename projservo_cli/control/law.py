@@ -288,7 +288,7 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
 
 
 @merged
-def follow(state: State) -> bool:
+def put_joint_velocity(state: State) -> bool:
     """Joint velocity ``q_dot`` of the velocity ``xi_dot``; False where the joints cannot make it."""
     if state.work.span.H_hat.shape[0] == 0:
         return True

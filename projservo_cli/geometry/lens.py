@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.records import FloatArray
 
 FIRST = 3
 """Where k1 stands in a lens; k2 follows."""
@@ -34,7 +34,7 @@ def _swelling_rate(k1: Number, k2: Number, square: Number) -> Number:
     return k1 + 2.0 * (square * k2)
 
 
-def turning(k1: float, k2: float) -> float:
+def _turning(k1: float, k2: float) -> float:
     """Square of the radius at which the bent radius ρ (1 + k1 ρ² + k2 ρ⁴) turns back, infinite for never."""
     inner = 9.0 * (k1 * k1) - 20.0 * k2
     if not inner >= 0.0:
@@ -44,7 +44,7 @@ def turning(k1: float, k2: float) -> float:
 
 
 # The same three for the kernels, which call nothing that is not compiled.
-_compiled_factor, _compiled_rate, _compiled_limit = njit(_swelling), njit(_swelling_rate), njit(turning)
+_compiled_factor, _compiled_rate, _compiled_limit = njit(_swelling), njit(_swelling_rate), njit(_turning)
 
 
 @merged
@@ -157,18 +157,13 @@ def straight_views(lens: FloatArray, s: FloatArray) -> FloatArray:
     return found
 
 
-def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:
-    """Which straight pixels (..., 2) lie on this side of the turning point of a lens (..., 5)."""
-    _, square = _offsets(lens, pixels)
-    limit = np.vectorize(turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
-    return np.asarray(square < limit)
-
-
 def through(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """What cameras report of straight pixels: bent, NaN beyond the turning point; the same without a lens."""
     if not lens[..., FIRST:].any():
         return pixels
-    return np.where(within(lens, pixels)[..., None], bent(lens, pixels), np.nan)
+    _, square = _offsets(lens, pixels)
+    limit = np.vectorize(_turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
+    return np.where((square < limit)[..., None], bent(lens, pixels), np.nan)
 
 
 def bent_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

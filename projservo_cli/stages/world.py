@@ -11,8 +11,8 @@ import numpy as np
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.loop.summary import Ends
 from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model
-from projservo_cli.robots.truth import (
-    Robot,
+from projservo_cli.robots.simulated import (
+    Arm,
     dh_robot,
     inverse_kinematics,
     look_at_camera,
@@ -83,7 +83,7 @@ def image_size_of(config: "Config") -> tuple[int, int] | None:
 class Truth:
     """Robot, rig and markers as they are."""
 
-    robot: Robot  # true kinematics
+    robot: Arm  # true kinematics
     P: FloatArray  # (2, 3, 4) true cameras, px
     M: FloatArray  # (m, 4) all markers at the robot's reference, m
     number: tuple[int, ...]  # (m,) their numbers
@@ -178,7 +178,7 @@ def _built(described: "DescribedRobot", rig: "Rig", markers: "Markers") -> Truth
     )
 
 
-def robot_of(described: "DescribedRobot") -> Robot:
+def robot_of(described: "DescribedRobot") -> Arm:
     """Robot of a DH table or of screws."""
     limits = described.limits
     if described.dh is not None:
@@ -192,7 +192,7 @@ def robot_of(described: "DescribedRobot") -> Robot:
     assert screws is not None
     types = described.joint_types
     bounds = np.array(limits)
-    return Robot(
+    return Arm(
         np.array([twist(j.w, j.v) for j in screws.joints]),
         np.array([PRISMATIC if t == "P" else REVOLUTE for t in types], dtype=np.int64),
         np.array(screws.reference.values(types)),

@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.calibration.prediction import displacements, image_points, moved_points
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
-from projservo_cli.robots.truth import METRIC_A_INF
+from projservo_cli.robots.simulated import METRIC_A_INF
 from projservo_cli.stages.world import Truth
 
 RANGE = 0.9

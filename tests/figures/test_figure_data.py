@@ -10,7 +10,7 @@ from projservo_cli.report import style
 from projservo_cli.report.figures import path, planned, scene
 from projservo_cli.report.figures.drift import drift_tables
 from projservo_cli.report.material import percent, title
-from projservo_cli.robots.truth import camera_center, look_at_camera
+from projservo_cli.robots.simulated import camera_center, look_at_camera
 from projservo_cli.task.trajectory import trajectory_displacement
 from tests.figures.cases import GAINS, SPECS, case
 from tests.samples import prismatic, revolute

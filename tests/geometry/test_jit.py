@@ -59,13 +59,13 @@ CALL = """
 import json
 import numpy as np
 from projservo_cli.geometry.jit import CACHE_FOLDER
-from projservo_cli.geometry.kernels import least_squares
+from projservo_cli.geometry.kernels import least_squares, new_system
 from projservo_cli.task.visibility import margin_coefficients
 values = margin_coefficients((1.0, 2.0, 3.0, 4.0), (0.5,) * 16, (1.0, 1.0, 0.0, 2.0))
 # One that only compiled functions call is called from Python by way of another, and cached as well.
-B, x = np.array([[1.0, 2.0, 3.0, 0.0], [4.0, 0.0, 6.0, 0.0]]), np.zeros(2)
-rhs = np.array([9.0, 2.0, 15.0, 0.0])
-assert least_squares(B, 3, 2, x, np.zeros(2, dtype=np.int64), np.zeros(2), rhs)
+system, x = new_system(2, 3), np.zeros(2)
+system.B[:, :3], system.rhs[:3] = [[1.0, 2.0, 3.0], [4.0, 0.0, 6.0]], [9.0, 2.0, 15.0]
+assert least_squares(system, 3, x)
 assert np.allclose(x, [1.0, 2.0])
 hits = [sum(function.stats.cache_hits.values()) for function in (margin_coefficients, least_squares)]
 print(json.dumps([values, CACHE_FOLDER is not None, *hits]))

@@ -11,6 +11,7 @@ from projservo_cli.geometry.kinematics import (
     joint_operators,
 )
 from projservo_cli.geometry.mechanisms import (
+    Seen,
     in_span,
     joint_motion,
     reach,
@@ -91,7 +92,7 @@ def test_newton_finds_the_joints_of_a_redundant_arm(types, rng):
         goal = forward_kinematics(model, q_start + size * rng.normal(size=n))
         goal = goal @ np.linalg.inv(forward_kinematics(model, q_start))
         q = q_start.copy()
-        assert reach(model, backward(model, q_start), as_mat(goal), A, q, work, np.zeros(n))
+        assert reach(model, Seen(A, backward(model, q_start)), as_mat(goal), q, work, 1e-8)
         found = forward_kinematics(model, q) @ np.linalg.inv(forward_kinematics(model, q_start))
         assert found == pytest.approx(goal, abs=1e-12)
         # What the arm can do without moving the face is left alone, to first order.

@@ -17,8 +17,7 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.compiled import run
 from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FREE, Model
-from projservo_cli.robots.simulated import Plant, pose_after
-from projservo_cli.robots.truth import METRIC_A_INF, twist
+from projservo_cli.robots.simulated import METRIC_A_INF, Plant, pose_after, twist
 from projservo_cli.task.face import center_of, cyclic_order, face_plane, task_from_images
 from tests.samples import displacement, pixels
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.robots.truth import (
+from projservo_cli.robots.simulated import (
     camera_center,
     dh_robot,
     inverse_kinematics,

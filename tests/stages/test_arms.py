@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.geometry.kinematics import joint_operators, project
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.truth import rotation_about_axis
+from projservo_cli.robots.simulated import rotation_about_axis
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import start_and_goal
 from projservo_cli.stages.world import truth_of

@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.truth import rotation_about_axis
+from projservo_cli.robots.simulated import rotation_about_axis
 from projservo_cli.stages import calibrate, plan, servo
 from tests.conftest import ROOT
 

@@ -18,6 +18,7 @@ from projservo_cli.task.body import (
     fit_body,
     new_normal,
     normal_equations,
+    solve_normal,
 )
 from tests.samples import arm, displacement, frame, in_frame, pixels, poe, revolute
 
