@@ -48,19 +48,19 @@ REGISTER = (
     _entry(
         "4",
         "Projective rotation: algebra to group and group to algebra",
-        "geometry.displacement.rotation geometry.displacement.log_rotation "
+        "geometry.displacement.rotation calibration.closed_form.closed_form_operators "
         "calibration.prediction.displacements",
         "geometry/test_displacement.py::test_rotation_is_the_matrix_exponential "
-        "geometry/test_displacement.py::test_logarithm_inverts_the_rotation",
+        "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0 and ±π: such trial motions are refused.",
     ),
     _entry(
         "5",
         "Projective translation: algebra to group and group to algebra",
-        "geometry.displacement.translation geometry.displacement.log_translation "
+        "geometry.displacement.translation calibration.closed_form.closed_form_operators "
         "calibration.prediction.displacements",
         "geometry/test_displacement.py::test_translation_is_the_matrix_exponential "
-        "geometry/test_displacement.py::test_logarithm_inverts_the_translation",
+        "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0: such trial motions are refused.",
     ),
     _entry(

@@ -5,7 +5,7 @@ import numpy as np
 from projservo_cli.calibration.covariance import ProjectiveScene, isotropic
 from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.geometry.displacement import log_rotation, log_translation, normalize_displacement
+from projservo_cli.geometry.displacement import normalize_displacement
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 _LEAST_MARKERS = 5
@@ -57,6 +57,9 @@ def _mean_operator(
 ) -> FloatArray:
     """Operator (4, 4) of joint i from its trials, the rows of M (K, m, 4) where it alone moved.
 
+    Each says (H − H⁻¹) / (2 sin θ), or / (2 τ): [RH00] eqs. (4), (5) from group to algebra, weighted by the
+    square of what it is divided by.
+
     ``depth`` (4,) is a plane that all points lie on one side of.
     """
     total, weights = np.zeros((4, 4)), 0.0
@@ -76,8 +79,7 @@ def _mean_operator(
             H = normalize_displacement(_homography(A, B), A, depth)
         except WorkFailed as error:
             raise WorkFailed(f"joint {i + 1}, pose {readings.pose[k]}: {error}") from None
-        logarithm = log_translation if readings.prismatic[i] else log_rotation
-        total += lever**2 * logarithm(H, amplitude)
+        total += 0.5 * lever * (H - np.linalg.inv(H))
         weights += lever**2
     if weights == 0.0:
         raise WorkFailed(f"joint {i + 1} has no trial that can be used: {refused}")

@@ -11,7 +11,7 @@ from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import Solution, follow
 from projservo_cli.calibration.prediction import LENS
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.geometry.lens import FIRST, straight_views, through
+from projservo_cli.geometry.lens import FIRST, straight_views, within
 from projservo_cli.records import BoolArray, Calibration, FloatArray, WorkFailed
 
 _COEFFICIENTS = 2 * LENS
@@ -89,7 +89,7 @@ def _unfolded(solution: Solution) -> BoolArray:
     """Readings (2, N) on this side of the radius at which the distortion turns back."""
     assert solution.scene.lens is not None
     straight, _ = solution.problem.pixels(dataclasses.replace(solution.scene, lens=None))
-    return np.asarray(np.isfinite(through(solution.scene.lens[:, None], straight)).all(axis=2))
+    return within(solution.scene.lens[:, None], straight)
 
 
 def straight_readings(readings: Readings, lens: FloatArray | None) -> Readings:

@@ -250,17 +250,7 @@ def _aimed(task: Task, state: State) -> Task:
     """The task whose target is where the plan is now; the task itself where none is followed."""
     if not following(task.reference):
         return task
-    return Task(
-        task.s_star,
-        state.A_aim,
-        task.order,
-        task.center,
-        task.F,
-        task.O,
-        task.visible,
-        task.body,
-        task.reference,
-    )
+    return Task(task.s_star, state.A_aim, *task[2:])
 
 
 @internal

@@ -1,4 +1,4 @@
-"""Projective displacements between the group and its algebra: [RH00] equations (2), (4) and (5)."""
+"""Projective displacements between the group and its algebra: [RH00] equations (2), (4), (5), and (24)."""
 
 import math
 
@@ -9,9 +9,6 @@ from projservo_cli.geometry.jit import inline, merged, njit
 from projservo_cli.records import FloatArray, WorkFailed
 
 IDENTITY: Mat4 = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-# Below this sine the quotient in (4) loses more than half the digits of a double.
-LEAST_SINE = 1e-6
 
 
 @inline
@@ -53,32 +50,6 @@ def exp_rotation(H_hat: FloatArray, theta: float) -> FloatArray:
     return as_array(rotation(as_mat(H_hat), float(theta)))
 
 
-def log_rotation(H: FloatArray, theta: float) -> FloatArray:
-    """Operator (4, 4) of an observed projective rotation (4, 4), det H = 1, θ in rad: [RH00] eq. (4).
-
-    Raises WorkFailed if θ is a multiple of π, where H − H⁻¹ vanishes and the operator is undefined.
-    """
-    sine = math.sin(theta)
-    if abs(sine) < LEAST_SINE:
-        raise WorkFailed(
-            f"a rotation by {math.degrees(theta):.6g}° does not determine its operator: "
-            "use an angle away from 0° and ±180°"
-        )
-    result: FloatArray = (H - np.linalg.inv(H)) / (2.0 * sine)
-    return result
-
-
-def log_translation(H: FloatArray, tau: float) -> FloatArray:
-    """Operator (4, 4) of an observed projective translation (4, 4), det H = 1, τ in m: [RH00] eq. (5).
-
-    Raises WorkFailed if τ = 0, where the operator is undefined.
-    """
-    if abs(tau) < LEAST_SINE:
-        raise WorkFailed(f"a translation by {tau:.3g} does not determine its operator: use a longer one")
-    result: FloatArray = (H - np.linalg.inv(H)) / (2.0 * tau)
-    return result
-
-
 def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Scale a 4×4 homography to a displacement with det H = 1, [RH00] eq. (2).
 
@@ -99,10 +70,7 @@ def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> F
 
 def as_mat(H: FloatArray) -> Mat4:
     """(4, 4) array as the tuple of sixteen floats the kernels take."""
-    values = [float(x) for x in np.asarray(H, dtype=np.float64).ravel()]
-    if len(values) != 16:
-        raise ValueError(f"expected a 4×4 matrix, got shape {np.shape(H)}")
-    return tuple(values)  # type: ignore[return-value]  # sixteen, as checked; the type knows any number
+    return tuple(H.ravel().tolist())  # type: ignore[return-value]  # the type knows any number
 
 
 def as_array(H: Mat4) -> FloatArray:

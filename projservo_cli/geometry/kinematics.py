@@ -147,7 +147,9 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
 
     Raises WorkFailed if no metric is kept.
     """
-    basis = np.array([_symmetric(i, j) for i in range(3) for j in range(i, 3)])
+    i, j = np.triu_indices(3)
+    basis = np.zeros((6, 3, 3))
+    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, 1.0 / np.sqrt(2.0))
     changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
     _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T, full_matrices=True)
     sizes = np.r_[sizes, np.zeros(6 - len(sizes))]
@@ -160,10 +162,3 @@ def invariant_rotations(actions: FloatArray) -> FloatArray:
         )
     C = np.linalg.cholesky(Q).T
     return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])
-
-
-def _symmetric(i: int, j: int) -> FloatArray:
-    """Symmetric 3×3 matrix of unit norm with entries at i, j and j, i."""
-    S = np.zeros((3, 3))
-    S[i, j] = S[j, i] = 1.0
-    return S / np.linalg.norm(S)

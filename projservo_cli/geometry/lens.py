@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.records import FloatArray
+from projservo_cli.records import BoolArray, FloatArray
 
 FIRST = 3
 """Where k1 stands in a lens; k2 follows."""
@@ -157,13 +157,18 @@ def straight_views(lens: FloatArray, s: FloatArray) -> FloatArray:
     return found
 
 
+def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:
+    """Which straight pixels (..., 2) lie on this side of the turning point of a lens (..., 5)."""
+    _, square = _offsets(lens, pixels)
+    limit = np.vectorize(_turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
+    return np.asarray(square < limit)
+
+
 def through(lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """What cameras report of straight pixels: bent, NaN beyond the turning point; the same without a lens."""
     if not lens[..., FIRST:].any():
         return pixels
-    _, square = _offsets(lens, pixels)
-    limit = np.vectorize(_turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
-    return np.where((square < limit)[..., None], bent(lens, pixels), np.nan)
+    return np.where(within(lens, pixels)[..., None], bent(lens, pixels), np.nan)
 
 
 def bent_derivative(lens: FloatArray, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:

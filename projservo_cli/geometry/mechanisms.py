@@ -88,22 +88,6 @@ def _put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
     put_vec(work.system.B[i, first : first + 4], A)
 
 
-@internal
-def _kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
-    """Kernel of the eight rows in ``work.B``, compiled once for that number."""
-    return kernel_vector(work.system, 8, q_hat)
-
-
-@merged
-def _operator_of(work: Work, q_hat: FloatArray) -> Mat4:
-    """Operator Σ q̂_i Ĥ_i of a joint motion."""
-    operators = work.basis
-    H = multiple(float(q_hat[0]), mat(operators[0]))
-    for i in range(1, q_hat.shape[0]):
-        H = combine(1.0, H, float(q_hat[i]), mat(operators[i]))
-    return H
-
-
 @merged
 def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Translation along the line through A and A + D, [RH00] eq. (8).
@@ -117,8 +101,6 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
         operator = mat(operators[i])
         _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
         _put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
-    if not _kernel_of_eight(work, q_hat):
-        return False, NO_OPERATOR
     return _moving(work, q_hat)
 
 
@@ -131,8 +113,6 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
         operator = mat(operators[i])
         _put_rows(work, i, 0, apply(operator, A_1))
         _put_rows(work, i, 4, apply(operator, A_2))
-    if not _kernel_of_eight(work, q_hat):
-        return False, NO_OPERATOR
     return _to_radians(work, q_hat)
 
 
@@ -145,20 +125,22 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
         operator = mat(operators[i])
         _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
         _put_rows(work, i, 4, apply(operator, A))
-    if not _kernel_of_eight(work, q_hat):
-        return False, NO_OPERATOR
     return _to_radians(work, q_hat)
 
 
 @internal
 def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
-    """Operator of a kernel vector, refused where it moves nothing.
+    """Kernel vector of the eight rows of the system and its operator, refused where that moves nothing.
 
     At a kinematic singularity the kernel is the null motion of the robot: joints move, the face does
     not. Then Σ q̂_i Ĥ_i vanishes against its terms.
     """
-    H = _operator_of(work, q_hat)
+    if not kernel_vector(work.system, 8, q_hat):
+        return False, NO_OPERATOR
     operators = work.basis
+    H = multiple(float(q_hat[0]), mat(operators[0]))
+    for i in range(1, q_hat.shape[0]):
+        H = combine(1.0, H, float(q_hat[i]), mat(operators[i]))
     terms = 0.0
     for i in range(q_hat.shape[0]):
         operator = mat(operators[i])
@@ -170,7 +152,7 @@ def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
 
 @internal
 def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
-    """Scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
+    """The same with the scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
     found, H = _moving(work, q_hat)
     if not found:
         return False, NO_OPERATOR

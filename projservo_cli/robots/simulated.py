@@ -245,23 +245,14 @@ METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 class Arm(NamedTuple):
-    """True kinematics of a serial robot in its base frame.
+    """True kinematics of a serial robot in its base frame."""
 
-    Attributes
-    ----------
-    H_hat_0 : (n, 4, 4) twists at the reference, per rad or m.
-    joint_types : (n,) ``REVOLUTE`` or ``PRISMATIC``.
-    q_reference : (n,) rad or m.
-    base_tool : (4, 4) pose of the tool at the reference, m.
-    lower, upper : (n,) joint limits, rad or m.
-    """
-
-    H_hat_0: FloatArray
-    joint_types: IntArray
-    q_reference: FloatArray
-    base_tool: FloatArray
+    H_hat_0: FloatArray  # (n, 4, 4) twists at the reference, per rad or m
+    joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
+    q_reference: FloatArray  # (n,) rad or m
+    base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
     lower: FloatArray
-    upper: FloatArray
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
 
     def model(self, P: FloatArray) -> Model:
         """Metric model of the robot seen by the cameras P (2, 3, 4)."""
