@@ -23,9 +23,7 @@ from projservo_cli.loop.python import bind, bound_command
 from projservo_cli.loop.step import Limits, new_log
 from projservo_cli.records import LAWS, FloatArray
 from projservo_cli.robots.simulated import Plant
-from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
-from projservo_cli.stages.world import joints_of, truth_of
-from projservo_cli.task.body import body_of
+from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.face import Task
 
 if TYPE_CHECKING:
@@ -40,23 +38,19 @@ class Case:
     """A noisy run of 256 states of a simulated task and all that a step needs, with the true model."""
 
     def __init__(self, config: "Config") -> None:
-        truth = truth_of(config)
-        joints, pins = joints_of(config), [truth.number[i] for i in truth.pins]
-        shown, _ = start_and_goal(config, truth, pins)
-        self.m, self.q_start, self.model = len(truth.face), shown.q_start, truth.model
-        self.gains = gains_of(config, joints)
-        self.limits = limits_of(config, joints, config.noise.servo_px)._replace(
+        body = {"control": config.control.model_copy(update={"observation": "body"})}
+        scenario = scenario_of(config.model_copy(update=body))
+        shown, seen = scenario.exact, len(scenario.numbers)
+        self.m, self.q_start, self.model = scenario.m, shown.q_start, scenario.model
+        self.gains = scenario.gains
+        self.limits = scenario.limits._replace(
             image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
-        self.plant = plant_of(config, truth, shown.q_start)
-        self.task = shown.task(self.model)
-        order = [*truth.face, *truth.pins]
-        body = body_of(self.model, truth.M[order])
-        self.body_task = shown._replace(body=body).task(self.model)
-        self.body_plant = self.plant._replace(pins=truth.of(pins))
-        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, len(order), 2))
+        self.task = shown.by_points().task(self.model)
+        self.plant = scenario.plant_of("stacked")
+        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, seen, 2))
         self.points = self._states(self.task, self.plant)
-        self.whole = self._states(self.body_task, self.body_plant)
+        self.whole = self._states(shown.task(self.model), scenario.plant_of("exact"))
         self.state = new_state(len(self.q_start), self.m)
         self.bound = bind(CODES["direct_three"], self.model, self.task, self.gains, self.state)
 
@@ -115,7 +109,7 @@ def seconds(function: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def measure(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
+def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
     """Time everything so many rounds; see the schema of ``projservo bench --json``."""
     matrices = itertools.cycle(case.matrices())
     whole = case.whole_run()

@@ -20,7 +20,6 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
-from projservo_cli.stages.trace import deviation_between_samples_mm, summary_of, trace_of
 from projservo_cli.sweep.design import RUNS, Design, name_of_run, seed_of
 from projservo_cli.task.body import NO_BODY
 
@@ -220,7 +219,7 @@ TOGETHER = 16
 
 def _setting_of(scenario: Scenario, law: str) -> Setting:
     """All that compiled runs of a law share whose seeds differ."""
-    body, model = scenario.exact.body, scenario.calibration.model()
+    body, model = scenario.exact.body, scenario.model
     return Setting(
         CODES[law],
         model,
@@ -286,8 +285,7 @@ def _run(
         made = drive(scenario, plan, name)
     except WorkFailed:
         return {"verdict": NOT_STARTED}, None
-    summary = summary_of(scenario, made)
-    row = {"verdict": made.verdict, "steps": made.steps, **summary._asdict()}
+    row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
     if design.sweep.between_samples:
-        row[BETWEEN.name] = deviation_between_samples_mm(scenario, made, summary)
-    return row, trace_of(scenario, made) if keep else None
+        row[BETWEEN.name] = made.deviation_mm()
+    return row, made.trace() if keep else None

@@ -11,7 +11,8 @@ import pytest
 
 from projservo_cli import calibration, cli, files
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed, law_and_mode
-from projservo_cli.stages import chain, steps
+from projservo_cli.stages import steps
+from projservo_cli.stages import steps as chain
 from projservo_cli.tables import read_table
 from tests.fake_records import fake
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError
-from projservo_cli.stages.plan import Profile, demands_of, plan_task
+from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import Shown
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.tasks import STRATA, random_tasks
+from projservo_cli.sweep.design import STRATA, random_tasks
 from projservo_cli.task.planning import turning_sense
-from tests.known import configured
+from tests.known import asked, configured, known_scenario
 from tests.planning.cases import constrained, reaching_of
 from tests.planning.oracle import TrueTask
 from tests.samples import frame, in_frame, pixels, poe
@@ -30,7 +30,7 @@ class Judged:
         H = [truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool) for q in (q_start, q_goal)]
         self.true = TrueTask(truth.P, truth.image_size, *((truth.M_face @ T.T)[:, :3] for T in H))
         shown = Shown(q_start, s_start, s_star, truth.center)
-        self.plan = plan = plan_task(model, shown, Profile("constrained"), demands_of(config))
+        self.plan = plan = plan_task(model, shown, asked("constrained"), known_scenario(config).demands)
         fine = np.linspace(0.0, 1.0, 1001)
         mu = np.stack([np.interp(fine, plan.sigma, column) for column in plan.mu.T], axis=1)
         senses = min(
@@ -150,8 +150,7 @@ def test_what_makes_a_task_infeasible_is_named():
 def test_a_start_that_is_the_goal_is_planned_as_no_motion():
     example = case("ur5")
     shown = example.ends._replace(s_star=example.ends.s_start)
-    asked = Profile("constrained", samples=5)
-    plan = plan_task(example.truth.model, shown, asked, demands_of(example.config))
+    plan = plan_task(example.truth.model, shown, asked("constrained", 5), example.scenario.demands)
     assert plan.feasible
     assert plan.duration == pytest.approx(0.0, abs=1e-6)
     assert np.abs(plan.H_d - np.eye(4)).max() < 1e-7

@@ -12,7 +12,8 @@ import pytest
 from projservo_cli.cli import run
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.store import SweepTable, load
-from projservo_cli.sweep import driver, engine
+from projservo_cli.sweep import engine
+from projservo_cli.sweep import folder as driver
 from projservo_cli.sweep.engine import Engine
 from projservo_cli.sweep.folder import Folder
 from projservo_cli.sweep.runs import run_part
@@ -169,7 +170,7 @@ def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypa
     found, folder = design(runs=2, chunk=2), Folder(tmp_path)
     for name in ("Folder.assemble", "shutil.rmtree"):
         with monkeypatch.context() as patched:
-            patched.setattr(f"projservo_cli.sweep.driver.{name}", killed)
+            patched.setattr(f"projservo_cli.sweep.folder.{name}", killed)
             with pytest.raises(SystemExit):
                 make(found, tmp_path)
         status = folder.status(found)
@@ -231,7 +232,7 @@ def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, mon
         found, recorded = design(runs=1, chunk=1), Recorded(workers)
         made.clear()
         folder = Folder(tmp_path / f"sweep{len(said)}{workers}")
-        driver.run(found, folder, recorded, lambda *_: None, said.append, force=True)
+        driver.run_sweep(found, folder, recorded, lambda *_: None, said.append, force=True)
         return recorded.given, [(part.first, part.last) for part in made]
 
     every = [(0, 1), (1, 2)]

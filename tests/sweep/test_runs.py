@@ -10,7 +10,7 @@ from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.sweep import runs
 from projservo_cli.sweep.design import changed, name_of_run
-from projservo_cli.sweep.driver import calibrate_one
+from projservo_cli.sweep.folder import calibrate_one
 from projservo_cli.sweep.runs import Part, is_compiled, numbers_of, run_part
 from tests.sweep.cases import design
 

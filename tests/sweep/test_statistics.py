@@ -10,9 +10,8 @@ import pytest
 from projservo_cli.records import InputError
 from projservo_cli.store import SweepTable, assemble, write_part
 from projservo_cli.sweep.folder import Folder
-from projservo_cli.sweep.report import report
 from projservo_cli.sweep.runs import MEASURED, NUMBERED, Column
-from projservo_cli.sweep.statistics import Rows, statistics, success_by, wilson
+from projservo_cli.sweep.statistics import Rows, report, statistics, success_by, wilson
 from tests.sweep.cases import design, make
 
 AXES = [["noise.servo_px", [0, 1]], ["law", ["direct_two", "stacked"]]]
