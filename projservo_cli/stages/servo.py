@@ -178,9 +178,7 @@ def _reason(run: Outcome, joint: int, remaining: tuple[float | None, float | Non
     }[run.verdict]
 
 
-def run(
-    config: "Config", calibration: Calibration, plan: Plan, name: str, *, progress: object = None
-) -> Trace:
+def run(config: "Config", calibration: Calibration, plan: Plan, name: str) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.

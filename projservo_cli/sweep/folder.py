@@ -23,7 +23,7 @@ from projservo_cli.files import replacing
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
-from projservo_cli.stages.steps import steps_for
+from projservo_cli.stages.steps import result_of, steps_for
 from projservo_cli.store import TABLE, Result, Run, SweepTable, assemble, load, save, write_part
 from projservo_cli.sweep.design import Design, from_recipe, name_of_run
 from projservo_cli.sweep.engine import Engine, versions
@@ -32,7 +32,7 @@ from projservo_cli.sweep.runs import Part, columns_of, is_compiled, run_part
 REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
 
 
-class Status(NamedTuple):
+class _Status(NamedTuple):
     """How far a sweep is: runs that are stored, and in all; ``complete`` when its parts are gone too."""
 
     done: int
@@ -41,7 +41,7 @@ class Status(NamedTuple):
     complete: bool = False
 
 
-class Calibrated(NamedTuple):
+class _Calibrated(NamedTuple):
     """What became of the calibration of a key: records, or why there are none."""
 
     key: str
@@ -76,7 +76,7 @@ class Folder:
             if self.part(first, last) not in stored:
                 yield first, last
 
-    def status(self, design: Design, *, force: bool = False) -> Status:
+    def status(self, design: Design, *, force: bool = False) -> _Status:
         """How far a sweep is.
 
         Raises InputError if the folder holds another sweep, or one made with other versions, and ``force`` is
@@ -88,12 +88,12 @@ class Folder:
                 f"{self.table}: its {self.manifest.name} is missing; choose another folder or use --force"
             )
         if force or not self.manifest.exists():
-            return Status(0, total, 0)
+            return _Status(0, total, 0)
         chunk = self._chunk(design)
         if self.table.exists() and SweepTable(self.table).rows == total:
-            return Status(total, total, chunk, complete=not self.stored())
+            return _Status(total, total, chunk, complete=not self.stored())
         left = sum(last - first for first, last in self.missing(design, chunk))
-        return Status(total - left, total, chunk)
+        return _Status(total - left, total, chunk)
 
     def _chunk(self, design: Design) -> int:
         """Runs of a part; refuses what was made of another configuration, or with versions of other bits."""
@@ -166,19 +166,15 @@ class Folder:
             if not any(self.calibration(key).with_suffix(kind).exists() for kind in (".h5", REFUSED))
         ]
 
-    def keep_calibration(self, made: Calibrated) -> None:
+    def keep_calibration(self, made: _Calibrated) -> None:
         """Store a calibration as a run file of its own, or why there is none."""
         path = self.calibration(made.key)
         if made.records is None:
             with replacing(path.with_suffix(REFUSED)) as temporary:
                 temporary.write_text(made.reason + "\n", encoding="utf-8")
             return
-        names = ("observation", "calibration", "cross_validation")
-        records = {name: one for name, one in zip(names, made.records, strict=True) if one is not None}
         (step,) = steps_for(made.config, Run(path), ["calibrate"])
-        origin = provenance.collect(seed=made.config.seed)
-        text = to_yaml(made.config)
-        save(Run(path, text, {"calibrate": Result(step.key, text, origin, step.inputs, records)}))
+        save(Run(path, to_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
 
     def calibrations(self, design: Design) -> dict[str, Calibration | None]:
         """Calibrations by their key, None where one was refused; without covariance, which no run needs."""
@@ -202,12 +198,13 @@ def run_of(target: str) -> tuple[Config, Result | None]:
         raise InputError(f"--from {target}: expected SWEEP:INDEX, such as results/sweep_noise:17")
     folder = Folder(sweep)
     design = folder.design()
-    at = design.numbers(int(index))
-    config = design.config(at.run).model_copy(update={"name": f"{design.sweep.name}-{at.run}"})
-    path = folder.calibration(design.calibration_key(at.cell, at.calibration))
+    run = int(index)
+    cell, _, number, _ = design.numbers(run)
+    config = design.config(run).model_copy(update={"name": f"{design.sweep.name}-{run}"})
+    path = folder.calibration(design.calibration_key(cell, number))
     refused = path.with_suffix(REFUSED)
     if refused.exists():
-        raise WorkFailed(f"run {at.run}: {refused.read_text(encoding='utf-8').strip()}")
+        raise WorkFailed(f"run {run}: {refused.read_text(encoding='utf-8').strip()}")
     if not path.exists():
         return config, None
     (step,) = steps_for(config, Run(path), ["calibrate"])
@@ -231,7 +228,7 @@ def run_sweep(
     say: Callable[[str], None],
     *,
     force: bool = False,
-) -> Status:
+) -> _Status:
     """Make the runs of a sweep that are not stored yet, and the table.
 
     Raises InputError if the folder holds another sweep, a file cannot be written, or a drawn value is
@@ -253,14 +250,14 @@ def run_sweep(
         engine.close()
     folder.assemble(design)
     shutil.rmtree(folder.parts)
-    return Status(design.total, design.total, status.chunk, complete=True)
+    return _Status(design.total, design.total, status.chunk, complete=True)
 
 
 def _make(
     design: Design,
     folder: Folder,
     engine: Engine,
-    status: Status,
+    status: _Status,
     progress: Progress,
     say: Callable[[str], None],
 ) -> None:
@@ -270,7 +267,7 @@ def _make(
     _compile_once(design, engine, say)
     wanted = folder.missing_calibrations(design)
     most = 1 + len(wanted) // CALIBRATIONS
-    with closing(engine.completed(calibrate_one, wanted, most=most)) as calibrated:
+    with closing(engine.completed(_calibrate, wanted, most=most)) as calibrated:
         for count, one in enumerate(calibrated):
             folder.keep_calibration(one)
             progress("calibrations", count + 1, len(wanted))
@@ -278,7 +275,7 @@ def _make(
 
     def part(first: int, last: int) -> Part:
         at = design.placed(np.arange(first, last))
-        pairs = zip(at["cell"].tolist(), at["calibration"].tolist(), strict=True)
+        pairs = zip(at.cell.tolist(), at.calibration.tolist(), strict=True)
         keys = {design.calibration_key(*pair) for pair in set(pairs)}
         return Part(design, first, last, {key: calibrations[key] for key in keys})
 
@@ -309,13 +306,13 @@ def _shares_settings(design: Design) -> bool:
     return all(is_compiled(design, design.cell(cell)) for cell in range(design.cells))
 
 
-def calibrate_one(wanted: tuple[str, Config]) -> Calibrated:
+def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
     """Make the calibration of a key, on one thread like all that must be the same to the bit."""
     with threadpool_limits(1):
         try:
-            return Calibrated(*wanted, calibrate.run(wanted[1]))
+            return _Calibrated(*wanted, calibrate.run(wanted[1]))
         except WorkFailed as error:
-            return Calibrated(*wanted, None, str(error))
+            return _Calibrated(*wanted, None, str(error))
 
 
 def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
@@ -333,8 +330,8 @@ def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) ->
 
 def _first_runs(design: Design) -> None:
     """One calibration and a run of each law with it, for the kernels they leave."""
-    records = calibrate_one((design.calibration_key(0, 0), design.calibrated(0, 0))).records
-    calibration = None if records is None else records[1]
+    made = _calibrate((design.calibration_key(0, 0), design.calibrated(0, 0)))
+    calibration = None if made.records is None else made.records[1]
     cells = range(design.cells // len(design.bases))
     by_law = {name_of_run(design.cell(cell)): cell for cell in reversed(cells)}
     for cell in by_law.values():

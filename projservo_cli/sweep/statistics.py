@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,19 +35,7 @@ MEASURES = (
 PAIRED = ("steps", "position_error_mm", "path_length_ratio")
 
 
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Interval of 95 % for a share of which so many of so many were seen; NaN where none was.
-
-    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
-    Journal of the American Statistical Association 22 (1927), p. 209.
-    """
-    if count == 0:
-        return math.nan, math.nan
-    interval = binomtest(successes, count).proportion_ci(0.95, "wilson")
-    return float(interval.low), float(interval.high)
-
-
-class Rows:
+class _Rows:
     """Columns of a table as they are needed, and what follows from them.
 
     table : of a sweep.
@@ -67,6 +55,8 @@ class Rows:
     def _derived(self, name: str) -> npt.NDArray[Any]:
         if name == "success":
             return np.asarray(self.table.column("verdict") == SUCCESS)
+        if name == LAW and LAW not in self.table.names:  # where an axis of another name sets it
+            return np.full(self.table.rows, "all")
         if name == "self_occluded":
             return (self["self_occluded_steps_left"] > 0) | (self["self_occluded_steps_right"] > 0)
         if name == "left_image":
@@ -89,7 +79,7 @@ class Rows:
             yield int(cell), self["cell"] == cell
 
 
-def statistics(rows: Rows) -> dict[str, Any]:
+def _statistics(rows: _Rows) -> dict[str, Any]:
     """Statistics of every cell, and laws against each other, as JSON values."""
     return {
         "cells": [
@@ -99,7 +89,7 @@ def statistics(rows: Rows) -> dict[str, Any]:
     }
 
 
-def _of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
+def _of_runs(rows: _Rows, these: BoolArray) -> dict[str, Any]:
     """Statistics of some runs; quantiles of those that converged."""
     count, good = int(these.sum()), these & rows["success"]
     successes = int(good.sum())
@@ -108,12 +98,22 @@ def _of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
         "runs": count,
         "converged": successes,
         "success_rate": successes / count,
-        "success_interval": wilson(successes, count),
+        "success_interval": _interval(successes, count),
         "self_occluded_rate": float(rows["self_occluded"][these].mean()),
         "left_image_rate": float(rows["left_image"][these].mean()),
         "verdicts": dict(zip(verdicts.tolist(), counts.tolist(), strict=True)),
         "quantiles": {name: _quantiles(rows[name][good]) for name in MEASURES},
     }
+
+
+def _interval(successes: int, count: int) -> tuple[float, float]:
+    """Interval of 95 % for a share of which so many of so many were seen.
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    Journal of the American Statistical Association 22 (1927), p. 209.
+    """
+    interval = binomtest(successes, count).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
@@ -123,7 +123,7 @@ def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
     return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}
 
 
-def _paired(rows: Rows) -> Iterator[dict[str, Any]]:
+def _paired(rows: _Rows) -> Iterator[dict[str, Any]]:
     """Each two laws on the same tasks with the same noise, in every combination of the other values."""
     names = [name for name, _ in rows.axes]
     if LAW not in names:
@@ -139,7 +139,7 @@ def _paired(rows: Rows) -> Iterator[dict[str, Any]]:
             yield {**values, "laws": [first, second], **_compared(rows, one, laws[second][1])}
 
 
-def _compared(rows: Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
+def _compared(rows: _Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
     """Runs of two laws that share their draws: how often which arrives, and differences where both do.
 
     The probabilities are of the exact test of McNemar and of the sign test: how often a difference as
@@ -169,33 +169,6 @@ def _chance(first: int, second: int) -> float:
     return float(binomtest(first, first + second).pvalue) if first + second else 1.0
 
 
-def success_by(rows: Rows, name: str, edges: Sequence[float] | None = None) -> Mapping[str, dict[str, Any]]:
-    """Success of each law over a column: at each of its values, or within edges.
-
-    Returns for each law arrays (k,): x, runs, rate, low and high of the interval.
-    """
-    x, success = rows[name], rows["success"]
-    law = rows[LAW] if LAW in rows.table.names else np.full(len(x), "all")
-    found: dict[str, dict[str, Any]] = {}
-    for one in dict.fromkeys(law.tolist()):
-        mine = law == one
-        bins = (
-            [(float(value), mine & (x == value)) for value in np.unique(x[mine])]
-            if edges is None
-            else [(0.5 * (low + high), mine & (x >= low) & (x < high)) for low, high in pairwise(edges)]
-        )
-        rows_of = [(at, int(these.sum()), int((these & success).sum())) for at, these in bins if these.any()]
-        intervals = np.array([wilson(good, count) for _, count, good in rows_of]).reshape(-1, 2)
-        found[one] = {
-            "x": np.array([at for at, _, _ in rows_of]),
-            "runs": np.array([count for _, count, _ in rows_of]),
-            "rate": np.array([good / count for _, count, good in rows_of]),
-            "low": intervals[:, 0],
-            "high": intervals[:, 1],
-        }
-    return found
-
-
 STATISTICS = "statistics.json"
 OFFSET = "task.start_offset."
 ANGLES = tuple(range(0, 181, 30))
@@ -220,37 +193,34 @@ def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[
     if folder.stored():
         folder.assemble(folder.design())
     table = SweepTable(folder.table)
-    rows = Rows(table)
-    found = {"runs": table.rows, "total": table.attributes["total"], **statistics(rows)}
-    files = [folder.path / STATISTICS]
-    with replacing(files[0]) as temporary:
-        temporary.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    rows = _Rows(table)
+    found = {"runs": table.rows, "total": table.attributes["total"], **_statistics(rows)}
+    text = json.dumps(found, indent=1, allow_nan=False) + "\n"
+    files = [_written(folder.path / STATISTICS, text.encode())]
     pictures = list(_pictures(rows))
     for done, picture in enumerate(pictures):
         progress("figures", done, len(pictures))
-        files += _drawn(picture, folder.path, formats)
+        made = {**_drawn(picture, formats), "csv": to_csv(picture.data).encode()}
+        files += [_written(folder.path / f"{picture.name}.{kind}", made[kind]) for kind in made]
     progress("figures", len(pictures), len(pictures))
     return found, files
 
 
-def _drawn(picture: _Picture, folder: Path, formats: Sequence[str]) -> Iterator[Path]:
+def _written(path: Path, content: bytes) -> Path:
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+    return path
+
+
+def _drawn(picture: _Picture, formats: Sequence[str]) -> dict[str, bytes]:
     with style.styled():
         figure = style.new_figure(picture.height, 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH)
         picture.draw(picture.data, figure)
         style.arrange(figure)
-        made = style.contents(figure, formats)
-    for kind, content in made.items():
-        path = folder / f"{picture.name}.{kind}"
-        with replacing(path) as temporary:
-            temporary.write_bytes(content)
-        yield path
-    path = folder / f"{picture.name}.csv"
-    with replacing(path) as temporary:
-        temporary.write_text(to_csv(picture.data), encoding="utf-8")
-    yield path
+        return style.contents(figure, formats)
 
 
-def _pictures(rows: Rows) -> Iterator[_Picture]:
+def _pictures(rows: _Rows) -> Iterator[_Picture]:
     """Every figure that the columns of a sweep allow."""
     axes = {name: values for name, values in rows.axes if len(values) > 1 and _numeric(values)}
     for name in axes:
@@ -274,13 +244,29 @@ def _numeric(values: Sequence[Any]) -> bool:
     return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
 
 
-def _success(rows: Rows, name: str, label: str, edges: Sequence[float] | None) -> Data:
-    found = success_by(rows, name, edges)
-    columns = {f"{law}.{key}": values for law, by in found.items() for key, values in by.items()}
-    return {"label": np.array(label), **columns}
+def _success(rows: _Rows, name: str, label: str, edges: Sequence[float] | None) -> Data:
+    """Success of each law over a column, at each of its values or within edges.
+
+    Of each law ``x``, ``runs``, ``rate``, and ``low`` and ``high`` of the interval (k,).
+    """
+    x, success, law = rows[name], rows["success"], rows[LAW]
+    data: Data = {"label": np.array(label)}
+    for one in dict.fromkeys(law.tolist()):
+        mine = law == one
+        bins = (
+            [(float(value), mine & (x == value)) for value in np.unique(x[mine])]
+            if edges is None
+            else [(0.5 * (low + high), mine & (x >= low) & (x < high)) for low, high in pairwise(edges)]
+        )
+        counted = [(at, int(these.sum()), int((these & success).sum())) for at, these in bins if these.any()]
+        at, count, good = (np.array([row[i] for row in counted]) for i in range(3))
+        low, high = np.array([_interval(*pair) for pair in zip(good, count, strict=True)]).reshape(-1, 2).T
+        columns = {"x": at, "runs": count, "rate": good / count, "low": low, "high": high}
+        data |= {f"{one}.{key}": values for key, values in columns.items()}
+    return data
 
 
-def _basin(rows: Rows, first: str, second: str) -> Data:
+def _basin(rows: _Rows, first: str, second: str) -> Data:
     x, y, begun = np.unique(rows[first]), np.unique(rows[second]), rows["steps"] >= 0
     data: Data = {"x": x, "y": y, "label_x": np.array(first), "label_y": np.array(second)}
     for law in dict.fromkeys(rows[LAW].tolist()):
@@ -294,7 +280,7 @@ def _basin(rows: Rows, first: str, second: str) -> Data:
     return data
 
 
-def _final_errors(rows: Rows) -> Data:
+def _final_errors(rows: _Rows) -> Data:
     data: Data = {}
     for law in dict.fromkeys(rows[LAW].tolist()):
         errors = rows["position_error_mm"][rows[LAW] == law]
