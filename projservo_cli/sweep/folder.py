@@ -24,7 +24,8 @@ from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
 from projservo_cli.stages.steps import result_of, steps_for
-from projservo_cli.store import TABLE, Result, Run, SweepTable, assemble, load, save, write_part
+from projservo_cli.store import Result, Run, load, save
+from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
 from projservo_cli.sweep.design import Design, from_recipe, name_of_run
 from projservo_cli.sweep.engine import Engine, versions
 from projservo_cli.sweep.runs import Part, columns_of, is_compiled, run_part

@@ -18,7 +18,7 @@ from projservo_cli.report import style
 from projservo_cli.report.figures.sweeps import draw_basin, draw_final_errors, draw_success
 from projservo_cli.report.material import Data
 from projservo_cli.stages import Progress
-from projservo_cli.store import SweepTable
+from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweep.folder import Folder
 from projservo_cli.tables import to_csv
 

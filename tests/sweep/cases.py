@@ -1,7 +1,7 @@
 """Small sweeps of a robot with few trial motions, quick enough to be made many times."""
 
 from projservo_cli.config.sweep import SweepConfig
-from projservo_cli.store import SweepTable
+from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweep.design import read_design
 from projservo_cli.sweep.engine import Engine
 from projservo_cli.sweep.folder import Folder, run_sweep

@@ -11,7 +11,8 @@ import pytest
 
 from projservo_cli.cli import run
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.store import SweepTable, load
+from projservo_cli.store import load
+from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweep import engine
 from projservo_cli.sweep import folder as driver
 from projservo_cli.sweep.engine import Engine

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError
-from projservo_cli.store import assemble, write_part
+from projservo_cli.store.sweep_table import assemble, write_part
 from projservo_cli.sweep.folder import Folder
 from projservo_cli.sweep.runs import MEASURED, NUMBERED
 from projservo_cli.sweep.statistics import report
