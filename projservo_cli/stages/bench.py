@@ -5,9 +5,9 @@ least times, which a busy machine disturbs the least.
 """
 
 import itertools
-import time
 from collections.abc import Callable
 from functools import partial
+from timeit import timeit
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.loop.compiled import Job, many_steps
 from projservo_cli.loop.compiled import run as run_compiled
 from projservo_cli.loop.python import bind, bound_command
-from projservo_cli.loop.step import Limits, new_log
+from projservo_cli.loop.step import new_log
 from projservo_cli.records import LAWS, FloatArray
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import scenario_of
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
-BODY = "exact, body"
+BODY, CODE = "exact, body", CODES["direct_three"]
 
 
 class Case:
@@ -40,39 +40,25 @@ class Case:
     def __init__(self, config: "Config") -> None:
         body = {"control": config.control.model_copy(update={"observation": "body"})}
         scenario = scenario_of(config.model_copy(update=body))
-        shown, seen = scenario.exact, len(scenario.numbers)
-        self.m, self.q_start, self.model = scenario.m, shown.q_start, scenario.model
-        self.gains = scenario.gains
+        shown, gains = scenario.exact, scenario.gains
+        self.m, self.q_start, self.model, self.gains = scenario.m, shown.q_start, scenario.model, gains
         self.limits = scenario.limits._replace(
             image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
-        self.task = shown.by_points().task(self.model)
-        self.plant = scenario.plant_of("stacked")
-        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, seen, 2))
-        self.points = self._states(self.task, self.plant)
-        self.whole = self._states(shown.task(self.model), scenario.plant_of("exact"))
-        self.state = new_state(len(self.q_start), self.m)
-        self.bound = bind(CODES["direct_three"], self.model, self.task, self.gains, self.state)
+        seen = 2, len(scenario.numbers), 2
+        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, *seen))
+        self.whole = self._run(shown.task(self.model), scenario.plant_of("exact"))
+        self.points = self._run(shown.by_points().task(self.model), scenario.plant_of("stacked"))
+        state = new_state(len(self.q_start), self.m)
+        self.bound = bind(CODE, self.model, self.points.task, gains, state)
 
-    def job(self, task: Task, plant: Plant, limits: Limits) -> Job:
-        """One run of direct_three with a state and a log of its own."""
+    def _run(self, task: Task, plant: Plant) -> Job:
+        """A run, whose log has the states that are cycled through."""
         n, seen = len(self.q_start), self.m + len(plant.pins)
-        return Job(
-            CODES["direct_three"],
-            self.model,
-            task,
-            self.gains,
-            limits,
-            plant,
-            np.ascontiguousarray(self.noise[:, :, :seen]),
-            self.q_start.copy(),
-            new_state(n, self.m),
-            new_log(n, seen, limits.max_steps, len(ERRORS)),
-        )
-
-    def _states(self, task: Task, plant: Plant) -> Job:
-        """A run whose log has the states that are cycled through."""
-        job = self.job(task, plant, self.limits)
+        noise = np.ascontiguousarray(self.noise[:, :, :seen])
+        log = new_log(n, seen, self.limits.max_steps, len(ERRORS))
+        start, state = self.q_start.copy(), new_state(n, self.m)
+        job = Job(CODE, self.model, task, self.gains, self.limits, plant, noise, start, state, log)
         run_compiled(*job)
         return job
 
@@ -88,7 +74,8 @@ class Case:
 
     def whole_run(self) -> Job:
         """A run of 150 steps, traced."""
-        return self.job(self.task, self.plant, self.limits._replace(max_steps=STEPS))
+        log = new_log(len(self.q_start), self.m, STEPS, len(ERRORS))
+        return self.points._replace(limits=self.limits._replace(max_steps=STEPS), log=log)
 
     def matrices(self) -> FloatArray:
         """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
@@ -97,16 +84,9 @@ class Case:
         found = np.empty((STATES, 8, len(self.q_start)))
         for k in range(STATES):
             operators_at(self.model, Q[k], work.H_hat)
-            A = self.task.A_star
+            A = self.points.task.A_star
             found[k] = np.concatenate([(work.H_hat @ A[0]).T, (work.H_hat @ A[1]).T])
         return found
-
-
-def seconds(function: Callable[[], object]) -> float:
-    """Time of one call, s."""
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
 
 
 def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
@@ -124,7 +104,10 @@ def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
         for function, _ in timed.values():
             function()
         table = 1e6 * np.array(
-            [[seconds(function) / count for function, count in timed.values()] for _ in range(rounds)]
+            [
+                [timeit(function, number=1) / count for function, count in timed.values()]
+                for _ in range(rounds)
+            ]
         )
     svd = float(table[:, 0].min())
     times = {name: _times(table[:, i], svd) for i, name in enumerate(timed)}
