@@ -10,7 +10,7 @@ from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.robots.yours import METHODS, DrivenRobot, ForeignRobot, Robot
-from projservo_cli.stages.scenario import Scenario, noise_px, observed
+from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.world import Joints
 
 if TYPE_CHECKING:
@@ -76,42 +76,37 @@ def step_limit(config: "Config", joints: Joints) -> FloatArray:
 
 def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
     """The robot, and as the loop of a law sees it: beside the plant that the calibration takes it for."""
-    numbers, plant = observed(scenario.config, scenario.calibration), _believed_plant(scenario)
+    assert scenario.calibration is not None
+    known, numbers = scenario.calibration.marker.tolist(), scenario.observed
+    face = [known.index(number) for number in scenario.numbers[: scenario.m]]
     innovation = None
     if not untested(scenario):
-        noise = scenario.config.stop.innovation_factor * noise_px(scenario.config, scenario.calibration)
+        noise = scenario.config.stop.innovation_factor * scenario.noise_px
         innovation = Innovation(scenario.calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
-    known = scenario.calibration.marker.tolist()
     shown = np.array([numbers.index(number) for number in scenario.numbers_of(law)])
     order = np.array([numbers.index(number) if number in numbers else -1 for number in known])
-    robot = foreign_robot(scenario.config, scenario.joints, len(numbers))
-    return robot, DrivenRobot(robot, plant, shown, order, innovation)
-
-
-def _believed_plant(scenario: Scenario) -> Plant:
-    """The calibrated robot and face as the plant that the loop takes it for."""
-    config, calibration = scenario.config, scenario.calibration
-    model, known = calibration.model(), calibration.marker.tolist()
-    task = scenario.ends.by_points().task(model)
-    size = config.rig.image_size_px if config.rig is not None else (math.inf, math.inf)
-    return Plant(
-        model,
-        np.ascontiguousarray(calibration.M[[known.index(n) for n in scenario.numbers[: scenario.m]]]),
+    task, rig = scenario.ends.by_points().task(scenario.model), scenario.config.rig
+    plant = Plant(
+        scenario.model,
+        np.ascontiguousarray(scenario.calibration.M[face]),
         task.order,
         task.center,
         task.O,
         task.visible,
-        np.array(size, dtype=np.float64),
+        np.array(rig.image_size_px if rig is not None else (math.inf, math.inf), dtype=np.float64),
         scenario.joints.lower,
         scenario.joints.upper,
         False,
     )
+    robot = foreign_robot(scenario.config, scenario.joints, len(numbers))
+    return robot, DrivenRobot(robot, plant, shown, order, innovation)
 
 
 def untested(scenario: Scenario) -> str:
     """Why images in the loop are not tested against the calibration; empty where they are."""
     if scenario.config.stop.innovation_factor == 0.0:
         return "stop.innovation_factor is 0"
+    assert scenario.calibration is not None
     if not np.isfinite(scenario.calibration.covariance).all():
         return "the calibration has no covariance, which the method refined gives"
     return ""

@@ -11,10 +11,9 @@ from projservo_cli.config import digest
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.yours import Robot, at_rest_after
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.calibrate import images_at, trial_motions
+from projservo_cli.stages.calibrate import images_at, trial_motions, trial_noise
 from projservo_cli.stages.own_robot import drive_to, foreign_robot, near, step_limit
-from projservo_cli.stages.scenario import CALIBRATION_NOISE, calibration_seed, generator
-from projservo_cli.stages.world import Truth, joints_of, outside, truth_of
+from projservo_cli.stages.world import Truth, beyond_limits, joints_of, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 if TYPE_CHECKING:
@@ -110,7 +109,7 @@ def prepare(
     if motions is not None:
         joints = joints_of(config)
         for pose, q in zip(motions.pose, motions.q, strict=True):
-            if wrong := outside(q, joints.lower, joints.upper):
+            if wrong := beyond_limits(q, joints.lower, joints.upper):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
     key = digest(config, DEPENDS_ON)[:16]
@@ -153,7 +152,7 @@ def record(
     """
     if robot is None and config.plant.use is not None:
         robot = foreign_robot(config, joints_of(config), len(recording.marker))
-    driven = robot or simulated(config, recording)
+    driven = robot or _simulated(config, recording)
     limit = step_limit(config, joints_of(config))
     total, saved, took, unsaved = len(recording.targets), time.monotonic(), 0.0, False
     try:
@@ -176,9 +175,7 @@ def record(
             recording.save()
 
 
-def simulated(config: "Config", recording: _Recording) -> SimulatedRobot:
+def _simulated(config: "Config", recording: _Recording) -> SimulatedRobot:
     """The robot of a configuration at its reference, with the noise that ``calibrate`` would add."""
-    truth = truth_of(config)
-    rng = generator(calibration_seed(config), CALIBRATION_NOISE)
-    noise = rng.standard_normal((len(recording.targets), 2, len(truth.number), 2))
-    return SimulatedRobot(truth, recording.targets[0], config.noise.calibration_px * noise[recording.pending])
+    noise = trial_noise(config, len(recording.targets), len(recording.marker))
+    return SimulatedRobot(truth_of(config), recording.targets[0], noise[recording.pending])

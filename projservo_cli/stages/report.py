@@ -63,7 +63,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     if has_task(config):
         bench = comparison_of(config, run.calibration, run.plan)
         material = material_of(run, bench, left_out, progress)
-        studies, eq22 = material.studies, composition(bench, config, left_out)
+        studies, eq22 = material.studies, composition(bench, left_out)
         claims = [claim._asdict() for claim in claims_of(material, eq22)]
     figures = draw_all(material, directory, config.report.formats, left_out, progress)
     told = {"figures": tuple(figures), "left_out": tuple(left_out), "claims": tuple(claims)}
@@ -149,10 +149,10 @@ def _without_collector() -> Iterator[None]:
         gc.enable()
 
 
-def composition(bench: Comparison, config: "Config", left_out: list[dict[str, str]]) -> _Eq22 | None:
+def composition(bench: Comparison, left_out: list[dict[str, str]]) -> _Eq22 | None:
     """Shares λ, and how far both sides of [RH00] eq. (22) differ at each, m; None, and why, if they fail."""
     try:
-        distance, _ = composition_error(metric_plan(bench, config.trajectory.delta))
+        distance, _ = composition_error(metric_plan(bench))
     except WorkFailed as error:
         left_out.append({"what": "equation (22)", "reason": " ".join(str(error).split())})
         return None

@@ -19,10 +19,9 @@ from projservo_cli.geometry.displacement import (
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.plan import Profile, plan_task
+from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
 from projservo_cli.stages.servo import drive
-from projservo_cli.stages.trace import trace_of
 from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.task.margins import within
 
@@ -64,7 +63,7 @@ class Comparison:
             prismatic = self.truth.robot.joint_types == PRISMATIC
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
         scenario = replace(self.scenario, gains=gains, limits=limits._replace(speed=speed))
-        return trace_of(scenario, drive(scenario, self.sense, law, self.models[operators]))
+        return drive(scenario, self.sense, law, self.models[operators]).trace()
 
 
 def projective_twin(model: Model) -> Model:
@@ -145,18 +144,15 @@ def run_studies(
     return Studies(tuple(gains), tuple(periods), own, STEP_LIMIT_DEG, sweep, by_model, rate)
 
 
-def metric_plan(bench: Comparison, delta: float) -> Plan:
+def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres.
 
     Raises WorkFailed if the task cannot be partitioned.
     """
-    robot = bench.truth.robot
-    return plan_task(
-        bench.models["true"],
-        bench.scenario.ends,
-        Profile("linear", delta, 2),
-        within(robot.lower, robot.upper),
-    )
+    short = {"profile": "linear", "samples": 2, "duration_s": None}
+    trajectory, robot = bench.scenario.config.trajectory.model_copy(update=short), bench.truth.robot
+    shown, limits = bench.scenario.ends, within(robot.lower, robot.upper)
+    return plan_task(bench.models["true"], shown, trajectory, limits)
 
 
 def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> tuple[FloatArray, FloatArray]:

@@ -20,7 +20,6 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
-from projservo_cli.stages.trace import deviation_between_samples_mm, summary_of, trace_of
 from projservo_cli.sweep.design import RUNS, Design, name_of_run, seed_of
 from projservo_cli.task.body import NO_BODY
 
@@ -133,14 +132,15 @@ def run_part(part: Part) -> _Made:
     with threadpool_limits(1):  # with more, sums may be taken in another order
         for these in _alike(design, runs):
             rows = these - part.first
-            at = design.numbers(int(these[0]))
-            calibration = part.calibrations[design.calibration_key(at.cell, at.calibration)]
-            _put(table, rows, _inputs(design, at.run))
+            first = int(these[0])
+            cell, _, number, _ = design.numbers(first)
+            calibration = part.calibrations[design.calibration_key(cell, number)]
+            _put(table, rows, _inputs(design, first))
             if calibration is None:
                 _put(table, rows, {"verdict": NOT_CALIBRATED, "usable": 0})
                 continue
             _put(table, rows, {"usable": int(calibration.usable)})
-            config = design.config(at.run)
+            config = design.config(first)
             if is_compiled(design, config):
                 _put(table, rows, _measured(config, calibration, table["seed"][rows]))
                 these = np.array([run for run in these if run in wanted], dtype=np.int64)
@@ -155,8 +155,8 @@ def run_part(part: Part) -> _Made:
 def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
     """Runs in groups that differ in their seeds alone."""
     at = design.placed(runs)
-    drawn = at["draw"] if design.sweep.random else np.zeros_like(runs)
-    keys = np.stack([at["cell"], at["calibration"], at["task"], drawn])
+    drawn = at.draw if design.sweep.random else np.zeros_like(runs)
+    keys = np.stack([at.cell, at.calibration, at.task, drawn])
     _, group = np.unique(keys, axis=1, return_inverse=True)
     order = np.argsort(group, kind="stable")
     yield from (runs[these] for these in np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
@@ -178,9 +178,9 @@ def _numbered(design: Design, runs: IntArray) -> _Columns:
         for column in columns_of(design)
     }
     at = design.placed(runs)
-    for name, number in ({"run": runs} | at).items():
+    for name, number in at._asdict().items():
         table[name][:] = number
-    table["seed"][:] = [seed_of(design.sweep.seed, RUNS, number) for number in at["draw"].tolist()]
+    table["seed"][:] = [seed_of(design.sweep.seed, RUNS, number) for number in at.draw.tolist()]
     return table
 
 
@@ -192,7 +192,7 @@ def _put(table: _Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
 
 def _inputs(design: Design, run: int) -> dict[str, Any]:
     """Values of the grid and drawn ones, by column."""
-    values = design.values(design.numbers(run).cell) | design.drawn(run)
+    values = design.values(design.numbers(run)[0]) | design.drawn(run)
     return {
         name: _shown(value) if not isinstance(value, (int, float)) or isinstance(value, bool) else value
         for name, value in values.items()
@@ -202,7 +202,7 @@ def _inputs(design: Design, run: int) -> dict[str, Any]:
 def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
     """What is measured of compiled runs, by column."""
     try:
-        numbers = numbers_of(scenario_of(config, calibration), name_of_run(config), seeds.tolist())
+        numbers = _numbers_of(scenario_of(config, calibration), name_of_run(config), seeds.tolist())
     except WorkFailed:
         return {"verdict": NOT_STARTED}
     found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
@@ -220,7 +220,7 @@ TOGETHER = 16
 
 def _setting_of(scenario: Scenario, law: str) -> Setting:
     """All that compiled runs of a law share whose seeds differ."""
-    body, model = scenario.exact.body, scenario.calibration.model()
+    body, model = scenario.exact.body, scenario.model
     return Setting(
         CODES[law],
         model,
@@ -238,7 +238,7 @@ def _setting_of(scenario: Scenario, law: str) -> Setting:
     )
 
 
-def numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
+def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
     """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone.
 
     Raises WorkFailed if the task cannot be begun, whatever the seed.
@@ -286,8 +286,7 @@ def _run(
         made = drive(scenario, plan, name)
     except WorkFailed:
         return {"verdict": NOT_STARTED}, None
-    summary = summary_of(scenario, made)
-    row = {"verdict": made.verdict, "steps": made.steps, **summary._asdict()}
+    row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
     if design.sweep.between_samples:
-        row[BETWEEN.name] = deviation_between_samples_mm(scenario, made, summary)
-    return row, trace_of(scenario, made) if keep else None
+        row[BETWEEN.name] = made.deviation_mm()
+    return row, made.trace() if keep else None

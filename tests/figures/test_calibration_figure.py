@@ -10,8 +10,8 @@ from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
 from projservo_cli.report.figures import calibration
 from projservo_cli.report.material import Fit
-from projservo_cli.stages import calibrate, chain
-from projservo_cli.stages.steps import steps_for
+from projservo_cli.stages import calibrate
+from projservo_cli.stages.steps import make_result, steps_for
 from projservo_cli.store import Result, Run
 from tests.fake_records import fake
 from tests.figures.cases import SPECS, case
@@ -198,7 +198,7 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
     assert "plan" in [step.stage for step in steps_for(config, run, ["plan", "report"])]
     records = {"calibration": material.calibration, "observation": material.observation}
     run = dataclasses.replace(run, results={"calibrate": Result(steps[0].key, "", {}, {}, records)})
-    made, _ = chain.make(steps[1], config, run, (), lambda *_: None)
+    made, _ = make_result(steps[1], config, run, (), lambda *_: None)
     report = made.results["report"].records[""]
     assert report.figures == ("figures/fig13_calibration.svg",)
     assert (tmp_path / report.figures[0]).read_bytes().startswith(b"<?xml")

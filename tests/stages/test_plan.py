@@ -7,11 +7,11 @@ import pytest
 
 from projservo_cli.stages import calibrate
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.plan import Profile, plan_task, rotation_sense
+from projservo_cli.stages.plan import plan_task, rotation_sense
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.margins import within
 from projservo_cli.task.trajectory import PROFILES
-from tests.known import configured
+from tests.known import asked, configured
 from tests.samples import frame, in_frame, pixels
 from tests.stages.cases import case
 
@@ -101,7 +101,7 @@ def test_a_start_that_is_the_goal_is_a_plan_without_motion():
     example = case("ur5")
     bounds = within(example.truth.robot.lower, example.truth.robot.upper)
     shown = example.ends._replace(s_star=example.ends.s_start)
-    plan = plan_task(example.truth.model, shown, Profile(samples=5), bounds)
+    plan = plan_task(example.truth.model, shown, asked(samples=5), bounds)
     assert plan.tau == 0.0
     assert abs(plan.theta_s) < 1e-9
     assert plan.feasible

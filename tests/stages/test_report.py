@@ -133,7 +133,7 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
 
 def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
     """Studies, and the comparison of both sides of equation (22)."""
-    config, bench, _ = case()
+    _, bench, _ = case()
 
     def fail(*_, **__):
         raise WorkFailed("the task\ncannot be partitioned")
@@ -149,7 +149,7 @@ def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
     record = report.record_of(None, None, figures=(), left_out=(), claims=())
     assert report.drift_rows(record) == []
     monkeypatch.setattr(report, "metric_plan", fail)
-    assert report.composition(bench, config, left_out) is None
+    assert report.composition(bench, left_out) is None
     assert left_out[1] == {"what": "equation (22)", "reason": "the task cannot be partitioned"}
 
 
@@ -171,7 +171,7 @@ def test_a_report_needs_a_plan(tmp_path):
 
 def test_both_sides_of_eq_22_agree_to_first_order_only():
     _, bench, _ = case()
-    plan = studies.metric_plan(bench, 0.9)
+    plan = studies.metric_plan(bench)
     lambdas = np.array([0.02, 0.01, 0.005])
     distance, norm = studies.composition_error(plan, lambdas)
     # the third order adds a few per mille at λ = 0.02
@@ -231,13 +231,13 @@ def test_a_claim_follows_its_number():
 @pytest.mark.parametrize("name", ["paper", "ur5"])
 def test_claims_of_a_whole_run_with_exact_operators(name):
     """All runs to their end: every claim has its number, and those that follow from the mathematics hold."""
-    config, bench, material = case(name, 2000, whole=True)
+    _, bench, material = case(name, 2000, whole=True)
     of_paper = (
         "The image error does not even decay monotonically",
         "stacked Jacobians: runs through self-occlusion, then converges",
         "Euclidean points: runs through self-occlusion, then converges",
     )
-    claims = claims_of(material, report.composition(bench, config, []))
+    claims = claims_of(material, report.composition(bench, []))
     assert len({claim.claim for claim in claims}) == len(claims) >= 24
     for claim in claims:
         assert claim.holds is not None

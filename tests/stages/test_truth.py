@@ -1,14 +1,14 @@
 """The simulated truth: other software's robots, start and goal, and what is refused."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.scenario import calibration_seed, generator, plant_of, start_and_goal
-from projservo_cli.stages.world import camera_of, truth_of
+from projservo_cli.stages.calibrate import trial_noise
+from projservo_cli.stages.scenario import generator, plant_of, scenario_of
+from projservo_cli.stages.world import truth_of
 from tests.known import configured as loaded
 from tests.known import known_scenario
 from tests.stages.cases import case
@@ -46,7 +46,7 @@ def test_turn_about_the_roll_axis_of_the_rig(turn_deg):
     """Start and goal differ by that rotation about the axis midway between the cameras."""
     config = loaded("paper", f"task.goal.turn_deg={turn_deg}")
     truth = truth_of(config)
-    shown, ends = start_and_goal(config, truth)
+    shown, ends = scenario_of(config).exact, scenario_of(config).true_ends
     T = ends.goal_pose @ np.linalg.inv(truth.robot.pose(shown.q_start))
     axis = np.array([-1.0, 0, 0])  # the cameras look along −x of the base, symmetric about y = 0
     eigenvalues = np.linalg.eigvals(T[:3, :3])
@@ -85,7 +85,7 @@ def test_the_benchmark_is_within_its_promised_dimensions():
 def test_a_camera_is_given_up_to_scale(scale):
     """Any multiple, of either sign, is the camera whose depths are positive metres."""
     P = case("ur5").truth.P[0]
-    there = camera_of(SimpleNamespace(matrix=(scale * P).tolist()))
+    there = truth_of(loaded("ur5", f"rig.left={{matrix: {(scale * P).tolist()}}}")).P[0]
     assert there == pytest.approx(P, rel=1e-8)
 
 
@@ -106,7 +106,7 @@ def test_what_the_robot_cannot_reach_is_refused(what):
     name, override, message = REFUSED[what]
     config = loaded(name, override)
     with pytest.raises(WorkFailed, match=rf"task\.{message}"):
-        start_and_goal(config, truth_of(config))
+        scenario_of(config)
 
 
 def test_perturbation_displaces_the_goal_by_what_it_says():
@@ -162,21 +162,20 @@ def test_a_face_that_shows_the_cameras_different_sides_is_refused():
 def test_missing_parts_are_named(section, message):
     bare = case("ur5").config.model_copy(update={section: None})
     with pytest.raises(InputError, match=message):
-        start_and_goal(bare, truth_of(bare))
+        scenario_of(bare)
 
 
 def test_an_offset_moves_the_start_and_leaves_the_goal():
-    plain = loaded("paper")
-    moved = loaded("paper", "task.start_offset={joints: [1, -2, 3, 0, 0, 0], unit: deg}")
-    truth = truth_of(plain)
-    (start, goal), (there, same) = start_and_goal(plain, truth), start_and_goal(moved, truth_of(moved))
-    assert np.allclose(np.degrees(there.q_start - start.q_start), [1, -2, 3, 0, 0, 0], atol=1e-12)
-    assert np.array_equal(goal.goal_pose, same.goal_pose)
+    offset = "task.start_offset={joints: [1, -2, 3, 0, 0, 0], unit: deg}"
+    plain, moved = (scenario_of(loaded("paper", *sets)) for sets in ((), (offset,)))
+    step = np.degrees(moved.exact.q_start - plain.exact.q_start)
+    assert np.allclose(step, [1, -2, 3, 0, 0, 0], atol=1e-12)
+    assert np.array_equal(plain.true_ends.goal_pose, moved.true_ends.goal_pose)
 
 
 def test_the_seed_of_the_calibration_is_its_own():
     """The noise of the trials follows calibration.seed, that of the loop follows seed."""
     own, other, both = (loaded("ur5", *sets) for sets in ((), ("calibration.seed=7",), ("seed=7",)))
-    seeds = [calibration_seed(config) for config in (own, other, both)]
-    assert seeds[1] == seeds[2] != seeds[0]
+    noise = [trial_noise(config, 2, 3).ravel().tolist() for config in (own, other, both)]
+    assert noise[1] == noise[2] != noise[0]
     assert other.seed == own.seed

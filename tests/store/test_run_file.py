@@ -12,7 +12,6 @@ import pytest
 
 from projservo_cli import store
 from projservo_cli.records import InputError, Plan, Trace
-from projservo_cli.store import run_file
 from projservo_cli.store.hdf5 import save_record
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
@@ -107,7 +106,7 @@ def test_what_is_added_to_and_what_is_written_as_a_whole_hold_the_same(tmp_path,
     made = sound_run(tmp_path / "run.h5").results
     stored = []
     monkeypatch.setattr(
-        run_file, "save_record", lambda group, record: stored.append(group.name) or save_record(group, record)
+        store, "save_record", lambda group, record: stored.append(group.name) or save_record(group, record)
     )
     run = store.Run(tmp_path / "run.h5")
     for name in made:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, Trace
-from projservo_cli.store import SweepTable, assemble, write_part
+from projservo_cli.store.sweep_table import SweepTable, assemble, write_part
 from tests.fake_records import fake
 
 HEADINGS = [("run", "i8", "1", "number"), ("law", "S7", "1", "text"), ("error", "f8", "px", "of the image")]
