@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import displacements, image_points, moved_points
+from projservo_cli.calibration.forward import displacements, image_points, moved_points
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.truth import METRIC_A_INF
