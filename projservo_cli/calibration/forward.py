@@ -50,6 +50,24 @@ def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(points[..., None, :, :] @ np.swapaxes(P, 1, 2))
 
 
+def projection_derivative(
+    P: FloatArray, lens: FloatArray | None, points: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Pixels (2, N, 2) of points (N, 4), and derivatives by image points (2, N, 2, 3) and k1, k2 of a lens.
+
+    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lenses (2, 5).
+    """
+    m = image_points(P, points)
+    pixels = m[..., :2] / m[..., 2:]
+    G = np.zeros((*pixels.shape, 3))
+    G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
+    G[..., 2] = -pixels / m[..., 2:]
+    if lens is None:
+        return pixels, G, None
+    by_pixel, by_lens = bent_derivative(lens[:, None], pixels)
+    return bent(lens[:, None], pixels), by_pixel @ G, by_lens
+
+
 class Images(NamedTuple):
     """Pixels of N sightings and their derivatives."""
 
@@ -87,19 +105,10 @@ class Scene:
     def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> Images:
         """Sightings (N,) of markers at rows of q (K, n), with their derivatives.
 
-        By image points: [RH00] eq. (7), second row corrected, rows (1, 0, −u)/m3 and (0, 1, −v)/m3, then
-        the lenses; from there to the point behind each joint by eq. (6).
+        From images to the point behind each joint by [RH00] eq. (6).
         """
         E, Y = self.carried(q, pose_of, marker_of)
-        m = image_points(self.P, Y[0])
-        pixels = m[..., :2] / m[..., 2:]
-        G = np.zeros((*pixels.shape, 3))
-        G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
-        G[..., 2] = -pixels / m[..., 2:]
-        by_lens = None
-        if self.lens is not None:
-            by_pixel, by_lens = bent_derivative(self.lens[:, None], pixels)
-            pixels, G = bent(self.lens[:, None], pixels), by_pixel @ G
+        pixels, G, by_lens = projection_derivative(self.P, self.lens, Y[0])
         D = np.empty((len(Y), *pixels.shape, 4))
         D[0] = G @ self.P[:, None]
         for i, by_joint in enumerate(E):
