@@ -17,9 +17,9 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.compiled import run
 from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FREE, Model
-from projservo_cli.robots.simulated import METRIC_A_INF, Plant, pose_after, twist
+from projservo_cli.robots.simulated import METRIC_A_INF, Plant, pose_after
 from projservo_cli.task.face import center_of, cyclic_order, face_plane, task_from_images
-from tests.samples import displacement, pixels
+from tests.samples import displacement, hat, pixels
 
 P = np.array([np.c_[np.eye(3), [0.15, 0, 0]], np.c_[np.eye(3), [-0.15, 0, 0]]])
 FACE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [0, 0]]) * 0.06
@@ -30,9 +30,7 @@ CONVERGED_RMS = math.sqrt(1e-8 / 10)
 
 def rig_twists():
     """Operators (6, 4, 4) of the face in the rig's frame for the rig's velocities v (m/s), ω (rad/s)."""
-    unit = np.eye(3).tolist()
-    moving = [twist((0, 0, 0), v) for v in unit] + [twist(w, (0, 0, 0)) for w in unit]
-    return -np.array(moving)
+    return -np.array([hat(row[3:], row[:3]) for row in np.eye(6)])
 
 
 def free_flying_plant(P, M, center):
