@@ -34,7 +34,7 @@ REGISTER = (
     _entry(
         "2",
         "Projective displacement, conjugate to a rigid motion, of unit determinant",
-        "geometry.displacement.normalize_displacement",
+        "geometry.algebra.normalize_displacement",
         "geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
         "det = 1 leaves ±H in dimension 4 (the trace is 0 at 180°): choose the sign that keeps the sign "
         "of a_inf·M.",
@@ -48,7 +48,7 @@ REGISTER = (
     _entry(
         "4",
         "Projective rotation: algebra to group and group to algebra",
-        "geometry.displacement.rotation calibration.projective.closed_form_operators "
+        "geometry.algebra.rotation calibration.projective.closed_form_operators "
         "calibration.forward.displacements",
         "geometry/test_displacement.py::test_rotation_is_the_matrix_exponential "
         "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
@@ -57,7 +57,7 @@ REGISTER = (
     _entry(
         "5",
         "Projective translation: algebra to group and group to algebra",
-        "geometry.displacement.translation calibration.projective.closed_form_operators "
+        "geometry.algebra.translation calibration.projective.closed_form_operators "
         "calibration.forward.displacements",
         "geometry/test_displacement.py::test_translation_is_the_matrix_exponential "
         "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
@@ -126,7 +126,7 @@ REGISTER = (
     _entry(
         "15",
         "The two solutions of the trigonometric equation",
-        "geometry.displacement.incidence_angles",
+        "geometry.algebra.incidence_angles",
         "geometry/test_composition.py::test_solutions_are_all_zeros_of_the_equation "
         "geometry/test_composition.py::test_the_printed_second_solution_holds_only_without_a_cosine",
         "θ⁻ = π − θ⁺ holds only where p_c = 0; θ± = atan2(p_s, p_c) ± arccos(−p_0 / √(p_s² + p_c²)).",
@@ -194,14 +194,14 @@ REGISTER = (
     _entry(
         "24",
         "One rotation for both rotations",
-        "geometry.displacement.composed_angle geometry.displacement.composed_operator",
+        "geometry.algebra.composed_angle geometry.algebra.composed_operator",
         "geometry/test_composition.py::test_one_rotation_equals_two "
         "control/test_direct.py::test_error_of_both_rotations_is_the_true_angle",
     ),
     _entry(
         "25",
         "Coefficients of the composed rotation",
-        "geometry.displacement.composed_angle",
+        "geometry.algebra.composed_angle",
         "geometry/test_composition.py::test_the_printed_factor_two_is_wrong",
         "c = sin(θ_p/2) sin(θ_r/2), without the factor 2, with [Ĥ_r, Ĥ_p] = Ĥ_r Ĥ_p − Ĥ_p Ĥ_r.",
     ),

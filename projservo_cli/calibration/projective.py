@@ -14,7 +14,7 @@ from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.forward import CAMERA, Scene
 from projservo_cli.calibration.readings import ON_A_LINE, Readings
-from projservo_cli.geometry.displacement import normalize_displacement
+from projservo_cli.geometry.algebra import normalize_displacement
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Least distance of the markers from their best line, in units of its own noise.

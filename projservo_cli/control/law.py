@@ -16,6 +16,8 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     axpy,
+    composed_angle,
+    composed_operator,
     dot,
     inner,
     mat,
@@ -25,7 +27,6 @@ from projservo_cli.geometry.algebra import (
     unit,
     vec,
 )
-from projservo_cli.geometry.displacement import composed_angle, composed_operator
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row

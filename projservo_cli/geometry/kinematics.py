@@ -2,17 +2,21 @@
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, mat, mul, put_mat, vec
-from projservo_cli.geometry.displacement import (
+from projservo_cli.geometry.algebra import (
     IDENTITY,
+    Mat4,
     as_array,
+    mat,
+    mul,
+    put_mat,
     rotation,
     rotation_and_inverse,
     translation,
+    vec,
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import through
-from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model, WorkFailed
+from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
 
 
 @internal
@@ -133,32 +137,3 @@ def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArra
             for i in range(H_hat.shape[0]):
                 _, _, J[view, k, 0, i], J[view, k, 1, i] = image_velocity(P[view], M[k], H_hat[i] @ M[k])
     return J
-
-
-# Forms that the joints keep up to this share of the largest change are kept.
-_INVARIANT = 1e-6
-
-
-def invariant_rotations(actions: FloatArray) -> FloatArray:
-    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints keep.
-
-    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
-    where few joints leave it open, the one nearest to the identity, which does as well for these joints.
-
-    Raises WorkFailed if no metric is kept.
-    """
-    i, j = np.triu_indices(3)
-    basis = np.zeros((6, 3, 3))
-    basis[range(6), i, j] = basis[range(6), j, i] = np.where(i == j, 1.0, 1.0 / np.sqrt(2.0))
-    changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
-    _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T, full_matrices=True)
-    sizes = np.r_[sizes, np.zeros(6 - len(sizes))]
-    kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
-    Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
-    if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
-        raise WorkFailed(
-            "the joints keep no metric of the calibrated frame: calibrate anew, or measure point by point "
-            "with control.observation: points"
-        )
-    C = np.linalg.cholesky(Q).T
-    return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])

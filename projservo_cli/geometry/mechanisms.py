@@ -17,6 +17,7 @@ from projservo_cli.geometry.algebra import (
     combine,
     dual_pencil,
     inner,
+    invariant_rotations,
     mat,
     mul,
     multiple,
@@ -33,7 +34,7 @@ from projservo_cli.geometry.kernels import (
     least_squares,
     new_system,
 )
-from projservo_cli.geometry.kinematics import invariant_rotations, joint_operators, operators_at
+from projservo_cli.geometry.kinematics import joint_operators, operators_at
 from projservo_cli.records import FloatArray, Model
 
 # A kernel vector whose operator is smaller than this share of its terms moves nothing.

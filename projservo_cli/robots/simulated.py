@@ -9,6 +9,8 @@ from projservo_cli.geometry.algebra import (
     Mat4,
     Vec4,
     apply,
+    as_array,
+    as_mat,
     axpy,
     combine,
     dot,
@@ -16,18 +18,13 @@ from projservo_cli.geometry.algebra import (
     mul,
     put_mat,
     put_vec,
+    twist_exponential,
     vec,
 )
-from projservo_cli.geometry.displacement import as_array, as_mat, twist_exponential
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, row
 from projservo_cli.geometry.lens import bend
-from projservo_cli.records import (
-    FREE,
-    FloatArray,
-    IntArray,
-    Model,
-)
+from projservo_cli.records import FREE, FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
 
 NO_PINS = np.zeros((0, 4))

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation
-from projservo_cli.geometry.displacement import as_array
+from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.plugins import what_failed

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from projservo_cli.control.law import Gains
-from projservo_cli.geometry.displacement import (
+from projservo_cli.geometry.algebra import (
     as_array,
     as_mat,
     composed_angle,

@@ -17,16 +17,16 @@ from projservo_cli.geometry.algebra import (
     apply_transposed,
     combine,
     dot,
+    invariant_rotations,
     mat,
     mul,
     put_vec,
     scale,
+    twist_exponential,
     vec,
 )
-from projservo_cli.geometry.displacement import twist_exponential
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.geometry.kinematics import invariant_rotations
 from projservo_cli.records import BoolArray, FloatArray, Model
 
 Vec3 = tuple[float, float, float]

@@ -12,16 +12,17 @@ from projservo_cli.geometry.algebra import (
     axpy,
     dot,
     dual_pencil,
+    incidence_angles,
     meet,
     mul,
     multiple,
     put_vec,
+    rotation,
     scale,
     sub,
     unit,
     vec,
 )
-from projservo_cli.geometry.displacement import incidence_angles, rotation
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,

@@ -4,8 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, mat, mul
-from projservo_cli.geometry.displacement import as_array, rotation, translation
+from projservo_cli.geometry.algebra import Mat4, as_array, mat, mul, rotation, translation
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.records import FloatArray
 

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from projservo_cli.geometry.algebra import (
     apply,
     apply_transposed,
+    as_array,
+    as_mat,
     axpy,
     combine,
     dot,
@@ -22,7 +24,6 @@ from projservo_cli.geometry.algebra import (
     unit,
     vec,
 )
-from projservo_cli.geometry.displacement import as_array, as_mat
 
 EPS = np.finfo(float).eps
 # Zeros and ones make special positions (axes, planes through the origin) common.

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from projservo_cli.geometry.displacement import (
+from projservo_cli.geometry.algebra import (
     as_array,
     as_mat,
     composed_angle,

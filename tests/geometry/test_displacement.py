@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.geometry.displacement import (
+from projservo_cli.geometry.algebra import (
     as_array,
     as_mat,
     exp_rotation,

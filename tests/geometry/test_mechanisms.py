@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.displacement import as_array
+from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.geometry.mechanisms import (
     planar_mechanism,

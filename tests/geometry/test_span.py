@@ -3,21 +3,9 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.displacement import as_mat
-from projservo_cli.geometry.kinematics import (
-    backward,
-    forward_kinematics,
-    invariant_rotations,
-    joint_operators,
-)
-from projservo_cli.geometry.mechanisms import (
-    Seen,
-    in_span,
-    joint_motion,
-    reach,
-    span_of,
-    workspace,
-)
+from projservo_cli.geometry.algebra import as_mat, invariant_rotations
+from projservo_cli.geometry.kinematics import backward, forward_kinematics, joint_operators
+from projservo_cli.geometry.mechanisms import Seen, in_span, joint_motion, reach, span_of, workspace
 from projservo_cli.records import PRISMATIC, WorkFailed
 from tests.samples import arm, face, frame, in_frame
 

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, new_state
-from projservo_cli.geometry.displacement import IDENTITY, as_array
+from projservo_cli.geometry.algebra import IDENTITY, as_array
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.compiled import run
 from projservo_cli.loop.step import VERDICTS, Limits, new_log

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.robots.simulated import AnalyticPlant, observe, rig_distance
 from tests.samples import displacement, poe
 from tests.scene import STEP, scene

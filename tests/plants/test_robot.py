@@ -102,7 +102,7 @@ def test_a_camera_looks_at_its_target():
     across = seen(target + 1e-3 * left / np.linalg.norm(left)) - [640, 500]
     assert across == pytest.approx([-1.2 / distance, 0], abs=1e-9)
     with pytest.raises(InputError, match="along the line of sight"):
-        camera(position, position + [0, 0, 4])
+        camera(position, np.add(position, [0, 0, 4]))
 
 
 def test_roll_axis_lies_between_the_cameras():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.geometry.displacement import as_array, as_mat
+from projservo_cli.geometry.algebra import as_array, as_mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import (

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.geometry.displacement import exp_rotation
+from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.lens import through
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
