@@ -19,7 +19,6 @@ from projservo_cli.robots.simulated import Plant, observe
 
 # Time a robot has to come to rest, s; until then not even Ctrl-C ends the waiting.
 STOP_S = 10.0
-METHODS = ("joints", "observe", "command", "stop")
 
 
 class Robot(Protocol):

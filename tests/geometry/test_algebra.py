@@ -69,13 +69,6 @@ def test_meet_is_the_determinant_with_one_row_open(a, b, c, x):
     assert abs(dot(meet(a, b, c), x) - wanted) <= 32 * EPS * max(size, 1e-30)
 
 
-def test_meet_of_coordinate_planes_is_a_coordinate_point_with_its_sign():
-    e = [tuple(row) for row in np.eye(4)]
-    assert meet(e[1], e[2], e[3]) == (1.0, 0.0, 0.0, 0.0)
-    assert meet(e[2], e[1], e[3]) == (-1.0, 0.0, 0.0, 0.0)
-    assert meet(e[0], e[1], e[2]) == (0.0, 0.0, 0.0, -1.0)
-
-
 @settings(deadline=None, max_examples=300)
 @given(vectors, vectors, st.integers(-13, 0))
 def test_dual_pencil_is_orthonormal_and_incident(A, D, exponent):

@@ -1,4 +1,4 @@
-"""Exponentials against SciPy, logarithms against exponentials, and where they are refused."""
+"""Exponentials against SciPy, and the scale of a homography that is a displacement."""
 
 import math
 
