@@ -17,8 +17,7 @@ def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArr
     if not measure(model, task, s, q, state):
         return LOST
     n = q.shape[0]
-    for i in range(n):
-        state.q_dot[i] = 0.0
+    state.q_dot[:] = 0.0
     for view in range(2):
         # Not a constant, for which the compiler would make the function anew.
         put_view(model, task, s, state, view, 0 * view)

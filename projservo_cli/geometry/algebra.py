@@ -36,33 +36,16 @@ def put_vec(target: FloatArray, A: Vec4) -> None:
 @inline
 def mat(H: FloatArray) -> Mat4:
     """4×4 array as a value."""
-    return (
-        float(H[0, 0]), float(H[0, 1]), float(H[0, 2]), float(H[0, 3]),
-        float(H[1, 0]), float(H[1, 1]), float(H[1, 2]), float(H[1, 3]),
-        float(H[2, 0]), float(H[2, 1]), float(H[2, 2]), float(H[2, 3]),
-        float(H[3, 0]), float(H[3, 1]), float(H[3, 2]), float(H[3, 3]),
-    )  # fmt: skip
+    return vec(H[0]) + vec(H[1]) + vec(H[2]) + vec(H[3])
 
 
 @inline
 def put_mat(target: FloatArray, H: Mat4) -> None:
     """Write a value into a 4×4 array."""
-    target[0, 0] = H[0]
-    target[0, 1] = H[1]
-    target[0, 2] = H[2]
-    target[0, 3] = H[3]
-    target[1, 0] = H[4]
-    target[1, 1] = H[5]
-    target[1, 2] = H[6]
-    target[1, 3] = H[7]
-    target[2, 0] = H[8]
-    target[2, 1] = H[9]
-    target[2, 2] = H[10]
-    target[2, 3] = H[11]
-    target[3, 0] = H[12]
-    target[3, 1] = H[13]
-    target[3, 2] = H[14]
-    target[3, 3] = H[15]
+    put_vec(target[0], H[0:4])
+    put_vec(target[1], H[4:8])
+    put_vec(target[2], H[8:12])
+    put_vec(target[3], H[12:16])
 
 
 @inline
@@ -106,25 +89,9 @@ def unit(A: Vec4) -> Vec4:
 
 @inline
 def mul(A: Mat4, B: Mat4) -> Mat4:
-    """Product A B."""
-    return (
-        (A[0] * B[0] + A[1] * B[4]) + (A[2] * B[8] + A[3] * B[12]),
-        (A[0] * B[1] + A[1] * B[5]) + (A[2] * B[9] + A[3] * B[13]),
-        (A[0] * B[2] + A[1] * B[6]) + (A[2] * B[10] + A[3] * B[14]),
-        (A[0] * B[3] + A[1] * B[7]) + (A[2] * B[11] + A[3] * B[15]),
-        (A[4] * B[0] + A[5] * B[4]) + (A[6] * B[8] + A[7] * B[12]),
-        (A[4] * B[1] + A[5] * B[5]) + (A[6] * B[9] + A[7] * B[13]),
-        (A[4] * B[2] + A[5] * B[6]) + (A[6] * B[10] + A[7] * B[14]),
-        (A[4] * B[3] + A[5] * B[7]) + (A[6] * B[11] + A[7] * B[15]),
-        (A[8] * B[0] + A[9] * B[4]) + (A[10] * B[8] + A[11] * B[12]),
-        (A[8] * B[1] + A[9] * B[5]) + (A[10] * B[9] + A[11] * B[13]),
-        (A[8] * B[2] + A[9] * B[6]) + (A[10] * B[10] + A[11] * B[14]),
-        (A[8] * B[3] + A[9] * B[7]) + (A[10] * B[11] + A[11] * B[15]),
-        (A[12] * B[0] + A[13] * B[4]) + (A[14] * B[8] + A[15] * B[12]),
-        (A[12] * B[1] + A[13] * B[5]) + (A[14] * B[9] + A[15] * B[13]),
-        (A[12] * B[2] + A[13] * B[6]) + (A[14] * B[10] + A[15] * B[14]),
-        (A[12] * B[3] + A[13] * B[7]) + (A[14] * B[11] + A[15] * B[15]),
-    )  # fmt: skip
+    """Product A B, whose rows are those of A times B."""
+    upper = apply_transposed(B, A[0:4]) + apply_transposed(B, A[4:8])
+    return upper + apply_transposed(B, A[8:12]) + apply_transposed(B, A[12:16])
 
 
 @inline
@@ -163,24 +130,13 @@ def combine(k: float, A: Mat4, l: float, B: Mat4) -> Mat4:
 @inline
 def multiple(k: float, A: Mat4) -> Mat4:
     """Multiple k A."""
-    return (
-        k * A[0], k * A[1], k * A[2], k * A[3],
-        k * A[4], k * A[5], k * A[6], k * A[7],
-        k * A[8], k * A[9], k * A[10], k * A[11],
-        k * A[12], k * A[13], k * A[14], k * A[15],
-    )  # fmt: skip
+    return scale(k, A[0:4]) + scale(k, A[4:8]) + scale(k, A[8:12]) + scale(k, A[12:16])
 
 
 @inline
 def inner(A: Mat4, B: Mat4) -> float:
     """Sum of the products of all entries."""
-    return (
-        ((A[0] * B[0] + A[1] * B[1]) + (A[2] * B[2] + A[3] * B[3]))
-        + ((A[4] * B[4] + A[5] * B[5]) + (A[6] * B[6] + A[7] * B[7]))
-    ) + (
-        ((A[8] * B[8] + A[9] * B[9]) + (A[10] * B[10] + A[11] * B[11]))
-        + ((A[12] * B[12] + A[13] * B[13]) + (A[14] * B[14] + A[15] * B[15]))
-    )
+    return (dot(A[0:4], B[0:4]) + dot(A[4:8], B[4:8])) + (dot(A[8:12], B[8:12]) + dot(A[12:16], B[12:16]))
 
 
 @inline

@@ -129,12 +129,12 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
             if not _put_pixel(camera, lens, A, s[view, k]):
                 in_front = False
             elif plant.opaque and not seen:
-                _put_unseen(s[view, k])
+                s[view, k, :] = math.nan
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]
             A = apply(H, vec(plant.pins[k]))
             if _put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
-                _put_unseen(pixel)
+                pixel[:] = math.nan
     return in_front
 
 
@@ -143,17 +143,10 @@ def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray)
     """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
     depth = row(camera, 2, A)
     if not depth > 0.0:
-        _put_unseen(pixel)
+        pixel[:] = math.nan
         return False
     pixel[0], pixel[1] = bend(lens, row(camera, 0, A) / depth, row(camera, 1, A) / depth)
     return True
-
-
-@merged
-def _put_unseen(pixel: FloatArray) -> None:
-    """Write what stands for an unseen marker, NaN."""
-    pixel[0] = math.nan
-    pixel[1] = math.nan
 
 
 @merged

@@ -269,12 +269,7 @@ def normal_equations(
 @inline
 def _outer(A: Vec4, a: Vec4) -> Mat4:
     """Product A aᵀ of a point and a plane."""
-    return (
-        A[0] * a[0], A[0] * a[1], A[0] * a[2], A[0] * a[3],
-        A[1] * a[0], A[1] * a[1], A[1] * a[2], A[1] * a[3],
-        A[2] * a[0], A[2] * a[1], A[2] * a[2], A[2] * a[3],
-        A[3] * a[0], A[3] * a[1], A[3] * a[2], A[3] * a[3],
-    )  # fmt: skip
+    return scale(A[0], a) + scale(A[1], a) + scale(A[2], a) + scale(A[3], a)
 
 
 @internal
