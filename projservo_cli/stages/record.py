@@ -12,7 +12,7 @@ from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.yours import Robot, at_rest_after
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.calibrate import images_at, trial_motions, trial_noise
-from projservo_cli.stages.own_robot import drive_to, foreign_robot, near, step_limit
+from projservo_cli.stages.own_robot import ARRIVED, drive_to, foreign_robot
 from projservo_cli.stages.world import Truth, beyond_limits, joints_of, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
@@ -90,7 +90,7 @@ class _Recording:
         )
 
 
-def prepare(
+def new_recording(
     config: "Config", path: Path, *, motions: JointList | None = None, force: bool = False
 ) -> _Recording:
     """What there is to record, and what of it the table holds already.
@@ -130,7 +130,8 @@ def _resume(recording: _Recording) -> None:
         raise InputError(f"{path}: has other markers than the configuration; {remedy}")
     column = np.searchsorted(table.marker, recording.marker)
     for k, pose in enumerate(table.pose.tolist()):
-        if not 0 <= pose < len(recording.targets) or not near(table.q[k], recording.targets[pose]):
+        known = 0 <= pose < len(recording.targets)
+        if not known or np.abs(table.q[k] - recording.targets[pose]).max() > ARRIVED:
             raise InputError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
         recording.q[pose], recording.images[pose] = table.q[k], table.images[k][:, column]
     recording.found = len(recording.q)
@@ -150,17 +151,15 @@ def record(
     Raises InputError if the table cannot be written; WorkFailed if the robot fails or does not arrive where
     it was sent.
     """
+    joints = joints_of(config)
     if robot is None and config.plant.use is not None:
-        robot = foreign_robot(config, joints_of(config), len(recording.marker))
+        robot = foreign_robot(config, joints, len(recording.marker))
     driven = robot or _simulated(config, recording)
-    limit = step_limit(config, joints_of(config))
     total, saved, took, unsaved = len(recording.targets), time.monotonic(), 0.0, False
     try:
         with at_rest_after(driven):
             for pose in recording.pending:
-                recording.commands += drive_to(
-                    driven, recording.targets[pose], limit, config.control.period_s
-                )
+                recording.commands += drive_to(driven, recording.targets[pose], config, joints, "record")
                 recording.q[pose], recording.images[pose] = driven.joints(), driven.observe()
                 unsaved = True
                 progress("record", len(recording.q), total)

@@ -282,13 +282,7 @@ def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
         wrong = driven.fits()
         if wrong:
             raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-        own_robot.drive_to(
-            driven,
-            scenario.ends.q_start,
-            own_robot.step_limit(scenario.config, scenario.joints),
-            scenario.gains.period,
-            "servo",
-        )
+        own_robot.drive_to(driven, scenario.ends.q_start, scenario.config, scenario.joints, "servo")
         return _driven_in_python(scenario, controller, driven)
 
 

@@ -49,8 +49,8 @@ class Step:
     stage: str  # name of the stage
     law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty
     key: str  # what the key of the result will be
-    why: str  # why it has to be made; empty where the stored one is up to date
     inputs: dict[str, str]  # files read and their hashes
+    why: str = ""  # why it has to be made; empty where the stored one is up to date
 
     @property
     def name(self) -> str:
@@ -74,19 +74,16 @@ def steps_for(
     if not has_task(config) and set(named) <= {"calibrate", "report"}:
         stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
     steps: list[Step] = []
-    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, stages):
-        step = Step(stage, law, key, "", inputs)
-        remade = any(before.why for before in steps if before.stage != stage)
-        steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
+    for step in _needed(config, run, laws or config.control.laws, stages):
+        remade = any(before.why for before in steps if before.stage != step.stage)
+        steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
     if steps[0].why and not force:
         _keep_recorded(config, run)
     return steps
 
 
-def _keys(
-    config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
-) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, run, key and input hashes of every result of the stages, each key made from those before."""
+def _needed(config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]) -> Iterator[Step]:
+    """Every result of the stages with its key, each made from those before."""
     inputs = _file_hashes(config, run)
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     for stage in stages:
@@ -94,7 +91,7 @@ def _keys(
         for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
             extra = {"before": before, "law": law}
             keys.append(digest(config, DEPENDS_ON[stage], without=NOT_HASHED[stage], extra=extra))
-            yield stage, law, keys[-1], inputs if stage == "calibrate" else {}
+            yield Step(stage, law, keys[-1], inputs if stage == "calibrate" else {})
         before = [*keys]
 
 
