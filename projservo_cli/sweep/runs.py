@@ -20,7 +20,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
-from projservo_cli.sweep.design import RUNS, Design, name_of_run, seed_of
+from projservo_cli.sweep.design import RUNS, Design, name_of_run
 from projservo_cli.task.body import NO_BODY
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
@@ -180,7 +180,7 @@ def _numbered(design: Design, runs: IntArray) -> _Columns:
     at = design.placed(runs)
     for name, number in at._asdict().items():
         table[name][:] = number
-    table["seed"][:] = [seed_of(design.sweep.seed, RUNS, number) for number in at.draw.tolist()]
+    table["seed"][:] = [design.seed(RUNS, number) for number in at.draw.tolist()]
     return table
 
 
