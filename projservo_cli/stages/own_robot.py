@@ -1,11 +1,11 @@
 """The robot of ``plant.use``: made, checked against the calibration, and driven to given joints."""
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation
+from projservo_cli.config import Config
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.simulated import Plant
@@ -13,14 +13,11 @@ from projservo_cli.robots.yours import METHODS, DrivenRobot, ForeignRobot, Robot
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.world import Joints
 
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-
 ARRIVED = 1e-3  # rad or m: a robot this near to where it was sent is there
 SETTLE = 10  # further commands for what rounding or a controller left at the end of a motion
 
 
-def foreign_robot(config: "Config", joints: Joints, markers: int) -> ForeignRobot:
+def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
     """Make the robot of ``plant.use``.
 
     Raises InputError if there is no such class, or a joint has no speed limit; WorkFailed if it cannot be
@@ -37,7 +34,7 @@ def foreign_robot(config: "Config", joints: Joints, markers: int) -> ForeignRobo
     return ForeignRobot(robot, f"plant {target}", len(joints.types), markers, config.plant.timeout_s)
 
 
-def drive_to(robot: Robot, target: FloatArray, config: "Config", joints: Joints, what: str) -> int:
+def drive_to(robot: Robot, target: FloatArray, config: Config, joints: Joints, what: str) -> int:
     """Move to joints (n,) along a straight line, each command within the speed limit; how many there were.
 
     what : the command it is for, in messages.

@@ -3,11 +3,10 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.config import digest
+from projservo_cli.config import Config, digest
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.yours import Robot, at_rest_after
 from projservo_cli.stages import Progress, silent
@@ -15,9 +14,6 @@ from projservo_cli.stages.calibrate import images_at, trial_motions, trial_noise
 from projservo_cli.stages.own_robot import ARRIVED, drive_to, foreign_robot
 from projservo_cli.stages.world import Truth, beyond_limits, joints_of, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
 DEPENDS_ON = (
@@ -28,12 +24,7 @@ SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 
 
 class SimulatedRobot:
-    """The robot of a configuration, with given pixel noise.
-
-    truth : robot, rig and markers.
-    q_start : (n,) first joints, rad or m.
-    noise : (k, 2, m, 2) px, added to each observation in turn.
-    """
+    """The robot of a configuration, from joints (n,) on, with noise (k, 2, m, 2) px for each look in turn."""
 
     def __init__(self, truth: Truth, q_start: FloatArray, noise: FloatArray) -> None:
         self._truth = truth
@@ -91,7 +82,7 @@ class _Recording:
 
 
 def new_recording(
-    config: "Config", path: Path, *, motions: JointList | None = None, force: bool = False
+    config: Config, path: Path, *, motions: JointList | None = None, force: bool = False
 ) -> _Recording:
     """What there is to record, and what of it the table holds already.
 
@@ -138,7 +129,7 @@ def _resume(recording: _Recording) -> None:
 
 
 def record(
-    config: "Config",
+    config: Config,
     recording: _Recording,
     robot: Robot | None = None,
     *,
@@ -174,7 +165,7 @@ def record(
             recording.save()
 
 
-def _simulated(config: "Config", recording: _Recording) -> SimulatedRobot:
+def _simulated(config: Config, recording: _Recording) -> SimulatedRobot:
     """The robot of a configuration at its reference, with the noise that ``calibrate`` would add."""
     noise = trial_noise(config, len(recording.targets), len(recording.marker))
     return SimulatedRobot(truth_of(config), recording.targets[0], noise[recording.pending])

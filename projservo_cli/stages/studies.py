@@ -4,10 +4,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from projservo_cli.config import Config
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.displacement import (
     as_array,
@@ -25,9 +26,6 @@ from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.task.margins import within
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
 
 GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
@@ -80,12 +78,8 @@ def projective_twin(model: Model) -> Model:
     )
 
 
-def comparison_of(config: "Config", calibration: Calibration, plan: Plan) -> Comparison:
-    """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
-
-    Raises InputError, WorkFailed if the configuration describes no simulated task, or the task cannot be
-    done.
-    """
+def comparison_of(config: Config, calibration: Calibration, plan: Plan) -> Comparison:
+    """Set up the extra runs; images are without noise, but for a goal that is known by them alone."""
     truth_of(config)  # refuses what lacks a part of the simulation
     control = config.control.model_copy(update={"observation": "points"})
     scenario = scenario_of(idealized(config).model_copy(update={"control": control}), calibration)
@@ -133,10 +127,7 @@ def run_studies(
 
 
 def metric_plan(bench: Comparison) -> Plan:
-    """The task partitioned with the true metric model, so that its operators are in metres.
-
-    Raises WorkFailed if the task cannot be partitioned.
-    """
+    """The task partitioned with the true metric model, so that its operators are in metres."""
     short = {"profile": "linear", "samples": 2, "duration_s": None}
     trajectory, robot = bench.scenario.config.trajectory.model_copy(update=short), bench.truth.robot
     shown, limits = bench.scenario.ends, within(robot.lower, robot.upper)

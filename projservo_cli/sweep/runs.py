@@ -239,10 +239,7 @@ def _setting_of(scenario: Scenario, law: str) -> Setting:
 
 
 def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
-    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone.
-
-    Raises WorkFailed if the task cannot be begun, whatever the seed.
-    """
+    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
     setting = _setting_of(scenario, law)
     desk = new_desk(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))

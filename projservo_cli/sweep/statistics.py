@@ -36,10 +36,7 @@ PAIRED = ("steps", "position_error_mm", "path_length_ratio")
 
 
 class _Rows:
-    """Columns of a table as they are needed, and what follows from them.
-
-    table : of a sweep.
-    """
+    """Columns of the table of a sweep as they are needed, and what follows from them."""
 
     def __init__(self, table: SweepTable) -> None:
         self.table = table
@@ -186,10 +183,7 @@ class _Picture(NamedTuple):
 
 
 def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
-    """Write statistics and figures of a sweep, of the runs that are done.
-
-    Returns the statistics, and the files.
-    """
+    """Write statistics and figures of a sweep, of the runs that are done; the statistics and the files."""
     if folder.stored():
         folder.assemble(folder.design())
     table = SweepTable(folder.table)
