@@ -15,9 +15,9 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, generator
 from projservo_cli.stages.world import (
     Truth,
-    beyond_limits,
     image_size_of,
     joints_of,
+    limit_passed,
     reference_of,
     truth_of,
 )
@@ -38,7 +38,7 @@ def trial_motions(config: Config) -> FloatArray:
         for offset in np.linspace(-amplitude, amplitude, settings.frames_per_joint):
             q = reference.copy()
             q[i] += offset
-            if wrong := beyond_limits(q, joints.lower, joints.upper):
+            if wrong := limit_passed(q, joints.lower, joints.upper):
                 raise InputError(
                     f"calibration: in a trial {wrong}: choose another calibration.reference or a smaller "
                     "amplitude"

@@ -12,7 +12,7 @@ from projservo_cli.robots.yours import Robot, at_rest_after
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.calibrate import images_at, trial_motions, trial_noise
 from projservo_cli.stages.own_robot import ARRIVED, drive_to, foreign_robot
-from projservo_cli.stages.world import Truth, beyond_limits, joints_of, truth_of
+from projservo_cli.stages.world import Truth, joints_of, limit_passed, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
@@ -100,7 +100,7 @@ def new_recording(
     if motions is not None:
         joints = joints_of(config)
         for pose, q in zip(motions.pose, motions.q, strict=True):
-            if wrong := beyond_limits(q, joints.lower, joints.upper):
+            if wrong := limit_passed(q, joints.lower, joints.upper):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
     key = digest(config, DEPENDS_ON)[:16]

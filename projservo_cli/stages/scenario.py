@@ -32,11 +32,11 @@ from projservo_cli.robots.truth import METRIC_A_INF
 from projservo_cli.stages.world import (
     Joints,
     Truth,
-    beyond_limits,
     center_index,
     face_numbers,
     image_size_of,
     joints_of,
+    limit_passed,
     truth_of,
 )
 from projservo_cli.task.body import Body, body_of
@@ -307,7 +307,7 @@ def _simulated_ends(
 
     def images(q: FloatArray, key: str) -> FloatArray:
         """Both apart, so that the face has the same bits with any pins."""
-        if wrong := beyond_limits(q, robot.lower, robot.upper):
+        if wrong := limit_passed(q, robot.lower, robot.upper):
             raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
@@ -359,7 +359,7 @@ def _predicted_ends(
             raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")
 
     def images(q: FloatArray, key: str) -> FloatArray:
-        if wrong := beyond_limits(q, joints.lower, joints.upper):
+        if wrong := limit_passed(q, joints.lower, joints.upper):
             raise InputError(f"{key}: {wrong}: choose another")
         s = predict(calibration, q[None])[0][:, columns]
         if np.isnan(s[:, :m]).any():

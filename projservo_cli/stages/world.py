@@ -42,7 +42,7 @@ class Joints(NamedTuple):
     speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
 
 
-def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
+def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
     """Which of the readings (n,) lies beyond its limits, in words; empty where none does."""
     for i in np.flatnonzero((q < lower) | (q > upper)):
         limits = f"{lower[i]:.6g} to {upper[i]:.6g} (rad or m)"

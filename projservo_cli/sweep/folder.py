@@ -162,6 +162,12 @@ class Folder:
         }
         assemble(self.table, self.stored(), columns, attributes)
 
+    def assembled(self) -> Path:
+        """The table of the runs that are done."""
+        if self.stored():
+            self.assemble(self.design())
+        return self.table
+
     def calibration(self, key: str) -> Path:
         """The run file that holds a calibration, or beside which a file says why there is none."""
         return self.path / "calibrations" / f"{key[:20]}.h5"
