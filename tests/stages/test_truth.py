@@ -104,9 +104,15 @@ REFUSED = {
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_the_robot_cannot_reach_is_refused(what):
     name, override, message = REFUSED[what]
-    config = loaded(name, override)
     with pytest.raises(WorkFailed, match=rf"task\.{message}"):
-        scenario_of(config)
+        scenario_of(loaded(name, override))
+
+
+@pytest.mark.parametrize("section", ["robot", "rig", "markers", "task"])
+def test_missing_parts_are_named(section):
+    bare = case("ur5").config.model_copy(update={section: None})
+    with pytest.raises(InputError, match=f"set {section}"):
+        scenario_of(bare)
 
 
 def test_perturbation_displaces_the_goal_by_what_it_says():
@@ -119,34 +125,20 @@ def test_perturbation_displaces_the_goal_by_what_it_says():
 def test_a_face_that_shows_the_cameras_different_sides_is_refused():
     """Turned all around by one joint, the face passes through poses that no task can start from."""
     example = case("ur5")
-    refused = 0
-    seen = set()
+    refused, seen, truth = 0, set(), example.truth
     for turn in np.linspace(0, 2 * math.pi, 60):
         q = example.ends.q_start + turn * np.eye(6)[4]
-        M = (
-            example.truth.M_face
-            @ (example.truth.robot.pose(q) @ np.linalg.inv(example.truth.robot.base_tool)).T
-        )
+        M = truth.M_face @ (truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool)).T
         normal = np.cross(M[1, :3] - M[0, :3], M[2, :3] - M[0, :3])
         sides = np.sign((example.plan.optical_center[:, :3] - M[0, :3]) @ normal)
         if sides[0] != sides[1]:
             refused += 1
             with pytest.raises(WorkFailed, match="different sides"):
-                plant_of(example.config, example.truth, q)
+                plant_of(example.config, truth, q)
         else:
-            seen.add(float(plant_of(example.config, example.truth, q).visible[0]))
+            seen.add(float(plant_of(example.config, truth, q).visible[0]))
     assert refused > 0
     assert seen == {-1.0, 1.0}
-
-
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [("robot", "set robot"), ("rig", "set rig"), ("markers", r"markers"), ("task", "set task")],
-)
-def test_missing_parts_are_named(section, message):
-    bare = case("ur5").config.model_copy(update={section: None})
-    with pytest.raises(InputError, match=message):
-        scenario_of(bare)
 
 
 def test_an_offset_moves_the_start_and_leaves_the_goal():

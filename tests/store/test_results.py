@@ -1,5 +1,6 @@
 """A run as an object: what its calibration predicts, against the run's own data and differences."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -8,12 +9,12 @@ import numpy as np
 import pytest
 
 import projservo_cli
-from projservo_cli import cli, store
+from projservo_cli import cli
 from projservo_cli.config import load_config
-from projservo_cli.records import Calibration, InputError, Plan, Trace
+from projservo_cli.records import InputError
 from projservo_cli.stages.world import truth_of
-from projservo_cli.store import Result, Run, save
-from tests.fake_records import fake
+from projservo_cli.store import save
+from tests.store.sound import sound_run
 
 STANFORD = Path(__file__).parents[2] / "configs" / "stanford.yaml"
 
@@ -85,26 +86,17 @@ def test_other_numbers_of_joints_or_coordinates_are_refused(run):
             run.calibration.project(points)
 
 
-def test_a_run_holds_plan_and_traces_or_says_how_to_make_them(run, tmp_path):
+def test_a_run_says_what_it_lacks_and_how_to_make_it(run, tmp_path):
     assert run.observation.images.shape == (49, 2, 10, 2)
     assert run.traces == {}
     with pytest.raises(InputError, match="projservo plan -o"):
         _ = run.plan
-    results = {
-        name: Result("key", "name: x", {}, {}, {label: fake(kind)})
-        for name, label, kind in [
-            ("calibrate", "calibration", Calibration),
-            ("plan", "", Plan),
-            ("servo/stacked", "", Trace),
-        ]
-    }
-    save(Run(tmp_path / "run.h5", "name: x", results))
-    full = projservo_cli.load(tmp_path / "run.h5")
-    assert full.configuration == "name: x"
-    assert full.plan.profile == "text ä"
-    assert list(full.traces) == ["stacked"]
-    assert isinstance(full.calibration, Calibration)
-    np.testing.assert_array_equal(full.calibration.P, store.load(tmp_path).calibration.P)
+    full = dataclasses.replace(sound_run(tmp_path / "run.h5"), configuration="name: x")
+    save(full)
+    again = projservo_cli.load(tmp_path)
+    assert again.configuration == "name: x"
+    assert (again.plan.profile, list(again.traces)) == (full.plan.profile, ["stacked", "direct_three"])
+    np.testing.assert_array_equal(again.calibration.P, full.calibration.P)
     with pytest.raises(InputError, match="there is no run file"):
         projservo_cli.load(tmp_path / "none")
 
