@@ -10,7 +10,12 @@ import pytest
 
 from projservo_cli.calibration import calibrate, predict, residual_statistics
 from projservo_cli.calibration.adjustment import Scene, prepare
-from projservo_cli.calibration.covariance import covariance_factor, isotropic, projective, spread_factor
+from projservo_cli.calibration.covariance import (
+    covariance_factor,
+    isotropic,
+    projective,
+    spread_factor,
+)
 from projservo_cli.calibration.prediction import prediction_derivative
 from projservo_cli.calibration.readings import gather
 from projservo_cli.geometry.kinematics import forward_kinematics
