@@ -316,7 +316,7 @@ def _make_steps(chain: _Chain) -> None:
     """Make what has to be made, stop at the first failure, keep what was made until then."""
     from projservo_cli.config import to_yaml
     from projservo_cli.records import WorkFailed
-    from projservo_cli.stages.steps import make_result
+    from projservo_cli.stages.chain import make_result
     from projservo_cli.store import save
 
     console = chain.console
@@ -382,7 +382,7 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
     """Write what is wanted, and the page anew, which links to it; the paths by name."""
     from projservo_cli.report.page import write_page
     from projservo_cli.stages import report as reporting
-    from projservo_cli.stages.steps import reported
+    from projservo_cli.stages.chain import reported
 
     told = reported(chain.config, chain.run, chain.laws)
     makers = {"view": reporting.view, "animation": reporting.animation}

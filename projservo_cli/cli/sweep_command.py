@@ -107,7 +107,7 @@ def tell_report(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
             raise InputError(f"--{flag}: not used by report {sweep}, which is of a sweep")
     folder = Folder(sweep)
     with working_in(folder.path):
-        found, files = report(folder, FORMATS, console.progress)
+        found, files = report(folder.assembled(), FORMATS, console.progress)
     value = {"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]}
     names = ", ".join(path.name for path in files)
     console.tell(value, [*_words(found), wrapped(f"files: {folder.path}: {names}")])

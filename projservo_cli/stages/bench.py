@@ -8,11 +8,12 @@ import itertools
 from collections.abc import Callable
 from functools import partial
 from timeit import timeit
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from projservo_cli.config import Config
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, new_state
 from projservo_cli.geometry.kinematics import operators_at
@@ -26,9 +27,6 @@ from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.face import Task
 
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
 BODY, CODE = "exact, body", CODES["direct_three"]
@@ -37,7 +35,7 @@ BODY, CODE = "exact, body", CODES["direct_three"]
 class Case:
     """A noisy run of 256 states of a simulated task and all that a step needs, with the true model."""
 
-    def __init__(self, config: "Config") -> None:
+    def __init__(self, config: Config) -> None:
         body = {"control": config.control.model_copy(update={"observation": "body"})}
         scenario = scenario_of(config.model_copy(update=body))
         shown, gains = scenario.exact, scenario.gains

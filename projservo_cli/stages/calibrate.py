@@ -3,33 +3,29 @@
 import csv
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from projservo_cli.calibration import Region, Solution, Suggestion, calibrate, cross_validate, suggest
+from projservo_cli.config import Config
+from projservo_cli.config.nominal import read_nominal
 from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, generator
 from projservo_cli.stages.world import (
     Truth,
-    beyond_limits,
     image_size_of,
     joints_of,
+    limit_passed,
     reference_of,
     truth_of,
 )
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
+from projservo_cli.tables import read_table
 
 
-def trial_motions(config: "Config") -> FloatArray:
-    """Joint readings (k, n) of the reference and of every single-joint trial, rad or m.
-
-    Raises InputError if a trial would pass a joint limit, or no reference is set.
-    """
+def trial_motions(config: Config) -> FloatArray:
+    """Joint readings (k, n) of the reference and of every single-joint trial, rad or m."""
     settings = config.calibration
     vector = reference_of(config)
     if vector is None:
@@ -42,7 +38,7 @@ def trial_motions(config: "Config") -> FloatArray:
         for offset in np.linspace(-amplitude, amplitude, settings.frames_per_joint):
             q = reference.copy()
             q[i] += offset
-            if wrong := beyond_limits(q, joints.lower, joints.upper):
+            if wrong := limit_passed(q, joints.lower, joints.upper):
                 raise InputError(
                     f"calibration: in a trial {wrong}: choose another calibration.reference or a smaller "
                     "amplitude"
@@ -51,18 +47,18 @@ def trial_motions(config: "Config") -> FloatArray:
     return np.array(rows)
 
 
-def _seed(config: "Config") -> int:
+def _seed(config: Config) -> int:
     """Seed of the trial motions and of all that is random in their evaluation."""
     return config.seed if config.calibration.seed is None else config.calibration.seed
 
 
-def trial_noise(config: "Config", poses: int, markers: int) -> FloatArray:
+def trial_noise(config: Config, poses: int, markers: int) -> FloatArray:
     """Pixel noise (poses, 2, markers, 2) of the trial motions, px."""
     drawn = generator(_seed(config), CALIBRATION_NOISE).standard_normal((poses, 2, markers, 2))
     return config.noise.calibration_px * drawn
 
 
-def simulate(config: "Config", truth: Truth) -> Observation:
+def simulate(config: Config, truth: Truth) -> Observation:
     """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
     q = trial_motions(config)
     noise = trial_noise(config, len(q), len(truth.number))
@@ -79,7 +75,7 @@ def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
 
 
 def run(
-    config: "Config", *, progress: Progress = silent
+    config: Config, *, progress: Progress = silent
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from simulated trial motions, or from the recorded table of the configuration.
 
@@ -87,8 +83,6 @@ def run(
     InputError if the table or the configuration cannot be used; WorkFailed if the data do not support a
     calibration.
     """
-    from projservo_cli.config.nominal import read_nominal
-
     settings, seed = config.calibration, _seed(config)
     init = read_nominal(settings.init) if settings.init is not None else None
     observation, types, sigma_px = _observed(config)
@@ -116,10 +110,8 @@ def run(
     return observation, calibration, held_out[0] if held_out else None
 
 
-def _observed(config: "Config") -> tuple[Observation, str, float | None]:
+def _observed(config: Config) -> tuple[Observation, str, float | None]:
     """What is to be explained, the types of the joints, and the noise if it is known, px."""
-    from projservo_cli.tables import read_table
-
     if config.data is not None:
         observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
         types = config.joint_types or "R" * observation.q.shape[1]
@@ -135,7 +127,7 @@ WIDER, FARTHER = 0.15, 1.0
 
 
 def suggest_motions(
-    config: "Config", observation: Observation, calibration: Calibration, count: int, path: Path
+    config: Config, observation: Observation, calibration: Calibration, count: int, path: Path
 ) -> tuple[Suggestion, ...]:
     """Write poses that reduce the variance of predictions most, within the joint limits where they are known.
 
@@ -163,7 +155,7 @@ def suggest_motions(
     return found
 
 
-def _image(config: "Config", observation: Observation) -> FloatArray:
+def _image(config: Config, observation: Observation) -> FloatArray:
     """Corners (2, 2, 2) of both images, px; where their size is not known, of where markers were seen."""
     size = image_size_of(config)
     if size is not None:
@@ -172,7 +164,7 @@ def _image(config: "Config", observation: Observation) -> FloatArray:
     return np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)
 
 
-def _region(config: "Config", q: FloatArray, share: float, image: FloatArray) -> Region:
+def _region(config: Config, q: FloatArray, share: float, image: FloatArray) -> Region:
     """The range of readings (K, n), widened at each end by a share of it as far as the limits allow."""
     span = np.ptp(q, axis=0)
     low, high = q.min(axis=0) - share * span, q.max(axis=0) + share * span

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from projservo_cli.config import Config
+from projservo_cli.config.models import Trajectory
 from projservo_cli.control.law import State, new_state
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -40,19 +42,13 @@ from projservo_cli.task.visibility import (
     visibility_translation,
 )
 
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-    from projservo_cli.config.models import Trajectory
-
 VIEWS = ("left", "right")
 
 
-def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: "Trajectory") -> FloatArray:
+def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
     """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
 
     Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
-
-    Raises WorkFailed if the joints would be too fast.
     """
     duration, ramp = trajectory.duration_s, trajectory.ramp_s
     eased = _from_rest(shortest, ramp)
@@ -179,9 +175,8 @@ def _partitioned(
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
-    Returns state: with the face and the joint motions; task: in the frame of the model; parts: translation
-    and rotations, a half turn in the sense that was rehearsed; note: what to say of the rehearsal. Raises
-    WorkFailed if a marker cannot be triangulated or a motion is not unique.
+    Returns the state with face and joint motions, the task in the frame of the model, translation and
+    rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
     """
     n, m = len(shown.q_start), shown.s_start.shape[1] - shown.pins
     task, seen = shown.task(model), straight_views(model.lens, shown.s_start)
@@ -213,15 +208,10 @@ STAGES = 20
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
-    """Refuse a task whose goal the joints cannot bring the face to.
+    """Refuse a task whose goal leaves more than ``LEFT_PX`` wherever the joints bring the face.
 
-    The joints that bring the face nearest to its planned images, in px, are carried along the plan.
-
-    model : calibrated model.
-    A : (m, 4) face at the start.
-    q_start : (n,) joints there, rad or m.
-    images : (s, 2, m, 2) planned pixels of the face.
-    Raises WorkFailed if more than ``LEFT_PX`` of image error are left at the goal.
+    The joints that bring the face A (m, 4) nearest to its planned images (s, 2, m, 2), in px, are carried
+    along the plan from those at the start (n,).
     """
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
     q = q_start
@@ -240,7 +230,7 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         )
 
 
-def run(config: "Config", calibration: Calibration) -> Plan:
+def run(config: Config, calibration: Calibration) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
     Raises InputError if the configuration lacks the task or the face; WorkFailed if the task cannot be
@@ -257,11 +247,9 @@ def run(config: "Config", calibration: Calibration) -> Plan:
     return plan_task(scenario.model, scenario.ends, config.trajectory, scenario.demands)
 
 
-def plan_task(model: Model, shown: Shown, trajectory: "Trajectory", demands: Demands) -> Plan:
+def plan_task(model: Model, shown: Shown, trajectory: Trajectory, demands: Demands) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
-    model : calibrated model.
-    shown : start and goal.
     trajectory : the motion that is asked for.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
     Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
@@ -379,10 +367,7 @@ def _in_sight(profile: str, found: Along) -> tuple[bool, str]:
 
 
 def rotation_sense(scenario: Scenario) -> FloatArray:
-    """Joint motions (2, n) of both rotations in the sense that the plan takes; few profiles need all of it.
-
-    Raises WorkFailed if the task cannot be partitioned.
-    """
+    """Joint motions (2, n) of both rotations in the sense of the plan; few profiles need all of that."""
     trajectory, joints = scenario.config.trajectory, scenario.joints
     if not rehearses(trajectory.profile):
         return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands).rotation_sense()

@@ -7,11 +7,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration import predict
+from projservo_cli.config import Config
+from projservo_cli.config.models import Task as TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.step import Limits
@@ -29,21 +31,17 @@ from projservo_cli.robots.simulated import METRIC_A_INF, NEVER, NO_PINS, Disturb
 from projservo_cli.stages.world import (
     Joints,
     Truth,
-    beyond_limits,
     center_index,
     face_numbers,
     image_size_of,
     joints_of,
+    limit_passed,
     truth_of,
 )
 from projservo_cli.task.body import Body, body_of
 from projservo_cli.task.face import Task, center_of, cyclic_order, face_plane, task_from_images
 from projservo_cli.task.margins import Demands
 from projservo_cli.task.target import task_from_body
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-    from projservo_cli.config.models import Task as TaskSettings
 
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
@@ -71,10 +69,7 @@ class Shown(NamedTuple):
         return Shown(self.q_start, s_start, s_star, self.center)
 
     def task(self, model: Model) -> Task:
-        """The task that they show to a model.
-
-        Raises WorkFailed if they do not show where the face or its body is.
-        """
+        """The task that they show to a model; a WorkFailed if they do not show where the face is."""
         if self.body is None:
             face = self.by_points()
             return task_from_images(model, face.s_start, face.s_star, self.center)
@@ -86,7 +81,7 @@ class Shown(NamedTuple):
 class Scenario:
     """What the runs of a configuration with a calibration take place in."""
 
-    config: "Config"
+    config: Config
     calibration: Calibration | None  # None: laws are given the true model
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
     joints: Joints  # as the laws take them
@@ -143,10 +138,7 @@ class Scenario:
         return truth_of(self.config).model
 
     def plant_of(self, law: str) -> Plant:
-        """The simulated robot as a law sees it, and what befalls it.
-
-        Raises WorkFailed if a camera sees the face edge-on at the start.
-        """
+        """The simulated robot as a law sees it, and what befalls it."""
         assert self.truth is not None
         plant = plant_of(self.config, self.truth, self.exact.q_start)
         M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
@@ -188,7 +180,7 @@ class Scenario:
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
 
-def scenario_of(config: "Config", calibration: Calibration | None = None) -> Scenario:
+def scenario_of(config: Config, calibration: Calibration | None = None) -> Scenario:
     """Make the scenario of a configuration, of its simulated robot or of the one in ``plant.use``.
 
     Without a calibration laws are given the true model of the simulated robot. Raises InputError if the
@@ -234,13 +226,13 @@ def scenario_of(config: "Config", calibration: Calibration | None = None) -> Sce
     )
 
 
-def idealized(config: "Config") -> "Config":
+def idealized(config: Config) -> Config:
     """A configuration without noise and disturbances in the loop."""
     noise = config.noise.model_copy(update={"servo_px": 0.0})
     return config.model_copy(update={"noise": noise, "disturbance": type(config.disturbance)()})
 
 
-def _gains(config: "Config", joints: Joints) -> Gains:
+def _gains(config: Config, joints: Joints) -> Gains:
     """Gains and limits of the laws."""
     c, endless = config.control, np.full(len(joints.types), math.inf)
     stop = _ends_at_joint_limits(config)
@@ -260,7 +252,7 @@ def _gains(config: "Config", joints: Joints) -> Gains:
     )
 
 
-def _limits(config: "Config", joints: Joints, sigma_px: float) -> Limits:
+def _limits(config: Config, joints: Joints, sigma_px: float) -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
     noise_px = config.stop.noise_factor * sigma_px
     return Limits(
@@ -276,12 +268,12 @@ def _limits(config: "Config", joints: Joints, sigma_px: float) -> Limits:
     )
 
 
-def _ends_at_joint_limits(config: "Config") -> bool:
+def _ends_at_joint_limits(config: Config) -> bool:
     """Whether a run ends at a joint limit; a robot that is not simulated is never driven beyond one."""
     return config.plant.use is not None or config.plant.joint_limits == "stop"
 
 
-def _by_points(config: "Config", calibration: Calibration | None) -> bool:
+def _by_points(config: Config, calibration: Calibration | None) -> bool:
     """Whether the face is measured point by point: as configured, else where no body is calibrated well."""
     if config.control.observation is None:
         return calibration is None or not calibration.usable  # such a body is worse than none
@@ -295,7 +287,7 @@ def _body(known: Calibration | Truth, indices: tuple[int, ...]) -> Body:
     return body_of(model, known.M[list(indices)])
 
 
-def _observed(config: "Config", calibration: Calibration) -> tuple[int, ...]:
+def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
     """Numbers of the markers that a robot in ``plant.use`` observes, in its order."""
     known = config.markers.known if config.markers is not None else None
     numbers = tuple(calibration.marker.tolist()) if known is None else known
@@ -307,14 +299,14 @@ def _observed(config: "Config", calibration: Calibration) -> tuple[int, ...]:
 
 @lru_cache(maxsize=2048)
 def _simulated_ends(
-    task: "TaskSettings", types: str, truth: Truth, pins: tuple[int, ...], center: int
+    task: TaskSettings, types: str, truth: Truth, pins: tuple[int, ...], center: int
 ) -> tuple[Shown, Ends]:
     """What the ends of a task look like, for any seed and noise."""
     M_pins, robot = truth.of(pins), truth.robot
 
     def images(q: FloatArray, key: str) -> FloatArray:
         """Both apart, so that the face has the same bits with any pins."""
-        if wrong := beyond_limits(q, robot.lower, robot.upper):
+        if wrong := limit_passed(q, robot.lower, robot.upper):
             raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
@@ -323,7 +315,7 @@ def _simulated_ends(
 
 
 def _shown(
-    task: "TaskSettings",
+    task: TaskSettings,
     types: str,
     pins: int,
     center: int,
@@ -354,7 +346,7 @@ def _unknown(base_tool: FloatArray) -> Ends:
 
 
 def _predicted_ends(
-    config: "Config", calibration: Calibration, joints: Joints, numbers: Sequence[int], center: int
+    config: Config, calibration: Calibration, joints: Joints, numbers: Sequence[int], center: int
 ) -> tuple[Shown, Ends]:
     """Start and goal of a robot that is not simulated, as the calibration predicts their images."""
     task = config.task
@@ -366,7 +358,7 @@ def _predicted_ends(
             raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")
 
     def images(q: FloatArray, key: str) -> FloatArray:
-        if wrong := beyond_limits(q, joints.lower, joints.upper):
+        if wrong := limit_passed(q, joints.lower, joints.upper):
             raise InputError(f"{key}: {wrong}: choose another")
         s = predict(calibration, q[None])[0][:, columns]
         if np.isnan(s[:, :m]).any():
@@ -382,7 +374,7 @@ def _predicted_ends(
     return shown, _unknown(np.full((4, 4), np.nan))
 
 
-def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
+def plant_of(config: Config, truth: Truth, q_start: FloatArray) -> Plant:
     """The truth as the loop sees it from the joints q_start (n,), undisturbed.
 
     Raises WorkFailed if a camera sees the face edge-on there.
@@ -417,7 +409,7 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
     )
 
 
-def _disturbance(config: "Config", n: int) -> Disturbance:
+def _disturbance(config: Config, n: int) -> Disturbance:
     """What befalls the joints and the images of a robot of n joints."""
     given = config.disturbance
     bump, frozen = given.bump, given.frozen_joint

@@ -5,10 +5,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from projservo_cli.config import Config
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains, new_state
 from projservo_cli.geometry.kernels import COORDINATES
@@ -39,9 +40,6 @@ from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.following import followed
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
 
 SUBSAMPLES = 50  # points of a joint step at which the deviation between samples is measured
 
@@ -178,7 +176,7 @@ def _reason(run: Outcome, joint: int, remaining: tuple[float | None, float | Non
     }[run.verdict]
 
 
-def run(config: "Config", calibration: Calibration, plan: Plan, name: str) -> Trace:
+def run(config: Config, calibration: Calibration, plan: Plan, name: str) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
@@ -218,12 +216,12 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
     return replace(run, law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
 
 
-def _in_compiled_loop(config: "Config", law: str) -> bool:
+def _in_compiled_loop(config: Config, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
     return law in CODES and config.plant.speed_scale == 1.0
 
 
-def sense_is_enough(config: "Config", name: str) -> bool:
+def sense_is_enough(config: Config, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
     return mode == REPLAN and _in_compiled_loop(config, law)
@@ -282,13 +280,7 @@ def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
         wrong = driven.fits()
         if wrong:
             raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-        own_robot.drive_to(
-            driven,
-            scenario.ends.q_start,
-            own_robot.step_limit(scenario.config, scenario.joints),
-            scenario.gains.period,
-            "servo",
-        )
+        own_robot.drive_to(driven, scenario.ends.q_start, scenario.config, scenario.joints, "servo")
         return _driven_in_python(scenario, controller, driven)
 
 

@@ -15,9 +15,8 @@ from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.records import InputError, names_of
 from projservo_cli.report.values import CLAIMS_FILE, PAGE_FILE
-from projservo_cli.stages import Progress
 from projservo_cli.stages.world import has_task
-from projservo_cli.store import SERVO, Result, Run, save
+from projservo_cli.store import SERVO, Result, Run
 
 STAGES = ("calibrate", "plan", "servo", "report")
 # What of the configuration each stage depends on, beside the stage before it.
@@ -49,8 +48,8 @@ class Step:
     stage: str  # name of the stage
     law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty
     key: str  # what the key of the result will be
-    why: str  # why it has to be made; empty where the stored one is up to date
     inputs: dict[str, str]  # files read and their hashes
+    why: str = ""  # why it has to be made; empty where the stored one is up to date
 
     @property
     def name(self) -> str:
@@ -74,19 +73,16 @@ def steps_for(
     if not has_task(config) and set(named) <= {"calibrate", "report"}:
         stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
     steps: list[Step] = []
-    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, stages):
-        step = Step(stage, law, key, "", inputs)
-        remade = any(before.why for before in steps if before.stage != stage)
-        steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
+    for step in _needed(config, run, laws or config.control.laws, stages):
+        remade = any(before.why for before in steps if before.stage != step.stage)
+        steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
     if steps[0].why and not force:
         _keep_recorded(config, run)
     return steps
 
 
-def _keys(
-    config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
-) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, run, key and input hashes of every result of the stages, each key made from those before."""
+def _needed(config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]) -> Iterator[Step]:
+    """Every result of the stages with its key, each made from those before."""
     inputs = _file_hashes(config, run)
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     for stage in stages:
@@ -94,7 +90,7 @@ def _keys(
         for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
             extra = {"before": before, "law": law}
             keys.append(digest(config, DEPENDS_ON[stage], without=NOT_HASHED[stage], extra=extra))
-            yield stage, law, keys[-1], inputs if stage == "calibrate" else {}
+            yield Step(stage, law, keys[-1], inputs if stage == "calibrate" else {})
         before = [*keys]
 
 
@@ -149,50 +145,8 @@ def _keep_recorded(config: Config, run: Run) -> None:
     )
 
 
-def make_result(
-    step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress
-) -> tuple[Run, list[str]]:
-    """Make one result from those before it, and put it into the run file.
-
-    laws : names of the runs a report is about; others may be stored, of other settings perhaps.
-    Returns the run with it, and the names of results dropped because they were made from older ones. Raises
-    InputError, WorkFailed as the stage does; the run file is then as it was.
-    """
-    run = replace(run, configuration=to_yaml(config))
-    result = result_of(step, config, *_made(step, config, run, laws, progress))
-    place = STAGES.index(step.stage)
-    after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
-    results = {name: stored for name, stored in run.results.items() if name not in after}
-    return save(replace(run, results={**results, step.name: result})), after
-
-
 def result_of(step: Step, config: Config, *made: Any) -> Result:
     """The result that consists of what its stage made."""
     labels = ("observation", "calibration", "cross_validation") if step.stage == "calibrate" else ("",)
     records = {label: record for label, record in zip(labels, made, strict=True) if record is not None}
     return Result(step.key, to_yaml(config), provenance.collect(seed=config.seed), step.inputs, records)
-
-
-def _made(step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress) -> tuple[Any, ...]:
-    """What a stage makes; its module is imported when it is needed."""
-    if step.stage == "calibrate":
-        from projservo_cli.stages import calibrate
-
-        return calibrate.run(config, progress=progress)
-    if step.stage == "plan":
-        from projservo_cli.stages import plan
-
-        return (plan.run(config, run.calibration),)
-    if step.stage == "servo":
-        from projservo_cli.stages import servo
-
-        return (servo.run(config, run.calibration, run.plan, step.law),)
-    from projservo_cli.stages import report
-
-    return (report.run(reported(config, run, laws), run.path.parent, progress=progress),)
-
-
-def reported(config: Config, run: Run, laws: Sequence[str]) -> Run:
-    """What a report is about: of the results before it those that the named runs of laws rest on."""
-    names = ["calibrate", *(["plan", *(SERVO + law for law in laws)] if has_task(config) else [])]
-    return replace(run, results={name: run.results[name] for name in names})

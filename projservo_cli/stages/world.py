@@ -4,24 +4,22 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.config import Config
+from projservo_cli.config.models import Goal
+from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, Robot
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.loop.summary import Ends
 from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
 from projservo_cli.robots.simulated import Arm, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
 
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-    from projservo_cli.config.models import Goal
-    from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, Robot
 
-
-def reference_of(config: "Config") -> "JointVector | None":
+def reference_of(config: Config) -> JointVector | None:
     """Joints around which the trial motions are made."""
     return config.calibration.reference or (config.task.start if config.task is not None else None)
 
@@ -35,7 +33,7 @@ class Joints(NamedTuple):
     speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
 
 
-def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
+def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
     """Which of the readings (n,) lies beyond its limits, in words; empty where none does."""
     for i in np.flatnonzero((q < lower) | (q > upper)):
         limits = f"{lower[i]:.6g} to {upper[i]:.6g} (rad or m)"
@@ -43,7 +41,7 @@ def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
     return ""
 
 
-def joints_of(config: "Config", default_types: str = "") -> Joints:
+def joints_of(config: Config, default_types: str = "") -> Joints:
     """Joints of the robot; of the calibration's ``default_types`` where the configuration does not tell."""
     vector = reference_of(config)
     types = config.joint_types or default_types or "R" * (len(vector.joints) if vector is not None else 0)
@@ -57,12 +55,12 @@ def joints_of(config: "Config", default_types: str = "") -> Joints:
     return Joints(types, lower, upper, speed)
 
 
-def has_task(config: "Config") -> bool:
+def has_task(config: Config) -> bool:
     """Whether there is a robot with a task; a recorded run may be reported on without."""
     return not config.recorded or None not in (config.robot, config.rig, config.markers, config.task)
 
 
-def image_size_of(config: "Config") -> tuple[int, int] | None:
+def image_size_of(config: Config) -> tuple[int, int] | None:
     """Width and height of the images, px, if they are known."""
     if config.data is not None and config.data.image_size_px is not None:
         return config.data.image_size_px
@@ -114,7 +112,7 @@ class Truth:
         """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
         return self.robot.pose(q) @ self._from_tool
 
-    def turned(self, q_start: FloatArray, goal: "Goal") -> FloatArray:
+    def turned(self, q_start: FloatArray, goal: Goal) -> FloatArray:
         """Joints (n,) after a turn about the roll axis of the rig and a small displacement of the tool."""
         assert goal.turn_deg is not None
         point, direction = roll_axis(self.P)
@@ -132,7 +130,7 @@ class Truth:
         return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
 
 
-def face_numbers(config: "Config") -> tuple[int, ...]:
+def face_numbers(config: Config) -> tuple[int, ...]:
     """Numbers of the face markers."""
     if config.markers is None or config.markers.face is None:
         raise InputError(
@@ -141,14 +139,14 @@ def face_numbers(config: "Config") -> tuple[int, ...]:
     return config.markers.face
 
 
-def center_index(markers: "Markers") -> int:
+def center_index(markers: Markers) -> int:
     """Position of the centre marker within the face, or ``MIDPOINT``."""
     return (
         MIDPOINT if markers.center == "midpoint" or not markers.face else markers.face.index(markers.center)
     )
 
 
-def truth_of(config: "Config") -> Truth:
+def truth_of(config: Config) -> Truth:
     """Build the truth, or find it again where it was built for another seed or task.
 
     Raises InputError if the configuration lacks a part of it, naming the key to set.
@@ -163,7 +161,7 @@ def truth_of(config: "Config") -> Truth:
 
 
 @lru_cache(maxsize=16)
-def _built(described: "Robot", rig: "Rig", markers: "Markers") -> Truth:
+def _built(described: Robot, rig: Rig, markers: Markers) -> Truth:
     robot = _robot_of(described)
     numbers = markers.known
     assert numbers is not None
@@ -198,7 +196,7 @@ def _about_axis(point: FloatArray, direction: FloatArray, theta: float) -> Float
     return _rigid(R, point - R.as_matrix() @ point)
 
 
-def _robot_of(described: "Robot") -> Arm:
+def _robot_of(described: Robot) -> Arm:
     """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero.
 
     In Craig's modified convention a and α come before θ and d; the joint variable is added to θ or d.
@@ -225,7 +223,7 @@ def _robot_of(described: "Robot") -> Arm:
     return Arm(np.array(moved), types, np.zeros(len(kinds)), T @ np.array(table.tool), lower, upper)
 
 
-def _camera_of(camera: "Camera") -> FloatArray:
+def _camera_of(camera: Camera) -> FloatArray:
     """Camera (3, 4) to px of its matrix or its look-at description."""
     if camera.matrix is not None:
         P = np.array(camera.matrix)

@@ -154,13 +154,7 @@ def save(run: Run) -> Run:
 
 
 def load(target: Path | str) -> Run:
-    """Read a run file.
-
-    Raises
-    ------
-    InputError
-        When there is none, it was changed since it was written, or another version made it.
-    """
+    """Read a run file; an InputError if there is none, it was changed since, or another version made it."""
     path = run_path(target)
     if not path.is_file():
         raise InputError(f"{path}: there is no run file; make one with: projservo calibrate -o {path.parent}")

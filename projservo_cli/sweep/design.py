@@ -141,11 +141,6 @@ def _overrides(what: str, key: str, value: Any) -> list[Override]:
 RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES = range(5)
 
 
-def seed_of(seed: int, stream: int, number: int) -> int:
-    """Seed of one of many draws."""
-    return int(np.random.SeedSequence(seed, spawn_key=(stream, number)).generate_state(1, np.uint64)[0] >> 1)
-
-
 def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
     """One value; always as many random numbers, whatever the distribution."""
     uniform, normal = rng.random(), rng.standard_normal()
@@ -187,6 +182,12 @@ class Design:
     sweep: SweepConfig  # its configuration
     bases: tuple[tuple[str, str], ...]  # name and resolved YAML of each base
 
+    @classmethod
+    def made_of(cls, recipe: Mapping[str, Any]) -> "Design":
+        """The design that a recipe is of."""
+        bases = tuple((str(name), str(text)) for name, text in recipe["bases"])
+        return cls(SweepConfig.model_validate(recipe["sweep"]), bases)
+
     @cached_property
     def axes(self) -> tuple[_Axis, ...]:
         """Dimensions of the grid, the last one running fastest; there is always one of laws."""
@@ -210,7 +211,7 @@ class Design:
 
     @cached_property
     def recipe(self) -> dict[str, Any]:
-        """All there is, as JSON values; ``from_recipe`` makes the design of it."""
+        """All there is, as JSON values; ``made_of`` makes the design of it."""
         return {"sweep": self.sweep.model_dump(mode="json"), "bases": [list(base) for base in self.bases]}
 
     @cached_property
@@ -275,7 +276,7 @@ class Design:
         drawn = self._drawn(CALIBRATION_VALUES, calibration)
         if drawn:
             config = _changed(config, drawn, f"calibration {calibration}")
-        seed = seed_of(self.sweep.seed, CALIBRATIONS, calibration)
+        seed = self.seed(CALIBRATIONS, calibration)
         update = {"calibration": config.calibration.model_copy(update={"seed": seed})}
         return config.model_copy(update=update)
 
@@ -313,7 +314,7 @@ class Design:
         drawn = self._drawn(VALUES, draw)
         if drawn:
             config = _changed(config, drawn, f"run {run}")
-        update: dict[str, Any] = {"seed": seed_of(self.sweep.seed, RUNS, draw)}
+        update: dict[str, Any] = {"seed": self.seed(RUNS, draw)}
         if task >= 0:
             assert config.task is not None
             ends = self.tasks(self.base_of(cell))
@@ -327,6 +328,11 @@ class Design:
         _, draw, calibration, _ = self.numbers(run)
         found = self._drawn(VALUES, draw) | self._drawn(CALIBRATION_VALUES, calibration)
         return {key: found[key] for key in self.sweep.random}
+
+    def seed(self, stream: int, number: int) -> int:
+        """Seed of one of many draws."""
+        sequence = np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number))
+        return int(sequence.generate_state(1, np.uint64)[0] >> 1)
 
     def _drawn(self, stream: int, number: int) -> dict[str, Any]:
         """Values of the keys that a stream is for: whether the calibration depends on them."""
@@ -350,12 +356,6 @@ def read_design(sweep: SweepConfig) -> Design:
     for draw in range(min(3, sweep.runs) if sweep.random else 0):
         _changed(design.cell(0), design.drawn(draw), f"run {draw}")
     return design
-
-
-def from_recipe(recipe: Mapping[str, Any]) -> Design:
-    """The design that a recipe is of."""
-    bases = tuple((str(name), str(text)) for name, text in recipe["bases"])
-    return Design(SweepConfig.model_validate(recipe["sweep"]), bases)
 
 
 def name_of_run(config: Config) -> str:

@@ -1,4 +1,4 @@
-"""The folder of a sweep: what it is of, how far it is, and one of its runs anew.
+"""The folder of a sweep: what it is of, how far it is, how it is filled, and one of its runs anew.
 
 A manifest says what all else is of. While a sweep runs there is a file for each part; a part that is there
 is done, so after any end the same command goes on with the others. The table is assembled from them, and
@@ -26,11 +26,18 @@ from projservo_cli.stages import Progress, calibrate
 from projservo_cli.stages.steps import result_of, steps_for
 from projservo_cli.store import Result, Run, load, save
 from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
-from projservo_cli.sweep.design import Design, from_recipe, name_of_run
+from projservo_cli.sweep.design import Design, name_of_run
 from projservo_cli.sweep.engine import Engine, versions
 from projservo_cli.sweep.runs import Part, columns_of, is_compiled, run_part
 
 REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
+PARTS = 4  # of each worker at least
+# Runs that take a second or two, by whether many have all but their images in common.
+SHARED, OWN = 2_000, 100
+CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
+SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
+# Indices of the machine code of the closed loop, by whether many runs are made in one call.
+LOOPS = ("compiled.run-*.nbi", "trial.without_rehearsal-*.nbi")
 
 
 class _Status(NamedTuple):
@@ -125,7 +132,7 @@ class Folder:
 
     def design(self) -> Design:
         """The design of the sweep that the folder holds."""
-        return from_recipe(self._read()["recipe"])
+        return Design.made_of(self._read()["recipe"])
 
     def begin(self, design: Design, chunk: int) -> None:
         """Write the manifest."""
@@ -154,6 +161,12 @@ class Folder:
             "total": design.total,
         }
         assemble(self.table, self.stored(), columns, attributes)
+
+    def assembled(self) -> Path:
+        """The table of the runs that are done."""
+        if self.stored():
+            self.assemble(self.design())
+        return self.table
 
     def calibration(self, key: str) -> Path:
         """The run file that holds a calibration, or beside which a file says why there is none."""
@@ -212,15 +225,6 @@ def run_of(target: str) -> tuple[Config, Result | None]:
     return config, replace(load(path).results["calibrate"], key=step.key)
 
 
-PARTS = 4  # of each worker at least
-# Runs that take a second or two, by whether many have all but their images in common.
-SHARED, OWN = 2_000, 100
-CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
-SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
-# Indices of the machine code of the closed loop, by whether many runs are made in one call.
-LOOPS = ("compiled.run-*.nbi", "trial.without_rehearsal-*.nbi")
-
-
 def run_sweep(
     design: Design,
     folder: Folder,
@@ -242,7 +246,13 @@ def run_sweep(
     if force:
         folder.clear()
     try:
-        _make(design, folder, engine, status, progress, say)
+        for base in range(len(design.bases) if design.sweep.tasks else 0):
+            design.tasks(base)  # or say that there are none, before anything else is made
+        _compile_once(design, engine, say)
+        _make_calibrations(design, folder, engine, progress)
+        if status.done:
+            say(f"{status.done} of {status.total} runs are stored already")
+        _make_parts(design, folder, engine, status, progress)
     except KeyboardInterrupt:
         if folder.stored():
             folder.assemble(design)
@@ -254,40 +264,31 @@ def run_sweep(
     return _Status(design.total, design.total, status.chunk, complete=True)
 
 
-def _make(
-    design: Design,
-    folder: Folder,
-    engine: Engine,
-    status: _Status,
-    progress: Progress,
-    say: Callable[[str], None],
-) -> None:
-    """Calibrations and parts that are missing."""
-    for base in range(len(design.bases) if design.sweep.tasks else 0):
-        design.tasks(base)  # or say that there are none, before anything else is made
-    _compile_once(design, engine, say)
+def _make_calibrations(design: Design, folder: Folder, engine: Engine, progress: Progress) -> None:
+    """Make the calibrations that are missing."""
     wanted = folder.missing_calibrations(design)
     most = 1 + len(wanted) // CALIBRATIONS
     with closing(engine.completed(_calibrate, wanted, most=most)) as calibrated:
         for count, one in enumerate(calibrated):
             folder.keep_calibration(one)
             progress("calibrations", count + 1, len(wanted))
-    calibrations = folder.calibrations(design)
 
-    def part(first: int, last: int) -> Part:
-        at = design.placed(np.arange(first, last))
-        pairs = zip(at.cell.tolist(), at.calibration.tolist(), strict=True)
-        keys = {design.calibration_key(*pair) for pair in set(pairs)}
-        return Part(design, first, last, {key: calibrations[key] for key in keys})
 
-    threads = _shares_settings(design)
+def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status, progress: Progress) -> None:
+    """Make the parts that are missing."""
+    calibrations, threads = folder.calibrations(design), _shares_settings(design)
     chunk = status.chunk or design.sweep.chunk
     if not chunk:
         chunk = min(SHARED if threads else OWN, math.ceil(design.total / (PARTS * engine.workers)))
     if not status.chunk:
         folder.begin(design, chunk)
-    if status.done:
-        say(f"{status.done} of {status.total} runs are stored already")
+
+    def part(first: int, last: int) -> Part:
+        at = design.placed(np.arange(first, last))
+        pairs = set(zip(at.cell.tolist(), at.calibration.tolist(), strict=True))
+        keys = {design.calibration_key(*pair) for pair in pairs}
+        return Part(design, first, last, {key: calibrations[key] for key in keys})
+
     done, left = 0, status.total - status.done
     progress("runs", 0, left)
     parts = (part(*pair) for pair in folder.missing(design, chunk))

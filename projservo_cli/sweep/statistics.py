@@ -19,7 +19,6 @@ from projservo_cli.report.figures.sweeps import draw_basin, draw_final_errors, d
 from projservo_cli.report.material import Data
 from projservo_cli.stages import Progress
 from projservo_cli.store.sweep_table import SweepTable
-from projservo_cli.sweep.folder import Folder
 from projservo_cli.tables import to_csv
 
 SUCCESS = "converged"
@@ -36,10 +35,7 @@ PAIRED = ("steps", "position_error_mm", "path_length_ratio")
 
 
 class _Rows:
-    """Columns of a table as they are needed, and what follows from them.
-
-    table : of a sweep.
-    """
+    """Columns of the table of a sweep as they are needed, and what follows from them."""
 
     def __init__(self, table: SweepTable) -> None:
         self.table = table
@@ -185,23 +181,18 @@ class _Picture(NamedTuple):
     height: float
 
 
-def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
-    """Write statistics and figures of a sweep, of the runs that are done.
-
-    Returns the statistics, and the files.
-    """
-    if folder.stored():
-        folder.assemble(folder.design())
-    table = SweepTable(folder.table)
+def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
+    """Write statistics and figures of the table of a sweep beside it; the statistics and the files."""
+    table, folder = SweepTable(path), path.parent
     rows = _Rows(table)
     found = {"runs": table.rows, "total": table.attributes["total"], **_statistics(rows)}
     text = json.dumps(found, indent=1, allow_nan=False) + "\n"
-    files = [_written(folder.path / STATISTICS, text.encode())]
+    files = [_written(folder / STATISTICS, text.encode())]
     pictures = list(_pictures(rows))
     for done, picture in enumerate(pictures):
         progress("figures", done, len(pictures))
         made = {**_drawn(picture, formats), "csv": to_csv(picture.data).encode()}
-        files += [_written(folder.path / f"{picture.name}.{kind}", made[kind]) for kind in made]
+        files += [_written(folder / f"{picture.name}.{kind}", made[kind]) for kind in made]
     progress("figures", len(pictures), len(pictures))
     return found, files
 

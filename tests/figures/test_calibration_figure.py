@@ -11,7 +11,8 @@ from projservo_cli.report import style
 from projservo_cli.report.figures import calibration
 from projservo_cli.report.material import Fit
 from projservo_cli.stages import calibrate
-from projservo_cli.stages.steps import make_result, steps_for
+from projservo_cli.stages.chain import make_result
+from projservo_cli.stages.steps import steps_for
 from projservo_cli.store import Result, Run
 from tests.fake_records import fake
 from tests.figures.cases import SPECS, case

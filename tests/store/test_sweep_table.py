@@ -44,16 +44,6 @@ def test_what_was_in_the_parts_is_in_the_table(table):
         found.trace(7)
 
 
-def test_xarray_opens_texts_as_texts(table):
-    xarray = pytest.importorskip("xarray")
-    with xarray.open_dataset(table, engine="h5netcdf") as data:
-        assert data["error"].dims == ("run",)
-        assert data["error"].attrs["units"] == "px"
-        frame = data.to_dataframe()
-    assert frame["law"].iloc[:3].tolist() == ["exact", "stacked", "dé"]
-    assert frame.loc[30_001, "error"] == 15_000.5
-
-
 def test_a_part_that_changed_costs_no_table(table, parts):
     before = table.read_bytes()
     parts[1].write_bytes(parts[1].read_bytes()[:-1])

@@ -9,7 +9,7 @@ import pytest
 from projservo_cli.config.sweep import SweepConfig, load_sweep
 from projservo_cli.records import InputError
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import Design, from_recipe, read_design
+from projservo_cli.sweep.design import Design, read_design
 from tests.conftest import ROOT
 from tests.sweep.cases import design
 
@@ -64,7 +64,7 @@ def test_a_run_depends_on_its_number_alone_and_cells_share_their_draws():
 
 def test_a_design_is_made_again_from_its_recipe_and_its_key_tells_what_matters():
     found = design()
-    again = from_recipe(found.recipe)
+    again = Design.made_of(found.recipe)
     assert again.key == found.key
     assert again.config(5) == found.config(5)
     assert design(chunk=2, name="other").key == found.key

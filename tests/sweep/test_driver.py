@@ -106,21 +106,6 @@ def test_what_is_not_of_this_sweep_is_refused(tmp_path):
         folder.status(second)
 
 
-def test_a_damaged_part_is_named(tmp_path):
-    def interrupt(what, done, total):
-        if what == "runs" and done == 1:
-            raise KeyboardInterrupt
-
-    found, folder = design(runs=1, chunk=1, traces=[0]), Folder(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        make(found, tmp_path, progress=interrupt)
-    (part,) = folder.stored()
-    assert folder.status(found).done == SweepTable(folder.table).rows == 1
-    part.write_bytes(part.read_bytes()[:1000])
-    with pytest.raises(InputError, match=f"{part.name}: cut short or changed"):
-        make(found, tmp_path)
-
-
 def test_threads_give_the_same_and_are_left_in_order(tmp_path):
     """Runs that differ in their seeds alone are threads; an interrupt waits for those at work."""
 

@@ -7,6 +7,7 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.plan import rotation_sense as sense_of
 from projservo_cli.sweep import runs
 from projservo_cli.sweep.design import name_of_run
 from projservo_cli.sweep.runs import Part, is_compiled, run_part
@@ -108,6 +109,14 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert made.columns["verdict"].tolist() == [b"not started"] * 2
     assert np.isnan(made.columns["position_error_mm"]).all()
     assert made.columns["steps"].tolist() == [-1, -1]
+
+
+@pytest.mark.volume
+def test_laws_on_the_same_images_share_the_plan_that_tells_the_sense(monkeypatch):
+    planned = []
+    monkeypatch.setattr(runs, "rotation_sense", lambda given: planned.append(given) or sense_of(given))
+    run_part(part_of(design(**CASES["constrained"] | {"runs": 2, "seed": 7})))
+    assert len(planned) == 2
 
 
 @pytest.mark.volume

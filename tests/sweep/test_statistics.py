@@ -48,7 +48,7 @@ def made(tmp_path_factory):
     write_part(folder / "part.h5", values, {})
     attributes = {"axes": AXES, "columns": [name for name, *_ in headings], "random": [], "total": count}
     assemble(folder / "sweep.h5", [folder / "part.h5"], headings, attributes)
-    told, _ = report(Folder(folder), [], lambda *_: None)
+    told, _ = report(folder / "sweep.h5", [], lambda *_: None)
     return told, folder, values, good
 
 
@@ -129,7 +129,7 @@ def test_the_report_of_a_sweep(tmp_path):
         random={f"{offset}.joints.5": {"uniform": [-2, 2]}},
     )
     make(found, tmp_path)
-    told, files = report(Folder(tmp_path), ["png"], lambda *_: None)
+    told, files = report(Folder(tmp_path).assembled(), ["png"], lambda *_: None)
     assert (told["runs"], len(told["cells"]), len(told["paired"])) == (24, 12, 6)
     written = json.loads((tmp_path / "statistics.json").read_text(encoding="utf-8"))
     assert written["cells"][3]["runs"] == 2
@@ -147,4 +147,4 @@ def test_the_report_of_a_sweep(tmp_path):
 
 def test_a_report_of_nothing(tmp_path):
     with pytest.raises(InputError, match="no table of a sweep"):
-        report(Folder(tmp_path), ["png"], lambda *_: None)
+        report(Folder(tmp_path).assembled(), ["png"], lambda *_: None)
