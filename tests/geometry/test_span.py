@@ -6,7 +6,7 @@ import pytest
 from projservo_cli.geometry.algebra import as_mat, invariant_rotations
 from projservo_cli.geometry.kinematics import backward, forward_kinematics, joint_operators
 from projservo_cli.geometry.mechanisms import Seen, in_span, joint_motion, reach, span_of, workspace
-from projservo_cli.records import PRISMATIC, WorkFailed
+from projservo_cli.records import WorkFailed
 from tests.samples import arm, face, frame, in_frame
 
 # Arms: redundant ones, general short ones, and one whose joints turn about one direction alone.
@@ -90,4 +90,3 @@ def test_newton_finds_the_joints_of_a_redundant_arm(types, rng):
 def test_no_metric_is_made_up_for_joints_that_keep_none(rng):
     with pytest.raises(WorkFailed, match="keep no metric"):
         invariant_rotations(rng.normal(size=(5, 3, 3)))
-    assert PRISMATIC not in arm("RRRRR").joint_types
