@@ -337,11 +337,10 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
     other = parts.theta_r - math.copysign(2.0 * math.pi, parts.theta_r)
     senses = np.array(sorted((parts.theta_r, other), key=abs))
     margins = np.zeros((2, 2))
-    for view in range(2):
-        c_0, c_s, c_c = margin_coefficients(parts.a, parts.H_r, vec(task.O[view]))
-        sign = task.visible[view] / abs(c_0 + c_c)
-        for i in range(2):
-            margins[i, view] = arc_minimum(sign * c_0, sign * c_s, sign * c_c, senses[i])
+    for view, O in enumerate(task.O):
+        c = np.array(margin_coefficients(parts.a, parts.H_r, vec(O)))
+        c_0, c_s, c_c = (c * (task.visible[view] / abs(c[0] + c[2]))).tolist()
+        margins[:, view] = [arc_minimum(c_0, c_s, c_c, sense) for sense in senses.tolist()]
     return senses, margins
 
 

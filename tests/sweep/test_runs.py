@@ -8,9 +8,11 @@ import pytest
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.plan import rotation_sense as sense_of
+from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.sweep import runs
 from projservo_cli.sweep.design import name_of_run
 from projservo_cli.sweep.runs import Part, is_compiled, run_part
+from tests.known import configured
 from tests.sweep.cases import design
 
 # Of each case every run is redone.
@@ -109,6 +111,15 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert made.columns["verdict"].tolist() == [b"not started"] * 2
     assert np.isnan(made.columns["position_error_mm"]).all()
     assert made.columns["steps"].tolist() == [-1, -1]
+
+
+@pytest.mark.volume
+def test_the_deviation_is_unknown_where_images_alone_show_the_goal():
+    s_star = scenario_of(configured("ur5")).exact.s_star.tolist()
+    goal = {"images": dict(zip(("left", "right"), s_star, strict=True))}
+    made = run_part(part_of(design(runs=1, set={"task.goal": goal}, between_samples=True))).columns
+    assert (made["steps"] > 0).all()
+    assert np.isnan(made["center_deviation_mm"]).all()
 
 
 @pytest.mark.volume
