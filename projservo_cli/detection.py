@@ -250,8 +250,7 @@ class TagFinder:
         image = self._cv.imdecode(content, flags) if content.size else None
         if image is None:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
-        found: FloatArray = np.asarray(image, dtype=np.float64)
-        return found
+        return np.asarray(image, dtype=np.float64)
 
     def find(self, image: FloatArray) -> tuple[dict[int, FloatArray], int]:
         """Corners (4, 2), px, of each tag in an image, and how many tags were there more than once.

@@ -176,8 +176,7 @@ class LeastSquares:
         result[self.joint[-1] : self.lens, :-2] = moved.reshape(len(motions), -1).T
         for v in (0, 1):
             result[v * CAMERA : (v + 1) * CAMERA, v - 2] = scene.P[v].ravel()
-        directions: FloatArray = result / np.linalg.norm(result, axis=0)
-        return directions
+        return np.asarray(result / np.linalg.norm(result, axis=0))
 
     def _blocks(self) -> Iterator[tuple[int, slice, IntArray]]:
         """View and rows of the readings of each marker, and their columns (c,), the same for all."""

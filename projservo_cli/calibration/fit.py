@@ -226,8 +226,7 @@ def _within(problem: LeastSquares, residual: FloatArray, limit: float) -> BoolAr
     readings = problem.readings
     good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
     most = readings.count_at(good) >= 0.5 * readings.count_at(readings.seen)
-    result: BoolArray = good & most[readings.pose_of]
-    return result
+    return np.asarray(good & most[readings.pose_of])
 
 
 def _degrees_of_freedom(problem: LeastSquares, scene: Scene, used: BoolArray) -> int:

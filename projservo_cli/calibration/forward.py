@@ -28,8 +28,7 @@ def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> Flo
     """
     squared = H_hat @ H_hat
     sine, versine = (part.T[..., None, None] for part in sine_and_versine(prismatic, q))
-    result: FloatArray = np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
-    return result
+    return np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:

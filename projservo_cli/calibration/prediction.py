@@ -90,8 +90,7 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     """
     J = prediction_derivative(calibration, q)
     variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
-    result: FloatArray = np.maximum(variance, 0.0)
-    return result
+    return np.asarray(np.maximum(variance, 0.0))
 
 
 def prediction_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
@@ -126,8 +125,7 @@ def _root(covariance: FloatArray) -> FloatArray:
     """Λ (d, r) with Λ Λᵀ the covariance (d, d); the gauge, and what no robot can do, have no spread."""
     spread, basis = np.linalg.eigh(covariance)
     known = spread > len(spread) * np.finfo(np.float64).eps * spread[-1]
-    result: FloatArray = basis[:, known] * np.sqrt(spread[known])
-    return result
+    return np.asarray(basis[:, known] * np.sqrt(spread[known]))
 
 
 # Observations in a row that must agree on a disturbance: one may be blurred, or a marker taken for another.

@@ -85,8 +85,7 @@ def spread_factor(solution: Solution) -> FloatArray:
     _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
     # Robots of one or two joints leave more directions open than the gauge, none of which matters
     # to an image: they must come out as zero after the product with its derivative.
-    result: FloatArray = (free @ (Vt.T / np.maximum(s, _OPEN_DIRECTION * s[0]))) / scale[:, None]
-    return result
+    return np.asarray((free @ (Vt.T / np.maximum(s, _OPEN_DIRECTION * s[0]))) / scale[:, None])
 
 
 def covariance_factor(solution: Solution, result: Projective, spread: FloatArray) -> FloatArray:
@@ -117,8 +116,7 @@ def _output_derivative(solution: Solution, result: Projective) -> FloatArray:
         for B, H_hat in zip(generators(scene), scene.H_hat, strict=True)
     ]
     markers = [result.W[:, :3]] * len(scene.M)
-    J: FloatArray = block_diag(*cameras, *joints, *markers, np.eye(problem.size - problem.lens))
-    return J
+    return block_diag(*cameras, *joints, *markers, np.eye(problem.size - problem.lens))
 
 
 def _output_gauge(scene: Scene) -> FloatArray:

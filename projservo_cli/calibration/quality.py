@@ -62,8 +62,7 @@ class _Uncertainty:
         )
         wide = 0.5 * (high - low)
         low, high = (low - wide)[:, None, None], (high + wide)[:, None, None]
-        inside: BoolArray = ((pixels >= low) & (pixels <= high)).all(axis=-1)
-        return inside
+        return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
 
     def spread(self, q: FloatArray, shown: BoolArray) -> FloatArray:
         """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one."""

@@ -50,24 +50,16 @@ class _Alignment:
 
     body: FloatArray  # (m, 3) markers, NaN where never merged
     R: FloatArray  # (K, 3, 3) rotations from the body to the pose
-    t: FloatArray  # (K, 3) translations
     merged: BoolArray  # (K,) poses whose rotation is known
 
 
 def _merged(guess: Guess, readings: Readings) -> _Alignment:
-    """Body and poses from the points of a guessed reconstruction, those both views saw."""
-    both = readings.both
-    shape = (len(readings.q), readings.marker.size)
-    points, seen = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
+    """Body and poses from the points of a guessed reconstruction, grown from the fullest pose."""
+    K, both = len(readings.q), readings.both
+    points = np.zeros((K, readings.marker.size, 3))
+    seen = np.zeros(points.shape[:2], dtype=bool)
     where = readings.pose_of[both], readings.marker_of[both]
     points[where], seen[where] = guess.points, True
-    return _merge(points, seen)
-
-
-def _merge(points: FloatArray, seen: BoolArray) -> _Alignment:
-    """Grow the body from the fullest pose until nothing is added, from points (K, m, 3) where seen (K, m)."""
-    K = len(seen)
-    points = np.where(seen[..., None], points, 0.0)
     R, t = np.tile(np.eye(3), (K, 1, 1)), np.zeros((K, 3))
     seed = _seed(points, seen)
     body = np.where(seen[seed][:, None], points[seed], np.nan)
@@ -86,7 +78,7 @@ def _merge(points: FloatArray, seen: BoolArray) -> _Alignment:
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
             body = _median_body(local, seen & found[:, None])
             grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
-    return _Alignment(body, R, t, found)
+    return _Alignment(body, R, found)
 
 
 def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -159,11 +151,10 @@ def _rotation_axes(
     keep: int,
     steps: int,
 ) -> list[FloatArray]:
-    """Sets of axes (n, 3) that explain the rotations at joint values (K, n), the distinct minima, best first.
+    """Sets of axes (n, 3) that explain the rotations at joint values (K, n), distinct minima, best first.
 
-    Levenberg–Marquardt under a Cauchy loss on log(R_k R_predᵀ) from many random sets of axes at once,
-    and from the axes that single-joint trials show directly. At most so many sets, none where no axes explain
-    the rotations at all; axes of prismatic joints have no meaning.
+    From many random sets and the axes that single-joint trials show directly. None where no axes explain the
+    rotations at all; axes of prismatic joints have no meaning.
     """
     R, q = alignment.R[alignment.merged], q[alignment.merged]
     w = rng.standard_normal((_STARTS, q.shape[1], 3))
@@ -227,7 +218,7 @@ def _isolated_axes(R: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatA
 def _fit_axes(
     w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Levenberg–Marquardt for all starts at once: axes (S, n, 3) and losses (S,)."""
+    """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ)."""
     S, n = w.shape[:2]
     away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
     base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])
@@ -241,9 +232,7 @@ def _fit_axes(
         A = weighted @ rows
         g = (weighted @ residual.reshape(S, -1, 1))[..., 0]
         A += (damping * np.trace(A, axis1=1, axis2=2) / size + 1e-12)[:, None, None] * np.eye(size)
-        turn = _rotations(
-            np.asarray(-np.linalg.solve(A, g[..., None]), dtype=np.float64).reshape(S, n + 1, 3)
-        )
+        turn = _rotations(np.asarray(-np.linalg.solve(A, g[..., None]).reshape(S, n + 1, 3), float))
         w_new = np.einsum("snij,snj->sni", turn[:, :n], w)
         base_new = turn[:, n] @ base
         residual_new, J_new = _axis_residuals(w_new, base_new, R, q, prismatic)
