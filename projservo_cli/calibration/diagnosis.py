@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, epipolar_geometry
-from projservo_cli.calibration.fit import RAYLEIGH, Misfit, Solution, fit_from, search_screws
+from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
+from projservo_cli.calibration.fit import Misfit, Solution, fit_from
 from projservo_cli.calibration.forward import LENS, Scene
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.readings import RAYLEIGH, Readings
 from projservo_cli.calibration.start import Search, starts_of_changed
 from projservo_cli.geometry.lens import straight_views, within
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, WorkFailed
@@ -194,7 +194,8 @@ def blamed_joint(search: Search, most_px: float) -> str:
         for done, ((words, changed, handicap), start) in enumerate(zip(changes, starts, strict=True)):
             search.tell("calibration, joint at fault", done, len(changes))
             if start is not None:
-                scene = search_screws(changed, start, changed.readings.seen, _SCREW_STEPS)
+                seen = changed.readings.seen
+                scene = minimize(changed, start, seen, robust=True, cameras=False, most=_SCREW_STEPS).scene
                 candidates.append((_level(changed, scene) + handicap, words, changed, scene))
     except WorkFailed:
         return ""
@@ -311,7 +312,7 @@ def with_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
         unbent, _ = problem.pixels(dataclasses.replace(found.scene, lens=None))
         if within(found.scene.lens[:, None], unbent)[found.used].all():
             straight = _straight(readings, found.scene.lens)
-            return found, epipolar_geometry(straight, search.rng)
+            return found, Epipolar.of(straight, search.rng)
     raise WorkFailed(
         "the images do not determine the distortion of the lenses: record poses with markers all over "
         "both images, or calibrate without --lens"

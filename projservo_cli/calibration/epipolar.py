@@ -33,6 +33,48 @@ class Epipolar:
     sigma_px: float  # noise per image coordinate from the residuals, px
     inlier: BoolArray  # (N,) which correspondences agree with F
 
+    @classmethod
+    def of(cls, readings: Readings, rng: np.random.Generator) -> "Epipolar":
+        """Fundamental matrix and noise of what both views saw, some of it wrong.
+
+        The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
+        a Cauchy loss over minimal parameters.
+
+        Raises WorkFailed with fewer than eight pairs, or where they do not determine the geometry.
+        """
+        left, right = readings.pixels[0][readings.both], readings.pixels[1][readings.both]
+        count = len(left)
+        if count < 8:
+            raise WorkFailed(
+                f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that "
+                "rows hold the pixels of both views"
+            )
+        T, T_ = _normalization(left), _normalization(right)
+        a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
+        picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
+        candidates = _eight_point(a[picks], b[picks])
+        medians = np.median(np.abs(_sampson(candidates, a, b)), axis=1)
+        F = candidates[np.argmin(medians)]
+        for _ in range(10):
+            r, slope = _sampson_and_slope(F, a, b)
+            F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
+        F = _refine(F, a, b, 2.0 * _deviation(_sampson(F, a, b), 1e-12))
+        product = T_.T @ F @ T
+        in_pixels: FloatArray = product / float(np.linalg.norm(product))
+        residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right))
+        inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
+        if inlier.sum() <= _PARAMETERS:
+            raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
+        sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
+        parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
+        if float(np.median(parallax)) < _LEAST_PARALLAX * sigma:
+            raise WorkFailed(
+                "both cameras see the same up to a change of image coordinates: without a baseline, or "
+                "with all markers always in one plane, there is no depth; move the cameras apart, or the "
+                "markers in depth"
+            )
+        return cls(in_pixels, sigma, inlier)
+
     @property
     def noise_px(self) -> float:
         """Noise to reckon with, px per coordinate: exact images have round-off."""
@@ -46,47 +88,6 @@ class Epipolar:
     def within(self, left: FloatArray, right: FloatArray, deviations: float) -> BoolArray:
         """Which pixels (N, 2) obey the geometry to so many standard deviations."""
         return np.abs(_sampson(self.F, _homogeneous(left), _homogeneous(right))) <= deviations * self.sigma_px
-
-
-def epipolar_geometry(readings: Readings, rng: np.random.Generator) -> Epipolar:
-    """Fundamental matrix and noise of what both views saw, some of it wrong.
-
-    The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
-    a Cauchy loss over minimal parameters.
-
-    Raises WorkFailed with fewer than eight correspondences, or where they do not determine the geometry.
-    """
-    left, right = readings.pixels[0][readings.both], readings.pixels[1][readings.both]
-    count = len(left)
-    if count < 8:
-        raise WorkFailed(
-            f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that rows "
-            "hold the pixels of both views"
-        )
-    T, T_ = _normalization(left), _normalization(right)
-    a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
-    picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
-    candidates = _eight_point(a[picks], b[picks])
-    medians = np.median(np.abs(_sampson(candidates, a, b)), axis=1)
-    F = candidates[np.argmin(medians)]
-    for _ in range(10):
-        r, slope = _sampson_and_slope(F, a, b)
-        F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
-    F = _refine(F, a, b, 2.0 * _deviation(_sampson(F, a, b), 1e-12))
-    product = T_.T @ F @ T
-    in_pixels: FloatArray = product / float(np.linalg.norm(product))
-    residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right))
-    inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
-    if inlier.sum() <= _PARAMETERS:
-        raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
-    sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
-    parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
-    if float(np.median(parallax)) < _LEAST_PARALLAX * sigma:
-        raise WorkFailed(
-            "both cameras see the same up to a change of image coordinates: without a baseline, or with all "
-            "markers always in one plane, there is no depth; move the cameras apart, or the markers in depth"
-        )
-    return Epipolar(in_pixels, sigma, inlier)
 
 
 def _deviation(r: FloatArray, least: float) -> float:
@@ -241,7 +242,7 @@ class ImageFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
+class _Guess:
     """Cameras and points in a guessed metric frame."""
 
     P: FloatArray  # (2, 3, 4) cameras to pixels
@@ -250,19 +251,22 @@ class Guess:
     focal: float  # guessed focal length over image size
 
 
-def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: int) -> list[Guess]:
-    """Guessed reconstructions of the pairs seen by both cameras, best first, so many at most.
+def metric_guesses(
+    epipolar: Epipolar, readings: Readings, frame: ImageFrame, keep: int, factor: float = 1.0
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Cameras (2, 3, 4) and points (N, 3) seen by both, in so many guessed metric frames at most, best first.
 
-    The focal length is the one that keeps the distances between markers most constant over the
+    The focal length is a factor of the one that keeps the distances between markers most constant over the
     poses, each local minimum of a scan refined within its neighbours.
 
     Raises WorkFailed if no two markers were seen together at two poses.
     """
+    F = epipolar.F
     both = readings.both
     pairs = _marker_pairs(readings.pose_of[both], readings.marker_of[both])
 
-    def guess(log_focal: float) -> Guess:
-        found = guess_at(F, readings, frame, float(np.exp(log_focal)))
+    def guess(log_focal: float) -> _Guess:
+        found = _guess_at(F, readings, frame, float(np.exp(log_focal)))
         return dataclasses.replace(found, spread=_distance_spread(found.points, pairs))
 
     grid = np.linspace(np.log(_SHORTEST), np.log(_LONGEST), _TRIALS)
@@ -282,11 +286,12 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: i
         fine = minimize_scalar(
             lambda x: guess(x).spread, bounds=bounds, method="bounded", options={"xatol": _FINE * step}
         )
-        found.append(min(scan[i], guess(fine.x), key=lambda g: g.spread))
-    return found
+        best = min(scan[i], guess(fine.x), key=lambda g: g.spread)
+        found.append(best if factor == 1.0 else _guess_at(F, readings, frame, factor * best.focal))
+    return [(one.P, one.points) for one in found]
 
 
-def guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float) -> Guess:
+def _guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float) -> _Guess:
     """Reconstruction of the pairs seen by both cameras from a focal length in units of the image size.
 
     [HZ04] result 9.19, the solution of the four that has most points in front of both cameras.
@@ -307,7 +312,7 @@ def guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float)
     # A ray nearly parallel to its partner meets it anywhere: the median ignores the few.
     scale = float(np.median(np.abs(depth))) or 1.0
     P = K @ np.stack([np.eye(3, 4), np.hstack([R, t[:, None] / scale])])
-    return Guess(P, x * (depth / scale)[:, None], np.inf, focal)
+    return _Guess(P, x * (depth / scale)[:, None], np.inf, focal)
 
 
 def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

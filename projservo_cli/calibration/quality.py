@@ -164,44 +164,82 @@ def _quantile(variances: FloatArray, probability: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Joints:
-    """What the data say of each joint."""
+class _Judgement:
+    """What the data say of each joint, and whether to trust the whole."""
 
-    prismatic: BoolArray  # (n,) types
     span: FloatArray  # (n,) range in the data, rad or m
     # (n,) predicted noise of images at its reach, in units of the pixel noise; NaN where unknown
     noise: FloatArray
-    needed: FloatArray  # (n,) range of a trial motion that would determine it, rad or m, NaN where none does
     # expected error of images at poses of all joints at once and its 99th percentile, px; None where unknown
     error: tuple[float, float] | None
+    usable: bool
+    reason: str  # why it is usable or not, and what limits it
+    advice: tuple[str, ...]  # what to do next
 
-    def advice(self, i: int) -> str:
-        """How far to move joint i."""
-        return describe_joint(i, float(self.span[i]), bool(self.prismatic[i]), float(self.needed[i]))
 
+def judged(
+    solution: Solution,
+    spread: FloatArray | None,
+    expected: Expected,
+    left_out: tuple[int, int, int],
+    suspicion: str,
+) -> _Judgement:
+    """Verdict on a fit with its ``spread_factor``, None for the closed form, which has none.
 
-def judged_joints(solution: Solution, factor: FloatArray | None, sigma_px: float) -> _Joints:
-    """What the data say of each joint, by a ``spread_factor`` (None for no covariance) and a noise, px.
+    From the numbers of outliers, of suspect joint readings and of exchanged markers left out, and a
+    suspicion of what may be to blame for more than pixel noise.
 
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
     """
     prismatic = solution.scene.prismatic
-    span = _require_joints_seen(solution, sigma_px)
-    if factor is None:
-        # NaN, not zero: a method without covariance does not claim certainty.
-        unknown = np.full(len(span), np.nan)
-        return _Joints(prismatic, span, unknown, unknown, None)
-    sure = _Uncertainty(solution, factor)
-    noise = _reach_noise(sure)
-    error, bound = _predicted_error(sure)
-    joints = _Joints(prismatic, span, noise, _needed_spans(sure, noise), (sigma_px * error, sigma_px * bound))
-    i = int(np.argmax(noise))
-    if noise[i] > _UNDETERMINED_NOISE:
-        raise WorkFailed(
-            f"joint {i + 1} is not determined: near the reference its images would be wrong by "
-            f"{noise[i]:.3g} times the pixel noise; {joints.advice(i)}"
+    # Residuals of a method without covariance are its own doing, not noise of the images.
+    sigma = expected.sigma_px if spread is None else expected.noise_px(solution)
+    span = _require_joints_seen(solution, sigma)
+    noise, error, advice = np.full(len(span), np.nan), None, []
+    if spread is not None:
+        sure = _Uncertainty(solution, spread)
+        noise = _reach_noise(sure)
+        typical, bound = _predicted_error(sure)
+        error = (sigma * typical, sigma * bound)
+        needed = _needed_spans(sure, noise)
+        moves = [describe_joint(i, *of) for i, of in enumerate(zip(span, prismatic, needed, strict=True))]
+        i = int(np.argmax(noise))
+        if noise[i] > _UNDETERMINED_NOISE:
+            raise WorkFailed(
+                f"joint {i + 1} is not determined: near the reference its images would be wrong by "
+                f"{noise[i]:.3g} times the pixel noise; {moves[i]}"
+            )
+        advice = [moves[i] for i in np.flatnonzero(noise > WEAK_NOISE)]
+    warned, share = expected.warns(solution), expected.ratio(solution)
+    found = f"{solution.sigma_px:.3g} px a coordinate"
+    wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
+    if spread is None and warned:
+        # Kept for comparison: it returns what it finds, marked so.
+        short = f"the closed_form method explains the images only to {found}"
+        return _Judgement(span, noise, error, False, f"{short}, {share:.3g} times {wanted}: use refined", ())
+    reason = f"residuals of {found} agree with {wanted}"
+    if warned:
+        reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"
+        if "joint readings" in suspicion:
+            advice.append("look for joint readings that lag behind the images")
+    outliers, suspects, swaps = left_out
+    limit = "noise"
+    if warned or suspicion == "lens":
+        limit = suspicion
+    elif (weak := noise > WEAK_NOISE).any():
+        few = span[weak] < np.where(prismatic[weak], REACH_M, REACH_RAD)
+        limit = "amplitude" if few.any() else "geometry"
+    elif outliers > _MOST_OUTLIERS * solution.used.shape[1]:
+        limit = "outliers"
+    if outliers:
+        advice.append(f"{outliers} sightings were left out as outliers: check the detection of markers")
+    if suspects:
+        advice.append(
+            f"{suspects} joint readings disagree with the images: check how poses and images are paired"
         )
-    return joints
+    if swaps:
+        advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
+    return _Judgement(span, noise, error, True, f"{reason}; limited by {limit}", tuple(advice))
 
 
 def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
@@ -214,53 +252,6 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     i = int(np.argmin(motion))
     require_moved(i, float(span[i]), bool(readings.prismatic[i]), float(motion[i]), sigma_px)
     return span
-
-
-def verdict(
-    method: str,
-    solution: Solution,
-    expected: Expected,
-    joints: _Joints,
-    left_out: tuple[int, int, int],
-    suspicion: str,
-) -> tuple[bool, str, tuple[str, ...]]:
-    """Whether and why a calibration is usable, what limits it, and what to do next, in words.
-
-    From the numbers of outliers, of suspect joint readings and of exchanged markers left out, and a
-    suspicion of what may be to blame for more than pixel noise. The closed form is kept for comparison: it
-    returns what it finds, marked so, for residuals above the noise are its own doing.
-    """
-    sigma, warned = solution.sigma_px, expected.warns(solution)
-    outliers, suspects, swaps = left_out
-    wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
-    if method != "refined" and warned:
-        short = f"the {method} method explains the images only to {sigma:.3g} px a coordinate"
-        return False, f"{short}, {expected.ratio(solution):.3g} times {wanted}: use refined", ()
-    weak = np.flatnonzero(joints.noise > WEAK_NOISE)
-    advice = [joints.advice(int(i)) for i in weak]
-    limit = "noise"
-    if warned or suspicion == "lens":
-        limit = suspicion
-    elif weak.size:
-        few = joints.span[weak] < np.where(joints.prismatic[weak], REACH_M, REACH_RAD)
-        limit = "amplitude" if few.any() else "geometry"
-    elif outliers > _MOST_OUTLIERS * solution.used.shape[1]:
-        limit = "outliers"
-    reason = f"residuals of {sigma:.3g} px a coordinate agree with {wanted}"
-    if warned:
-        left = f"residuals of {sigma:.3g} px a coordinate are {expected.ratio(solution):.3g} times {wanted}"
-        reason = f"more than pixel noise is left: {left}"
-        if "joint readings" in suspicion:
-            advice.append("look for joint readings that lag behind the images")
-    if outliers:
-        advice.append(f"{outliers} sightings were left out as outliers: check the detection of markers")
-    if suspects:
-        advice.append(
-            f"{suspects} joint readings disagree with the images: check how poses and images are paired"
-        )
-    if swaps:
-        advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
-    return True, f"{reason}; limited by {limit}", tuple(advice)
 
 
 # Readings of a joint this near, rad or m, are one: a robot that holds a joint still reads it with jitter.

@@ -17,6 +17,8 @@ SAME_READING = 1e-7
 LEAST_SIGMA = 1e-4
 # Median of |x| over the standard deviation of a normal variable.
 MAD = 0.6744897501960817
+# Median of the length of a two-dimensional normal vector of unit deviation.
+RAYLEIGH = 1.1774100225154747
 
 
 @dataclass(frozen=True, eq=False)
