@@ -197,16 +197,3 @@ def test_a_file_that_is_not_there_or_not_text(tmp_path):
     (tmp_path / "deep.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match="not JSON"):
         read_nominal(tmp_path / "deep.json")
-
-
-@pytest.mark.volume
-def test_files_of_other_labs(shared_data):
-    name = "stanford"
-    from projservo_cli.tables import read_table
-
-    nominal = read_nominal(shared_data / name / "truth.json")
-    table = read_table(shared_data / name / "trials_0.5px.csv", nominal.joint_types)
-    found, alone = (
-        calibrate(table, nominal.joint_types, source="recorded", init=init) for init in (nominal, None)
-    )
-    agree(found, alone, table.q)
