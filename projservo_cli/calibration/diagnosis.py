@@ -57,9 +57,6 @@ def explain(solution: Solution, epipolar: Epipolar) -> Outliers:
         pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
         if int(pose.seen.any(axis=0).sum()) < 3:
             continue
-        pose = dataclasses.replace(
-            pose, q=readings.q[k : k + 1], pose_of=np.zeros(int(here.sum()), dtype=np.int64)
-        )
         joints = _wrong_joints(LeastSquares.of(pose, problem.q_reference), scene, sigma)
         suspects += [(int(k), i) for i in joints]
         if joints:
@@ -84,9 +81,9 @@ def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) ->
     matched = fits.sum(axis=1) == 1
     explained = np.zeros_like(out)
     explained[:, rows[matched]] = out[:, rows[matched]]
-    read, actual = readings.marker_of[rows[matched]], np.argmax(fits[matched], axis=1)
-    triples = zip(readings.pose_of[rows[matched]].tolist(), read.tolist(), actual.tolist(), strict=True)
-    found = set(triples)
+    hit = rows[matched]
+    columns = readings.pose_of[hit], readings.marker_of[hit], np.argmax(fits[matched], axis=1)
+    found = set(zip(*(column.tolist() for column in columns), strict=True))
     # An exchange shows in both markers and is one finding.
     listed = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
     return np.array(listed, dtype=np.int64).reshape(-1, 3), explained
@@ -116,8 +113,8 @@ def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int]) -> flo
         distance = np.linalg.norm(residual, axis=2)
         root = np.where(seen, 1.0 / np.sqrt(1.0 + (distance / max(2.0 * level, 1e-9)) ** 2), 0.0)
         rows = (J[..., joints] * root[..., None, None]).reshape(-1, len(joints))
-        q = pose.q.copy()
-        q[0, joints] -= np.linalg.lstsq(rows, (residual * root[..., None]).ravel(), rcond=None)[0]
+        q = pose.q.copy()  # all rows alike: the readings are of one
+        q[:, joints] -= np.linalg.lstsq(rows, (residual * root[..., None]).ravel(), rcond=None)[0]
         pose = dataclasses.replace(pose, q=q)
     return best
 

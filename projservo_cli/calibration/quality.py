@@ -93,32 +93,28 @@ class _Uncertainty:
         return self.spread(q, shown)
 
 
-def _reach_noise(sure: _Uncertainty) -> FloatArray:
-    """Noise of predicted images (n,) with each joint at its reach, in units of the pixel noise."""
-    rows = (sure.reach_spread(i) for i in range(len(sure.solution.scene.prismatic)))
-    return np.array([np.sqrt((T**2).sum() / max(len(T), 1)) for T in rows])
-
-
-def _needed_spans(sure: _Uncertainty, noise: FloatArray) -> FloatArray:
-    """Range (n,) of a trial motion of each joint of too much noise (n,) that would mend it, rad or m.
+def _needed_spans(sure: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
+    """Range (n,) of a trial motion that would mend each joint of too much noise at its reach, rad or m.
 
     The trial is of eight frames about the reference, of this joint alone, beside the data there are;
     information adds up. NaN for joints that are not weak or that no trial of sensible range mends.
     """
-    needed = np.full(len(noise), np.nan)
-    for i in np.flatnonzero(noise > WEAK_NOISE).tolist():
-        T = sure.reach_spread(i)
+    needed = np.full(len(spreads), np.nan)
+    for i, T in enumerate(spreads):
         low, high = _LEAST_REACHES * sure.reach(i), MOST_REACHES * sure.reach(i)
-        if _noise_after(sure, i, high, T) > WEAK_NOISE:
+        if _rms(T) <= WEAK_NOISE or _noise_after(sure, i, high, T) > WEAK_NOISE:
             continue
         for _ in range(_BISECTIONS):
             middle = float(np.sqrt(low * high))
-            if _noise_after(sure, i, middle, T) > WEAK_NOISE:
-                low = middle
-            else:
-                high = middle
+            enough = _noise_after(sure, i, middle, T) <= WEAK_NOISE
+            low, high = (low, middle) if enough else (middle, high)
         needed[i] = high
     return needed
+
+
+def _rms(T: FloatArray) -> float:
+    """Noise of predicted images by a ``spread`` (rows, r) of them, in units of the pixel noise."""
+    return float(np.sqrt((T**2).sum() / max(len(T), 1)))
 
 
 def _noise_after(sure: _Uncertainty, i: int, span: float, T: FloatArray) -> float:
@@ -126,8 +122,7 @@ def _noise_after(sure: _Uncertainty, i: int, span: float, T: FloatArray) -> floa
     q = sure.at(i, np.linspace(-0.5 * span, 0.5 * span, _FRAMES))
     C = sure.spread(q, sure.shown(q))
     root = np.asarray(np.linalg.qr(np.vstack([np.eye(C.shape[1]), C]), mode="r"))
-    left = np.linalg.solve(root.T, T.T)
-    return float(np.sqrt((left**2).sum() / max(len(T), 1)))
+    return _rms(np.linalg.solve(root.T, T.T).T)
 
 
 def _predicted_error(sure: _Uncertainty) -> tuple[float, float]:
@@ -198,10 +193,11 @@ def judged(
     noise, error, advice = np.full(len(span), np.nan), None, []
     if spread is not None:
         sure = _Uncertainty(solution, spread)
-        noise = _reach_noise(sure)
+        spreads = [sure.reach_spread(i) for i in range(len(span))]
+        noise = np.array([_rms(T) for T in spreads])
         typical, bound = _predicted_error(sure)
         error = (sigma * typical, sigma * bound)
-        needed = _needed_spans(sure, noise)
+        needed = _needed_spans(sure, spreads)
         moves = [describe_joint(i, *of) for i, of in enumerate(zip(span, prismatic, needed, strict=True))]
         i = int(np.argmax(noise))
         if noise[i] > _UNDETERMINED_NOISE:

@@ -85,16 +85,3 @@ def test_errors_are_expected_as_the_bound_says(draws):
     assert np.mean(square) / np.mean(stated**2) == pytest.approx(1.0, abs=spread + 0.2)
     # Two beyond the bound have a chance of one in a hundred, by the binomial distribution.
     assert int((np.sqrt(square) > limit).sum()) <= 1
-
-
-def test_noise_is_estimated_from_the_images_alone():
-    rng = np.random.default_rng(8)
-    robot = random_robot("RRR", rng)
-    q = trials(robot, frames=8)
-    ratio = []
-    for seed in range(8):
-        observation = robot.observe(q, 0.8, np.random.default_rng(seed))
-        ratio.append(calibrate(observation, "RRR", source="recorded").sigma_px / 0.8)
-    # One epipolar residual a pair, 250 pairs minus 7: 4.5 % of a draw; four standard errors of the mean.
-    assert np.mean(ratio) == pytest.approx(1.0, abs=4.0 * 0.045 / np.sqrt(len(ratio)))
-    assert np.abs(np.array(ratio) - 1.0).max() < 5.0 * 0.045

@@ -147,10 +147,8 @@ def test_other_joints_or_unknown_markers_are_refused(robot, observation, written
 
 BAD = {
     "nothing": ("", r":1:1: not JSON: Expecting value"),
-    "list": ([1, 2], r": the file: input should be an object"),
     "no camera": ({"camera_left": None}, r": camera_left: input should be a valid array"),
     "NaN": ({"q_reference": [float("nan"), 0, 0, 0]}, r": q_reference.0: input should be a finite number"),
-    "text": ({"q_reference": ["0", 0, 0, 0]}, r": q_reference.0: input should be a valid number"),
     "few joints": ({"q_reference": [0.0]}, r": q_reference: 1 values for 4 screws"),
     "flat camera": ({"camera_right": [[1, 0, 0, 0]] * 3}, r": camera_right: a camera matrix has three indep"),
     "twice": (
