@@ -237,12 +237,7 @@ class _Expansion:
     """First order of the images about a scene, with weights (2, N), by the parameters from a first one on."""
 
     def __init__(
-        self,
-        problem: LeastSquares,
-        scene: Scene,
-        residual: FloatArray,
-        weight: FloatArray,
-        least: FloatArray,
+        self, problem: LeastSquares, scene: Scene, residual: FloatArray, weight: FloatArray, least: FloatArray
     ) -> None:
         self.problem, self.scene, self.residual, self.weight = problem, scene, residual, weight
         first = problem.size - len(least)

@@ -55,10 +55,10 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     InputError if the readings have another number of joints or are not finite.
     """
     known = np.isin(observation.marker, calibration.marker)
-    column = {int(number): j for j, number in enumerate(calibration.marker)}
-    order = np.array([column[int(number)] for number in observation.marker[known]], dtype=np.int64)
+    numbers = calibration.marker.tolist()
+    order = [numbers.index(number) for number in observation.marker[known].tolist()]
     pixels = predict(calibration, observation.q)[:, :, order]
-    seen: BoolArray = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
+    seen: BoolArray = np.asarray(np.isfinite(observation.images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
     residual = (pixels - observation.images[:, :, known])[seen[:, :, known] & ahead]
     return distance_statistics(np.linalg.norm(residual, axis=1)) | {
@@ -66,7 +66,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
             "unknown_marker": int(seen[:, :, ~known].sum()),
             "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
             "missing": int((~seen).sum()),
-        },
+        }
     }
 
 
@@ -148,10 +148,9 @@ class Innovation:
         """
         J = self._scene.derivative(q[None] - self.calibration.q_reference)[0] @ self._factor
         r = images - predict(self.calibration, q[None])[0] - J @ self._mean
-        m = len(self.calibration.marker)
-        views, numbers = np.arange(2)[:, None], np.arange(m)
-        parts = [*(np.tile(views == view, m) for view in range(2))]
-        parts += [np.tile(numbers == j, (2, 1)) for j in range(m)]
+        shape = r.shape[:2]
+        parts = [np.broadcast_to(view[:, None], shape) for view in np.eye(2, dtype=np.bool_)]
+        parts += [np.broadcast_to(marker, shape) for marker in np.eye(shape[1], dtype=np.bool_)]
         beyond = np.array([self._beyond_chance(r, J, part) for part in parts])
         self._beyond = [*self._beyond[1 - WINDOW :], beyond]
         lasting = np.all(self._beyond, axis=0)

@@ -21,21 +21,12 @@ from projservo_cli.calibration.readings import (
     require_motion,
     require_moved,
 )
-from projservo_cli.records import (
-    BoolArray,
-    CrossValidation,
-    FloatArray,
-    InputError,
-    IntArray,
-    WorkFailed,
-)
+from projservo_cli.records import BoolArray, CrossValidation, FloatArray, InputError, IntArray, WorkFailed
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 _UNDETERMINED_NOISE = 1000.0
 # Share of sightings beyond which outliers are what limits a fit.
 _MOST_OUTLIERS = 0.05
-
-
 # Noise of predictions at the reach, in units of the pixel noise: above it a joint is weak.
 WEAK_NOISE = 3.0
 # Poses at which predictions are judged; how sure they stay below the bound; halvings of an empty range.
