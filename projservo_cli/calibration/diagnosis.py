@@ -41,29 +41,29 @@ class Outliers:
         rows = np.zeros((0, 3), dtype=np.int64)
         return cls(rows[:, :2], rows, np.zeros_like(readings.seen))
 
+    @classmethod
+    def of(cls, solution: Solution, epipolar: Epipolar) -> "Outliers":
+        """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings.
 
-def explain(solution: Solution, epipolar: Epipolar) -> Outliers:
-    """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings.
-
-    Raises Misfit where too much is left, by the geometry of what projective cameras would have seen.
-    """
-    problem, scene, used = solution.problem, solution.scene, solution.used
-    readings, sigma = problem.readings, solution.sigma_px
-    out = readings.seen & ~used
-    swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
-    suspects: list[tuple[int, int]] = []
-    for k in np.flatnonzero(readings.count_at(used) == 0):
-        here = readings.pose_of == k
-        pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
-        if int(pose.seen.any(axis=0).sum()) < 3:
-            continue
-        joints = _wrong_joints(LeastSquares.of(pose, problem.q_reference), scene, sigma)
-        suspects += [(int(k), i) for i in joints]
-        if joints:
-            explained[:, here] |= out[:, here]
-    found = Outliers(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
-    _require_explained(_straight(readings, scene.lens), used, found, epipolar)
-    return found
+        Raises Misfit where too much is left, by the geometry of what projective cameras would have seen.
+        """
+        problem, scene, used = solution.problem, solution.scene, solution.used
+        readings, sigma = problem.readings, solution.sigma_px
+        out = readings.seen & ~used
+        swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
+        suspects: list[tuple[int, int]] = []
+        for k in np.flatnonzero(readings.count_at(used) == 0):
+            here = readings.pose_of == k
+            pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
+            if int(pose.seen.any(axis=0).sum()) < 3:
+                continue
+            joints = _wrong_joints(LeastSquares.of(pose, problem.q_reference), scene, sigma)
+            suspects += [(int(k), i) for i in joints]
+            if joints:
+                explained[:, here] |= out[:, here]
+        found = cls(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
+        _require_explained(_straight(readings, scene.lens), used, found, epipolar)
+        return found
 
 
 def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:

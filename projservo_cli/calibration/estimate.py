@@ -10,17 +10,10 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.diagnosis import (
-    Outliers,
-    blamed_joint,
-    explain,
-    listed,
-    share_explained,
-    with_lens,
-)
+from projservo_cli.calibration.diagnosis import Outliers, blamed_joint, listed, share_explained, with_lens
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve
-from projservo_cli.calibration.projective import Projective, closed_form_operators, spread_factor
+from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, judged
 from projservo_cli.calibration.readings import Readings, require_images, require_motion
 from projservo_cli.calibration.start import Nominal, Search, Tell
@@ -160,13 +153,13 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
         refusal = expected.refusal(solution)
         if refusal is not None:
             raise Misfit(refusal)
-        found = explain(solution, epipolar)
+        found = Outliers.of(solution, epipolar)
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
             raise
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
-    spread = spread_factor(solution)
+    spread = solution.spread_factor()
     suspicion = "lens" if share else "joint readings"
     record = _record(Projective.of(solution), solution, expected, spread, found, suspicion)
     advice = (*record.advice, *_lens_advice(record, share, frame.known))

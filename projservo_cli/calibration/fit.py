@@ -19,6 +19,8 @@ from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 # is less, more than pixel noise is left; above the last the model does not describe the data.
 WARN_RATIO, _WARN_ERRORS, REFUSE_RATIO = 1.15, 4.0, 3.0
 _CHI2_TAIL = 1e-4
+# A direction whose singular value is this share of the largest is open.
+OPEN_DIRECTION = 1e-10
 
 
 class Misfit(WorkFailed):
@@ -71,6 +73,24 @@ class Solution:
         used = self.used[:, rows]
         dof = _degrees_of_freedom(smaller, scene, used)
         return Solution(smaller, scene, self.residual[:, rows], used, dof), keep
+
+    def spread_factor(self) -> FloatArray:
+        """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that the readings determine.
+
+        Singular values of J itself keep the weakest direction, which the normal matrix would lose.
+        At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
+        """
+        problem, scene = self.problem, self.scene
+        J = problem.dense(problem.derivative(scene)[1], self.used)
+        scale = np.linalg.norm(J, axis=0)
+        # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
+        scale = np.where(scale > 0.0, scale, scale.max())
+        G = np.linalg.qr(scale[:, None] * problem.gauge(scene))[0]
+        free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
+        _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
+        # Robots of one or two joints leave more directions open than the gauge, none of which matters
+        # to an image: they must come out as zero after the product with its derivative.
+        return np.asarray((free @ (Vt.T / np.maximum(s, OPEN_DIRECTION * s[0]))) / scale[:, None])
 
 
 @dataclass(frozen=True)
@@ -203,12 +223,17 @@ def fit_inliers(
         if np.array_equal(used, within):
             break
     _, depth = problem.pixels(scene)
-    # A camera is known up to its sign.
-    sign = np.sign(depth.sum(axis=1))
-    if not (np.sign(depth) == sign[:, None])[used].all():
+    sign, ahead = _sides(depth)
+    if not ahead[used].all():
         return None
     scene = dataclasses.replace(scene, P=scene.P * sign[:, None, None])
     return Solution(problem, scene, fit.residual, used, dof)
+
+
+def _sides(depth: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Signs (2,) of the cameras, and which points of depths (2, N) lie on the side of most."""
+    sign = np.sign(depth.sum(axis=1))
+    return sign, np.sign(depth) == sign[:, None]
 
 
 def _within(problem: LeastSquares, residual: FloatArray, limit: float) -> BoolArray:
@@ -248,10 +273,7 @@ def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[
     problem, found = search.problem, None
     scene = nominal.scene(problem.readings, problem.q_reference)
     pixels, depth = problem.pixels(scene)
-    # A camera is given up to scale and sign: most points are to lie in front of it.
-    sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
-    scene = dataclasses.replace(scene, P=scene.P * sign[:, None, None])
-    if np.isfinite(pixels).all() and ((depth * sign[:, None])[problem.readings.seen] > 0.0).all():
+    if np.isfinite(pixels).all() and _sides(depth)[1][problem.readings.seen].all():
         found = fit_from(problem, scene, search.epipolar)
     if found is not None and expected.agrees(found):
         return found, ""

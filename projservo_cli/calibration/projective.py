@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from projservo_cli.calibration.adjustment import moved_operators
 from projservo_cli.calibration.epipolar import reconstruct
-from projservo_cli.calibration.fit import Solution
+from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.forward import CAMERA, Scene
 from projservo_cli.calibration.readings import ON_A_LINE, Readings
 from projservo_cli.geometry.displacement import log_rotation, log_translation, normalize_displacement
@@ -19,8 +19,6 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Least distance of the markers from their best line, in units of its own noise.
 _OFF_LINE = 5.0
-# A direction whose singular value is this share of the largest is open.
-_OPEN_DIRECTION = 1e-10
 _A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -93,25 +91,6 @@ def _isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective
     return Projective(Scene(P, H_hat, scene.prismatic, M @ W.T, scene.lens), a_inf @ back, W, scale)
 
 
-def spread_factor(solution: Solution) -> FloatArray:
-    """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that the readings determine.
-
-    Singular values of J itself keep the weakest direction, which the normal matrix would lose.
-    At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
-    """
-    problem, scene = solution.problem, solution.scene
-    J = problem.dense(problem.derivative(scene)[1], solution.used)
-    scale = np.linalg.norm(J, axis=0)
-    # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
-    scale = np.where(scale > 0.0, scale, scale.max())
-    G = np.linalg.qr(scale[:, None] * problem.gauge(scene))[0]
-    free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
-    _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
-    # Robots of one or two joints leave more directions open than the gauge, none of which matters
-    # to an image: they must come out as zero after the product with its derivative.
-    return np.asarray((free @ (Vt.T / np.maximum(s, _OPEN_DIRECTION * s[0]))) / scale[:, None])
-
-
 def _output_derivative(solution: Solution, result: Projective) -> FloatArray:
     """Derivative of P, H_hat_0, M and the lenses (ravelled, in this order) by the adjusted parameters.
 
@@ -145,7 +124,7 @@ def _require_off_line(M: FloatArray, gauge: FloatArray, factor: FloatArray) -> N
     scales = np.vstack([np.zeros((first, m)), block_diag(*M[:, :, None])])
     # One of the directions is a sum of others: all markers scaled at once.
     U, s, _ = np.linalg.svd(np.hstack([gauge, scales]), full_matrices=False)
-    free = U[:, s > _OPEN_DIRECTION * s[0]]
+    free = U[:, s > OPEN_DIRECTION * s[0]]
     markers = (factor - free @ (free.T @ factor))[first:]
     U, extent, Vt = np.linalg.svd(M, full_matrices=False)
     across = np.eye(m) - U[:, :2] @ U[:, :2].T

@@ -11,7 +11,6 @@ from scipy.special import chdtri
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
 from projservo_cli.calibration.prediction import distance_statistics
-from projservo_cli.calibration.projective import spread_factor
 from projservo_cli.calibration.readings import (
     MOST_REACHES,
     REACH_M,
@@ -354,7 +353,7 @@ def _predicted(
     found = fit_inliers(problem, scene, solution.sigma_px)
     if found is None:
         raise WorkFailed(_OPEN)
-    factor = spread_factor(found)
+    factor = found.spread_factor()
     place = held_out[whole.pose_of] & known[whole.marker_of]
     test = LeastSquares.of(whole.of_poses(held_out).of_markers(known), q_reference, lens)
     pixels, J = test.derivative(found.scene)

@@ -1,7 +1,6 @@
 """Calibration as a whole, on robots simulated with scipy's matrix exponential."""
 
 import dataclasses
-import inspect
 import subprocess
 import sys
 
@@ -12,7 +11,7 @@ from projservo_cli.calibration import calibrate, predict, residual_statistics
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.projective import Projective, spread_factor
+from projservo_cli.calibration.projective import Projective
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, Observation
@@ -22,16 +21,6 @@ from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, 
 def noisy(types="RRPRRR", seed=5, sigma=0.5, poses=trials):
     robot = random_robot(types, np.random.default_rng(seed))
     return robot, robot.observe(poses(robot), sigma, np.random.default_rng(seed + 1))
-
-
-def test_it_sees_pixels_and_joint_readings_only():
-    """Anything else, as a start (``init``), is left out by default."""
-    parameters = inspect.signature(calibrate).parameters
-    assert set(parameters) == {
-        "observation", "joint_types", "method", "sigma_px", "source", "image_size", "seed",
-        "lens", "init", "fitted", "tell",
-    }  # fmt: skip
-    assert parameters["init"].default is None
 
 
 def test_no_stage_imports_all_distributions():
@@ -101,7 +90,7 @@ def test_covariance_is_that_of_the_parameters():
     problem = LeastSquares.of(readings, robot.q_reference)
     scene = Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers)
     solution = Solution(problem, scene, problem.residual(scene), readings.seen, 1)
-    spread = spread_factor(solution)
+    spread = solution.spread_factor()
     direct = problem.dense(problem.derivative(scene)[1], readings.seen) @ spread
     result = Projective.of(solution)
     chained = result.scene.derivative(problem.q) @ result.covariance_factor(solution, spread)

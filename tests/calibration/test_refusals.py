@@ -99,16 +99,6 @@ def test_motion_lost_in_the_noise_names_the_joint_and_what_to_do(types, joint, a
     assert re.search(words, message)
 
 
-def test_weak_joints_are_named_but_not_refused():
-    q = Q.copy()
-    q[:, 3] = Q[0, 3] + 0.05 * (Q[:, 3] - Q[0, 3])
-    calibration = calibrate(seen(q=q), TYPES, source="recorded")
-    assert calibration.usable
-    np.testing.assert_array_equal(calibration.weak, np.arange(6) == 3)
-    assert any("joint 4 moved only 3°" in advice for advice in calibration.advice)
-    assert calibration.excitation[3] == pytest.approx(np.radians(3.0))
-
-
 def test_a_view_that_sees_nothing_or_what_the_other_sees():
     images = seen().images
     blind = images.copy()

@@ -15,16 +15,6 @@ def within_20_deg(offset):
     return np.abs(offset).max(axis=1) <= np.radians(20.0) + 1e-9
 
 
-def four_a_joint(offset):
-    """From end to end of each joint, and the reference."""
-    keep = np.abs(offset).max(axis=1) < 1e-9
-    for column in offset.T:
-        rows = np.flatnonzero(np.abs(column) > 1e-9)
-        rows = rows[np.argsort(column[rows])]
-        keep[rows[np.linspace(0, len(rows) - 1, 4).round().astype(int)]] = True
-    return keep
-
-
 def every(offset):
     return np.ones(len(offset), dtype=bool)
 
@@ -34,7 +24,6 @@ def every(offset):
     ("arm", "poses", "sigma", "removed"),
     [
         ("ur5", within_20_deg, 1.0, 0.0),
-        ("ur5", four_a_joint, 1.0, 0.0),
         ("ur5", every, 0.5, 0.4),
         ("stanford", every, 0.5, 0.0),
     ],
