@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
@@ -19,16 +19,8 @@ from projservo_cli.tables import JointList
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
 
 
-class _Pair(NamedTuple):
-    """Both images of one pose."""
-
-    pose: int
-    left: Path
-    right: Path
-
-
-def pair_images(left: str, right: str, joints: JointList, where: str) -> list[_Pair]:
-    """Both images of every pose.
+def pair_images(left: str, right: str, joints: JointList, where: str) -> list[tuple[int, Path, Path]]:
+    """Number of the pose and both images, of every pose.
 
     left, right : a folder, or a pattern such as ``left/*.png``.
     joints : the poses. Named images are looked up by name; with pose numbers, the image of a pose is the one
@@ -36,23 +28,27 @@ def pair_images(left: str, right: str, joints: JointList, where: str) -> list[_P
     where : the file of the poses, for messages.
     Raises InputError when there are no images, or one of a pose is missing or not the only one.
     """
+    poses = joints.pose.tolist()
     if joints.left is not None and joints.right is not None:
         sides = [_named(left, joints.left, where), _named(right, joints.right, where)]
+    elif joints.numbered:
+        sides = [_by_number(side, poses, where) for side in (left, right)]
     else:
-        find = _by_number if joints.numbered else _by_order
-        found = [(side, _images(side)) for side in (left, right)]
-        sides = [find(side, files, joints.pose.tolist(), where) for side, files in found]
-    return [_Pair(*row) for row in zip(joints.pose.tolist(), *sides, strict=True)]
+        sides = [_images(left), _images(right)]
+        for side, files in zip((left, right), sides, strict=True):
+            if len(files) != len(poses):
+                raise InputError(
+                    f"{side}: {len(files)} images for the {len(poses)} rows of {where}; name the images in "
+                    "columns left and right, or number the rows in a column pose"
+                )
+    return list(zip(poses, *sides, strict=True))
 
 
 def _images(source: str) -> list[Path]:
     """Images of a folder or pattern, in the order of their names, 2 before 10."""
-    folder = Path(source)
-    if folder.is_dir():
-        candidates = list(folder.iterdir())
-    else:
-        candidates = list(folder.parent.glob(folder.name)) if folder.parent.is_dir() else []
-    files = [file for file in candidates if file.is_file() and file.suffix.lower() in _SUFFIXES]
+    pattern = Path(source, "*") if Path(source).is_dir() else Path(source)
+    files = [file for file in pattern.parent.glob(pattern.name) if file.suffix.lower() in _SUFFIXES]
+    files = [file for file in files if file.is_file()]
     if not files:
         kinds = " ".join(sorted(suffix[1:] for suffix in _SUFFIXES))
         raise InputError(f"{source}: no images there; give a folder or a quoted pattern of files ({kinds})")
@@ -73,23 +69,10 @@ def _named(source: str, names: Sequence[str], where: str) -> list[Path]:
     return files
 
 
-def _by_order(source: str, files: list[Path], poses: list[int], where: str) -> list[Path]:
-    if len(files) != len(poses):
-        raise InputError(
-            f"{source}: {len(files)} images for the {len(poses)} rows of {where}; name the images in "
-            "columns left and right, or number the rows in a column pose"
-        )
-    return files
-
-
-def _by_number(source: str, files: list[Path], poses: list[int], where: str) -> list[Path]:
-    numbered: dict[int, list[Path]] = {}
-    for file in files:
-        for number in re.findall(r"\d+", file.stem)[-1:]:
-            numbered.setdefault(int(number), []).append(file)
-    chosen = []
+def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
+    files, chosen = _images(source), []
     for pose in poses:
-        fitting = numbered.get(pose, [])
+        fitting = [file for file in files if [*map(int, re.findall(r"\d+", file.stem))][-1:] == [pose]]
         if len(fitting) != 1:
             names = ", ".join(file.name for file in fitting)
             found = f"the names of {names} end" if fitting else "no image has a name that ends"
@@ -97,7 +80,7 @@ def _by_number(source: str, files: list[Path], poses: list[int], where: str) -> 
                 f"{source}: {found} in {pose}, the pose of {where}; name the images in columns left and "
                 "right, or leave the column pose out to take them in the order of their names"
             )
-        chosen.append(fitting[0])
+        chosen += fitting
     return chosen
 
 
@@ -250,8 +233,7 @@ class TagFinder:
         image = self._cv.imdecode(content, flags) if content.size else None
         if image is None:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
-        found: FloatArray = np.asarray(image, dtype=np.float64)
-        return found
+        return np.asarray(image, dtype=np.float64)
 
     def find(self, image: FloatArray) -> tuple[dict[int, FloatArray], int]:
         """Corners (4, 2), px, of each tag in an image, and how many tags were there more than once.
@@ -303,7 +285,7 @@ class _Findings:
 
 
 def observe_tags(
-    pairs: Sequence[_Pair],
+    pairs: Sequence[tuple[int, Path, Path]],
     q: FloatArray,
     finder: TagFinder,
     points: str,
@@ -311,7 +293,7 @@ def observe_tags(
 ) -> tuple[Observation, _Findings]:
     """Find tags in pairs of images.
 
-    pairs : both images of each pose.
+    pairs : number and both images of each pose.
     q : (K, n) joint readings of the poses.
     finder : of the tags.
     points : ``corners``: corner k of tag t is marker 4 t + k; ``centers``: tag t is marker t.
@@ -321,8 +303,8 @@ def observe_tags(
     """
     found = _Findings()
     shapes: dict[int, tuple[int, ...]] = {}
-    for k, pair in enumerate(pairs):
-        for view, path in enumerate((pair.left, pair.right)):
+    for k, (_, *views) in enumerate(pairs):
+        for view, path in enumerate(views):
             image = finder.read(path)
             if shapes.setdefault(view, image.shape) != image.shape:
                 height, width = shapes[view]
@@ -348,7 +330,7 @@ def observe_tags(
     for (k, view, tag), pixels in found.images.items():
         images[k, view, numbers.index(tag)] = pixels
     marker = (each * np.array(numbers, dtype=np.int64)[:, None] + np.arange(each)).ravel()
-    pose = np.array([pair.pose for pair in pairs], dtype=np.int64)
+    pose = np.array([number for number, *_ in pairs], dtype=np.int64)
     observation = Observation(pose, marker, q, images.reshape(len(pairs), 2, len(marker), 2))
     if not np.isfinite(observation.images[..., 0]).all(axis=1).any():
         raise WorkFailed("no tag was seen by both cameras at the same pose: look whether the images pair up")

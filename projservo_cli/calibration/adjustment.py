@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from projservo_cli.calibration.forward import CAMERA, LENS, Images, Scene, image_points
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.forward import CAMERA, LENS, Scene, image_points
+from projservo_cli.calibration.readings import RAYLEIGH, Readings
 from projservo_cli.geometry.lens import FIRST, bent
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
@@ -31,7 +31,7 @@ def _axis_of(H_hat: FloatArray) -> FloatArray:
     return np.stack([H_hat[..., 2, 1], H_hat[..., 0, 2], H_hat[..., 1, 0]], axis=-1)
 
 
-def generators(scene: Scene) -> list[FloatArray]:
+def _generators(scene: Scene) -> list[FloatArray]:
     """Rigid motions (b, 4, 4) that move each joint's screw: four for an axis, two for a direction.
 
     An axis turns about its point nearest to the markers and shifts across itself; a direction turns.
@@ -55,6 +55,11 @@ def generators(scene: Scene) -> list[FloatArray]:
     B[:, 2:, :3, 3] = across * size
     B[prismatic, :2, :3, 3] = 0.0
     return [B[i, : 2 if slides else 4] for i, slides in enumerate(prismatic)]
+
+
+def moved_operators(scene: Scene) -> list[FloatArray]:
+    """Derivatives B Ĥ − Ĥ B (b, 4, 4) of each operator by the parameters of its joint."""
+    return [B @ H_hat - H_hat @ B for B, H_hat in zip(_generators(scene), scene.H_hat, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,19 +110,16 @@ class LeastSquares:
         readings = self.readings
         return np.where(readings.seen[..., None], self.pixels(scene)[0] - readings.pixels, 0.0)
 
-    def images(self, scene: Scene) -> Images:
-        """Every sighting, seen by a view or not, with its derivatives."""
-        return scene.images(self.q, self.readings.pose_of, self.readings.marker_of)
-
     def derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Pixels (2, N, 2) and their compact derivative (2, N, 2, c), columns as in ``columns``.
 
         With Y_i the point behind joint i, D_i the derivative by it and B a generator, a joint contributes
         D_i (B Y_i − E_i B Y_{i+1}), where D_i E_i is D_{i+1}.
         """
-        pixels, Y, by_camera, D, by_lens = self.images(scene)
+        readings = self.readings
+        pixels, Y, by_camera, D, by_lens = scene.images(self.q, readings.pose_of, readings.marker_of)
         blocks = [by_camera]
-        for i, B in enumerate(generators(scene)):
+        for i, B in enumerate(_generators(scene)):
             near, far = (D[k] @ np.einsum("bij,Nj->Nib", B, Y[k]) for k in (i, i + 1))
             blocks.append(near - far)
         blocks.append(D[-1][..., :3])
@@ -127,14 +129,14 @@ class LeastSquares:
 
     def joint_derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values, [RH00] eqs. (7), (19)."""
-        images = self.images(scene)
+        images = scene.images(self.q, self.readings.pose_of, self.readings.marker_of)
         velocity = images.points[:-1] @ scene.H_hat.swapaxes(1, 2)
         return images.pixels, np.einsum("ivNrc,iNc->vNri", images.by_point[:-1], velocity)
 
     def retract(self, scene: Scene, x: FloatArray) -> Scene:
         """Scene after a step x (size,); screws move as rigid bodies and keep their constraints."""
         steps = np.split(x[self.joint[0] : self.joint[-1]], self.joint[1:-1] - self.joint[0])
-        twists = [np.tensordot(step, B, axes=1) for step, B in zip(steps, generators(scene), strict=True)]
+        twists = [np.tensordot(step, B, axes=1) for step, B in zip(steps, _generators(scene), strict=True)]
         motion = expm(np.array(twists))
         moved = motion @ scene.H_hat @ np.linalg.inv(motion)
         # Without the round-off of the step: speed and vanishing pitch restored.
@@ -167,17 +169,15 @@ class LeastSquares:
         motions[6:, :3, :3] = np.eye(3)
         result = np.zeros((self.size, len(motions) + 2))
         result[: 2 * CAMERA, :-2] = -(scene.P @ motions[:, None]).reshape(len(motions), -1).T
-        for i, B in enumerate(generators(scene)):
-            H_hat = scene.H_hat[i]
+        for i, (H_hat, reach) in enumerate(zip(scene.H_hat, moved_operators(scene), strict=True)):
             wanted = (motions @ H_hat - H_hat @ motions).reshape(-1, 16).T
-            reach = (B @ H_hat - H_hat @ B).reshape(-1, 16).T
-            result[self.joint[i] : self.joint[i + 1], :-2] = np.linalg.lstsq(reach, wanted, rcond=None)[0]
+            found = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
+            result[self.joint[i] : self.joint[i + 1], :-2] = found
         moved = (scene.M @ motions.swapaxes(1, 2))[..., :3]
         result[self.joint[-1] : self.lens, :-2] = moved.reshape(len(motions), -1).T
         for v in (0, 1):
             result[v * CAMERA : (v + 1) * CAMERA, v - 2] = scene.P[v].ravel()
-        directions: FloatArray = result / np.linalg.norm(result, axis=0)
-        return directions
+        return np.asarray(result / np.linalg.norm(result, axis=0))
 
     def _blocks(self) -> Iterator[tuple[int, slice, IntArray]]:
         """View and rows of the readings of each marker, and their columns (c,), the same for all."""
@@ -220,8 +220,8 @@ _SETTLED, _ROUGHLY = 1e-7, 1e-2
 # Residuals below this, px, are round-off for the purpose of that rule: pixels have some 1e-13 of it.
 _LEAST_RESIDUAL = 1e-5
 
-Weighting = Callable[[FloatArray], FloatArray]
-Stalled = Callable[[FloatArray], bool]
+# Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
+_CAUCHY = 2.385
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,12 +237,7 @@ class _Expansion:
     """First order of the images about a scene, with weights (2, N), by the parameters from a first one on."""
 
     def __init__(
-        self,
-        problem: LeastSquares,
-        scene: Scene,
-        residual: FloatArray,
-        weight: FloatArray,
-        least: FloatArray,
+        self, problem: LeastSquares, scene: Scene, residual: FloatArray, weight: FloatArray, least: FloatArray
     ) -> None:
         self.problem, self.scene, self.residual, self.weight = problem, scene, residual, weight
         first = problem.size - len(least)
@@ -286,19 +281,20 @@ class _Expansion:
 def minimize(
     problem: LeastSquares,
     scene: Scene,
-    weighting: Weighting,
+    rows: BoolArray,
     *,
+    robust: bool,
     cameras: bool = True,
     most: int = 200,
-    stalled: Stalled = lambda residual: False,
+    stalled: Callable[[FloatArray], bool] = lambda residual: False,
 ) -> _Fit:
-    """Weighted least squares from a scene over all parameters, or roughly with the cameras held.
+    """Least squares of some readings (2, N) from a scene, over all parameters or roughly with cameras held.
 
-    Weights (2, N) come from residuals (2, N, 2) anew after each accepted step, and ``stalled``, told the
-    same, may end the search; a step that moves the images by less than a share of the residual is the last.
+    Under a Cauchy loss if ``robust``, its width from the residuals of each step. ``stalled``, told these, may
+    end the search; a step that moves the images by less than a share of the residual is the last.
     """
     residual = problem.residual(scene)
-    weight = weighting(residual)
+    weight = _weights(residual, rows, robust)
     scale = np.zeros(problem.size - (0 if cameras else 2 * CAMERA))
     least_change = (_SETTLED if cameras else _ROUGHLY) ** 2
     damping = 1e-3
@@ -318,7 +314,7 @@ def minimize(
             moved = _cost(weight, problem.change(here.J, x))
             settled = moved <= least_change * max(cost, _LEAST_RESIDUAL**2 * float(weight.sum()))
         if fresh:
-            scene, residual, weight = candidate, new_residual, weighting(new_residual)
+            scene, residual, weight = candidate, new_residual, _weights(new_residual, rows, robust)
             damping = max(0.1 * damping, _LEAST_DAMPING)
             if stalled(residual):
                 break
@@ -327,6 +323,15 @@ def minimize(
         if settled or damping > _MOST_DAMPING:
             break
     return _Fit(scene, residual, _cost(weight, residual))
+
+
+def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
+    """Weights (2, N) of residuals (2, N, 2): one for some readings, or those of their Cauchy loss."""
+    if not robust:
+        return rows.astype(np.float64)
+    distance = np.linalg.norm(residual, axis=2)
+    width = _CAUCHY * max(float(np.median(distance[rows])) / RAYLEIGH, 1e-9)
+    return np.where(rows, 1.0 / (1.0 + (distance / width) ** 2), 0.0)
 
 
 def _cost(weight: FloatArray, residual: FloatArray) -> float:

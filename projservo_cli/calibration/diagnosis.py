@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.special import fdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, epipolar_geometry
-from projservo_cli.calibration.fit import RAYLEIGH, Misfit, Solution, fit_from, search_screws
+from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
+from projservo_cli.calibration.fit import Misfit, Solution, fit_from
 from projservo_cli.calibration.forward import LENS, Scene
-from projservo_cli.calibration.readings import Readings
+from projservo_cli.calibration.readings import RAYLEIGH, Readings
 from projservo_cli.calibration.start import Search, starts_of_changed
 from projservo_cli.geometry.lens import straight_views, within
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, WorkFailed
@@ -41,32 +41,29 @@ class Outliers:
         rows = np.zeros((0, 3), dtype=np.int64)
         return cls(rows[:, :2], rows, np.zeros_like(readings.seen))
 
+    @classmethod
+    def of(cls, solution: Solution, epipolar: Epipolar) -> "Outliers":
+        """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings.
 
-def explain(solution: Solution, epipolar: Epipolar) -> Outliers:
-    """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings.
-
-    Raises Misfit where too much is left, by the geometry of what projective cameras would have seen.
-    """
-    problem, scene, used = solution.problem, solution.scene, solution.used
-    readings, sigma = problem.readings, solution.sigma_px
-    out = readings.seen & ~used
-    swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
-    suspects: list[tuple[int, int]] = []
-    for k in np.flatnonzero(readings.count_at(used) == 0):
-        here = readings.pose_of == k
-        pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
-        if int(pose.seen.any(axis=0).sum()) < 3:
-            continue
-        pose = dataclasses.replace(
-            pose, q=readings.q[k : k + 1], pose_of=np.zeros(int(here.sum()), dtype=np.int64)
-        )
-        joints = _wrong_joints(LeastSquares.of(pose, problem.q_reference), scene, sigma)
-        suspects += [(int(k), i) for i in joints]
-        if joints:
-            explained[:, here] |= out[:, here]
-    found = Outliers(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
-    _require_explained(_straight(readings, scene.lens), used, found, epipolar)
-    return found
+        Raises Misfit where too much is left, by the geometry of what projective cameras would have seen.
+        """
+        problem, scene, used = solution.problem, solution.scene, solution.used
+        readings, sigma = problem.readings, solution.sigma_px
+        out = readings.seen & ~used
+        swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
+        suspects: list[tuple[int, int]] = []
+        for k in np.flatnonzero(readings.count_at(used) == 0):
+            here = readings.pose_of == k
+            pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
+            if int(pose.seen.any(axis=0).sum()) < 3:
+                continue
+            joints = _wrong_joints(LeastSquares.of(pose, problem.q_reference), scene, sigma)
+            suspects += [(int(k), i) for i in joints]
+            if joints:
+                explained[:, here] |= out[:, here]
+        found = cls(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
+        _require_explained(_straight(readings, scene.lens), used, found, epipolar)
+        return found
 
 
 def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
@@ -84,9 +81,9 @@ def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) ->
     matched = fits.sum(axis=1) == 1
     explained = np.zeros_like(out)
     explained[:, rows[matched]] = out[:, rows[matched]]
-    read, actual = readings.marker_of[rows[matched]], np.argmax(fits[matched], axis=1)
-    triples = zip(readings.pose_of[rows[matched]].tolist(), read.tolist(), actual.tolist(), strict=True)
-    found = set(triples)
+    hit = rows[matched]
+    columns = readings.pose_of[hit], readings.marker_of[hit], np.argmax(fits[matched], axis=1)
+    found = set(zip(*(column.tolist() for column in columns), strict=True))
     # An exchange shows in both markers and is one finding.
     listed = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
     return np.array(listed, dtype=np.int64).reshape(-1, 3), explained
@@ -116,8 +113,8 @@ def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int]) -> flo
         distance = np.linalg.norm(residual, axis=2)
         root = np.where(seen, 1.0 / np.sqrt(1.0 + (distance / max(2.0 * level, 1e-9)) ** 2), 0.0)
         rows = (J[..., joints] * root[..., None, None]).reshape(-1, len(joints))
-        q = pose.q.copy()
-        q[0, joints] -= np.linalg.lstsq(rows, (residual * root[..., None]).ravel(), rcond=None)[0]
+        q = pose.q.copy()  # all rows alike: the readings are of one
+        q[:, joints] -= np.linalg.lstsq(rows, (residual * root[..., None]).ravel(), rcond=None)[0]
         pose = dataclasses.replace(pose, q=q)
     return best
 
@@ -194,7 +191,8 @@ def blamed_joint(search: Search, most_px: float) -> str:
         for done, ((words, changed, handicap), start) in enumerate(zip(changes, starts, strict=True)):
             search.tell("calibration, joint at fault", done, len(changes))
             if start is not None:
-                scene = search_screws(changed, start, changed.readings.seen, _SCREW_STEPS)
+                seen = changed.readings.seen
+                scene = minimize(changed, start, seen, robust=True, cameras=False, most=_SCREW_STEPS).scene
                 candidates.append((_level(changed, scene) + handicap, words, changed, scene))
     except WorkFailed:
         return ""
@@ -311,7 +309,7 @@ def with_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
         unbent, _ = problem.pixels(dataclasses.replace(found.scene, lens=None))
         if within(found.scene.lens[:, None], unbent)[found.used].all():
             straight = _straight(readings, found.scene.lens)
-            return found, epipolar_geometry(straight, search.rng)
+            return found, Epipolar.of(straight, search.rng)
     raise WorkFailed(
         "the images do not determine the distortion of the lenses: record poses with markers all over "
         "both images, or calibrate without --lens"

@@ -2,6 +2,8 @@
 
 The metric reconstruction rests on guesses (focal length, image centre, square pixels): a place to start
 from, never a result. All of it is free in the adjustment, whose result is projective.
+
+[HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
 """
 
 import dataclasses
@@ -31,6 +33,48 @@ class Epipolar:
     sigma_px: float  # noise per image coordinate from the residuals, px
     inlier: BoolArray  # (N,) which correspondences agree with F
 
+    @classmethod
+    def of(cls, readings: Readings, rng: np.random.Generator) -> "Epipolar":
+        """Fundamental matrix and noise of what both views saw, some of it wrong.
+
+        The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
+        a Cauchy loss over minimal parameters.
+
+        Raises WorkFailed with fewer than eight pairs, or where they do not determine the geometry.
+        """
+        left, right = readings.pixels[0][readings.both], readings.pixels[1][readings.both]
+        count = len(left)
+        if count < 8:
+            raise WorkFailed(
+                f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that "
+                "rows hold the pixels of both views"
+            )
+        T, T_ = _normalization(left), _normalization(right)
+        a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
+        picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
+        candidates = _eight_point(a[picks], b[picks])
+        medians = np.median(np.abs(_sampson(candidates, a, b)), axis=1)
+        F = candidates[np.argmin(medians)]
+        for _ in range(10):
+            r, slope = _sampson_and_slope(F, a, b)
+            F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
+        F = _refine(F, a, b, 2.0 * _deviation(_sampson(F, a, b), 1e-12))
+        product = T_.T @ F @ T
+        in_pixels: FloatArray = product / float(np.linalg.norm(product))
+        residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right))
+        inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
+        if inlier.sum() <= _PARAMETERS:
+            raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
+        sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
+        parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
+        if float(np.median(parallax)) < _LEAST_PARALLAX * sigma:
+            raise WorkFailed(
+                "both cameras see the same up to a change of image coordinates: without a baseline, or "
+                "with all markers always in one plane, there is no depth; move the cameras apart, or the "
+                "markers in depth"
+            )
+        return cls(in_pixels, sigma, inlier)
+
     @property
     def noise_px(self) -> float:
         """Noise to reckon with, px per coordinate: exact images have round-off."""
@@ -46,48 +90,6 @@ class Epipolar:
         return np.abs(_sampson(self.F, _homogeneous(left), _homogeneous(right))) <= deviations * self.sigma_px
 
 
-def epipolar_geometry(readings: Readings, rng: np.random.Generator) -> Epipolar:
-    """Fundamental matrix and noise of what both views saw, some of it wrong.
-
-    The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
-    a Cauchy loss over minimal parameters.
-
-    Raises WorkFailed with fewer than eight correspondences, or where they do not determine the geometry.
-    """
-    left, right = readings.pixels[0][readings.both], readings.pixels[1][readings.both]
-    count = len(left)
-    if count < 8:
-        raise WorkFailed(
-            f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that rows "
-            "hold the pixels of both views"
-        )
-    T, T_ = _normalization(left), _normalization(right)
-    a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
-    picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
-    candidates = _eight_point(a[picks], b[picks])
-    medians = np.median(np.abs(_sampson(candidates, a, b)), axis=1)
-    F = candidates[np.argmin(medians)]
-    for _ in range(10):
-        incidence, slope = _incidence_and_slope(F, a, b)
-        r = incidence / slope
-        F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
-    F = _refine(F, a, b, 2.0 * _deviation(_sampson(F, a, b), 1e-12))
-    product = T_.T @ F @ T
-    in_pixels: FloatArray = product / float(np.linalg.norm(product))
-    residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right))
-    inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
-    if inlier.sum() <= _PARAMETERS:
-        raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
-    sigma = float(np.sqrt((residual[inlier] ** 2).sum() / (inlier.sum() - _PARAMETERS)))
-    parallax = _transfer(a[inlier], b[inlier]) / T_[0, 0]
-    if float(np.median(parallax)) < _LEAST_PARALLAX * sigma:
-        raise WorkFailed(
-            "both cameras see the same up to a change of image coordinates: without a baseline, or with all "
-            "markers always in one plane, there is no depth; move the cameras apart, or the markers in depth"
-        )
-    return Epipolar(in_pixels, sigma, inlier)
-
-
 def _deviation(r: FloatArray, least: float) -> float:
     """Robust standard deviation of residuals about zero."""
     return max(float(np.median(np.abs(r))) / MAD, least)
@@ -99,39 +101,30 @@ def _homogeneous(pixels: FloatArray) -> FloatArray:
 
 
 def _normalization(pixels: FloatArray) -> FloatArray:
-    """Similarity (3, 3) that brings pixels (N, 2) to zero median and unit mean absolute deviation.
-
-    Source: R. Hartley, "In defense of the eight-point algorithm", PAMI 19(6), 1997, with medians.
-    """
+    """Similarity (3, 3) that brings pixels (N, 2) to zero median and unit deviation: [HZ04] 4.4."""
     center = np.median(pixels, axis=0)
     spread = float(np.median(np.abs(pixels - center))) or 1.0
     return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
 
 
-def _incidence_and_slope(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Residual rightᵀ F left of correspondences and the length of its gradient by all four pixels, (…, N)."""
-    lines_right = left @ np.swapaxes(F, -1, -2)
-    lines_left = right @ F
-    incidence: FloatArray = (lines_right * right).sum(axis=-1)
+def _sampson_and_slope(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Signed first-order distances (…, N) of points (N, 3) from F (…, 3, 3), the root of [HZ04] eq. (11.9).
+
+    And the length (…, N) of the gradient of rightᵀ F left by all four pixels.
+    """
+    lines_right, lines_left = left @ np.swapaxes(F, -1, -2), right @ F
     square = (lines_right[..., :2] ** 2).sum(axis=-1) + (lines_left[..., :2] ** 2).sum(axis=-1)
-    slope: FloatArray = np.sqrt(np.maximum(square, np.finfo(float).tiny))
-    return incidence, slope
+    slope = np.sqrt(np.maximum(square, np.finfo(float).tiny))
+    return (lines_right * right).sum(axis=-1) / slope, slope
 
 
 def _sampson(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Signed first-order distances (…, N) of points (N, 3) from the epipolar varieties of F (…, 3, 3).
-
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., eq. (11.9), its square root.
-    """
-    incidence, slope = _incidence_and_slope(F, left, right)
-    return incidence / slope
+    """The distances alone."""
+    return _sampson_and_slope(F, left, right)[0]
 
 
 def _eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None = None) -> FloatArray:
-    """Matrices (…, 3, 3) of rank two and unit norm from eight or more normalised points (…, N, 3) each.
-
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 11.1.
-    """
+    """Matrices (…, 3, 3) of rank two and unit norm from eight or more points (…, N, 3) each: [HZ04] 11.1."""
     rows = (right[..., :, None] * left[..., None, :]).reshape(*left.shape[:-1], 9)
     if weight is not None:
         rows = rows * weight[..., None]
@@ -140,8 +133,7 @@ def _eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None 
     U, s, Vt = np.linalg.svd(F)
     s[..., 2] = 0.0
     s /= np.linalg.norm(s, axis=-1, keepdims=True)
-    result: FloatArray = (U * s[..., None, :]) @ Vt
-    return result
+    return np.asarray((U * s[..., None, :]) @ Vt)
 
 
 def _refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) -> FloatArray:
@@ -156,8 +148,7 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) ->
 
     def turned(x: FloatArray) -> FloatArray:
         turn, turn_ = Rotation.from_rotvec(x[:6].reshape(2, 3)).as_matrix()
-        product: FloatArray = (U @ turn * [np.cos(phi + x[6]), np.sin(phi + x[6]), 0.0]) @ turn_.T @ Vt
-        return product
+        return np.asarray((U @ turn * [np.cos(phi + x[6]), np.sin(phi + x[6]), 0.0]) @ turn_.T @ Vt)
 
     def distances(x: FloatArray) -> FloatArray:
         return _sampson(turned(x), left, right)
@@ -169,17 +160,12 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) ->
 
 
 def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Distance (N,) of the right points from a homography of the left ones, in normalised units.
-
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 4.1.
-    """
+    """Distance (N,) of the right points from a homography of the left ones, in their units: [HZ04] 4.1."""
     zero = np.zeros_like(left)
-    first = np.concatenate([left, zero, -right[:, :1] * left], axis=1)
-    second = np.concatenate([zero, left, -right[:, 1:2] * left], axis=1)
-    H = np.linalg.svd(np.concatenate([first, second]))[2][8].reshape(3, 3)
+    rows = np.block([[left, zero, -right[:, :1] * left], [zero, left, -right[:, 1:2] * left]])
+    H = np.linalg.svd(rows)[2][8].reshape(3, 3)
     moved = left @ H.T
-    distance: FloatArray = np.linalg.norm(moved[:, :2] / moved[:, 2:] - right[:, :2], axis=1)
-    return distance
+    return np.asarray(np.linalg.norm(moved[:, :2] / moved[:, 2:] - right[:, :2], axis=1))
 
 
 def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -202,25 +188,15 @@ def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[Flo
 
 
 def _canonical_pair(F: FloatArray) -> FloatArray:
-    """Cameras (2, 3, 4) of a fundamental matrix, [I | 0] and [[e']× F | e'].
-
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., result 9.14.
-    """
+    """Cameras (2, 3, 4) of a fundamental matrix, [I | 0] and [[e']× F | e']: [HZ04] result 9.14."""
     e = np.linalg.svd(F)[0][:, 2]
-    right = np.hstack([np.cross(e[:, None], F, axis=0), e[:, None]])
-    return np.stack([np.hstack([np.eye(3), np.zeros((3, 1))]), right])
+    return np.stack([np.eye(3, 4), np.hstack([np.cross(e[:, None], F, axis=0), e[:, None]])])
 
 
 def _triangulate(P: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Points (N, 4) of unit norm from linear equations in both views, homogeneous pixels (N, 3).
-
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 12.2.
-    """
-    rows = np.concatenate(
-        [image[:, :2, None] * camera[2] - camera[:2] for camera, image in zip(P, (left, right), strict=True)],
-        axis=1,
-    )
-    return np.linalg.svd(rows)[2][:, 3]
+    """Points (N, 4) of unit norm from linear equations in homogeneous pixels (N, 3): [HZ04] 12.2."""
+    rows = [m[:, :2, None] * camera[2] - camera[:2] for camera, m in zip(P, (left, right), strict=True)]
+    return np.linalg.svd(np.concatenate(rows, axis=1))[2][:, 3]
 
 
 def _isotropic_frame(points: FloatArray) -> FloatArray:
@@ -266,7 +242,7 @@ class ImageFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
+class _Guess:
     """Cameras and points in a guessed metric frame."""
 
     P: FloatArray  # (2, 3, 4) cameras to pixels
@@ -275,23 +251,23 @@ class Guess:
     focal: float  # guessed focal length over image size
 
 
-def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: int) -> list[Guess]:
-    """Guessed reconstructions of the pairs seen by both cameras, best first, so many at most.
+def metric_guesses(
+    epipolar: Epipolar, readings: Readings, frame: ImageFrame, keep: int, factor: float = 1.0
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Cameras (2, 3, 4) and points (N, 3) seen by both, in so many guessed metric frames at most, best first.
 
-    The focal length is the one that keeps the distances between markers most constant over the
+    The focal length is a factor of the one that keeps the distances between markers most constant over the
     poses, each local minimum of a scan refined within its neighbours.
 
     Raises WorkFailed if no two markers were seen together at two poses.
     """
+    F = epipolar.F
     both = readings.both
     pairs = _marker_pairs(readings.pose_of[both], readings.marker_of[both])
 
-    def guess(log_focal: float) -> Guess:
-        found = guess_at(F, readings, frame, float(np.exp(log_focal)))
+    def guess(log_focal: float) -> _Guess:
+        found = _guess_at(F, readings, frame, float(np.exp(log_focal)))
         return dataclasses.replace(found, spread=_distance_spread(found.points, pairs))
-
-    def spread_at(log_focal: float) -> float:
-        return guess(log_focal).spread
 
     grid = np.linspace(np.log(_SHORTEST), np.log(_LONGEST), _TRIALS)
     scan = [guess(x) for x in grid]
@@ -307,16 +283,18 @@ def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: i
     found = []
     for i in minima:
         bounds = float(grid[i]) - step, float(grid[i]) + step
-        fine = minimize_scalar(spread_at, bounds=bounds, method="bounded", options={"xatol": _FINE * step})
-        found.append(min(scan[i], guess(fine.x), key=lambda g: g.spread))
-    return found
+        fine = minimize_scalar(
+            lambda x: guess(x).spread, bounds=bounds, method="bounded", options={"xatol": _FINE * step}
+        )
+        best = min(scan[i], guess(fine.x), key=lambda g: g.spread)
+        found.append(best if factor == 1.0 else _guess_at(F, readings, frame, factor * best.focal))
+    return [(one.P, one.points) for one in found]
 
 
-def guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float) -> Guess:
+def _guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float) -> _Guess:
     """Reconstruction of the pairs seen by both cameras from a focal length in units of the image size.
 
-    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., result 9.19; the solution of
-    the four that has most points in front of both cameras.
+    [HZ04] result 9.19, the solution of the four that has most points in front of both cameras.
     """
     K = np.zeros((2, 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = focal * frame.size
@@ -326,19 +304,15 @@ def guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float)
     U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     x, y = (np.linalg.solve(K[v], _homogeneous(readings.pixels[v][readings.both]).T).T for v in (0, 1))
-    best = -1
-    for R in (U @ W @ Vt, U @ W.T @ Vt):
-        for t in (U[:, 2], -U[:, 2]):
-            depth, depth_ = _ray_depths(R, t, x, y)
-            count = int(((depth > 0.0) & (depth_ > 0.0)).sum())
-            if count > best:
-                best, solution = count, (R, t, depth)
-    R, t, depth = solution
+    # Turn and baseline, and depths along the rays of both cameras.
+    solutions = [
+        (R, t, *_ray_depths(R, t, x, y)) for R in (U @ W @ Vt, U @ W.T @ Vt) for t in (U[:, 2], -U[:, 2])
+    ]
+    R, t, depth, _ = max(solutions, key=lambda one: int(((one[2] > 0.0) & (one[3] > 0.0)).sum()))
     # A ray nearly parallel to its partner meets it anywhere: the median ignores the few.
     scale = float(np.median(np.abs(depth))) or 1.0
-    left = np.hstack([np.eye(3), np.zeros((3, 1))])
-    right = np.hstack([R, t[:, None] / scale])
-    return Guess(K @ np.stack([left, right]), x * (depth / scale)[:, None], np.inf, focal)
+    P = K @ np.stack([np.eye(3, 4), np.hstack([R, t[:, None] / scale])])
+    return _Guess(P, x * (depth / scale)[:, None], np.inf, focal)
 
 
 def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -352,13 +326,9 @@ def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> t
 
 def _marker_pairs(pose_of: IntArray, marker_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     """Two markers seen at the same pose: rows of the first, of the second, and which two markers they are."""
-    order = np.lexsort((marker_of, pose_of))
-    firsts, seconds = [], []
-    for rows in np.split(order, np.flatnonzero(np.diff(pose_of[order])) + 1):
-        a, b = np.triu_indices(rows.size, 1)
-        firsts.append(rows[a])
-        seconds.append(rows[b])
-    first, second = np.concatenate(firsts), np.concatenate(seconds)
+    rows = [np.flatnonzero(pose_of == k) for k in np.unique(pose_of)]
+    pairs = [here[np.stack(np.triu_indices(here.size, 1))] for here in rows]
+    first, second = np.concatenate(pairs, axis=1)
     pair = marker_of[first] * (int(marker_of.max()) + 1) + marker_of[second]
     return first, second, np.unique(pair, return_inverse=True)[1]
 

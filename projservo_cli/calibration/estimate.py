@@ -10,24 +10,11 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.diagnosis import (
-    Outliers,
-    blamed_joint,
-    explain,
-    listed,
-    share_explained,
-    with_lens,
-)
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, epipolar_geometry
-from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, determined, solve
-from projservo_cli.calibration.projective import (
-    Projective,
-    closed_form_operators,
-    covariance_factor,
-    projective,
-    spread_factor,
-)
-from projservo_cli.calibration.quality import WEAK_NOISE, judged_joints, verdict
+from projservo_cli.calibration.diagnosis import Outliers, blamed_joint, listed, share_explained, with_lens
+from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
+from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve
+from projservo_cli.calibration.projective import Projective, closed_form_operators
+from projservo_cli.calibration.quality import WEAK_NOISE, judged
 from projservo_cli.calibration.readings import Readings, require_images, require_motion
 from projservo_cli.calibration.start import Nominal, Search, Tell
 from projservo_cli.geometry.lens import FIRST
@@ -105,7 +92,7 @@ def calibrate(
             _require_size(readings, image_size)
         require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
-        epipolar = epipolar_geometry(readings, rng)
+        epipolar = Epipolar.of(readings, rng)
         expect = partial(Expected.of, sigma_px=sigma_px, source=source)
         expected = expect(epipolar)
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
@@ -161,20 +148,20 @@ def _most_likely(
 def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: ImageFrame) -> Calibration:
     """Record of the maximum likelihood in its projective frame, with its covariance."""
     share = share_explained(whole, frame)
-    solution, kept = determined(whole)
+    solution, kept = whole.determined()
     try:
         refusal = expected.refusal(solution)
         if refusal is not None:
             raise Misfit(refusal)
-        found = explain(solution, epipolar)
+        found = Outliers.of(solution, epipolar)
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
             raise
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
-    spread = spread_factor(solution)
+    spread = solution.spread_factor()
     suspicion = "lens" if share else "joint readings"
-    record = _record(projective(solution), solution, expected, spread, found, suspicion)
+    record = _record(Projective.of(solution), solution, expected, spread, found, suspicion)
     advice = (*record.advice, *_lens_advice(record, share, frame.known))
     if kept.all():
         return dataclasses.replace(record, advice=advice)
@@ -232,26 +219,22 @@ def _record(
     method = "closed_form" if spread is None else "refined"
     problem, readings, scene = solution.problem, solution.problem.readings, result.scene
     if spread is None:
-        # Residuals of a method without covariance are its own doing, not noise of the images.
-        sigma = expected.sigma_px
         covariance = np.full((scene.P.size + scene.H_hat.size + scene.M.size,) * 2, np.nan)
     else:
-        sigma = expected.noise_px(solution)
-        factor = covariance_factor(solution, result, spread)
-        covariance = sigma**2 * (factor @ factor.T)
-    joints = judged_joints(solution, spread, sigma)
+        factor = expected.noise_px(solution) * result.covariance_factor(solution, spread)
+        covariance = factor @ factor.T
     outlier = listed(readings, readings.seen & ~solution.used & ~found.explained)
     counts = (len(outlier), len(found.suspect), len(found.swapped))
-    usable, reason, advice = verdict(method, solution, expected, joints, counts, suspicion)
-    operator_defect, trace_defect, plane_defect = _defects(result)
+    verdict = judged(solution, spread, expected, counts, suspicion)
+    operator_defect, trace_defect, plane_defect = result.defects()
     used_rows = solution.used.any(axis=0)
     return Calibration(
         method=method,
         source="",
         joint_types="".join("P" if slides else "R" for slides in readings.prismatic),
-        usable=usable,
-        reason=reason,
-        advice=advice,
+        usable=verdict.usable,
+        reason=verdict.reason,
+        advice=verdict.advice,
         rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
         sigma_fitted_px=solution.sigma_px,
@@ -265,12 +248,12 @@ def _record(
         marker=readings.marker,
         M=scene.M,
         covariance=covariance,
-        excitation=joints.span,
-        weak=joints.noise > WEAK_NOISE,
+        excitation=verdict.span,
+        weak=verdict.noise > WEAK_NOISE,
         operator_defect=operator_defect,
         trace_defect=trace_defect,
         plane_defect=plane_defect,
-        prediction_noise=joints.noise,
+        prediction_noise=verdict.noise,
         merged_poses=int(np.unique(readings.pose_of[used_rows]).size),
         merged_markers=int(np.unique(readings.marker_of[used_rows]).size),
         outlier=outlier,
@@ -278,19 +261,7 @@ def _record(
         swapped=np.concatenate(
             [readings.pose[found.swapped[:, :1]], readings.marker[found.swapped[:, 1:]]], axis=1
         ),
-        predicted_rms_px=None if joints.error is None else joints.error[0],
-        predicted_p99_px=None if joints.error is None else joints.error[1],
+        predicted_rms_px=None if verdict.error is None else verdict.error[0],
+        predicted_p99_px=None if verdict.error is None else verdict.error[1],
         lens=scene.lens,
-    )
-
-
-def _defects(result: Projective) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of no trace, of one plane at infinity."""
-    H_hat, prismatic = result.scene.H_hat, result.scene.prismatic
-    square = H_hat @ H_hat
-    law = np.where(prismatic[:, None, None], square, square @ H_hat + H_hat)
-    return (
-        np.linalg.norm(law, axis=(1, 2)) / np.linalg.norm(H_hat, axis=(1, 2)),
-        np.abs(np.trace(H_hat, axis1=1, axis2=2)),
-        np.linalg.norm(result.a_inf @ H_hat, axis=1) / np.linalg.norm(result.a_inf),
     )

@@ -1,26 +1,26 @@
 """Fits: a robust search from each start, then least squares of the readings that count, and their noise."""
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares, Stalled, Weighting, minimize
+from projservo_cli.calibration.adjustment import LeastSquares, minimize
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.readings import RAYLEIGH
 from projservo_cli.calibration.start import Nominal, Search, starts
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
-
-# Median of the length of a two-dimensional normal vector of unit deviation.
-RAYLEIGH = 1.1774100225154747
 
 # Fitted noise over the noise expected: above the first, or so many standard errors above one where that
 # is less, more than pixel noise is left; above the last the model does not describe the data.
 WARN_RATIO, _WARN_ERRORS, REFUSE_RATIO = 1.15, 4.0, 3.0
 _CHI2_TAIL = 1e-4
+# A direction whose singular value is this share of the largest is open.
+OPEN_DIRECTION = 1e-10
 
 
 class Misfit(WorkFailed):
@@ -56,6 +56,41 @@ class Solution:
     def typical_px(self) -> float:
         """Median residual over all readings seen, outliers included, px."""
         return _median_px(self.residual, self.problem.readings.seen)
+
+    def determined(self) -> tuple["Solution", BoolArray]:
+        """The solution without markers of which hardly any reading counts, and which markers (m,) stay.
+
+        One reading is less than the three coordinates of a marker, and a few among many wrong ones agree by
+        chance; either would spoil what is said about the body as a whole.
+        """
+        problem, scene, readings = self.problem, self.scene, self.problem.readings
+        keep = readings.count_of(self.used) >= np.maximum(2, _LEAST_SHARE * readings.count_of(readings.seen))
+        if keep.all():
+            return self, keep
+        rows = keep[readings.marker_of]
+        smaller = LeastSquares.of(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
+        scene = dataclasses.replace(scene, M=scene.M[keep])
+        used = self.used[:, rows]
+        dof = _degrees_of_freedom(smaller, scene, used)
+        return Solution(smaller, scene, self.residual[:, rows], used, dof), keep
+
+    def spread_factor(self) -> FloatArray:
+        """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that the readings determine.
+
+        Singular values of J itself keep the weakest direction, which the normal matrix would lose.
+        At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
+        """
+        problem, scene = self.problem, self.scene
+        J = problem.dense(problem.derivative(scene)[1], self.used)
+        scale = np.linalg.norm(J, axis=0)
+        # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
+        scale = np.where(scale > 0.0, scale, scale.max())
+        G = np.linalg.qr(scale[:, None] * problem.gauge(scene))[0]
+        free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
+        _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
+        # Robots of one or two joints leave more directions open than the gauge, none of which matters
+        # to an image: they must come out as zero after the product with its derivative.
+        return np.asarray((free @ (Vt.T / np.maximum(s, OPEN_DIRECTION * s[0]))) / scale[:, None])
 
 
 @dataclass(frozen=True)
@@ -117,8 +152,6 @@ def chi2_band(dof: int) -> tuple[float, float]:
     return float(chdtri(dof, 1.0 - _CHI2_TAIL)) / dof, float(chdtri(dof, _CHI2_TAIL)) / dof
 
 
-# Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
-_CAUCHY = 2.385
 _MASK_ROUNDS = 4
 # Least share of the readings of a marker that must count for it to be part of the model.
 _LEAST_SHARE = 0.25
@@ -127,8 +160,6 @@ _HOPELESS = 10.0
 # A robust search that would still be refused and has come nearer by less than this share over so many
 # steps is not continued.
 _CRAWL, _PATIENCE = 0.01, 10
-# A step of the screws alone that moves the images by less than this fraction of the residual is the last.
-_ROUGHLY = 1e-2
 
 
 def _median_px(residual: FloatArray, mask: BoolArray) -> float:
@@ -136,23 +167,7 @@ def _median_px(residual: FloatArray, mask: BoolArray) -> float:
     return float(np.median(np.linalg.norm(residual[mask], axis=1)))
 
 
-def _cauchy(seen: BoolArray) -> Weighting:
-    """Weights of a Cauchy loss whose width follows the median residual of what was seen (2, N)."""
-
-    def weighting(residual: FloatArray) -> FloatArray:
-        distance = np.linalg.norm(residual, axis=2)
-        width = _CAUCHY * max(float(np.median(distance[seen])) / RAYLEIGH, 1e-9)
-        return np.where(seen, 1.0 / (1.0 + (distance / width) ** 2), 0.0)
-
-    return weighting
-
-
-def _constant(weight: FloatArray, residual: FloatArray) -> FloatArray:
-    """Weights (2, N) that do not depend on the residuals."""
-    return weight
-
-
-def _crawling(seen: BoolArray, far: float) -> Stalled:
+def _crawling(seen: BoolArray, far: float) -> Callable[[FloatArray], bool]:
     """Whether a search is farther off than a noise, px, and hardly comes nearer, asked after each step."""
     levels: list[float] = []
 
@@ -178,15 +193,10 @@ def _robust_search(
 
     Given up where the fit would be refused and hardly proceeds.
     """
-    scene = search_screws(problem, scene, rows, 20)
-    far = REFUSE_RATIO * epipolar.noise_px
-    fit = minimize(problem, scene, _cauchy(rows), most=100, stalled=_crawling(rows, far))
+    scene = minimize(problem, scene, rows, robust=True, cameras=False, most=20).scene
+    stalled = _crawling(rows, REFUSE_RATIO * epipolar.noise_px)
+    fit = minimize(problem, scene, rows, robust=True, most=100, stalled=stalled)
     return fit.scene, _median_px(fit.residual, rows)
-
-
-def search_screws(problem: LeastSquares, scene: Scene, rows: BoolArray, most: int) -> Scene:
-    """The scene after so many steps of screws and markers alone, under a Cauchy loss over readings (2, N)."""
-    return minimize(problem, scene, _cauchy(rows), cameras=False, most=most).scene
 
 
 def fit_inliers(
@@ -204,7 +214,7 @@ def fit_inliers(
     within = _within(problem, residual, OUTLIER * max(sigma, 1e-9))
     for _ in range(_MASK_ROUNDS):
         used = within
-        fit = minimize(problem, scene, partial(_constant, used.astype(np.float64)))
+        fit = minimize(problem, scene, used, robust=False)
         scene = fit.scene
         dof = _degrees_of_freedom(problem, scene, used)
         if dof <= 0:
@@ -213,12 +223,17 @@ def fit_inliers(
         if np.array_equal(used, within):
             break
     _, depth = problem.pixels(scene)
-    # A camera is known up to its sign.
-    sign = np.sign(depth.sum(axis=1))
-    if not (np.sign(depth) == sign[:, None])[used].all():
+    sign, ahead = _sides(depth)
+    if not ahead[used].all():
         return None
     scene = dataclasses.replace(scene, P=scene.P * sign[:, None, None])
     return Solution(problem, scene, fit.residual, used, dof)
+
+
+def _sides(depth: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Signs (2,) of the cameras, and which points of depths (2, N) lie on the side of most."""
+    sign = np.sign(depth.sum(axis=1))
+    return sign, np.sign(depth) == sign[:, None]
 
 
 def _within(problem: LeastSquares, residual: FloatArray, limit: float) -> BoolArray:
@@ -226,33 +241,12 @@ def _within(problem: LeastSquares, residual: FloatArray, limit: float) -> BoolAr
     readings = problem.readings
     good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
     most = readings.count_at(good) >= 0.5 * readings.count_at(readings.seen)
-    result: BoolArray = good & most[readings.pose_of]
-    return result
+    return np.asarray(good & most[readings.pose_of])
 
 
 def _degrees_of_freedom(problem: LeastSquares, scene: Scene, used: BoolArray) -> int:
     """Coordinates used minus the rank of their derivative."""
     return 2 * int(np.count_nonzero(used)) - problem.size + len(problem.gauge(scene).T)
-
-
-def determined(solution: Solution) -> tuple[Solution, BoolArray]:
-    """The solution without markers of which hardly any reading counts, and which markers (m,) stay.
-
-    One reading is less than the three coordinates of a marker, and a few among many wrong ones agree by
-    chance; either would spoil what is said about the body as a whole.
-    """
-    problem, scene = solution.problem, solution.scene
-    readings = problem.readings
-    counts = readings.count_of(solution.used)
-    keep = counts >= np.maximum(2, _LEAST_SHARE * readings.count_of(readings.seen))
-    if keep.all():
-        return solution, keep
-    rows = keep[readings.marker_of]
-    smaller = LeastSquares.of(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
-    scene = dataclasses.replace(scene, M=scene.M[keep])
-    used = solution.used[:, rows]
-    dof = _degrees_of_freedom(smaller, scene, used)
-    return Solution(smaller, scene, solution.residual[:, rows], used, dof), keep
 
 
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a
@@ -279,10 +273,7 @@ def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[
     problem, found = search.problem, None
     scene = nominal.scene(problem.readings, problem.q_reference)
     pixels, depth = problem.pixels(scene)
-    # A camera is given up to scale and sign: most points are to lie in front of it.
-    sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
-    scene = dataclasses.replace(scene, P=scene.P * sign[:, None, None])
-    if np.isfinite(pixels).all() and ((depth * sign[:, None])[problem.readings.seen] > 0.0).all():
+    if np.isfinite(pixels).all() and _sides(depth)[1][problem.readings.seen].all():
         found = fit_from(problem, scene, search.epipolar)
     if found is not None and expected.agrees(found):
         return found, ""

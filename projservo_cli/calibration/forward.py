@@ -16,7 +16,7 @@ CAMERA = 12
 LENS = 2
 
 
-def sine_and_versine(prismatic: BoolArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _sine_and_versine(prismatic: BoolArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Coefficients (K, n) of Ĥ and Ĥ² in [RH00] eqs. (4), (5) at joints (K, n) from the reference."""
     return np.where(prismatic, q, np.sin(q)), np.where(prismatic, 0.0, 2.0 * np.sin(0.5 * q) ** 2)
 
@@ -27,9 +27,8 @@ def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> Flo
     Joint values are from the reference, rad or m.
     """
     squared = H_hat @ H_hat
-    sine, versine = (part.T[..., None, None] for part in sine_and_versine(prismatic, q))
-    result: FloatArray = np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
-    return result
+    sine, versine = (part.T[..., None, None] for part in _sine_and_versine(prismatic, q))
+    return np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
 
 
 def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
@@ -68,7 +67,7 @@ def projection_derivative(
     return bent(lens[:, None], pixels), by_pixel @ G, by_lens
 
 
-class Images(NamedTuple):
+class _Images(NamedTuple):
     """Pixels of N sightings and their derivatives."""
 
     pixels: FloatArray  # (2, N, 2) px
@@ -102,7 +101,7 @@ class Scene:
         E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]
         return E, moved_points(E, self.M[marker_of][:, None])[:, :, 0]
 
-    def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> Images:
+    def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> _Images:
         """Sightings (N,) of markers at rows of q (K, n), with their derivatives.
 
         From images to the point behind each joint by [RH00] eq. (6).
@@ -114,4 +113,31 @@ class Scene:
         for i, by_joint in enumerate(E):
             D[i + 1] = D[i] @ by_joint
         by_camera = (G[..., None] * Y[0][:, None, None, :]).reshape(*pixels.shape, CAMERA)
-        return Images(pixels, Y, by_camera, D, by_lens)
+        return _Images(pixels, Y, by_camera, D, by_lens)
+
+    def derivative(self, q: FloatArray) -> FloatArray:
+        """Derivative of all markers' pixels by P, H_hat, M (ravelled): (K, 2, m, 2, 24 + 16 n + 4 m).
+
+        With a lens, by k1 and k2 of both views in four more columns. An operator enters by
+        E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ).
+        """
+        (K, n), m = q.shape, len(self.M)
+        pose_of, marker_of = np.divmod(np.arange(K * m), m)
+        images = self.images(q, pose_of, marker_of)
+        joints, markers = 2 * CAMERA, 2 * CAMERA + 16 * n
+        lenses = markers + 4 * m
+        J = np.zeros((2, K * m, 2, lenses + (0 if images.by_lens is None else 2 * LENS)))
+        for v in (0, 1):
+            J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
+            if images.by_lens is not None:
+                J[v, ..., lenses + v * LENS : lenses + (v + 1) * LENS] = images.by_lens[v]
+        parts = _sine_and_versine(self.prismatic, q)
+        sine, versine = (part[pose_of].T[..., None, None, None] for part in parts)
+        for i, (s, c, H) in enumerate(zip(sine, versine, self.H_hat, strict=True)):
+            D, Y = images.by_point[i], images.points[i + 1]
+            Y, HY = Y[:, None, None], (Y @ H.T)[:, None, None]
+            block = D[..., None] * (s * Y + c * HY) + (c * (D @ H)[..., None]) * Y
+            J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(2, K * m, 2, 16)
+        columns = markers + 4 * marker_of[None, :, None, None] + np.arange(4)
+        np.put_along_axis(J, columns, images.by_point[n], axis=3)
+        return np.asarray(J.reshape(2, K, m, *J.shape[2:]).swapaxes(0, 1))

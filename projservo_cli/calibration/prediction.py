@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.forward import CAMERA, LENS, Scene, sine_and_versine
+from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.readings import LEAST_SIGMA
 from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation, WorkFailed
 
@@ -55,10 +55,10 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
     InputError if the readings have another number of joints or are not finite.
     """
     known = np.isin(observation.marker, calibration.marker)
-    column = {int(number): j for j, number in enumerate(calibration.marker)}
-    order = np.array([column[int(number)] for number in observation.marker[known]], dtype=np.int64)
+    numbers = calibration.marker.tolist()
+    order = [numbers.index(number) for number in observation.marker[known].tolist()]
     pixels = predict(calibration, observation.q)[:, :, order]
-    seen: BoolArray = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
+    seen: BoolArray = np.asarray(np.isfinite(observation.images).all(axis=-1))
     ahead = np.isfinite(pixels[..., 0])
     residual = (pixels - observation.images[:, :, known])[seen[:, :, known] & ahead]
     return distance_statistics(np.linalg.norm(residual, axis=1)) | {
@@ -66,7 +66,7 @@ def residual_statistics(calibration: Calibration, observation: Observation) -> d
             "unknown_marker": int(seen[:, :, ~known].sum()),
             "behind_camera": int((seen[:, :, known] & ~ahead).sum()),
             "missing": int((~seen).sum()),
-        },
+        }
     }
 
 
@@ -88,46 +88,17 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     Returns (K, 2, m, 2) variances of u and v, px². Raises InputError if the readings have another number of
     joints or are not finite.
     """
-    J = prediction_derivative(calibration, q)
-    variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
-    result: FloatArray = np.maximum(variance, 0.0)
-    return result
-
-
-def prediction_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
-    """Derivative of predicted pixels by P, H_hat_0, M (ravelled): (K, 2, m, 2, 24 + 16 n + 4 m).
-
-    With a lens, by k1 and k2 of both views in four more columns. An operator enters by E = I + s Ĥ + c Ĥ²,
-    [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). ``q``: (K, n) joint readings, rad or m.
-    """
     scene, q = _scene(calibration, q)
-    (K, n), m = q.shape, len(scene.M)
-    pose_of, marker_of = np.divmod(np.arange(K * m), m)
-    images = scene.images(q, pose_of, marker_of)
-    joints, markers = 2 * CAMERA, 2 * CAMERA + 16 * n
-    lenses = markers + 4 * m
-    J = np.zeros((2, K * m, 2, lenses + (0 if images.by_lens is None else 2 * LENS)))
-    for v in (0, 1):
-        J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
-        if images.by_lens is not None:
-            J[v, ..., lenses + v * LENS : lenses + (v + 1) * LENS] = images.by_lens[v]
-    sine, versine = (part[pose_of].T[..., None, None, None] for part in sine_and_versine(scene.prismatic, q))
-    for i, (s, c, H) in enumerate(zip(sine, versine, scene.H_hat, strict=True)):
-        D, Y = images.by_point[i], images.points[i + 1]
-        Y, HY = Y[:, None, None], (Y @ H.T)[:, None, None]
-        block = D[..., None] * (s * Y + c * HY) + (c * (D @ H)[..., None]) * Y
-        J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(2, K * m, 2, 16)
-    columns = markers + 4 * marker_of[None, :, None, None] + np.arange(4)
-    np.put_along_axis(J, columns, images.by_point[n], axis=3)
-    return J.reshape(2, K, m, *J.shape[2:]).swapaxes(0, 1)
+    J = scene.derivative(q)
+    variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
+    return np.asarray(np.maximum(variance, 0.0))
 
 
 def _root(covariance: FloatArray) -> FloatArray:
     """Λ (d, r) with Λ Λᵀ the covariance (d, d); the gauge, and what no robot can do, have no spread."""
     spread, basis = np.linalg.eigh(covariance)
     known = spread > len(spread) * np.finfo(np.float64).eps * spread[-1]
-    result: FloatArray = basis[:, known] * np.sqrt(spread[known])
-    return result
+    return np.asarray(basis[:, known] * np.sqrt(spread[known]))
 
 
 # Observations in a row that must agree on a disturbance: one may be blurred, or a marker taken for another.
@@ -161,6 +132,7 @@ class Innovation:
 
     def __post_init__(self) -> None:
         self._factor = _root(self.calibration.covariance)
+        self._scene = _scene(self.calibration, self.calibration.q_reference[None])[0]
         r = self._factor.shape[1]
         self._mean, self._C = np.zeros(r), np.eye(r)
         self._sigma = max(self.sigma_px, _BEYOND_FIRST_ORDER * self.calibration.sigma_px, LEAST_SIGMA)
@@ -174,12 +146,11 @@ class Innovation:
         q : (n,) joint readings, rad or m.
         images : (2, m, 2) pixels of the markers of the calibration, NaN where unseen.
         """
-        J = prediction_derivative(self.calibration, q[None])[0] @ self._factor
+        J = self._scene.derivative(q[None] - self.calibration.q_reference)[0] @ self._factor
         r = images - predict(self.calibration, q[None])[0] - J @ self._mean
-        m = len(self.calibration.marker)
-        views, numbers = np.arange(2)[:, None], np.arange(m)
-        parts = [*(np.tile(views == view, m) for view in range(2))]
-        parts += [np.tile(numbers == j, (2, 1)) for j in range(m)]
+        shape = r.shape[:2]
+        parts = [np.broadcast_to(view[:, None], shape) for view in np.eye(2, dtype=np.bool_)]
+        parts += [np.broadcast_to(marker, shape) for marker in np.eye(shape[1], dtype=np.bool_)]
         beyond = np.array([self._beyond_chance(r, J, part) for part in parts])
         self._beyond = [*self._beyond[1 - WINDOW :], beyond]
         lasting = np.all(self._beyond, axis=0)
@@ -323,15 +294,16 @@ def _shown(
 
     Rows of what is not seen are zero.
     """
+    scene, _ = _scene(calibration, region.low[None])
     poses: list[FloatArray] = []
     rows: list[FloatArray] = []
     for _ in range(_BATCHES):
         q = rng.uniform(region.low, region.high, (_BATCH, len(region.low)))
-        pixels, (low, high) = predict(calibration, q), region.image.swapaxes(0, 1)[:, :, None]
+        pixels, (low, high) = scene.seen(q - calibration.q_reference), region.image.swapaxes(0, 1)[:, :, None]
         seen = ((pixels >= low) & (pixels <= high)).all(axis=-1)  # none that is NaN, behind the camera
         enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
         if enough.size:
-            J = prediction_derivative(calibration, q[enough]) @ factor
+            J = scene.derivative(q[enough] - calibration.q_reference) @ factor
             sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= _VAGUE * np.ptp(region.image, axis=1).max()
             seen = seen[enough] & sharp
             J[~seen] = 0.0

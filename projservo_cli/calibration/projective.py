@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from projservo_cli.calibration.adjustment import generators
+from projservo_cli.calibration.adjustment import moved_operators
 from projservo_cli.calibration.epipolar import reconstruct
-from projservo_cli.calibration.fit import Solution
+from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.forward import CAMERA, Scene
 from projservo_cli.calibration.readings import ON_A_LINE, Readings
 from projservo_cli.geometry.algebra import normalize_displacement
@@ -19,8 +19,6 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Least distance of the markers from their best line, in units of its own noise.
 _OFF_LINE = 5.0
-# A direction whose singular value is this share of the largest is open.
-_OPEN_DIRECTION = 1e-10
 _A_INF = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -34,8 +32,40 @@ class Projective:
     W: FloatArray  # (4, 4) frame change that led here
     camera_scale: FloatArray  # (2,) factors the cameras took
 
+    @classmethod
+    def of(cls, solution: Solution) -> "Projective":
+        """The adjusted scene in the isotropic projective frame of the points seen."""
+        problem, readings = solution.problem, solution.problem.readings
+        moved = solution.scene.carried(problem.q, readings.pose_of, readings.marker_of)[1][0]
+        return _isotropic(solution.scene, _A_INF, moved)
 
-def isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective:
+    def covariance_factor(self, solution: Solution, spread: FloatArray) -> FloatArray:
+        """Factor (24 + 16 n + 4 m, r) of the covariance of P, H_hat, M, gauge fixed, by ``spread_factor``.
+
+        At a noise of one pixel; with four rows more, for k1 and k2 of both views, where lenses are adjusted.
+
+        Raises WorkFailed where the markers cannot be told from a line.
+        """
+        factor = _output_derivative(solution, self) @ spread
+        free = _output_gauge(self.scene)
+        first = len(free)
+        factor[:first] -= free @ (free.T @ factor[:first])
+        _require_off_line(self.scene.M, free, solution.sigma_px * factor[:first])
+        return factor
+
+    def defects(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of no trace, of one plane at infinity."""
+        H_hat, prismatic = self.scene.H_hat, self.scene.prismatic
+        square = H_hat @ H_hat
+        law = np.where(prismatic[:, None, None], square, square @ H_hat + H_hat)
+        return (
+            np.linalg.norm(law, axis=(1, 2)) / np.linalg.norm(H_hat, axis=(1, 2)),
+            np.abs(np.trace(H_hat, axis1=1, axis2=2)),
+            np.linalg.norm(self.a_inf @ H_hat, axis=1) / np.linalg.norm(self.a_inf),
+        )
+
+
+def _isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective:
     """The one projective frame in which points seen, ``moved`` (N, 4), have the identity as second moment.
 
     The rotation that leaves free is settled by the left camera: its depth row and then its two image
@@ -61,49 +91,6 @@ def isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective:
     return Projective(Scene(P, H_hat, scene.prismatic, M @ W.T, scene.lens), a_inf @ back, W, scale)
 
 
-def projective(solution: Solution) -> Projective:
-    """The adjusted scene in the isotropic projective frame of the points seen."""
-    problem, scene = solution.problem, solution.scene
-    readings = problem.readings
-    moved = scene.carried(problem.q, readings.pose_of, readings.marker_of)[1][0]
-    return isotropic(scene, _A_INF, moved)
-
-
-def spread_factor(solution: Solution) -> FloatArray:
-    """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that the readings determine.
-
-    Singular values of J itself keep the weakest direction, which the normal matrix would lose.
-    At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
-    """
-    problem, scene = solution.problem, solution.scene
-    J = problem.dense(problem.derivative(scene)[1], solution.used)
-    scale = np.linalg.norm(J, axis=0)
-    # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
-    scale = np.where(scale > 0.0, scale, scale.max())
-    G = np.linalg.qr(scale[:, None] * problem.gauge(scene))[0]
-    free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
-    _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
-    # Robots of one or two joints leave more directions open than the gauge, none of which matters
-    # to an image: they must come out as zero after the product with its derivative.
-    result: FloatArray = (free @ (Vt.T / np.maximum(s, _OPEN_DIRECTION * s[0]))) / scale[:, None]
-    return result
-
-
-def covariance_factor(solution: Solution, result: Projective, spread: FloatArray) -> FloatArray:
-    """Factor (24 + 16 n + 4 m, r) of the covariance of P, H_hat_0, M, gauge fixed, by the ``spread_factor``.
-
-    At a noise of one pixel; with four rows more, for k1 and k2 of both views, where lenses are adjusted.
-
-    Raises WorkFailed where the markers cannot be told from a line.
-    """
-    factor = _output_derivative(solution, result) @ spread
-    free = _output_gauge(result.scene)
-    first = len(free)
-    factor[:first] -= free @ (free.T @ factor[:first])
-    _require_off_line(result.scene.M, free, solution.sigma_px * factor[:first])
-    return factor
-
-
 def _output_derivative(solution: Solution, result: Projective) -> FloatArray:
     """Derivative of P, H_hat_0, M and the lenses (ravelled, in this order) by the adjusted parameters.
 
@@ -112,13 +99,9 @@ def _output_derivative(solution: Solution, result: Projective) -> FloatArray:
     problem, scene = solution.problem, solution.scene
     back = np.linalg.inv(result.W)
     cameras = [scale * np.kron(np.eye(3), back.T) for scale in result.camera_scale]
-    joints = [
-        (result.W @ (B @ H_hat - H_hat @ B) @ back).reshape(-1, 16).T
-        for B, H_hat in zip(generators(scene), scene.H_hat, strict=True)
-    ]
+    joints = [(result.W @ moved @ back).reshape(-1, 16).T for moved in moved_operators(scene)]
     markers = [result.W[:, :3]] * len(scene.M)
-    J: FloatArray = block_diag(*cameras, *joints, *markers, np.eye(problem.size - problem.lens))
-    return J
+    return block_diag(*cameras, *joints, *markers, np.eye(problem.size - problem.lens))
 
 
 def _output_gauge(scene: Scene) -> FloatArray:
@@ -141,7 +124,7 @@ def _require_off_line(M: FloatArray, gauge: FloatArray, factor: FloatArray) -> N
     scales = np.vstack([np.zeros((first, m)), block_diag(*M[:, :, None])])
     # One of the directions is a sum of others: all markers scaled at once.
     U, s, _ = np.linalg.svd(np.hstack([gauge, scales]), full_matrices=False)
-    free = U[:, s > _OPEN_DIRECTION * s[0]]
+    free = U[:, s > OPEN_DIRECTION * s[0]]
     markers = (factor - free @ (free.T @ factor))[first:]
     U, extent, Vt = np.linalg.svd(M, full_matrices=False)
     across = np.eye(m) - U[:, :2] @ U[:, :2].T
@@ -191,7 +174,7 @@ def closed_form_operators(
     sides = points @ a_inf
     a_inf = a_inf * np.sign(np.median(sides))
     scene = Scene(P, H_hat, readings.prismatic, M[home, known[home]])
-    return isotropic(scene, a_inf, points[np.abs(sides) > 1e-6]), readings.q[home], known[home]
+    return _isotropic(scene, a_inf, points[np.abs(sides) > 1e-6]), readings.q[home], known[home]
 
 
 def _mean_operator(

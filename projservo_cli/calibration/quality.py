@@ -11,7 +11,6 @@ from scipy.special import chdtri
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
 from projservo_cli.calibration.prediction import distance_statistics
-from projservo_cli.calibration.projective import spread_factor
 from projservo_cli.calibration.readings import (
     MOST_REACHES,
     REACH_M,
@@ -21,21 +20,12 @@ from projservo_cli.calibration.readings import (
     require_motion,
     require_moved,
 )
-from projservo_cli.records import (
-    BoolArray,
-    CrossValidation,
-    FloatArray,
-    InputError,
-    IntArray,
-    WorkFailed,
-)
+from projservo_cli.records import BoolArray, CrossValidation, FloatArray, InputError, IntArray, WorkFailed
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 _UNDETERMINED_NOISE = 1000.0
 # Share of sightings beyond which outliers are what limits a fit.
 _MOST_OUTLIERS = 0.05
-
-
 # Noise of predictions at the reach, in units of the pixel noise: above it a joint is weak.
 WEAK_NOISE = 3.0
 # Poses at which predictions are judged; how sure they stay below the bound; halvings of an empty range.
@@ -62,8 +52,7 @@ class _Uncertainty:
         )
         wide = 0.5 * (high - low)
         low, high = (low - wide)[:, None, None], (high + wide)[:, None, None]
-        inside: BoolArray = ((pixels >= low) & (pixels <= high)).all(axis=-1)
-        return inside
+        return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
 
     def spread(self, q: FloatArray, shown: BoolArray) -> FloatArray:
         """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one."""
@@ -94,32 +83,28 @@ class _Uncertainty:
         return self.spread(q, shown)
 
 
-def _reach_noise(sure: _Uncertainty) -> FloatArray:
-    """Noise of predicted images (n,) with each joint at its reach, in units of the pixel noise."""
-    rows = (sure.reach_spread(i) for i in range(len(sure.solution.scene.prismatic)))
-    return np.array([np.sqrt((T**2).sum() / max(len(T), 1)) for T in rows])
-
-
-def _needed_spans(sure: _Uncertainty, noise: FloatArray) -> FloatArray:
-    """Range (n,) of a trial motion of each joint of too much noise (n,) that would mend it, rad or m.
+def _needed_spans(sure: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
+    """Range (n,) of a trial motion that would mend each joint of too much noise at its reach, rad or m.
 
     The trial is of eight frames about the reference, of this joint alone, beside the data there are;
     information adds up. NaN for joints that are not weak or that no trial of sensible range mends.
     """
-    needed = np.full(len(noise), np.nan)
-    for i in np.flatnonzero(noise > WEAK_NOISE).tolist():
-        T = sure.reach_spread(i)
+    needed = np.full(len(spreads), np.nan)
+    for i, T in enumerate(spreads):
         low, high = _LEAST_REACHES * sure.reach(i), MOST_REACHES * sure.reach(i)
-        if _noise_after(sure, i, high, T) > WEAK_NOISE:
+        if _rms(T) <= WEAK_NOISE or _noise_after(sure, i, high, T) > WEAK_NOISE:
             continue
         for _ in range(_BISECTIONS):
             middle = float(np.sqrt(low * high))
-            if _noise_after(sure, i, middle, T) > WEAK_NOISE:
-                low = middle
-            else:
-                high = middle
+            enough = _noise_after(sure, i, middle, T) <= WEAK_NOISE
+            low, high = (low, middle) if enough else (middle, high)
         needed[i] = high
     return needed
+
+
+def _rms(T: FloatArray) -> float:
+    """Noise of predicted images by a ``spread`` (rows, r) of them, in units of the pixel noise."""
+    return float(np.sqrt((T**2).sum() / max(len(T), 1)))
 
 
 def _noise_after(sure: _Uncertainty, i: int, span: float, T: FloatArray) -> float:
@@ -127,8 +112,7 @@ def _noise_after(sure: _Uncertainty, i: int, span: float, T: FloatArray) -> floa
     q = sure.at(i, np.linspace(-0.5 * span, 0.5 * span, _FRAMES))
     C = sure.spread(q, sure.shown(q))
     root = np.asarray(np.linalg.qr(np.vstack([np.eye(C.shape[1]), C]), mode="r"))
-    left = np.linalg.solve(root.T, T.T)
-    return float(np.sqrt((left**2).sum() / max(len(T), 1)))
+    return _rms(np.linalg.solve(root.T, T.T).T)
 
 
 def _predicted_error(sure: _Uncertainty) -> tuple[float, float]:
@@ -165,44 +149,83 @@ def _quantile(variances: FloatArray, probability: float) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Joints:
-    """What the data say of each joint."""
+class _Judgement:
+    """What the data say of each joint, and whether to trust the whole."""
 
-    prismatic: BoolArray  # (n,) types
     span: FloatArray  # (n,) range in the data, rad or m
     # (n,) predicted noise of images at its reach, in units of the pixel noise; NaN where unknown
     noise: FloatArray
-    needed: FloatArray  # (n,) range of a trial motion that would determine it, rad or m, NaN where none does
     # expected error of images at poses of all joints at once and its 99th percentile, px; None where unknown
     error: tuple[float, float] | None
+    usable: bool
+    reason: str  # why it is usable or not, and what limits it
+    advice: tuple[str, ...]  # what to do next
 
-    def advice(self, i: int) -> str:
-        """How far to move joint i."""
-        return describe_joint(i, float(self.span[i]), bool(self.prismatic[i]), float(self.needed[i]))
 
+def judged(
+    solution: Solution,
+    spread: FloatArray | None,
+    expected: Expected,
+    left_out: tuple[int, int, int],
+    suspicion: str,
+) -> _Judgement:
+    """Verdict on a fit with its ``spread_factor``, None for the closed form, which has none.
 
-def judged_joints(solution: Solution, factor: FloatArray | None, sigma_px: float) -> _Joints:
-    """What the data say of each joint, by a ``spread_factor`` (None for no covariance) and a noise, px.
+    From the numbers of outliers, of suspect joint readings and of exchanged markers left out, and a
+    suspicion of what may be to blame for more than pixel noise.
 
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
     """
     prismatic = solution.scene.prismatic
-    span = _require_joints_seen(solution, sigma_px)
-    if factor is None:
-        # NaN, not zero: a method without covariance does not claim certainty.
-        unknown = np.full(len(span), np.nan)
-        return _Joints(prismatic, span, unknown, unknown, None)
-    sure = _Uncertainty(solution, factor)
-    noise = _reach_noise(sure)
-    error, bound = _predicted_error(sure)
-    joints = _Joints(prismatic, span, noise, _needed_spans(sure, noise), (sigma_px * error, sigma_px * bound))
-    i = int(np.argmax(noise))
-    if noise[i] > _UNDETERMINED_NOISE:
-        raise WorkFailed(
-            f"joint {i + 1} is not determined: near the reference its images would be wrong by "
-            f"{noise[i]:.3g} times the pixel noise; {joints.advice(i)}"
+    # Residuals of a method without covariance are its own doing, not noise of the images.
+    sigma = expected.sigma_px if spread is None else expected.noise_px(solution)
+    span = _require_joints_seen(solution, sigma)
+    noise, error, advice = np.full(len(span), np.nan), None, []
+    if spread is not None:
+        sure = _Uncertainty(solution, spread)
+        spreads = [sure.reach_spread(i) for i in range(len(span))]
+        noise = np.array([_rms(T) for T in spreads])
+        typical, bound = _predicted_error(sure)
+        error = (sigma * typical, sigma * bound)
+        needed = _needed_spans(sure, spreads)
+        moves = [describe_joint(i, *of) for i, of in enumerate(zip(span, prismatic, needed, strict=True))]
+        i = int(np.argmax(noise))
+        if noise[i] > _UNDETERMINED_NOISE:
+            raise WorkFailed(
+                f"joint {i + 1} is not determined: near the reference its images would be wrong by "
+                f"{noise[i]:.3g} times the pixel noise; {moves[i]}"
+            )
+        advice = [moves[i] for i in np.flatnonzero(noise > WEAK_NOISE)]
+    warned, share = expected.warns(solution), expected.ratio(solution)
+    found = f"{solution.sigma_px:.3g} px a coordinate"
+    wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
+    if spread is None and warned:
+        # Kept for comparison: it returns what it finds, marked so.
+        short = f"the closed_form method explains the images only to {found}"
+        return _Judgement(span, noise, error, False, f"{short}, {share:.3g} times {wanted}: use refined", ())
+    reason = f"residuals of {found} agree with {wanted}"
+    if warned:
+        reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"
+        if "joint readings" in suspicion:
+            advice.append("look for joint readings that lag behind the images")
+    outliers, suspects, swaps = left_out
+    limit = "noise"
+    if warned or suspicion == "lens":
+        limit = suspicion
+    elif (weak := noise > WEAK_NOISE).any():
+        few = span[weak] < np.where(prismatic[weak], REACH_M, REACH_RAD)
+        limit = "amplitude" if few.any() else "geometry"
+    elif outliers > _MOST_OUTLIERS * solution.used.shape[1]:
+        limit = "outliers"
+    if outliers:
+        advice.append(f"{outliers} sightings were left out as outliers: check the detection of markers")
+    if suspects:
+        advice.append(
+            f"{suspects} joint readings disagree with the images: check how poses and images are paired"
         )
-    return joints
+    if swaps:
+        advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
+    return _Judgement(span, noise, error, True, f"{reason}; limited by {limit}", tuple(advice))
 
 
 def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
@@ -215,53 +238,6 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     i = int(np.argmin(motion))
     require_moved(i, float(span[i]), bool(readings.prismatic[i]), float(motion[i]), sigma_px)
     return span
-
-
-def verdict(
-    method: str,
-    solution: Solution,
-    expected: Expected,
-    joints: _Joints,
-    left_out: tuple[int, int, int],
-    suspicion: str,
-) -> tuple[bool, str, tuple[str, ...]]:
-    """Whether and why a calibration is usable, what limits it, and what to do next, in words.
-
-    From the numbers of outliers, of suspect joint readings and of exchanged markers left out, and a
-    suspicion of what may be to blame for more than pixel noise. The closed form is kept for comparison: it
-    returns what it finds, marked so, for residuals above the noise are its own doing.
-    """
-    sigma, warned = solution.sigma_px, expected.warns(solution)
-    outliers, suspects, swaps = left_out
-    wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
-    if method != "refined" and warned:
-        short = f"the {method} method explains the images only to {sigma:.3g} px a coordinate"
-        return False, f"{short}, {expected.ratio(solution):.3g} times {wanted}: use refined", ()
-    weak = np.flatnonzero(joints.noise > WEAK_NOISE)
-    advice = [joints.advice(int(i)) for i in weak]
-    limit = "noise"
-    if warned or suspicion == "lens":
-        limit = suspicion
-    elif weak.size:
-        few = joints.span[weak] < np.where(joints.prismatic[weak], REACH_M, REACH_RAD)
-        limit = "amplitude" if few.any() else "geometry"
-    elif outliers > _MOST_OUTLIERS * solution.used.shape[1]:
-        limit = "outliers"
-    reason = f"residuals of {sigma:.3g} px a coordinate agree with {wanted}"
-    if warned:
-        left = f"residuals of {sigma:.3g} px a coordinate are {expected.ratio(solution):.3g} times {wanted}"
-        reason = f"more than pixel noise is left: {left}"
-        if "joint readings" in suspicion:
-            advice.append("look for joint readings that lag behind the images")
-    if outliers:
-        advice.append(f"{outliers} sightings were left out as outliers: check the detection of markers")
-    if suspects:
-        advice.append(
-            f"{suspects} joint readings disagree with the images: check how poses and images are paired"
-        )
-    if swaps:
-        advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
-    return True, f"{reason}; limited by {limit}", tuple(advice)
 
 
 # Readings of a joint this near, rad or m, are one: a robot that holds a joint still reads it with jitter.
@@ -377,7 +353,7 @@ def _predicted(
     found = fit_inliers(problem, scene, solution.sigma_px)
     if found is None:
         raise WorkFailed(_OPEN)
-    factor = spread_factor(found)
+    factor = found.spread_factor()
     place = held_out[whole.pose_of] & known[whole.marker_of]
     test = LeastSquares.of(whole.of_poses(held_out).of_markers(known), q_reference, lens)
     pixels, J = test.derivative(found.scene)

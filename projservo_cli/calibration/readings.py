@@ -17,6 +17,8 @@ SAME_READING = 1e-7
 LEAST_SIGMA = 1e-4
 # Median of |x| over the standard deviation of a normal variable.
 MAD = 0.6744897501960817
+# Median of the length of a two-dimensional normal vector of unit deviation.
+RAYLEIGH = 1.1774100225154747
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +81,7 @@ class Readings:
     @property
     def both(self) -> BoolArray:
         """(N,) whether both views saw the marker."""
-        result: BoolArray = np.logical_and(self.seen[0], self.seen[1])
-        return result
+        return np.asarray(np.logical_and(self.seen[0], self.seen[1]))
 
     def rows(self, keep: BoolArray) -> "Readings":
         """Some of the sightings (N,); the lists of poses and markers stay."""
@@ -133,8 +134,7 @@ class Readings:
             span = np.ptp(self.q, axis=0)
             deviation = (self.q - np.median(self.q, axis=0)) / np.where(span > 0.0, span, 1.0)
             row = int(np.argmin((deviation**2).sum(axis=1)))
-        result: FloatArray = self.q[row].copy()
-        return result
+        return np.asarray(self.q[row].copy())
 
 
 def _require_shapes(observation: Observation) -> None:
@@ -269,8 +269,7 @@ def _spread(pixels: FloatArray) -> FloatArray:
     length = np.linalg.norm(offset, axis=1, keepdims=True)
     signs = offset / np.where(length > 0.0, length, 1.0)
     axes = np.linalg.eigh(signs.T @ signs)[1][:, ::-1]
-    result: FloatArray = np.median(np.abs(offset @ axes), axis=0) / MAD
-    return result
+    return np.asarray(np.median(np.abs(offset @ axes), axis=0) / MAD)
 
 
 def _require_spread(readings: Readings, sigma: float) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix
-from projservo_cli.calibration.epipolar import Epipolar, Guess, ImageFrame, guess_at, metric_guesses
+from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, metric_guesses
 from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.readings import MAD, SAME_READING, Readings
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
@@ -50,24 +50,16 @@ class _Alignment:
 
     body: FloatArray  # (m, 3) markers, NaN where never merged
     R: FloatArray  # (K, 3, 3) rotations from the body to the pose
-    t: FloatArray  # (K, 3) translations
     merged: BoolArray  # (K,) poses whose rotation is known
 
 
-def _merged(guess: Guess, readings: Readings) -> _Alignment:
-    """Body and poses from the points of a guessed reconstruction, those both views saw."""
-    both = readings.both
-    shape = (len(readings.q), readings.marker.size)
-    points, seen = np.zeros((*shape, 3)), np.zeros(shape, dtype=bool)
+def _merged(reconstructed: FloatArray, readings: Readings) -> _Alignment:
+    """Body and poses from the points (N, 3) that both cameras saw, grown from the fullest pose."""
+    K, both = len(readings.q), readings.both
+    points = np.zeros((K, readings.marker.size, 3))
+    seen = np.zeros(points.shape[:2], dtype=bool)
     where = readings.pose_of[both], readings.marker_of[both]
-    points[where], seen[where] = guess.points, True
-    return _merge(points, seen)
-
-
-def _merge(points: FloatArray, seen: BoolArray) -> _Alignment:
-    """Grow the body from the fullest pose until nothing is added, from points (K, m, 3) where seen (K, m)."""
-    K = len(seen)
-    points = np.where(seen[..., None], points, 0.0)
+    points[where], seen[where] = reconstructed, True
     R, t = np.tile(np.eye(3), (K, 1, 1)), np.zeros((K, 3))
     seed = _seed(points, seen)
     body = np.where(seen[seed][:, None], points[seed], np.nan)
@@ -86,7 +78,7 @@ def _merge(points: FloatArray, seen: BoolArray) -> _Alignment:
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
             body = _median_body(local, seen & found[:, None])
             grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
-    return _Alignment(body, R, t, found)
+    return _Alignment(body, R, found)
 
 
 def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -159,11 +151,10 @@ def _rotation_axes(
     keep: int,
     steps: int,
 ) -> list[FloatArray]:
-    """Sets of axes (n, 3) that explain the rotations at joint values (K, n), the distinct minima, best first.
+    """Sets of axes (n, 3) that explain the rotations at joint values (K, n), distinct minima, best first.
 
-    Levenberg–Marquardt under a Cauchy loss on log(R_k R_predᵀ) from many random sets of axes at once,
-    and from the axes that single-joint trials show directly. At most so many sets, none where no axes explain
-    the rotations at all; axes of prismatic joints have no meaning.
+    From many random sets and the axes that single-joint trials show directly. None where no axes explain the
+    rotations at all; axes of prismatic joints have no meaning.
     """
     R, q = alignment.R[alignment.merged], q[alignment.merged]
     w = rng.standard_normal((_STARTS, q.shape[1], 3))
@@ -227,7 +218,7 @@ def _isolated_axes(R: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatA
 def _fit_axes(
     w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray, steps: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Levenberg–Marquardt for all starts at once: axes (S, n, 3) and losses (S,)."""
+    """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ)."""
     S, n = w.shape[:2]
     away = np.swapaxes(_chain(w, q, prismatic)[:, n], -1, -2) @ R
     base = np.stack([Rotation.from_matrix(rotations).mean().as_matrix() for rotations in away])
@@ -241,9 +232,7 @@ def _fit_axes(
         A = weighted @ rows
         g = (weighted @ residual.reshape(S, -1, 1))[..., 0]
         A += (damping * np.trace(A, axis1=1, axis2=2) / size + 1e-12)[:, None, None] * np.eye(size)
-        turn = _rotations(
-            np.asarray(-np.linalg.solve(A, g[..., None]), dtype=np.float64).reshape(S, n + 1, 3)
-        )
+        turn = _rotations(np.asarray(-np.linalg.solve(A, g[..., None]).reshape(S, n + 1, 3), float))
         w_new = np.einsum("snij,snj->sni", turn[:, :n], w)
         base_new = turn[:, n] @ base
         residual_new, J_new = _axis_residuals(w_new, base_new, R, q, prismatic)
@@ -293,14 +282,14 @@ _RIDGE = 0.03
 _LEAST_SCALE = 1e-3
 
 
-def _place(w: FloatArray, guess: Guess, readings: Readings, q: FloatArray) -> Scene:
+def _place(w: FloatArray, guess: tuple[FloatArray, FloatArray], readings: Readings, q: FloatArray) -> Scene:
     """Axis points, directions of translation and markers, linear in the points once all axes are known.
 
     A point of marker j at pose k is R̄_n X_j + Σ R̄_{i−1} ((I − R_i) p_i, or q_i v_i if prismatic):
     least squares under a Cauchy loss with a small ridge. Translations get one common speed. Joint values
     (K, n) are from the reference; the readings of both views are those of the guess.
     """
-    points, prismatic = guess.points, readings.prismatic
+    (P, points), prismatic = guess, readings.prismatic
     n, m = w.shape[0], readings.marker.size
     pose_of, marker_of = readings.pose_of[readings.both], readings.marker_of[readings.both]
     chain = _chain(w, q, prismatic)
@@ -322,7 +311,7 @@ def _place(w: FloatArray, guess: Guess, readings: Readings, q: FloatArray) -> Sc
     length = np.linalg.norm(x[:n], axis=1)[prismatic]
     if prismatic.any():
         H_hat[prismatic, :3, 3] = x[:n][prismatic] / length[:, None] * np.median(length)
-    return Scene(guess.P, H_hat, prismatic, np.hstack([x[n:], np.ones((m, 1))]))
+    return Scene(P, H_hat, prismatic, np.hstack([x[n:], np.ones((m, 1))]))
 
 
 def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> FloatArray:
@@ -346,12 +335,9 @@ def starts(search: Search, readings: Readings, factors: tuple[float, ...]) -> It
 
     The readings are those of the problem, perhaps at some of its poses.
     """
-    F, frame = search.epipolar.F, search.frame
-    guesses = metric_guesses(F, readings, frame, _FOCAL_MINIMA)
     for factor in factors:
-        for best in guesses:
-            guess = best if factor == 1.0 else guess_at(F, readings, frame, factor * best.focal)
-            alignment = _merged(guess, readings)
+        for guess in metric_guesses(search.epipolar, readings, search.frame, _FOCAL_MINIMA, factor):
+            alignment = _merged(guess[1], readings)
             if int(np.isfinite(alignment.body[:, 0]).sum()) < _LEAST:
                 raise WorkFailed(
                     "no three markers are seen together by both cameras: more must be seen at once"
@@ -369,8 +355,8 @@ def starts_of_changed(search: Search, changes: Iterable[LeastSquares], steps: in
     Raises WorkFailed if no two markers were seen together at two poses.
     """
     readings = search.problem.readings
-    guess = metric_guesses(search.epipolar.F, readings, search.frame, keep=1)[0]
-    alignment = _merged(guess, readings)
+    guess = metric_guesses(search.epipolar, readings, search.frame, keep=1)[0]
+    alignment = _merged(guess[1], readings)
     for changed in changes:
         axes = _rotation_axes(alignment, changed.q, changed.readings.prismatic, search.rng, 1, steps)
         yield next(filter(_finite, (_place(w, guess, changed.readings, changed.q) for w in axes)), None)

@@ -1,7 +1,6 @@
 """Calibration as a whole, on robots simulated with scipy's matrix exponential."""
 
 import dataclasses
-import inspect
 import subprocess
 import sys
 
@@ -12,28 +11,16 @@ from projservo_cli.calibration import calibrate, predict, residual_statistics
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.prediction import prediction_derivative
-from projservo_cli.calibration.projective import covariance_factor, isotropic, projective, spread_factor
+from projservo_cli.calibration.projective import Projective
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.records import Calibration, InputError, Observation
+from projservo_cli.records import InputError, Observation
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
-from tests.fake_records import fake
 
 
 def noisy(types="RRPRRR", seed=5, sigma=0.5, poses=trials):
     robot = random_robot(types, np.random.default_rng(seed))
     return robot, robot.observe(poses(robot), sigma, np.random.default_rng(seed + 1))
-
-
-def test_it_sees_pixels_and_joint_readings_only():
-    """Anything else, as a start (``init``), is left out by default."""
-    parameters = inspect.signature(calibrate).parameters
-    assert set(parameters) == {
-        "observation", "joint_types", "method", "sigma_px", "source", "image_size", "seed",
-        "lens", "init", "fitted", "tell",
-    }  # fmt: skip
-    assert parameters["init"].default is None
 
 
 def test_no_stage_imports_all_distributions():
@@ -85,18 +72,14 @@ def test_frame_is_projective_and_isotropic():
 
 
 def test_frame_does_not_depend_on_the_frame_it_comes_from():
-    robot = random_robot("RPR", np.random.default_rng(2))
-    a_inf = np.array([0.0, 0.0, 0.0, 1.0])
-    rng = np.random.default_rng(3)
-    points = np.hstack([rng.uniform(-0.2, 0.2, (50, 3)), np.ones((50, 1))])
-    scene = Scene(robot.cameras, robot.twists, np.array([False, True, False]), robot.markers)
-    first = isotropic(scene, a_inf, points).scene
-    Z = np.eye(4) + 0.3 * rng.standard_normal((4, 4))
-    back = np.linalg.inv(Z)
-    moved = dataclasses.replace(scene, P=-3.0 * scene.P @ back, H_hat=Z @ scene.H_hat @ back, M=scene.M @ Z.T)
-    second = isotropic(moved, a_inf @ back, points @ Z.T).scene
-    for one, other in ((first.P, second.P), (first.H_hat, second.H_hat), (first.M, second.M)):
-        assert np.allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(one).max())
+    """The closed form comes from a projective frame, the refined one from a metric guess."""
+    _, observation = noisy("RPRR", sigma=0.0)
+    one, other = (
+        calibrate(observation, "RPRR", source="recorded", method=m) for m in ("refined", "closed_form")
+    )
+    for name in ("P", "H_hat_0", "M", "a_inf"):
+        expected = getattr(one, name)
+        np.testing.assert_allclose(getattr(other, name), expected, atol=1e-6 * np.abs(expected).max())
 
 
 def test_covariance_is_that_of_the_parameters():
@@ -107,19 +90,10 @@ def test_covariance_is_that_of_the_parameters():
     problem = LeastSquares.of(readings, robot.q_reference)
     scene = Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers)
     solution = Solution(problem, scene, problem.residual(scene), readings.seen, 1)
-    spread = spread_factor(solution)
+    spread = solution.spread_factor()
     direct = problem.dense(problem.derivative(scene)[1], readings.seen) @ spread
-    result = projective(solution)
-    record = fake(
-        Calibration,
-        P=result.scene.P,
-        H_hat_0=result.scene.H_hat,
-        M=result.scene.M,
-        joint_types="RPR",
-        q_reference=robot.q_reference,
-        lens=None,
-    )
-    chained = prediction_derivative(record, q) @ covariance_factor(solution, result, spread)
+    result = Projective.of(solution)
+    chained = result.scene.derivative(problem.q) @ result.covariance_factor(solution, spread)
     chained = chained[readings.pose_of, :, readings.marker_of].transpose(1, 0, 2, 3).reshape(direct.shape)
     # Both are factors of one covariance, each with a gauge of its own.
     covariance, other = direct @ direct.T, chained @ chained.T

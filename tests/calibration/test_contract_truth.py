@@ -66,14 +66,6 @@ def table(honest, tmp_path_factory):
     return path
 
 
-def test_a_recorded_run_does_not_look_at_the_configured_robot(table):
-    data = (f"data={{table: {table}, joints: RRRRRR, noise_px: 0.5}}",)
-    same(
-        stage.run(load_config(PAPER, data))[1],
-        stage.run(load_config(PAPER, (*data, *GARBAGE)))[1],
-    )
-
-
 def test_a_recorded_run_needs_neither_robot_nor_rig(honest, table, tmp_path):
     bare = tmp_path / "bare.yaml"
     bare.write_text(f"name: bare\nseed: 5\ndata: {{table: {table}}}\n", encoding="utf-8")

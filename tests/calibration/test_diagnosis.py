@@ -36,13 +36,7 @@ def flipped(types, i):
     return types[:i] + {"R": "P", "P": "R"}[types[i]] + types[i + 1 :]
 
 
-@pytest.mark.parametrize(
-    ("types", "joint", "motions"),
-    [
-        ("RRPRRR", 2, "trials"),
-        ("RPRP", 0, "all at once"),
-    ],
-)
+@pytest.mark.parametrize(("types", "joint", "motions"), [("RRPRRR", 2, "trials"), ("RPRP", 0, "all at once")])
 def test_a_joint_of_the_wrong_type(types, joint, motions):
     robot = robot_of(types)
     message = refusal(seen(robot, poses(robot, motions)), flipped(types, joint))
@@ -58,13 +52,7 @@ def test_a_joint_of_the_wrong_type_whose_fit_passes():
     assert calibration.advice[0] == "by the images joint 4 is prismatic, not revolute: check --joints"
 
 
-@pytest.mark.parametrize(
-    ("types", "joint", "motions"),
-    [
-        ("RRRRRR", 3, "trials"),
-        ("RPRP", 1, "all at once"),
-    ],
-)
+@pytest.mark.parametrize(("types", "joint", "motions"), [("RRRRRR", 3, "trials"), ("RPRP", 1, "all at once")])
 def test_a_joint_that_stands_still_while_its_readings_move(types, joint, motions):
     robot = robot_of(types)
     q = poses(robot, motions)

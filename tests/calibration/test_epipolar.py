@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.calibration.epipolar import epipolar_geometry, reconstruct
+from projservo_cli.calibration.epipolar import Epipolar
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.stereo import fundamental_matrix
 from projservo_cli.records import Observation, WorkFailed
@@ -21,7 +21,7 @@ def geometry(left, right, seed):
     """Of a marker seen at as many poses."""
     images = np.stack([left, right], axis=1)[:, :, None]
     seen = Observation(np.arange(len(left)), np.array([0]), np.zeros((len(left), 1)), images)
-    return epipolar_geometry(Readings.of(seen, "R"), np.random.default_rng(seed))
+    return Epipolar.of(Readings.of(seen, "R"), np.random.default_rng(seed))
 
 
 def same_up_to_sign(F, G):
@@ -62,14 +62,3 @@ def test_too_few_and_flat_sightings_are_refused():
     again = left + 0.3 * np.random.default_rng(6).standard_normal(left.shape)
     with pytest.raises(WorkFailed, match="without a baseline"):
         geometry(left, again, 0)
-
-
-def test_reconstruction_is_isotropic_and_projects_back():
-    left, right = sightings(60, 0.0, np.random.default_rng(7))
-    P, points = reconstruct(fundamental_matrix(rig()), left, right)
-    m = P @ points.T
-    assert np.all(m[:, 2] > 0.0)
-    for camera, image in zip(m, (left, right), strict=True):
-        assert np.abs((camera[:2] / camera[2]).T - image).max() < 1e-7
-    moments = 4.0 * points.T @ points / len(points)
-    assert np.abs(moments - np.eye(4)).max() < 1e-3

@@ -147,10 +147,8 @@ def test_other_joints_or_unknown_markers_are_refused(robot, observation, written
 
 BAD = {
     "nothing": ("", r":1:1: not JSON: Expecting value"),
-    "list": ([1, 2], r": the file: input should be an object"),
     "no camera": ({"camera_left": None}, r": camera_left: input should be a valid array"),
     "NaN": ({"q_reference": [float("nan"), 0, 0, 0]}, r": q_reference.0: input should be a finite number"),
-    "text": ({"q_reference": ["0", 0, 0, 0]}, r": q_reference.0: input should be a valid number"),
     "few joints": ({"q_reference": [0.0]}, r": q_reference: 1 values for 4 screws"),
     "flat camera": ({"camera_right": [[1, 0, 0, 0]] * 3}, r": camera_right: a camera matrix has three indep"),
     "twice": (
@@ -197,16 +195,3 @@ def test_a_file_that_is_not_there_or_not_text(tmp_path):
     (tmp_path / "deep.json").write_text("[" * 100_000)
     with pytest.raises(InputError, match="not JSON"):
         read_nominal(tmp_path / "deep.json")
-
-
-@pytest.mark.volume
-def test_files_of_other_labs(shared_data):
-    name = "stanford"
-    from projservo_cli.tables import read_table
-
-    nominal = read_nominal(shared_data / name / "truth.json")
-    table = read_table(shared_data / name / "trials_0.5px.csv", nominal.joint_types)
-    found, alone = (
-        calibrate(table, nominal.joint_types, source="recorded", init=init) for init in (nominal, None)
-    )
-    agree(found, alone, table.q)

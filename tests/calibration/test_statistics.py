@@ -1,31 +1,18 @@
-"""Draws on the noise-free table of another simulator, and random robots: errors against the bound."""
+"""Draws on the noise-free table of another simulator: errors against the bound."""
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
 from projservo_cli.calibration import calibrate, predict, prediction_variance
 from projservo_cli.records import Observation
 from projservo_cli.tables import read_table
-from tests.calibration.bound import Bound, derivative, robot_of, spread
-from tests.calibration.simulated_robot import around, random_robot, trials
+from tests.calibration.bound import derivative, robot_of, spread
 
-DRAWS, ROBOTS = 4, 5
-NEAREST = 0.3  # m; a robot that brings a marker nearer to a camera is not drawn
+DRAWS = 4
 
 
 def within_20_deg(offset):
     return np.abs(offset).max(axis=1) <= np.radians(20.0) + 1e-9
-
-
-def four_a_joint(offset):
-    """From end to end of each joint, and the reference."""
-    keep = np.abs(offset).max(axis=1) < 1e-9
-    for column in offset.T:
-        rows = np.flatnonzero(np.abs(column) > 1e-9)
-        rows = rows[np.argsort(column[rows])]
-        keep[rows[np.linspace(0, len(rows) - 1, 4).round().astype(int)]] = True
-    return keep
 
 
 def every(offset):
@@ -37,7 +24,6 @@ def every(offset):
     ("arm", "poses", "sigma", "removed"),
     [
         ("ur5", within_20_deg, 1.0, 0.0),
-        ("ur5", four_a_joint, 1.0, 0.0),
         ("ur5", every, 0.5, 0.4),
         ("stanford", every, 0.5, 0.0),
     ],
@@ -71,23 +57,3 @@ def test_data_of_another_lab_are_used_as_well_as_can_be(
     assert np.sqrt(square.mean() / bound.mean()) <= 1.10 + 2.0 * error
     # Nothing wrong without a word: of normal errors in a few directions no draw errs twice the bound.
     assert np.sqrt(square / bound).max() <= 2.0
-
-
-@pytest.mark.volume
-def test_random_robots_are_calibrated_to_the_bound():
-    """Six joints, up to three prismatic, 10 markers, 8 frames a joint within ±30° or ±0.15 m."""
-    calibrated = 0
-    for seed in range(1000, 1000 + ROBOTS + 1):
-        rng = np.random.default_rng(seed)
-        letters = np.array(list("RRRRRR"))
-        letters[rng.choice(6, rng.integers(0, 4), replace=False)] = "P"
-        robot = random_robot("".join(letters), rng)
-        q, ahead = trials(robot), around(robot, 60, rng)
-        if robot.projected(np.vstack([q, ahead]))[:, :, 2].min() < NEAREST:
-            continue
-        found = calibrate(robot.observe(q, 0.5, rng), robot.joint_types, sigma_px=0.5)
-        square = np.mean((predict(found, ahead) - robot.images(ahead)) ** 2)
-        assert np.sqrt(square / Bound(robot, q, ahead).mean_square()) <= 1.5 * 0.5
-        assert abs(chi2.cdf(found.chi2_per_dof * found.dof, found.dof) - 0.5) < 0.5 - 1e-4
-        calibrated += 1
-    assert calibrated >= ROBOTS

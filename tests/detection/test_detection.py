@@ -35,11 +35,8 @@ def write(path, image):
 # twice what 12 images showed; OpenCV's own corners are 0.13 to 0.67 px off here, drawn inwards.
 CONDITIONS = {
     "small and sharp": (30, 0.7, 0, 0.03, 0.08),
-    "small and soft": (36, 1.2, 3, 0.1, 0.3),
     "usual": (60, 0.7, 3, 0.025, 0.08),
-    "soft": (60, 1.2, 3, 0.03, 0.1),
     "noisy": (60, 1.2, 8, 0.07, 0.25),
-    "large": (120, 1.2, 3, 0.02, 0.08),
 }
 
 

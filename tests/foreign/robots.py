@@ -63,10 +63,6 @@ class Faulty(Sound):
             return s
         if self.fault == "bumped camera":
             s[0] += [2.0, -2.5]
-        if self.fault == "moved marker":
-            s[:, 6] += [6.0, 1.0]
-        if self.fault == "one bad frame" and self.count % 4 == 0:
-            s[:, 3:] += 50.0
         if self.fault == "lost" or (self.fault == "lost for a while" and self.count < self.after + 10):
             s[:] = np.nan
         if self.fault == "raises":
@@ -75,19 +71,12 @@ class Faulty(Sound):
             raise KeyboardInterrupt
         if self.fault == "hangs":
             time.sleep(5.0)
-        if self.fault == "too few":
-            return s[:, :4]
         return s
 
     def command(self, step, period):
         super().command(step, period)
         if self.wrong and self.fault == "command raises":
             raise RuntimeError("protective stop")
-
-    def stop(self):
-        super().stop()
-        if self.fault == "does not stop":
-            raise OSError("no answer from the controller")
 
 
 class NoStop:

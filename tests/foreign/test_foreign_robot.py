@@ -57,9 +57,7 @@ def test_sound_answers_are_copied():
         ((1.0, 2.0, 3.0), r"plant m:C: joints\(\) gave numbers of shape \(3,\), expected \(2,\)"),
         ((1.0, np.nan), r"joints\(\) gave \[ 1. nan\]: readings must be finite"),
         (("1", "2"), r"joints\(\) gave tuple: expected numbers of shape \(2,\)"),
-        (None, r"joints\(\) gave NoneType"),
         ([[1.0], [1.0, 2.0]], r"joints\(\) gave list: expected numbers"),
-        ([True, False], r"joints\(\) gave list"),
         ([1j, 2.0], r"joints\(\) gave list"),
     ],
 )
@@ -69,16 +67,11 @@ def test_nonsense_readings(q, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("s", "message"),
-    [
-        (np.zeros((2, 2, 2)), r"observe\(\) gave numbers of shape \(2, 2, 2\), expected \(2, 3, 2\)"),
-        (np.full((2, 3, 2), np.inf), "infinite pixel: NaN stands for unseen"),
-    ],
-)
-def test_nonsense_images(s, message):
-    with pytest.raises(WorkFailed, match=message):
-        guarded(Scripted(s=s)).observe()
+def test_nonsense_images():
+    with pytest.raises(WorkFailed, match=r"shape \(2, 2, 2\), expected \(2, 3, 2\)"):
+        guarded(Scripted(s=np.zeros((2, 2, 2)))).observe()
+    with pytest.raises(WorkFailed, match="infinite pixel: NaN stands for unseen"):
+        guarded(Scripted(s=np.full((2, 3, 2), np.inf))).observe()
 
 
 def test_a_step_that_is_not_finite_is_never_sent():
@@ -145,20 +138,6 @@ def test_signals_that_are_ignored_stay_ignored():
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_other_threads_need_no_signals():
-    robot, done = Scripted(), []
-
-    def work():
-        with at_rest_after(guarded(robot)):
-            done.append(True)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert done
-    assert len(robot.stopped) == 1
 
 
 def test_a_robot_that_does_not_come_to_rest_is_said_beside_the_failure(monkeypatch):

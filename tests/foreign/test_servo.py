@@ -3,7 +3,6 @@
 import io
 import shutil
 import sys
-from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -111,22 +110,16 @@ def test_speed_scale_scales_every_command(servo):
     assert slow.steps > 3 * trace.steps
     limit = np.radians(125.0) * 0.04
     assert max(np.abs(step).max() for _, step, _ in quarter) <= 0.25 * limit * (1 + 1e-12)
-
-
-def test_speed_scale_of_the_simulated_robot(servo):
-    assert servo("-q").code == 0
-    whole = load("run").traces["direct_three"]
+    assert servo("-q").code == 0  # the simulated robot too
+    simulated = load("run").traces["direct_three"]
     assert servo("--speed-scale", "0.5", "-q").code == 0
-    half = load("run").traces["direct_three"]
-    np.testing.assert_array_equal(half.q_dot[0], 0.5 * whole.q_dot[0])
-    assert half.position_error_mm < 1.0
+    np.testing.assert_array_equal(load("run").traces["direct_three"].q_dot[0], 0.5 * simulated.q_dot[0])
 
 
 @pytest.mark.parametrize(
     ("fault", "after", "message"),
     [
         ("raises", 30, r"observe() failed: OSError: camera 2 is unplugged (robots.py:"),
-        ("too few", 30, "observe() gave numbers of shape (2, 4, 2), expected (2, 10, 2)"),
         ("command raises", 30, "command() failed: RuntimeError: protective stop"),
         ("hangs", 30, "observe() did not return within 0.5 s"),
     ],
@@ -168,18 +161,10 @@ def test_ctrl_c_stops_the_robot(servo):
     assert CALLS[-1] == "stop"
 
 
-def test_a_robot_that_does_not_stop_is_said(servo):
-    answer = servo(*faulty("does not stop"))
-    assert answer.code == 1
-    assert "stop() failed: OSError: no answer from the controller" in answer.err
-    assert "see to it that the robot is at rest" in answer.err
-
-
 @pytest.mark.parametrize(
     ("fault", "culprit"),
     [
         ("bumped camera", "those of the left camera alone: it was moved; recalibrate"),
-        ("moved marker", "marker 6 was moved on the tool; put it back, or recalibrate"),
         ("frozen readings", "in both cameras alike: the joint readings are wrong"),
     ],
 )
@@ -214,11 +199,6 @@ def test_a_calibration_without_covariance_tests_nothing_and_says_so():
     assert untested(SimpleNamespace(config=config, calibration=sound)) == ""
 
 
-def test_single_bad_frames_are_no_disturbance(servo):
-    answer = servo(*faulty("one bad frame", 80), "--json")
-    assert answer.json["laws"][0]["verdict"] != "disturbed"
-
-
 def test_lost_markers_are_waited_for(servo):
     answer = servo(*faulty("lost for a while", 40), "--json")
     assert answer.json["laws"][0]["verdict"] == "converged"
@@ -249,19 +229,6 @@ def test_a_robot_without_speed_limit_is_refused(servo):
     assert answer.code == 2
     assert "set control.joint_speed_limit_deg_s" in answer.err
     assert commands() == []
-
-
-@pytest.mark.parametrize(
-    ("setting", "code", "message"),
-    [
-        ("plant=no_such_robot:A", 2, "plant no_such_robot:A: there is no module no_such_robot"),
-        (f"plant={HERE}:Unmakeable", 1, "cannot be made: ConnectionError"),
-    ],
-)
-def test_a_robot_that_cannot_be_had(servo, setting, code, message):
-    answer = servo("--set", setting)
-    assert answer.code == code
-    assert message in answer.err.splitlines()[-1]
 
 
 def test_a_law_of_others_equals_the_built_in_one_it_calls(servo):
@@ -402,12 +369,6 @@ def test_a_report_never_moves_a_robot(servo, projservo):
     assert answer.code == 2
     assert "which moves tests.foreign.robots:Sound: run projservo servo first" in answer.err
     assert CALLS == []
-
-
-def test_registered_names_on_the_command_line(servo, monkeypatch):
-    points = [metadata.EntryPoint("mine", f"{HERE}:DirectThree", "projservo.laws")]
-    monkeypatch.setattr(metadata, "entry_points", lambda group: points)
-    assert servo("--json", law="mine").json["laws"][0]["law"] == f"{HERE}:DirectThree"
 
 
 def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
