@@ -1,6 +1,6 @@
 """The named arrays that pass from stage to stage, and the model every kernel reads.
 
-Records hold plain arrays with documented shapes and units. ``array`` attaches the names of the
+Records hold plain arrays with documented shapes and units. ``_array`` attaches the names of the
 dimensions and the unit to a field, so that the run file can label what it stores; nothing here
 knows how it is stored.
 """
@@ -37,12 +37,12 @@ SIZES = {
 }
 
 
-def array(*dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
+def _array(*dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare an array field: the names of its dimensions, its unit and what it holds."""
     return field(metadata={"dims": dims, "units": units, "about": about}, **default)
 
 
-def scalar(units: str = "1", about: str = "", **default: Any) -> Any:
+def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare a scalar or text field with its unit and what it holds."""
     return field(metadata={"units": units, "about": about}, **default)
 
@@ -85,10 +85,10 @@ class Model(NamedTuple):
 class Observation:
     """Stereo images of the markers at a sequence of robot poses."""
 
-    pose: IntArray = array("pose", about="number of the pose")
-    marker: IntArray = array("marker", about="number of the marker")
-    q: FloatArray = array("pose", "joint", units="rad or m", about="joint readings")
-    images: FloatArray = array("pose", "view", "marker", "xy", units="px", about="pixels, NaN where unseen")
+    pose: IntArray = _array("pose", about="number of the pose")
+    marker: IntArray = _array("marker", about="number of the marker")
+    q: FloatArray = _array("pose", "joint", units="rad or m", about="joint readings")
+    images: FloatArray = _array("pose", "view", "marker", "xy", units="px", about="pixels, NaN where unseen")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,59 +98,59 @@ class Calibration:
     Points are scaled to ``a_inf @ M = 1``, so that the mean of points is their midpoint.
     """
 
-    method: str = scalar(about="refined or closed_form")
-    source: str = scalar(about="simulated or recorded")
-    joint_types: str = scalar(about="one letter a joint, R or P")
-    usable: bool = scalar(about="whether the calibration may be used for control")
-    reason: str = scalar(about="why it is usable or not, in words")
-    advice: tuple[str, ...] = scalar(about="what to do next, one sentence each")
-    rms_px: float = scalar(units="px", about="reprojection residual, rms per marker and view (Euclidean)")
-    sigma_px: float = scalar(units="px", about="noise per image coordinate: configured, given or estimated")
-    sigma_fitted_px: float = scalar(units="px", about="noise per coordinate from the residuals of the fit")
-    chi2_per_dof: float = scalar(about="squared residuals over sigma_px squared, per degree of freedom")
-    dof: int = scalar(about="degrees of freedom of the fit")
-    seconds: float = scalar(units="s", about="time the calibration took")
-    P: FloatArray = array("view", "image_row", "coordinate", units="px", about="cameras, projective frame")
-    H_hat_0: FloatArray = array("joint", "row", "coordinate", about="joint operators at the reference")
-    q_reference: FloatArray = array("joint", units="rad or m", about="joint reading at the reference")
-    a_inf: FloatArray = array("coordinate", about="common plane at infinity")
-    marker: IntArray = array("marker", about="number of the marker")
-    M: FloatArray = array("marker", "coordinate", about="markers at the reference, a_inf @ M = 1")
-    covariance: FloatArray = array(
+    method: str = _scalar(about="refined or closed_form")
+    source: str = _scalar(about="simulated or recorded")
+    joint_types: str = _scalar(about="one letter a joint, R or P")
+    usable: bool = _scalar(about="whether the calibration may be used for control")
+    reason: str = _scalar(about="why it is usable or not, in words")
+    advice: tuple[str, ...] = _scalar(about="what to do next, one sentence each")
+    rms_px: float = _scalar(units="px", about="reprojection residual, rms per marker and view (Euclidean)")
+    sigma_px: float = _scalar(units="px", about="noise per image coordinate: configured, given or estimated")
+    sigma_fitted_px: float = _scalar(units="px", about="noise per coordinate from the residuals of the fit")
+    chi2_per_dof: float = _scalar(about="squared residuals over sigma_px squared, per degree of freedom")
+    dof: int = _scalar(about="degrees of freedom of the fit")
+    seconds: float = _scalar(units="s", about="time the calibration took")
+    P: FloatArray = _array("view", "image_row", "coordinate", units="px", about="cameras, projective frame")
+    H_hat_0: FloatArray = _array("joint", "row", "coordinate", about="joint operators at the reference")
+    q_reference: FloatArray = _array("joint", units="rad or m", about="joint reading at the reference")
+    a_inf: FloatArray = _array("coordinate", about="common plane at infinity")
+    marker: IntArray = _array("marker", about="number of the marker")
+    M: FloatArray = _array("marker", "coordinate", about="markers at the reference, a_inf @ M = 1")
+    covariance: FloatArray = _array(
         "parameter",
         "parameter_",
         about="of P.ravel(), H_hat_0.ravel(), M.ravel(), gauge fixed, and k1, k2 of both lenses if any",
     )
-    excitation: FloatArray = array("joint", units="rad or m", about="range of joint motion in the data")
-    weak: BoolArray = array("joint", about="joints whose operator the data hardly determine")
-    operator_defect: FloatArray = array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
-    trace_defect: FloatArray = array("joint", about="absolute trace of Ĥ")
-    plane_defect: FloatArray = array("joint", about="norm of a_inf @ Ĥ, a_inf of unit norm")
-    prediction_noise: FloatArray = array(
+    excitation: FloatArray = _array("joint", units="rad or m", about="range of joint motion in the data")
+    weak: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
+    operator_defect: FloatArray = _array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
+    trace_defect: FloatArray = _array("joint", about="absolute trace of Ĥ")
+    plane_defect: FloatArray = _array("joint", about="norm of a_inf @ Ĥ, a_inf of unit norm")
+    prediction_noise: FloatArray = _array(
         "joint", about="noise of predicted images 0.5 rad or 0.15 m from the reference, over the pixel noise"
     )
-    merged_poses: int = scalar(about="poses that the fit uses")
-    merged_markers: int = scalar(about="markers that the fit uses")
-    outlier: IntArray = array(
+    merged_poses: int = _scalar(about="poses that the fit uses")
+    merged_markers: int = _scalar(about="markers that the fit uses")
+    outlier: IntArray = _array(
         "outlier_row",
         "outlier_column",
         about="readings left out: pose, marker, view (0 left, 1 right, 2 both)",
     )
-    suspect: IntArray = array(
+    suspect: IntArray = _array(
         "suspect_row", "suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
     )
-    swapped: IntArray = array(
+    swapped: IntArray = _array(
         "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
     )
-    predicted_rms_px: float | None = scalar(
+    predicted_rms_px: float | None = _scalar(
         units="px",
         about="expected error of images at poses of all joints within their ranges, rms per marker and view",
         default=None,
     )
-    predicted_p99_px: float | None = scalar(
+    predicted_p99_px: float | None = _scalar(
         units="px", about="what that rms stays below in 99 of 100 draws of the noise", default=None
     )
-    lens: FloatArray | None = array(
+    lens: FloatArray | None = _array(
         "view",
         "lens_term",
         about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
@@ -172,25 +172,25 @@ class CrossValidation:
     Readings that the calibration leaves out as outliers do not count.
     """
 
-    folds: int = scalar(about="parts the poses were divided into, each predicted from the others")
-    seed: int = scalar(about="seed of the division")
-    unit: str = scalar(about="poses, or configurations: poses that differ in one joint stay together")
-    failed: tuple[str, ...] = scalar(about="parts that could not be predicted, each with the reason")
-    reason: str = scalar(about="how the held-out error compares with the predicted one, in words")
-    count: int = scalar(about="marker-view pairs that were predicted")
-    rms_px: float | None = scalar(units="px", about="held-out residual, root mean square")
-    median_px: float | None = scalar(units="px", about="held-out residual, median")
-    p95_px: float | None = scalar(units="px", about="held-out residual, 95th percentile")
-    predicted_rms_px: float | None = scalar(
+    folds: int = _scalar(about="parts the poses were divided into, each predicted from the others")
+    seed: int = _scalar(about="seed of the division")
+    unit: str = _scalar(about="poses, or configurations: poses that differ in one joint stay together")
+    failed: tuple[str, ...] = _scalar(about="parts that could not be predicted, each with the reason")
+    reason: str = _scalar(about="how the held-out error compares with the predicted one, in words")
+    count: int = _scalar(about="marker-view pairs that were predicted")
+    rms_px: float | None = _scalar(units="px", about="held-out residual, root mean square")
+    median_px: float | None = _scalar(units="px", about="held-out residual, median")
+    p95_px: float | None = _scalar(units="px", about="held-out residual, 95th percentile")
+    predicted_rms_px: float | None = _scalar(
         units="px", about="the same root mean square from noise and covariance of each fit"
     )
-    pose: IntArray = array("pose", about="number of the pose")
-    fold: IntArray = array("pose", about="part of the pose, from 0")
-    marker: IntArray = array("marker", about="number of the marker")
-    residual: FloatArray = array(
+    pose: IntArray = _array("pose", about="number of the pose")
+    fold: IntArray = _array("pose", about="part of the pose, from 0")
+    marker: IntArray = _array("marker", about="number of the marker")
+    residual: FloatArray = _array(
         "pose", "view", "marker", "xy", units="px", about="seen minus predicted, NaN where there is none"
     )
-    predicted: FloatArray = array(
+    predicted: FloatArray = _array(
         "pose",
         "view",
         "marker",
@@ -208,7 +208,7 @@ POINT_LAWS = ("stacked", "blockwise", "euclidean_points")
 BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)
 
 
-def signed(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:
+def in_sense(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:
     """Joint motions (2, n) of both rotations in the sense of their angles."""
     signs = np.where(np.array([theta_r, theta_p]) >= 0.0, 1.0, -1.0)
     return np.asarray(signs[:, None] * q_hat)
@@ -222,150 +222,152 @@ class Plan:
     where they concern visibility: None is stored as NaN where a motion never changes it.
     """
 
-    profile: str = scalar(about="which part is driven when")
-    feasible: bool = scalar(
+    profile: str = _scalar(about="which part is driven when")
+    feasible: bool = _scalar(
         about="whether both cameras see the face all along; in the profile constrained, whether all "
         "constraints hold"
     )
-    reason: str = scalar(about="what makes the plan feasible or not, in words")
-    tau: float = scalar(about="amplitude of the translation, unit-norm kernel of (8)")
-    theta_r: float = scalar(units="rad", about="angle onto the target plane, in the sense chosen")
-    theta_p: float = scalar(units="rad", about="angle within the plane")
-    theta_s: float = scalar(units="rad", about="angle of both rotations together")
-    constraint: str = scalar(
+    reason: str = _scalar(about="what makes the plan feasible or not, in words")
+    tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
+    theta_r: float = _scalar(units="rad", about="angle onto the target plane, in the sense chosen")
+    theta_p: float = _scalar(units="rad", about="angle within the plane")
+    theta_s: float = _scalar(units="rad", about="angle of both rotations together")
+    constraint: str = _scalar(
         about="what the motion comes nearest to failing, as a share of its ends' margins"
     )
-    duration: float | None = scalar(
+    duration: float | None = _scalar(
         units="s",
         about="time it takes, as asked for or at the joint-speed limit; none without a limit or where "
         "joints cannot follow",
     )
-    tau_limit: float = scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
-    sigma: FloatArray = array("sample", about="path parameter from 0 to 1")
-    time: FloatArray = array("sample", units="s", about="when that is reached; NaN where there is no time")
-    mu: FloatArray = array("sample", "part", about="shares of t, r, p that are done")
-    H_d: FloatArray = array("sample", "row", "coordinate", about="planned displacement of the face")
-    s: FloatArray = array("sample", "view", "marker", "xy", units="px", about="predicted images of the face")
-    margin: FloatArray = array("sample", "view", about="visibility margin a·O, 1 at the start")
-    border_distance: FloatArray = array(
+    tau_limit: float = _scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
+    sigma: FloatArray = _array("sample", about="path parameter from 0 to 1")
+    time: FloatArray = _array("sample", units="s", about="when that is reached; NaN where there is no time")
+    mu: FloatArray = _array("sample", "part", about="shares of t, r, p that are done")
+    H_d: FloatArray = _array("sample", "row", "coordinate", about="planned displacement of the face")
+    s: FloatArray = _array("sample", "view", "marker", "xy", units="px", about="predicted images of the face")
+    margin: FloatArray = _array("sample", "view", about="visibility margin a·O, 1 at the start")
+    border_distance: FloatArray = _array(
         "sample", "view", units="px", about="least distance of a marker from the image border"
     )
-    q: FloatArray = array(
+    q: FloatArray = _array(
         "sample", "joint", units="rad or m", about="joints that follow the motion, NaN where none can"
     )
-    joint_margin: FloatArray = array("sample", about="least distance from a joint limit over half the range")
-    condition: FloatArray = array("sample", about="reciprocal condition of the image Jacobian of the face")
-    least: FloatArray = array(
+    joint_margin: FloatArray = _array("sample", about="least distance from a joint limit over half the range")
+    condition: FloatArray = _array("sample", about="reciprocal condition of the image Jacobian of the face")
+    least: FloatArray = _array(
         "constraint",
         about="smallest visibility margin, border distance in px, joint margin, reciprocal condition",
     )
-    least_mu: FloatArray = array("constraint", "part", about="shares of t, r, p where that is")
-    s_start: FloatArray = array("view", "marker", "xy", units="px", about="images at the start")
-    s_star: FloatArray = array("view", "marker", "xy", units="px", about="images at the goal")
-    A: FloatArray = array("marker", "coordinate", about="face at the start")
-    A_star: FloatArray = array("marker", "coordinate", about="face at the goal")
-    A_t: FloatArray = array("marker", "coordinate", about="goal less the translation")
-    A_r: FloatArray = array("marker", "coordinate", about="goal less translation and rotation onto the plane")
-    a: FloatArray = array("coordinate", about="plane of the face at the start")
-    a_star: FloatArray = array("coordinate", about="plane of the face at the goal")
-    a_t: FloatArray = array("coordinate", about="plane of the goal less the translation")
-    A_c: FloatArray = array("coordinate", about="centre of the face at the start")
-    A_c_star: FloatArray = array("coordinate", about="centre of the face at the goal")
-    q_start: FloatArray = array("joint", units="rad or m", about="joint readings at the start")
-    q_hat: FloatArray = array("part", "joint", about="joint motions t, r, p at the start")
-    H_hat: FloatArray = array("part", "row", "coordinate", about="operators t, r, p at the start")
-    optical_center: FloatArray = array("view", "coordinate", about="optical centres")
-    tau_0: FloatArray = array("view", about="translation at which visibility changes")
-    theta_0: FloatArray = array("view", "solution", units="rad", about="angles at which visibility changes")
-    sense: FloatArray = array("solution", units="rad", about="both senses of the rotation onto the plane")
-    sense_margin: FloatArray = array(
+    least_mu: FloatArray = _array("constraint", "part", about="shares of t, r, p where that is")
+    s_start: FloatArray = _array("view", "marker", "xy", units="px", about="images at the start")
+    s_star: FloatArray = _array("view", "marker", "xy", units="px", about="images at the goal")
+    A: FloatArray = _array("marker", "coordinate", about="face at the start")
+    A_star: FloatArray = _array("marker", "coordinate", about="face at the goal")
+    A_t: FloatArray = _array("marker", "coordinate", about="goal less the translation")
+    A_r: FloatArray = _array(
+        "marker", "coordinate", about="goal less translation and rotation onto the plane"
+    )
+    a: FloatArray = _array("coordinate", about="plane of the face at the start")
+    a_star: FloatArray = _array("coordinate", about="plane of the face at the goal")
+    a_t: FloatArray = _array("coordinate", about="plane of the goal less the translation")
+    A_c: FloatArray = _array("coordinate", about="centre of the face at the start")
+    A_c_star: FloatArray = _array("coordinate", about="centre of the face at the goal")
+    q_start: FloatArray = _array("joint", units="rad or m", about="joint readings at the start")
+    q_hat: FloatArray = _array("part", "joint", about="joint motions t, r, p at the start")
+    H_hat: FloatArray = _array("part", "row", "coordinate", about="operators t, r, p at the start")
+    optical_center: FloatArray = _array("view", "coordinate", about="optical centres")
+    tau_0: FloatArray = _array("view", about="translation at which visibility changes")
+    theta_0: FloatArray = _array("view", "solution", units="rad", about="angles at which visibility changes")
+    sense: FloatArray = _array("solution", units="rad", about="both senses of the rotation onto the plane")
+    sense_margin: FloatArray = _array(
         "solution", "view", about="least margin along each sense, 1 at the start"
     )
 
     def rotation_sense(self) -> FloatArray:
         """Joint motions (2, n) of the rotations r and p in the sense they are planned."""
-        return signed(self.theta_r, self.theta_p, self.q_hat[1:3])
+        return in_sense(self.theta_r, self.theta_p, self.q_hat[1:3])
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
     """One closed-loop run of one law, from the first instant to its verdict."""
 
-    law: str = scalar(about="name of the control law")
-    mode: str = scalar(about="replan: each step plans anew; track, image_track: the plan is followed")
-    planned_s: float | None = scalar(units="s", about="when the followed plan arrives; none for replan")
-    verdict: str = scalar(about="how the run ended")
-    reason: str = scalar(about="why, in a sentence")
-    steps: int = scalar(about="commands sent")
-    period: float = scalar(units="s", about="control period")
-    observation: str = scalar(about="how the face is measured: points or body")
-    position_error_mm: float | None = scalar(units="mm", about="true centre to true goal at the end")
-    rotation_error_deg: float | None = scalar(units="deg", about="true rotation to the goal at the end")
-    translation_left: float | None = scalar(
+    law: str = _scalar(about="name of the control law")
+    mode: str = _scalar(about="replan: each step plans anew; track, image_track: the plan is followed")
+    planned_s: float | None = _scalar(units="s", about="when the followed plan arrives; none for replan")
+    verdict: str = _scalar(about="how the run ended")
+    reason: str = _scalar(about="why, in a sentence")
+    steps: int = _scalar(about="commands sent")
+    period: float = _scalar(units="s", about="control period")
+    observation: str = _scalar(about="how the face is measured: points or body")
+    position_error_mm: float | None = _scalar(units="mm", about="true centre to true goal at the end")
+    rotation_error_deg: float | None = _scalar(units="deg", about="true rotation to the goal at the end")
+    translation_left: float | None = _scalar(
         about="share of the translation left at the end, as the law measures it"
     )
-    rotation_left_deg: float | None = scalar(
+    rotation_left_deg: float | None = _scalar(
         units="deg", about="rotation left at the end, as the law measures it"
     )
-    self_occluded_steps_left: int = scalar(about="instants at which the left camera is behind the face")
-    self_occluded_steps_right: int = scalar(about="instants at which the right camera is behind the face")
-    center_deviation_mm: float | None = scalar(
+    self_occluded_steps_left: int = _scalar(about="instants at which the left camera is behind the face")
+    self_occluded_steps_right: int = _scalar(about="instants at which the right camera is behind the face")
+    center_deviation_mm: float | None = _scalar(
         units="mm", about="largest distance of the centre from the line, between samples too"
     )
-    center_deviation_at_samples_mm: float | None = scalar(
+    center_deviation_at_samples_mm: float | None = _scalar(
         units="mm", about="largest distance of the centre from the line at the sampling instants"
     )
-    path_length_mm: float | None = scalar(
+    path_length_mm: float | None = _scalar(
         units="mm", about="length of the path of the centre, from sample to sample"
     )
-    effort: float = scalar(units="rad²/s or m²/s", about="integral of the squared joint velocities")
-    plateau_steps: int = scalar(
+    effort: float = _scalar(units="rad²/s or m²/s", about="integral of the squared joint velocities")
+    plateau_steps: int = _scalar(
         about="longest stretch in which stop_error falls < 1 % in each stop.plateau_steps"
     )
-    speed_limited_steps: int = scalar(about="commands scaled to the joint-speed limit")
-    visibility_limited_steps: int = scalar(about="commands whose translation was kept within delta·tau_0")
-    first_outside_image: int = scalar(about="first instant with a marker outside an image, -1 for never")
-    first_beyond_limit: int = scalar(about="first instant beyond a joint limit, -1 for never")
-    limit_joint: int = scalar(
+    speed_limited_steps: int = _scalar(about="commands scaled to the joint-speed limit")
+    visibility_limited_steps: int = _scalar(about="commands whose translation was kept within delta·tau_0")
+    first_outside_image: int = _scalar(about="first instant with a marker outside an image, -1 for never")
+    first_beyond_limit: int = _scalar(about="first instant beyond a joint limit, -1 for never")
+    limit_joint: int = _scalar(
         about="the joint, from 0, that passed its limit first or stopped the run at it, -1 for none"
     )
-    q: FloatArray = array("instant", "joint", units="rad or m", about="joints")
-    s: FloatArray = array("instant", "view", "marker", "xy", units="px", about="measured images of the face")
-    s_star: FloatArray = array("view", "marker", "xy", units="px", about="target images")
-    image_error: FloatArray = array("instant", units="px", about="rms over markers and views")
-    stop_error: FloatArray = array(
+    q: FloatArray = _array("instant", "joint", units="rad or m", about="joints")
+    s: FloatArray = _array("instant", "view", "marker", "xy", units="px", about="measured images of the face")
+    s_star: FloatArray = _array("view", "marker", "xy", units="px", about="target images")
+    image_error: FloatArray = _array("instant", units="px", about="rms over markers and views")
+    stop_error: FloatArray = _array(
         "instant",
         units="px",
         about="the same by which runs end: with the body, of the face where the body was measured to be",
     )
-    tau: FloatArray = array("instant", about="translation error, unit-norm kernel of (8)")
-    tau_affine: FloatArray = array("instant", about="translation error, scale fixed through a_inf")
-    theta_r: FloatArray = array("instant", units="rad", about="rotation error onto the plane")
-    theta_p: FloatArray = array("instant", units="rad", about="rotation error within the plane")
-    theta_s: FloatArray = array("instant", units="rad", about="rotation error of both together")
-    prediction_px: FloatArray = array(
+    tau: FloatArray = _array("instant", about="translation error, unit-norm kernel of (8)")
+    tau_affine: FloatArray = _array("instant", about="translation error, scale fixed through a_inf")
+    theta_r: FloatArray = _array("instant", units="rad", about="rotation error onto the plane")
+    theta_p: FloatArray = _array("instant", units="rad", about="rotation error within the plane")
+    theta_s: FloatArray = _array("instant", units="rad", about="rotation error of both together")
+    prediction_px: FloatArray = _array(
         "instant",
         units="px",
         about="observed less predicted from the joints, rms per coordinate; NaN for points",
     )
-    fit_px: FloatArray = array(
+    fit_px: FloatArray = _array(
         "instant", units="px", about="noise per coordinate that the fit of the body leaves; NaN for points"
     )
-    views_used: FloatArray = array("instant", about="markers the body was fitted to, counted once a view")
-    q_dot: FloatArray = array("step", "joint", units="rad/s or m/s", about="commands after the limit")
-    speed_factor: FloatArray = array("step", about="factor of the joint-speed limit")
-    self_occluded: BoolArray = array("instant", "view", about="true self-occlusion of the face")
-    pose: FloatArray = array("instant", "row", "coordinate", units="m", about="true pose of the tool")
-    goal_pose: FloatArray = array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
-    center: FloatArray = array("instant", "axis", units="m", about="true centre of the face")
-    unplanned: str = scalar(
+    views_used: FloatArray = _array("instant", about="markers the body was fitted to, counted once a view")
+    q_dot: FloatArray = _array("step", "joint", units="rad/s or m/s", about="commands after the limit")
+    speed_factor: FloatArray = _array("step", about="factor of the joint-speed limit")
+    self_occluded: BoolArray = _array("instant", "view", about="true self-occlusion of the face")
+    pose: FloatArray = _array("instant", "row", "coordinate", units="m", about="true pose of the tool")
+    goal_pose: FloatArray = _array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
+    center: FloatArray = _array("instant", "axis", units="m", about="true centre of the face")
+    unplanned: str = _scalar(
         about="why a run that was to follow the plan went without it; empty where it followed", default=""
     )
-    untested: str = scalar(
+    untested: str = _scalar(
         about="why the images of a robot that is not simulated were not tested against the calibration",
         default="",
     )
-    q_read: FloatArray | None = array(
+    q_read: FloatArray | None = _array(
         "instant",
         "joint",
         units="rad or m",
@@ -382,26 +384,26 @@ class Report:
     per step. Deviations are NaN where the goal pose is unknown.
     """
 
-    figures: tuple[str, ...] = scalar(about="files written, relative to the folder of the run")
-    left_out: tuple[dict[str, str], ...] = scalar(about="figures and studies left out, each with the reason")
-    claims: tuple[dict[str, Any], ...] = scalar(about="claim, source, measured, criterion, holds")
-    step_limit_deg: float = scalar(units="deg", about="joint motion per step of the limited runs")
-    gain_per_step: FloatArray = array("gain_per_step", about="share of the error taken in one step")
-    drift_mm: FloatArray = array(
+    figures: tuple[str, ...] = _scalar(about="files written, relative to the folder of the run")
+    left_out: tuple[dict[str, str], ...] = _scalar(about="figures and studies left out, each with the reason")
+    claims: tuple[dict[str, Any], ...] = _scalar(about="claim, source, measured, criterion, holds")
+    step_limit_deg: float = _scalar(units="deg", about="joint motion per step of the limited runs")
+    gain_per_step: FloatArray = _array("gain_per_step", about="share of the error taken in one step")
+    drift_mm: FloatArray = _array(
         "law", "operators", "limit", "gain_per_step", units="mm", about="largest deviation of the centre"
     )
-    drift_at_samples_mm: FloatArray = array(
+    drift_at_samples_mm: FloatArray = _array(
         "law", "operators", "limit", "gain_per_step", units="mm", about="the same at the sampling instants"
     )
-    drift_converged: BoolArray = array(
+    drift_converged: BoolArray = _array(
         "law", "operators", "limit", "gain_per_step", about="whether the run converged"
     )
-    period: FloatArray = array("period", units="s", about="control period at the configured gains")
-    period_drift_mm: FloatArray = array(
+    period: FloatArray = _array("period", units="s", about="control period at the configured gains")
+    period_drift_mm: FloatArray = _array(
         "law", "period", units="mm", about="largest deviation of the centre, true operators, no limit"
     )
-    share: FloatArray = array("share", about="share of the task in both sides of (22)")
-    composition_mm: FloatArray = array(
+    share: FloatArray = _array("share", about="share of the task in both sides of (22)")
+    composition_mm: FloatArray = _array(
         "share", units="mm", about="distance of the centre between both sides of (22)"
     )
 

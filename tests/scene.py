@@ -6,16 +6,16 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, Gains, new_state
+from projservo_cli.control.law import ERRORS, Gains, Law, new_state
 from projservo_cli.geometry.lens import bent
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.loop.compiled import run
+from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.task.body import body_of
-from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane, task_from_images
-from projservo_cli.task.target import task_from_body
+from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
+from projservo_cli.task.target import Shown
 from tests.samples import METRIC_A_INF, arm, face, in_frame, pixels, poe
 
 GAINS = Gains(2.5, 2.5, 2.5, 2.5, 1.0, 2.5, 0.04, 0.9)
@@ -38,7 +38,7 @@ class Scene(NamedTuple):
 
     def task(self, G=None) -> Task:
         """Task in the frame of the model ``self.seen(G)``."""
-        return task_from_images(self.seen(G), self.s_start, self.s_star, self.plant.center)
+        return Shown(self.q_start, self.s_start, self.s_star, self.plant.center).task(self.seen(G))
 
     def seen(self, G=None) -> Model:
         """Model in another frame."""
@@ -51,7 +51,7 @@ class Scene(NamedTuple):
         body = body_of(model, M if G is None else M @ G.T)
         lens = self.model.lens[:, None]
         s = [bent(lens, pixels(self.model.P, M @ poe(self.model, q).T)) for q in (self.q_start, self.q_goal)]
-        return task_from_body(model, body, self.q_start, *s, self.plant.center, len(self.plant.M))
+        return Shown(self.q_start, *s, self.plant.center, len(self.plant.pins), body).task(model)
 
     def images(self, q) -> FloatArray:
         """True pixels of the face at the joints q."""
@@ -111,13 +111,12 @@ class Run:
         noise = np.zeros((bounds.max_steps + 1, 2, seen, 2)) if noise is None else noise
         self.state, self.full = new_state(n, m, seen), new_log(n, seen, bounds.max_steps, len(ERRORS))
         if memory is not None:
-            self.state.memory.rotation[:] = memory
+            self.state.driven[:] = memory
         task = scene.task(G) if task is None else task
         gains = gains._replace(speed=bounds.speed)
-        self.code, self.steps = run(
-            CODES[law], scene.seen(G), task, gains, bounds, scene.plant, noise, scene.q_start.copy(),
-            self.state, self.full,
-        )  # fmt: skip
+        course = Course(scene.plant, bounds, scene.q_start.copy())
+        built_in = Law(CODES[law], scene.seen(G), task, gains)
+        self.code, self.steps = run_compiled(built_in, course, noise, self.state, self.full)
         self.verdict = VERDICTS[self.code] if self.code >= 0 else None
-        self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-3]), *self.full[-3:])
+        self.log = type(self.full)(*(rows[: self.steps + 1] for rows in self.full[:-4]), *self.full[-4:])
         self.center = (self.log.H @ np.array(center_of(scene.plant.M, scene.plant.center)))[:, :3]

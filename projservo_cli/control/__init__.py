@@ -6,11 +6,10 @@ file, its lines here, and its name among ``records.LAWS``, whose order means not
 
 from projservo_cli.control import blockwise, direct_three, direct_two, euclidean_points, exact, stacked
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, speed_share
-from projservo_cli.geometry.algebra import apply, put_vec, vec
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray
-from projservo_cli.task.trajectory import Reference, between, following, place, planned
+from projservo_cli.task.trajectory import Reference, following, put_aim
 
 _DIRECT_THREE, _DIRECT_TWO, _STACKED = direct_three.CODE, direct_two.CODE, stacked.CODE
 _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = blockwise.CODE, euclidean_points.CODE, exact.CODE
@@ -43,7 +42,8 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
         straight(model.lens, s, state.straight)
         seen = state.straight
     if following(task.reference):
-        _aim(task.reference, gains, state)
+        lead = 1.0 / (gains.gain * gains.period)
+        put_aim(task.reference, float(state.clock[0]), lead, state.A_aim, state.s_aim, state.q_ahead)
     if code == _DIRECT_THREE:
         status = direct_three.direct_three(model, task, gains, seen, q, state)
     elif code == _DIRECT_TWO:
@@ -59,30 +59,6 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
     if following(task.reference):
         _go_on(task.reference, gains, status, code == _EXACT, state)
     return status
-
-
-@merged
-def _aim(reference: Reference, gains: Gains, state: State) -> None:
-    """Write where the face should be now, where its images should go, and how the joints lead there.
-
-    For the image-based law, whose command is −λ J⁺ (s − s_aim), the planned velocity ṡ is fed forward by
-    aiming ahead: s_aim = s + ṡ/λ.
-    """
-    i, x = place(reference, float(state.clock[0]))
-    j, y = place(reference, float(state.clock[0]) + 1.0)
-    lead = 1.0 / (gains.gain * gains.period)
-    H = planned(reference, float(state.clock[0]))
-    for k in range(state.A_aim.shape[0]):
-        for c in range(4):
-            state.A_aim[k, c] = between(reference.A[:, k, c], i, x)
-        put_vec(state.A_aim[k], apply(H, vec(state.A_aim[k])))
-        for view in range(2):
-            for c in range(2):
-                here = between(reference.s[:, view, k, c], i, x)
-                ahead = between(reference.s_ahead[:, view, k, c], i, x)
-                state.s_aim[view, k, c] = here + lead * ahead
-    for l in range(state.q_ahead.shape[0]):
-        state.q_ahead[l] = between(reference.q[:, l], j, y) - between(reference.q[:, l], i, x)
 
 
 @merged

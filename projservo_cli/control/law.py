@@ -27,22 +27,18 @@ from projservo_cli.geometry.algebra import (
     unit,
     vec,
 )
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import composed, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import straighten
 from projservo_cli.geometry.mechanisms import OWN, Span, Work, joint_motion, rotation_mechanism, workspace
 from projservo_cli.geometry.stereo import triangulate
 from projservo_cli.records import FloatArray, IntArray, Model
-from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, Until, carry, fit_body, new_normal
+from projservo_cli.task.body import SEEN, SHOWN, carry, fit_body
 from projservo_cli.task.face import Task, center_of
-from projservo_cli.task.partition import Memory, Parts, no_parts, partition
+from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition
 from projservo_cli.task.trajectory import following
 from projservo_cli.task.visibility import limited_translation
-
-# Whether to fit only the views that the goal showed, and in how many steps; written as values of a loop,
-# for the compiler makes a function anew for each literal argument.
-_ATTEMPTS = ((True, MOST_STEPS), (False, MOST_STEPS))
 
 # Parts a law may split one step into.
 MOST_PARTS = 128
@@ -108,7 +104,7 @@ class State(NamedTuple):
     q_dot: FloatArray  # (n,) joint velocity commanded, rad/s or m/s
     xi_dot: FloatArray  # (6,) the same in the coordinates of ``q_hat``; ``q_dot`` itself for six joints
     errors: FloatArray  # (5,) τ in the unit-norm scale of (8), τ in the scale of a_inf, θ_r, θ_p, θ_s in rad
-    memory: Memory  # what is carried to the next step
+    driven: FloatArray  # (2, n) joint motions of the last rotations r and p in the sense they were driven
     limited: FloatArray  # (1,) how often visibility limited the translation
     # (3,) sums of squared residuals of the predicted and of the fitted body, px², and the markers used,
     # counted once a view; NaN where the face is measured point by point
@@ -146,11 +142,11 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
         q_dot,
         q_dot if own else np.zeros(k),
         np.full(len(ERRORS), np.nan),
-        Memory(np.zeros((2, k))),
+        np.zeros((2, k)),
         np.zeros(1),
         np.full(3, np.nan),
         np.full(1, np.nan),
-        new_normal(),
+        np.zeros((COORDINATES, COORDINATES + 1)),
         np.zeros((MOST_PARTS + 1, n)),
         np.full(1, -1.0),
         np.zeros(1, dtype=np.int64),
@@ -166,7 +162,7 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
 @njit
 def reset(state: State) -> None:
     """Make a state as fresh as a new one, for another run."""
-    state.memory.rotation[:] = 0.0
+    state.driven[:] = 0.0
     state.q_dot[:] = 0.0
     state.q_ahead[:] = 0.0
     state.errors[:] = math.nan
@@ -179,7 +175,13 @@ def reset(state: State) -> None:
     state.clock[0] = 0.0
 
 
-@internal
+@composed
+def split_of(state: State) -> Split:
+    """The arrays of a state in which the task is partitioned."""
+    return Split(state.work, state.A, state.A_t, state.A_r, state.q_hat, state.driven)
+
+
+@njit
 def measure(model: Model, task: Task, s: FloatArray, q: FloatArray, state: State) -> bool:
     """Measure the face, with the body or point by point, and move the operators to the current joints.
 
@@ -213,13 +215,10 @@ def _measure_body(model: Model, task: Task, s: FloatArray, H: Mat4, state: State
     At the goal the errors of the calibration cancel between what is seen and what was shown where both
     are fitted to the same views; others serve only where these do not determine the body.
     """
-    fit = Fit(False, H, 0.0, 0.0, 0)
     state.face_px[0] = math.nan
-    for shown_only, most_steps in _ATTEMPTS:
-        until = Until(shown_only, SETTLED_PX, most_steps)
-        fit = fit_body(model.P, task.body, s, H, until, state.normal)
-        if fit.found:
-            break
+    fit = fit_body(model.P, task.body, s, H, SHOWN, state.normal)
+    if not fit.found:
+        fit = fit_body(model.P, task.body, s, H, SEEN, state.normal)
     state.fit[0] = fit.before
     state.fit[1] = fit.after
     state.fit[2] = fit.views
@@ -263,9 +262,9 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
     state.q_dot[:] = 0.0
     state.errors[:] = math.nan
     if not measure(model, task, s, q, state):
-        return LOST, no_parts()
+        return LOST, NO_PARTS
     aim = _aimed(task, state)
-    parts = partition(state.work, aim, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+    parts = partition(aim, split_of(state))
     if not parts.found:
         return SINGULAR, parts
     way = sub(center_of(aim.A_star, task.center), parts.A_c)

@@ -25,24 +25,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.control.law import LOST, SINGULAR
 from projservo_cli.geometry.jit import merged
+from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.records import FloatArray, IntArray
-from projservo_cli.robots.simulated import inside
+from projservo_cli.robots.simulated import Plant, inside
 
 RUNNING = -1
-(
-    BEHIND_CAMERA,
-    LEFT_IMAGE,
-    MARKERS_LOST,
-    CONVERGED,
-    DIVERGED,
-    SINGULAR_VERDICT,
-    PLATEAU,
-    MAX_STEPS,
-    JOINT_LIMIT,
-    DISTURBED,
-    FAILED,
-) = range(11)
+WAITING = -3  # for lost markers; no verdict of a run
+BEHIND_CAMERA, LEFT_IMAGE, MARKERS_LOST, CONVERGED, DIVERGED, SINGULAR_VERDICT = range(6)
+PLATEAU, MAX_STEPS, JOINT_LIMIT, DISTURBED, FAILED = range(6, 11)
 VERDICTS = (
     "behind camera",
     "left image",
@@ -56,201 +48,25 @@ VERDICTS = (
     "disturbed",
     "failed",
 )
-PLATEAU_FALL = 0.01
+_PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.
-NO_MOTION = 1e-6
+_NO_MOTION = 1e-6
 # A step ends this share of it before a limit, lest rounding take it beyond.
-ROUND_OFF = 1e-12
+_ROUND_OFF = 1e-12
 
 
 class Limits(NamedTuple):
-    """When a run ends and what bounds its commands.
+    """When a run ends and what bounds its commands."""
 
-    Attributes
-    ----------
-    speed : (n,) most joint motion per second, rad/s or m/s; infinite for none.
-    image_px : image error that counts as converged, px rms per marker and view.
-    diverged_factor : growth of error or distance that counts as diverged.
-    plateau_steps : window of the plateau test.
-    max_steps : most commands.
-    stop_at_joint_limit, stop_at_border : end the run, or only record.
-    lost_steps : periods in a row that lost markers are waited for.
-    noise_px : how much of ``image_px`` allows for noise.
-    """
-
-    speed: FloatArray
-    image_px: float
-    diverged_factor: float
-    plateau_steps: int
-    max_steps: int
+    speed: FloatArray  # (n,) most joint motion per second, rad/s or m/s; infinite for none
+    image_px: float  # image error that counts as converged, px rms per marker and view
+    diverged_factor: float  # growth of error or distance that counts as diverged
+    plateau_steps: int  # window of the plateau test
+    max_steps: int  # most commands
     stop_at_joint_limit: bool
-    stop_at_border: bool
-    lost_steps: int = 0
-    noise_px: float = 0.0
-
-
-class Instant(NamedTuple):
-    """What the verdict of one instant depends on, before its command.
-
-    Attributes
-    ----------
-    in_front : whether every face marker is in front of both cameras.
-    seen : whether the law could measure with the markers that were seen.
-    left : whether a face marker lies outside an image.
-    error, first_error : image error now and at the start, px rms per marker and view: of the face as
-        it is seen, or as the body that was measured has it.
-    tolerance : image error that counts as converged.
-    distance, first_distance : of the face from the rig now and at the start, m.
-    finite_command : whether every joint velocity is a finite number.
-    singular : whether the joint motion of the law is not unique.
-    """
-
-    in_front: bool
-    seen: bool
-    left: bool
-    error: float
-    first_error: float
-    tolerance: float
-    distance: float
-    first_distance: float
-    finite_command: bool
-    singular: bool
-
-
-@merged
-def image_error(s: FloatArray, s_star: FloatArray) -> float:
-    """Root mean square of the Euclidean pixel error over the markers and views of the face seen.
-
-    NaN where none is. Further markers in ``s`` do not count.
-    """
-    total = 0.0
-    seen = 0
-    for view in range(2):
-        for k in range(s_star.shape[1]):
-            du = s[view, k, 0] - s_star[view, k, 0]
-            dv = s[view, k, 1] - s_star[view, k, 1]
-            if math.isfinite(du) and math.isfinite(dv):
-                total += du * du + dv * dv
-                seen += 1
-    return math.sqrt(total / seen) if seen > 0 else math.nan
-
-
-@merged
-def outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
-    """Whether one of the first m markers was seen outside an image."""
-    for view in range(2):
-        for k in range(m):
-            seen = math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])
-            if seen and not inside(s[view, k], image_size):
-                return True
-    return False
-
-
-@merged
-def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
-    """Scale the command uniformly to the joint-speed limit; returns the factor, 1 where it holds."""
-    factor = 1.0
-    for i in range(q_dot.shape[0]):
-        size = abs(q_dot[i])
-        if size * factor > speed[i]:
-            factor = speed[i] / size
-    if factor < 1.0:
-        for i in range(q_dot.shape[0]):
-            q_dot[i] *= factor
-    return factor
-
-
-@merged
-def tolerance(limits: Limits, views: float) -> float:
-    """Image error that counts as converged, px rms per marker and view.
-
-    A body fitted by six coordinates to so many markers, counted once a view, keeps √(6 / (2 views)) of
-    the noise of their pixels; NaN where the face is measured point by point.
-    """
-    if not views > 0.0:
-        return limits.image_px
-    return limits.image_px - limits.noise_px * max(0.0, 1.0 - math.sqrt(3.0 / views))
-
-
-@merged
-def shorten(q: FloatArray, dq: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
-    """Scale a joint step so that it ends where the first joint meets its limit; that joint, or −1.
-
-    A joint already beyond its limit may return, but go no farther.
-    """
-    share = 1.0
-    joint = -1
-    for i in range(q.shape[0]):
-        room = max(0.0, (upper[i] if dq[i] > 0.0 else -lower[i]) - (q[i] if dq[i] > 0.0 else -q[i]))
-        if abs(dq[i]) * share > room:
-            share = room / abs(dq[i]) * (1.0 - ROUND_OFF)
-            joint = i
-    if joint >= 0:
-        for i in range(q.shape[0]):
-            dq[i] *= share
-    return joint
-
-
-@merged
-def stands_still(dq: FloatArray) -> bool:
-    """Whether a joint step is too short to count as motion."""
-    for i in range(dq.shape[0]):
-        if abs(dq[i]) > NO_MOTION:
-            return False
-    return True
-
-
-@merged
-def finite(q_dot: FloatArray) -> bool:
-    """Whether every entry is a finite number."""
-    for i in range(q_dot.shape[0]):
-        if not math.isfinite(q_dot[i]):
-            return False
-    return True
-
-
-@merged
-def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
-    """Whether the image error fell by less than 1 % over the last ``window`` steps."""
-    if k < window:
-        return False
-    return bool(errors[k] > (1.0 - PLATEAU_FALL) * errors[k - window])
-
-
-def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
-    """First and last instant of the longest stretch in which ``on_plateau`` holds from its window on.
-
-    Parameters
-    ----------
-    errors : (k,) errors that a run is judged by, px.
-    window : of the plateau test, steps.
-    """
-    flat = errors[window:] > (1.0 - PLATEAU_FALL) * errors[:-window]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
-    if not len(edges):
-        return None
-    first, end = edges.reshape(-1, 2)[np.argmax(edges[1::2] - edges[::2])]
-    return int(first), int(end) - 1 + window
-
-
-@merged
-def verdict_at(now: Instant, limits: Limits) -> int:
-    """Verdict of one instant before its command, in the order the module states; RUNNING for none."""
-    if not now.in_front:
-        return BEHIND_CAMERA
-    if now.left and limits.stop_at_border:
-        return LEFT_IMAGE
-    if not now.seen:
-        return MARKERS_LOST
-    if now.error <= now.tolerance:
-        return CONVERGED
-    grown = now.error > limits.diverged_factor * now.first_error
-    receded = now.distance > limits.diverged_factor * now.first_distance
-    if grown or receded or not now.finite_command:
-        return DIVERGED
-    if now.singular:
-        return SINGULAR_VERDICT
-    return RUNNING
+    stop_at_border: bool  # stop_at_joint_limit, stop_at_border: end the run, or only record
+    lost_steps: int = 0  # periods in a row that lost markers are waited for
+    noise_px: float = 0.0  # how much of ``image_px`` allows for noise
 
 
 class Log(NamedTuple):
@@ -270,9 +86,12 @@ class Log(NamedTuple):
     path: FloatArray  # (k, parts + 1, n) joints at the ends of the parts of each step
     parts: IntArray  # (k,) parts each step was sent in; 0 where the joints went straight to the end
     fit: FloatArray  # (k, 3) what measuring with the body left, as in the state of the law
-    # (4,) first instant outside an image, first beyond a joint limit, the joint that passed one or stopped
-    # the run at its own, and how often visibility limited the translation; −1 for never
+    # (3,) first instant outside an image, first beyond a joint limit, and the joint that passed one or
+    # stopped the run at its own; −1 for never
     events: FloatArray
+    # (3,) distance of the face from the rig, m, at first, the first image error, and the periods that markers
+    # have been waited for
+    begun: FloatArray
     M: FloatArray
     scratch: FloatArray  # M, scratch: (m, 4) and (4, n), at least (4, 2), workspaces of the simulated robot
 
@@ -294,7 +113,218 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
         np.zeros((rows, parts + 1, n)),
         np.zeros(rows, dtype=np.int64),
         np.full((rows, 3), np.nan),
-        np.full(4, -1.0),
+        np.full(3, -1.0),
+        np.zeros(3),
         np.zeros((m, 4)),
         np.zeros((4, max(n, 2))),
     )
+
+
+@merged
+def note(log: Log, k: int, s_star: FloatArray, plant: Plant, limits: Limits) -> bool:
+    """Log what images and readings of an instant say by themselves; whether a face marker left an image."""
+    left = _outside(log.s[k], s_star.shape[1], plant.image_size)
+    if left and log.events[0] < 0.0:
+        log.events[0] = k
+    joint = beyond_limits(log.read[k], plant.lower, plant.upper)
+    if joint >= 0 and log.events[1] < 0.0 and not limits.stop_at_joint_limit:
+        log.events[1] = k
+        log.events[2] = joint
+    log.error[k] = _image_error(log.s[k], s_star)
+    log.judged[k] = log.error[k]
+    return left
+
+
+@merged
+def _image_error(s: FloatArray, s_star: FloatArray) -> float:
+    """Root mean square of the Euclidean pixel error over the markers and views of the face seen.
+
+    NaN where none is. Further markers in ``s`` do not count.
+    """
+    total = 0.0
+    seen = 0
+    for view in range(2):
+        for k in range(s_star.shape[1]):
+            du = s[view, k, 0] - s_star[view, k, 0]
+            dv = s[view, k, 1] - s_star[view, k, 1]
+            if math.isfinite(du) and math.isfinite(dv):
+                total += du * du + dv * dv
+                seen += 1
+    return math.sqrt(total / seen) if seen > 0 else math.nan
+
+
+@merged
+def _outside(s: FloatArray, m: int, image_size: FloatArray) -> bool:
+    """Whether one of the first m markers was seen outside an image."""
+    for view in range(2):
+        for k in range(m):
+            seen = math.isfinite(s[view, k, 0]) and math.isfinite(s[view, k, 1])
+            if seen and not inside(s[view, k], image_size):
+                return True
+    return False
+
+
+class Instant(NamedTuple):
+    """What the verdict of an instant depends on beside its row of the log, before its command."""
+
+    in_front: bool  # whether every face marker is in front of both cameras; the law is asked only then
+    left: bool  # whether a face marker lies outside an image
+    distance: float  # of the face from the rig, m
+    status: int  # of the law
+    q_dot: FloatArray  # (n,) what it asks for, rad/s or m/s
+
+
+@merged
+def verdict_at(log: Log, k: int, now: Instant, limits: Limits) -> int:
+    """Verdict of an instant in the order the module states; ``RUNNING`` for none, ``WAITING`` to hold."""
+    if k == 0:
+        log.begun[0], log.begun[1], log.begun[2] = now.distance, math.nan, 0.0
+    if math.isnan(log.begun[1]):
+        log.begun[1] = log.judged[k]
+    verdict = _first_cause(log, k, now, limits)
+    if verdict == MARKERS_LOST and log.begun[2] < limits.lost_steps and k < limits.max_steps:
+        log.begun[2] += 1.0
+        return WAITING
+    log.begun[2] = 0.0
+    if verdict == RUNNING and k == limits.max_steps:
+        return PLATEAU if _on_plateau(log.judged, k, limits.plateau_steps) else MAX_STEPS
+    return verdict
+
+
+@merged
+def _first_cause(log: Log, k: int, now: Instant, limits: Limits) -> int:
+    """The first verdict that an instant gives cause for, as long as steps are left."""
+    error = log.judged[k]
+    if not now.in_front:
+        return BEHIND_CAMERA
+    if now.left and limits.stop_at_border:
+        return LEFT_IMAGE
+    if now.status == LOST:
+        return MARKERS_LOST
+    if error <= tolerance(limits, log.fit[k, 2]):
+        return CONVERGED
+    grown = error > limits.diverged_factor * log.begun[1]
+    receded = now.distance > limits.diverged_factor * log.begun[0]
+    if grown or receded or not _finite(now.q_dot):
+        return DIVERGED
+    if now.status == SINGULAR:
+        return SINGULAR_VERDICT
+    return RUNNING
+
+
+@merged
+def tolerance(limits: Limits, views: float) -> float:
+    """Image error that counts as converged, px rms per marker and view.
+
+    A body fitted by six coordinates to so many markers, counted once a view, keeps √(6 / (2 views)) of
+    the noise of their pixels; NaN where the face is measured point by point.
+    """
+    if not views > 0.0:
+        return limits.image_px
+    return limits.image_px - limits.noise_px * max(0.0, 1.0 - math.sqrt(3.0 / views))
+
+
+@merged
+def _finite(q_dot: FloatArray) -> bool:
+    """Whether every entry is a finite number."""
+    for i in range(q_dot.shape[0]):
+        if not math.isfinite(q_dot[i]):
+            return False
+    return True
+
+
+@merged
+def _on_plateau(errors: FloatArray, k: int, window: int) -> bool:
+    """Whether the image error fell by less than 1 % over the last ``window`` steps."""
+    return bool(k >= window and errors[k] > (1.0 - _PLATEAU_FALL) * errors[k - window])
+
+
+def plateau_stretch(errors: FloatArray, window: int) -> tuple[int, int] | None:
+    """First and last instant of the longest stretch in which the plateau test holds from its window on.
+
+    errors : (k,) errors that a run is judged by, px; window : of the test, steps.
+    """
+    flat = errors[window:] > (1.0 - _PLATEAU_FALL) * errors[:-window]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flat, [False]])))
+    if not len(edges):
+        return None
+    first, end = edges.reshape(-1, 2)[np.argmax(edges[1::2] - edges[::2])]
+    return int(first), int(end) - 1 + window
+
+
+class Command(NamedTuple):
+    """What a law asks for in a period."""
+
+    q_dot: FloatArray  # (n,) joint velocity, rad/s or m/s; bounded in place
+    share: float  # what the law's own joint-speed limit left of the amplitude, negative if it keeps none
+    blocked: int  # joint at whose limit the law ended its step, or −1
+    period: float  # control period, s
+    scale: float  # factor of every command
+
+
+@merged
+def bounded(log: Log, k: int, asked: Command, plant: Plant, limits: Limits) -> int:
+    """Bound a command; its joint step (n,), rad or m, goes to the first row of ``log.scratch``.
+
+    Returns ``JOINT_LIMIT`` where no motion is left, else ``RUNNING``.
+    """
+    q_dot = asked.q_dot
+    dq = log.scratch[0, : q_dot.shape[0]]
+    log.factor[k] = asked.share if asked.share >= 0.0 else _limit_speed(q_dot, limits.speed)
+    for i in range(q_dot.shape[0]):
+        q_dot[i] *= asked.scale
+        dq[i] = q_dot[i] * asked.period
+    if limits.stop_at_joint_limit:
+        joint = _shorten(log.read[k], dq, plant.lower, plant.upper)
+        if joint >= 0:
+            for i in range(q_dot.shape[0]):
+                q_dot[i] = dq[i] / asked.period
+        joint = max(joint, asked.blocked)
+        if joint >= 0 and _stands_still(dq):
+            log.events[2] = joint
+            return JOINT_LIMIT
+    for i in range(q_dot.shape[0]):
+        log.q_dot[k, i] = q_dot[i]
+    return RUNNING
+
+
+@merged
+def _limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
+    """Scale the command uniformly to the joint-speed limit; returns the factor, 1 where it holds."""
+    factor = 1.0
+    for i in range(q_dot.shape[0]):
+        size = abs(q_dot[i])
+        if size * factor > speed[i]:
+            factor = speed[i] / size
+    if factor < 1.0:
+        for i in range(q_dot.shape[0]):
+            q_dot[i] *= factor
+    return factor
+
+
+@merged
+def _shorten(q: FloatArray, dq: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
+    """Scale a joint step so that it ends where the first joint meets its limit; that joint, or −1.
+
+    A joint already beyond its limit may return, but go no farther.
+    """
+    share = 1.0
+    joint = -1
+    for i in range(q.shape[0]):
+        room = max(0.0, (upper[i] if dq[i] > 0.0 else -lower[i]) - (q[i] if dq[i] > 0.0 else -q[i]))
+        if abs(dq[i]) * share > room:
+            share = room / abs(dq[i]) * (1.0 - _ROUND_OFF)
+            joint = i
+    if joint >= 0:
+        for i in range(q.shape[0]):
+            dq[i] *= share
+    return joint
+
+
+@merged
+def _stands_still(dq: FloatArray) -> bool:
+    """Whether a joint step is too short to count as motion."""
+    for i in range(dq.shape[0]):
+        if abs(dq[i]) > _NO_MOTION:
+            return False
+    return True

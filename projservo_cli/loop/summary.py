@@ -4,13 +4,14 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.loop.step import Log
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant, pose_after
+from projservo_cli.robots.simulated import Ends, Plant, pose_after
 from projservo_cli.task.face import center_of
 
 MM = 1e3
+SUBSAMPLES = 50  # points of a joint step at which the deviation between samples is measured
 
 
 class Summary(NamedTuple):
@@ -34,16 +35,8 @@ class Summary(NamedTuple):
     center_deviation_at_samples_mm: float  # largest distance of the centre from its line
 
 
-class Ends(NamedTuple):
-    """Where the true robot holds the tool."""
-
-    base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
-    goal_pose: FloatArray  # (4, 4) pose at the goal, m; NaN where it is not known
-    goal: FloatArray  # (4,) centre of the face there, m
-
-
 @njit
-def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, ends: Ends) -> Summary:
+def summarize(plant: Plant, log: Log, steps: int, limited: float, period: float, ends: Ends) -> Summary:
     """Numbers of a run of so many steps, whose translation visibility limited so often."""
     hidden_left, hidden_right, slowed = 0, 0, 0
     for k in range(steps + 1):
@@ -58,7 +51,7 @@ def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, e
     start, end = apply(first, middle), apply(last, middle)
     length, at_samples = math.nan, math.nan
     if math.isfinite(goal[0]):
-        length, at_samples = path_along(plant, log, steps, start, goal)
+        length, at_samples = _path_along(plant, log, steps, start, goal)
     base_tool, goal_pose = mat(ends.base_tool), mat(ends.goal_pose)
     return Summary(
         float(log.error[steps]),
@@ -69,16 +62,16 @@ def summary(plant: Plant, log: Log, steps: int, limited: float, period: float, e
         slowed,
         int(limited),
         _effort(log, steps, period),
-        math.degrees(angle_between(mul(first, base_tool), goal_pose)),
+        math.degrees(_angle_between(mul(first, base_tool), goal_pose)),
         MM * _distance(start, goal),
         MM * _distance(end, goal),
-        math.degrees(angle_between(mul(last, base_tool), goal_pose)),
+        math.degrees(_angle_between(mul(last, base_tool), goal_pose)),
         MM * length,
         MM * at_samples,
     )
 
 
-@internal
+@merged
 def _effort(log: Log, steps: int, period: float) -> float:
     """Integral of the squared joint velocities, rad²/s and m²/s added."""
     total = 0.0
@@ -88,15 +81,15 @@ def _effort(log: Log, steps: int, period: float) -> float:
     return total * period
 
 
-@internal
+@merged
 def _distance(A: Vec4, B: Vec4) -> float:
     """Distance of two metric points, m."""
     way = sub(A, B)
     return math.sqrt(dot(way, way))
 
 
-@njit
-def angle_between(A: Mat4, B: Mat4) -> float:
+@merged
+def _angle_between(A: Mat4, B: Mat4) -> float:
     """Angle of the rotation from pose A to pose B, rad."""
     trace = (A[0] * B[0] + A[4] * B[4] + A[8] * B[8]) + (A[1] * B[1] + A[5] * B[5] + A[9] * B[9])
     trace += A[2] * B[2] + A[6] * B[6] + A[10] * B[10]
@@ -107,7 +100,7 @@ def angle_between(A: Mat4, B: Mat4) -> float:
 
 
 @merged
-def path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> tuple[float, float]:
+def _path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> tuple[float, float]:
     """Length of the true centre's path from sample to sample, and its largest distance from start–goal, m."""
     M = log.M[: plant.M.shape[0]]
     length = 0.0
@@ -128,49 +121,32 @@ def path_along(plant: Plant, log: Log, steps: int, start: Vec4, goal: Vec4) -> t
 
 @njit
 def path_deviation(
-    plant: Plant, log: Log, steps: int, period: float, start: FloatArray, goal: FloatArray, samples: int
+    plant: Plant, log: Log, steps: int, period: float, start: FloatArray, goal: FloatArray
 ) -> float:
     """Largest distance of the true centre from the line start–goal, between the samples too, m.
 
-    Between two samples the joints move linearly; ``samples`` parts of each step are looked at.
+    Between two samples, or the ends of the parts of a step, the joints move linearly.
     """
-    start_and_goal = vec(start), vec(goal)
-    q, dq = log.scratch[2, : log.q.shape[1]], log.scratch[3, : log.q.shape[1]]
+    ends = vec(start), vec(goal)
+    n, M = log.q.shape[1], log.M[: plant.M.shape[0]]
+    part, reached, q, dq = log.scratch[0], log.scratch[1], log.scratch[2], log.scratch[3]
     most = 0.0
     for k in range(steps):
-        H = mat(log.H[k])
-        if log.parts[k] == 0:
-            for i in range(dq.shape[0]):
-                q[i], dq[i] = log.q[k, i], log.q_dot[k, i] * period
-            most = max(most, _step_deviation(plant, log, H, start_and_goal, samples))
-        for j in range(log.parts[k]):
-            for i in range(dq.shape[0]):
-                q[i], dq[i] = log.path[k, j, i], log.path[k, j + 1, i] - log.path[k, j, i]
-            share = max(1, samples // log.parts[k])
-            most = max(most, _step_deviation(plant, log, H, start_and_goal, share))
-    return most
-
-
-@internal
-def _step_deviation(
-    plant: Plant, log: Log, H: Mat4, start_and_goal: tuple[Vec4, Vec4], samples: int
-) -> float:
-    """Largest distance of the centre from the line start–goal during one joint step, m.
-
-    The joints and their step are in rows 2 and 3 of ``log.scratch``; they move linearly, and the step is
-    sampled at so many equal parts, its end included.
-    """
-    part, reached, q, dq = log.scratch[0], log.scratch[1], log.scratch[2], log.scratch[3]
-    n, M = log.q.shape[1], log.M[: plant.M.shape[0]]
-    most = 0.0
-    for j in range(1, samples + 1):
-        for i in range(n):
-            part[i] = dq[i] * (j / samples)
-        H_part = pose_after(plant, H, q[:n], part, reached)
-        for k in range(M.shape[0]):
-            put_vec(M[k], apply(H_part, vec(plant.M[k])))
-        start, goal = start_and_goal
-        most = max(most, _line_distance(center_of(M, plant.center), start, goal))
+        H, parts = mat(log.H[k]), max(1, log.parts[k])
+        samples = max(1, SUBSAMPLES // parts)
+        for j in range(parts):
+            for i in range(n):
+                if log.parts[k] == 0:
+                    q[i], dq[i] = log.q[k, i], log.q_dot[k, i] * period
+                else:
+                    q[i], dq[i] = log.path[k, j, i], log.path[k, j + 1, i] - log.path[k, j, i]
+            for sample in range(1, samples + 1):
+                for i in range(n):
+                    part[i] = dq[i] * (sample / samples)
+                H_part = pose_after(plant, H, q[:n], part, reached)
+                for i in range(M.shape[0]):
+                    put_vec(M[i], apply(H_part, vec(plant.M[i])))
+                most = max(most, _line_distance(center_of(M, plant.center), ends[0], ends[1]))
     return most
 
 

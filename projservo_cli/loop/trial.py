@@ -7,17 +7,27 @@ import numpy as np
 from numba import literal_unroll
 
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, State, measure, new_state, reset
+from projservo_cli.control.law import (
+    ERRORS,
+    MOST_PARTS,
+    Gains,
+    Law,
+    State,
+    measure,
+    new_state,
+    reset,
+    split_of,
+)
 from projservo_cli.geometry.algebra import as_array
-from projservo_cli.geometry.jit import composed, njit
+from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.lens import straight
-from projservo_cli.geometry.mechanisms import OWN, Span
-from projservo_cli.loop.compiled import run
+from projservo_cli.geometry.mechanisms import OWN, Span, span_of
+from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
-from projservo_cli.loop.summary import Ends, Summary, summary
+from projservo_cli.loop.summary import Summary, summarize
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.robots.simulated import Plant
+from projservo_cli.robots.simulated import Ends, Plant
 from projservo_cli.task.body import NO_BODY, Body
 from projservo_cli.task.face import (
     FOUND,
@@ -28,130 +38,103 @@ from projservo_cli.task.face import (
     center_of,
     new_task,
     put_task,
+    require_found,
 )
-from projservo_cli.task.partition import Parts, no_parts, partition, partition_now
-from projservo_cli.task.target import Bench, new_bench, put_body_task
+from projservo_cli.task.partition import NO_PARTS, Parts, partition
+from projservo_cli.task.target import put_body_task
 
 # Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
-HALF_TURN_BAND = math.radians(2.0)
-REHEARSAL_STEPS = 300
-REHEARSAL_PX = 1.0
-REHEARSAL_STEP = math.radians(5.0)
-REHEARSAL = Gains(0.1, 0.1, 0.1, 0.1, 1.0, 0.1, 1.0, 0.9)
-DIRECT_TWO = CODES["direct_two"]
+_HALF_TURN_BAND = math.radians(2.0)
+_REHEARSAL_STEPS = 300
+_REHEARSAL_PX = 1.0
+_REHEARSAL_STEP = math.radians(5.0)
+_REHEARSAL = Gains(0.1, 0.1, 0.1, 0.1, 1.0, 0.1, 1.0, 0.9)
+_DIRECT_TWO = CODES["direct_two"]
+_Bounds = tuple[FloatArray, FloatArray]
 
 
-class _Stage(NamedTuple):
-    """Where half turns are rehearsed: a robot that is as the model says, without noise."""
+class _Rehearsal:
+    """Both senses of a half turn, tried on a robot that is as the model says, without noise.
 
-    limits: Limits  # at most 5° a step
-    plant: Plant  # with the limits of the true joints; its model and face are those of the task
-    noise: FloatArray  # (k, 2, m, 2) none
-    state: State
-    log: Log  # state, log: of the law and its run
+    Either sense reaches the goal, but they take the joints elsewhere. Both are rehearsed at a tenth of the
+    error and at most 5° a step; the sense that arrives without passing a joint limit is taken, between equals
+    the one that arrives in fewer steps.
 
+    model : calibrated; q_start : (n,) first joints, rad or m; m : markers of the face; bounds : lower and
+        upper limits (n,) of the joints; span : of an arm of n ≠ 6 joints.
+    """
 
-def new_stage(model: Model, m: int, lower: FloatArray, upper: FloatArray, span: Span = OWN) -> _Stage:
-    """Stage for a face of m markers and joint limits (n,), rad or m; an arm of n ≠ 6 joints has a span."""
-    n, endless = len(lower), np.full(2, np.inf)
-    no_face = (np.zeros((m, 4)), np.zeros(m, dtype=np.int64), MIDPOINT, np.zeros((2, 4)), np.zeros(2))
-    return _Stage(
-        Limits(np.full(n, REHEARSAL_STEP), REHEARSAL_PX, math.inf, 20, REHEARSAL_STEPS, False, False),
-        Plant(model, *no_face, endless, lower, upper, False),
-        np.zeros((REHEARSAL_STEPS + 1, 2, m, 2)),
-        new_state(n, m, span=span),
-        new_log(n, m, REHEARSAL_STEPS, len(ERRORS)),
-    )
+    def __init__(self, model: Model, q_start: FloatArray, m: int, bounds: _Bounds, span: Span = OWN) -> None:
+        self.model, self.q_start, self.bounds, n = model, q_start, bounds, len(q_start)
+        self.noise, self.state = np.zeros((_REHEARSAL_STEPS + 1, 2, m, 2)), new_state(n, m, span=span)
+        self.log = new_log(n, m, _REHEARSAL_STEPS, len(ERRORS))
+
+    def better(self, task: Task, state: State) -> tuple[int, Parts, bool]:
+        """A partitioned task in the better sense: what is wrong, its parts, and whether it arrives."""
+        model = self.model
+        # Cameras have no sign of their own; the plant tells front from back by positive depths.
+        depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
+        seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
+        M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
+        endless = np.full(2, np.inf)
+        plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, *self.bounds, False)
+        law = Law(_DIRECT_TWO, seen, task._replace(body=NO_BODY), _REHEARSAL)
+        step = np.full(len(self.q_start), _REHEARSAL_STEP)
+        q_hat_p = state.q_hat[2].copy()
+
+        def rehearsed(sense: float, most: int) -> tuple[bool, bool, int]:
+            """Whether a sense fails to arrive, whether it passes a joint limit, and in how many steps."""
+            reset(self.state)
+            self.state.driven[1] = sense * q_hat_p
+            limits = Limits(step, _REHEARSAL_PX, math.inf, 20, most, False, False)
+            course = Course(plant, limits, self.q_start)
+            verdict, steps = run_compiled(law, course, self.noise, self.state, self.log)
+            return verdict != CONVERGED, bool(self.log.events[1] >= 0.0), steps
+
+        first = rehearsed(1.0, _REHEARSAL_STEPS)
+        # Where the first sense does well, the other one is better only if it arrives before.
+        other = rehearsed(-1.0, _REHEARSAL_STEPS if any(first[:2]) else max(0, first[2] - 1))
+        state.driven[1] = (-1.0 if other < first else 1.0) * q_hat_p
+        parts = partition(task, split_of(state))
+        return FOUND if parts.found else NOT_UNIQUE, parts, not (first[0] and other[0])
 
 
 def begin(
-    model: Model, task: Task, s: FloatArray, q_start: FloatArray, rehearse: bool, state: State, stage: _Stage
-) -> tuple[int, Parts, bool]:
+    model: Model, task: Task, s: FloatArray, q_start: FloatArray, bounds: _Bounds | None
+) -> tuple[State, Parts, bool]:
     """Measure and partition the task at its start.
 
-    model : calibrated.
-    task : in its frame.
-    s : (2, b, 2) straight pixels at the start.
-    q_start : (n,) joints there, rad or m.
-    rehearse : whether a half turn is made in the sense that is better when rehearsed.
-    state : fresh; on return with the face and the joint motions.
-    Returns what is wrong, ``FOUND`` for nothing; the parts; False where neither sense of a half turn arrived.
+    model : calibrated; task : in its frame.
+    s : (2, b, 2) straight pixels at the start; q_start : (n,) joints there, rad or m.
+    bounds : lower and upper limits (n,) of the joints, rad or m, where a half turn is to be made in the sense
+        that is better when rehearsed.
+    Returns the state with the face and the joint motions; the parts; False where neither sense of a half turn
+    arrived. Raises WorkFailed if the face is not seen, or a motion not unique.
     """
+    m, span, arrives = len(task.A_star), span_of(model, task.A_star), True
+    state = new_state(len(q_start), m, span=span)
     status, parts = _first_parts(model, task, s, q_start, state)
-    if status == FOUND and rehearse and _is_half_turn(parts.theta_p):
-        parts, arrives = _in_better_sense(model, task, q_start, state, stage)
-        return FOUND if parts.found else NOT_UNIQUE, parts, arrives
-    return status, parts, True
+    if status == FOUND and bounds is not None and _is_half_turn(parts.theta_p):
+        status, parts, arrives = _Rehearsal(model, q_start, m, bounds, span).better(task, state)
+    require_found(status, 0)
+    return state, parts, arrives
 
 
-@njit
+@composed
 def _first_parts(
     model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
 ) -> tuple[int, Parts]:
     """Measure and partition the task in the sense that the angles have; what is wrong, and the parts."""
     if not measure(model, task, s, q_start, state):
-        return NOT_MEASURED, no_parts()
-    parts = partition(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
+        return NOT_MEASURED, NO_PARTS
+    parts = partition(task, split_of(state))
     return FOUND if parts.found else NOT_UNIQUE, parts
 
 
 @composed
 def _is_half_turn(theta_p: float) -> bool:
     """Whether the rotation within the plane is so near to half a turn that its sense must be chosen."""
-    return math.pi - abs(theta_p) < HALF_TURN_BAND
-
-
-def _in_better_sense(
-    model: Model, task: Task, q_start: FloatArray, state: State, stage: _Stage
-) -> tuple[Parts, bool]:
-    """The parts of a task that was partitioned, with its half turn in the better sense, and if it arrives."""
-    sense, arrives = _half_turn_sense(model, task, state.A, q_start, state.q_hat[2], stage)
-    state.memory.rotation[1] = sense * state.q_hat[2]
-    parts = partition_now(state.work, task, state.A, state.A_t, state.A_r, state.q_hat, state.memory)
-    return parts, arrives
-
-
-def _half_turn_sense(
-    model: Model, task: Task, A: FloatArray, q_start: FloatArray, q_hat_p: FloatArray, stage: _Stage
-) -> tuple[float, bool]:
-    """Sense of a half turn within the plane, 1 for that of the motion q̂_p or −1, and whether it arrives.
-
-    Either sense reaches the goal, but they take the joints elsewhere. Both are rehearsed on the
-    calibrated model itself, at a tenth of the error and at most 5° a step; the sense that arrives
-    without passing a joint limit is taken, between equals the one that arrives in fewer steps.
-
-    A : (m, 4) face at the start; q_hat_p : (n,) joint motion, or (6,) coordinates in the span.
-    """
-    # Cameras have no sign of their own; the plant tells front from back by positive depths.
-    depth = model.P[:, 2] @ np.array(center_of(A, MIDPOINT))
-    seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
-    plant = stage.plant._replace(
-        model=seen,
-        M=np.ascontiguousarray(A @ as_array(backward(model, q_start)).T),
-        order=task.order,
-        center=task.center,
-        O=task.O,
-        visible=task.visible,
-    )
-    task = task._replace(body=NO_BODY)
-
-    def rehearsed(sense: float, most: int) -> tuple[bool, bool, int]:
-        """Whether a sense arrives, whether it keeps within joint limits, and in how many steps."""
-        state, log = stage.state, stage.log
-        reset(state)
-        state.memory.rotation[1] = sense * q_hat_p
-        limits = stage.limits._replace(max_steps=most)
-        verdict, steps = run(
-            DIRECT_TWO, seen, task, REHEARSAL, limits, plant, stage.noise, q_start, state, log
-        )
-        return verdict == CONVERGED, bool(log.events[1] < 0.0), steps
-
-    arrived, inside, steps = rehearsed(1.0, REHEARSAL_STEPS)
-    # Where the first sense does well, the other one is better only if it arrives before.
-    most = max(0, steps - 1) if arrived and inside else REHEARSAL_STEPS
-    other_arrived, other_inside, other_steps = rehearsed(-1.0, most)
-    better = (not other_arrived, not other_inside, other_steps) < (not arrived, not inside, steps)
-    return (-1.0 if better else 1.0), arrived or other_arrived
+    return math.pi - abs(theta_p) < _HALF_TURN_BAND
 
 
 # A run that could not be begun; other verdicts as of ``step``.
@@ -159,6 +142,7 @@ NOT_STARTED = -2
 # Columns of the numbers of a run: verdict, steps, then those of its summary.
 VERDICT, STEPS = range(2)
 NUMBERS = ("verdict", "steps", *Summary._fields)
+_NOT_OPENED = -1
 
 
 class Setting(NamedTuple):
@@ -170,21 +154,15 @@ class Setting(NamedTuple):
     body: Body  # with which the task is measured; none for point by point
     shares_task: bool  # whether the law measures the task in the same way; it else does point by point
     rehearse: bool  # whether half turns are rehearsed
-    gains: Gains
-    limits: Limits  # gains, limits: of the law
-    plant: Plant  # true robot as the law observes it
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) limits of the joints, rad or m
-    q_start: FloatArray  # (n,) joints at the start, rad or m
+    gains: Gains  # of the law
+    course: Course  # true robot as the law observes it, from its first joints
     ends: Ends  # true poses of the tool
 
 
-class _Measuring(NamedTuple):
+class _Desk(NamedTuple):
     """Workspace in which the task of a run is measured, and the run driven."""
 
-    start: FloatArray
-    goal: FloatArray  # start, goal: (2, b, 2) straight pixels of the images there
-    bench: Bench  # in which the task is measured
+    shown: FloatArray  # (2, 2, b, 2) straight pixels of the images at the start and at the goal
     task: Task
     own_task: Task  # task, own_task: as it is partitioned, and as a law sees it that measures in another way
     state: State
@@ -192,147 +170,117 @@ class _Measuring(NamedTuple):
     log: Log  # of the run
 
 
-class _Opened(NamedTuple):
-    """A task that was measured and partitioned: what is wrong, ``FOUND`` for nothing, and its angles, rad."""
+class Trials:
+    """Runs of a setting, one after the other, in arrays that one run leaves to the next.
 
-    status: int
-    theta_r: float
-    theta_p: float
-
-
-class _Desk(NamedTuple):
-    """Workspace for the runs of a setting, one after the other."""
-
-    measuring: _Measuring  # of the task and the run
-    stage: _Stage  # for half turns
-
-
-def new_desk(setting: Setting, shown: int) -> _Desk:
-    """Workspace for a setting in which so many markers are shown at the start and at the goal.
-
+    shown : how many markers are shown at the start and at the goal.
     Raises WorkFailed if the face has fewer than three markers.
     """
-    n, m = len(setting.q_start), len(setting.plant.M)
-    observed = m + len(setting.plant.pins)
-    s_star = np.zeros((2, m, 2))
-    body = setting.body._replace(shown=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
-    center, parts = setting.plant.center, MOST_PARTS if setting.gains.substeps else 0
-    measuring = _Measuring(
-        np.zeros((2, shown, 2)),
-        np.zeros((2, shown, 2)),
-        new_bench(n, m),
-        new_task(setting.model, s_star, center)._replace(body=body),
-        new_task(setting.believed, s_star, center),
-        new_state(n, m, shown),
-        new_state(n, m, observed),
-        new_log(n, observed, setting.limits.max_steps, len(ERRORS), parts),
-    )
-    return _Desk(measuring, new_stage(setting.model, m, setting.lower, setting.upper))
+
+    def __init__(self, setting: Setting, shown: int) -> None:
+        plant, limits, q_start = setting.course
+        n, m = len(q_start), len(plant.M)
+        observed, s_star = m + len(plant.pins), np.zeros((2, m, 2))
+        body = setting.body._replace(shown=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
+        self.setting = setting
+        self.desk = _Desk(
+            np.zeros((2, 2, shown, 2)),
+            new_task(setting.model, s_star, plant.center)._replace(body=body),
+            new_task(setting.believed, s_star, plant.center),
+            new_state(n, m, shown),
+            new_state(n, m, observed),
+            new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if setting.gains.substeps else 0),
+        )
+        self.rehearsal = _Rehearsal(setting.model, q_start, m, (plant.lower, plant.upper))
+
+    def numbers(self, shown: FloatArray, noise: FloatArray) -> FloatArray:
+        """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).
+
+        shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.
+        noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
+            short.
+        """
+        numbers = np.full((len(shown), len(NUMBERS)), math.nan)
+        at, made, opened = self.desk, 0, _NOT_OPENED
+        while made < len(shown):
+            made += _until_rehearsal(self.setting, shown[made:], noise[made:], at, opened, numbers[made:])
+            if made < len(shown):
+                opened, _, _ = self.rehearsal.better(at.task, at.state)
+        return numbers
+
+
+@njit
+def _until_rehearsal(
+    setting: Setting, shown: FloatArray, noise: FloatArray, desk: _Desk, opened: int, numbers: FloatArray
+) -> int:
+    """Runs up to one whose half turn is to be rehearsed, and how many; that one is opened.
+
+    A call takes as long as a tenth of a run to hand its arguments over, and all of it with the lock of the
+    interpreter held: hence many runs a call.
+
+    opened : what is wrong with the first run, which was opened; else ``_NOT_OPENED``.
+    """
+    for made in range(len(shown)):
+        status = opened
+        if made > 0 or opened == _NOT_OPENED:
+            status, theta_p = _open(setting, shown[made], desk)
+            if status == FOUND and setting.rehearse and _is_half_turn(theta_p):
+                return made
+        _drive(setting, status, noise[made], desk, numbers[made])
+    return len(shown)
+
+
+@merged
+def _open(setting: Setting, shown: FloatArray, desk: _Desk) -> tuple[int, float]:
+    """Measure and partition a task, and measure it as the law will; what is wrong, and the angle θ_p, rad."""
+    reset(desk.own_state)
+    if not setting.shares_task:
+        status = _put_measured(setting, setting.believed, shown, desk, desk.own_task)
+        if status != FOUND:
+            return status, 0.0
+    status = _put_measured(setting, setting.model, shown, desk, desk.task)
+    if status != FOUND:
+        return status, 0.0
+    reset(desk.state)
+    status, parts = _first_parts(setting.model, desk.task, desk.shown[0], setting.course.q_start, desk.state)
+    return status, parts.theta_p
 
 
 @composed
-def _put_measured(model: Model, q_start: FloatArray, shown: FloatArray, desk: _Measuring, task: Task) -> int:
+def _put_measured(setting: Setting, model: Model, shown: FloatArray, desk: _Desk, task: Task) -> int:
     """Measure a task from images (2, 2, b, 2) at its start and goal, px; what is wrong."""
     for view in range(2):
         for k in range(task.s_star.shape[1]):
             for i in range(2):
                 task.s_star[view, k, i] = shown[1, view, k, i]
-    straight(model.lens, shown[0], desk.start)
-    straight(model.lens, shown[1], desk.goal)
-    status, _ = put_task(model.P, model.a_inf, desk.start, desk.goal, desk.bench.A, desk.bench.angle, task)
+    straight(model.lens, shown[0], desk.shown[0])
+    straight(model.lens, shown[1], desk.shown[1])
+    state = desk.state
+    status, _ = put_task(model, desk.shown, task, state.A, state.work.system.rhs)
     if status == FOUND and task.body.M.shape[0] > 0:
-        status, _ = put_body_task(model, q_start, desk.start, desk.goal, desk.bench, task)
+        q_start = setting.course.q_start
+        status, _ = put_body_task(model, q_start, desk.shown, task, split_of(state), state.normal)
     return status
 
 
-@njit
-def _open(setting: Setting, shown: FloatArray, desk: _Measuring) -> _Opened:
-    """Measure and partition a task, and measure it as the law will.
-
-    shown : (2, 2, b, 2) images at the start and at the goal, the face first, px.
-    desk : on return with tasks and states.
-    """
-    reset(desk.own_state)
-    if not setting.shares_task:
-        status = _put_measured(setting.believed, setting.q_start, shown, desk, desk.own_task)
-        if status != FOUND:
-            return _Opened(status, 0.0, 0.0)
-    status = _put_measured(setting.model, setting.q_start, shown, desk, desk.task)
-    if status != FOUND:
-        return _Opened(status, 0.0, 0.0)
-    reset(desk.state)
-    status, parts = _first_parts(setting.model, desk.task, desk.start, setting.q_start, desk.state)
-    return _Opened(status, parts.theta_r, parts.theta_p)
-
-
-def trials(setting: Setting, shown: FloatArray, noise: FloatArray, desk: _Desk, numbers: FloatArray) -> None:
-    """Runs, one after the other: measure the task, partition it, drive the law to its verdict, and sum up.
-
-    shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.
-    noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
-        short.
-    desk : workspace.
-    numbers : (r, ``NUMBERS``) on return the numbers of the runs.
-    """
-    made = 0
-    while made < len(shown):
-        made = _without_rehearsal(setting, shown, noise, desk.measuring, made, numbers)
-        if made < len(shown):
-            at = desk.measuring
-            parts, _ = _in_better_sense(setting.model, at.task, setting.q_start, at.state, desk.stage)
-            opened = _Opened(FOUND if parts.found else NOT_UNIQUE, parts.theta_r, parts.theta_p)
-            _drive(setting, opened, noise[made], at, numbers[made])
-            made += 1
-
-
-@njit
-def _without_rehearsal(
-    setting: Setting, shown: FloatArray, noise: FloatArray, desk: _Measuring, first: int, numbers: FloatArray
-) -> int:
-    """Runs from the first on, up to one whose half turn is to be rehearsed; that one is opened.
-
-    A call takes as long as a tenth of a run to hand its arguments over, and all of it with the lock of the
-    interpreter held: hence many runs a call.
-    """
-    runs = len(shown)
-    for made in range(first, runs):
-        opened = _open(setting, shown[made], desk)
-        if opened.status == FOUND and setting.rehearse and _is_half_turn(opened.theta_p):
-            return made
-        _drive(setting, opened, noise[made], desk, numbers[made])
-    return runs
-
-
-@njit
-def _drive(
-    setting: Setting, opened: _Opened, noise: FloatArray, desk: _Measuring, numbers: FloatArray
-) -> None:
+@merged
+def _drive(setting: Setting, status: int, noise: FloatArray, desk: _Desk, numbers: FloatArray) -> None:
     """Drive the law of a run that was opened; its numbers."""
-    for i in range(numbers.shape[0]):
-        numbers[i] = math.nan
     numbers[VERDICT] = NOT_STARTED
-    if opened.status != FOUND:
+    if status != FOUND:
         return
-    state, q_hat = desk.own_state, desk.state.q_hat
-    for i in range(state.memory.rotation.shape[1]):
-        state.memory.rotation[0, i] = q_hat[1, i] if opened.theta_r >= 0.0 else -q_hat[1, i]
-        state.memory.rotation[1, i] = q_hat[2, i] if opened.theta_p >= 0.0 else -q_hat[2, i]
-    verdict, steps = run(
-        setting.code,
-        setting.believed,
-        desk.task if setting.shares_task else desk.own_task,
-        setting.gains,
-        setting.limits,
-        setting.plant,
-        noise,
-        setting.q_start,
-        state,
-        desk.log,
-    )
+    state = desk.own_state
+    for part in range(2):
+        for i in range(state.driven.shape[1]):
+            state.driven[part, i] = desk.state.driven[part, i]
+    task = desk.task if setting.shares_task else desk.own_task
+    law = Law(setting.code, setting.believed, task, setting.gains)
+    verdict, steps = run_compiled(law, setting.course, noise, state, desk.log)
     numbers[VERDICT] = verdict
     numbers[STEPS] = steps
     if verdict != RUNNING:
-        found = summary(setting.plant, desk.log, steps, state.limited[0], setting.gains.period, setting.ends)
+        limited, period = state.limited[0], setting.gains.period
+        found = summarize(setting.course.plant, desk.log, steps, limited, period, setting.ends)
         column = 2
         for value in literal_unroll(found):
             numbers[column] = value

@@ -48,6 +48,14 @@ class Disturbance(NamedTuple):
 UNDISTURBED = Disturbance(0, -1, np.zeros(64), True, -1, 0, NEVER)
 
 
+class Ends(NamedTuple):
+    """Where the true robot holds the tool."""
+
+    base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
+    goal_pose: FloatArray  # (4, 4) pose at the goal, m; NaN where it is not known
+    goal: FloatArray  # (4,) centre of the face there, m
+
+
 class Plant(NamedTuple):
     """True robot, rig and face in the metric frame."""
 

@@ -8,20 +8,19 @@ import itertools
 from collections.abc import Callable
 from functools import partial
 from timeit import timeit
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, new_state
+from projservo_cli.control.law import ERRORS, Law, State, new_state
 from projservo_cli.geometry.kinematics import operators_at
 from projservo_cli.geometry.mechanisms import workspace
-from projservo_cli.loop.compiled import Job, many_steps
-from projservo_cli.loop.compiled import run as run_compiled
-from projservo_cli.loop.python import bind, bound_command
-from projservo_cli.loop.step import new_log
+from projservo_cli.loop.compiled import Course, many_steps, run_compiled
+from projservo_cli.loop.python import BuiltInLaw
+from projservo_cli.loop.step import Log, new_log
 from projservo_cli.records import LAWS, FloatArray
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import scenario_of
@@ -30,6 +29,16 @@ from projservo_cli.task.face import Task
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
 BODY, CODE = "exact, body", CODES["direct_three"]
+
+
+class _Job(NamedTuple):
+    """A run; ``state`` and ``log`` are its own, the rest may be shared."""
+
+    law: Law
+    course: Course
+    noise: FloatArray
+    state: State
+    log: Log
 
 
 class Case:
@@ -47,33 +56,33 @@ class Case:
         self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, *seen))
         self.whole = self._run(shown.task(self.model), scenario.plant_of("exact"))
         self.points = self._run(shown.by_points().task(self.model), scenario.plant_of("stacked"))
-        state = new_state(len(self.q_start), self.m)
-        self.bound = bind(CODE, self.model, self.points.task, gains, state)
+        self.law = BuiltInLaw(*self.points.law)
 
-    def _run(self, task: Task, plant: Plant) -> Job:
+    def _run(self, task: Task, plant: Plant) -> _Job:
         """A run, whose log has the states that are cycled through."""
         n, seen = len(self.q_start), self.m + len(plant.pins)
         noise = np.ascontiguousarray(self.noise[:, :, :seen])
+        law, course = Law(CODE, self.model, task, self.gains), Course(plant, self.limits, self.q_start)
         log = new_log(n, seen, self.limits.max_steps, len(ERRORS))
-        start, state = self.q_start.copy(), new_state(n, self.m)
-        job = Job(CODE, self.model, task, self.gains, self.limits, plant, noise, start, state, log)
+        job = _Job(law, course, noise, new_state(n, self.m), log)
         run_compiled(*job)
         return job
 
     def steps(self, law: str, *, body: bool = False) -> float:
         """One step of a law in each state."""
         job = self.whole if body else self.points
-        return many_steps(job._replace(code=CODES[law]))
+        return many_steps(job.law._replace(code=CODES[law]), job.course, job.state, job.log)
 
-    def one_step(self) -> int:
+    def one_step(self) -> tuple[int, FloatArray]:
         """One step of direct_three, called from Python."""
         log = self.points.log
-        return bound_command(self.bound, log.s[0], log.q[0])
+        return self.law(log.s[0], log.q[0])
 
-    def whole_run(self) -> Job:
+    def whole_run(self) -> _Job:
         """A run of 150 steps, traced."""
         log = new_log(len(self.q_start), self.m, STEPS, len(ERRORS))
-        return self.points._replace(limits=self.limits._replace(max_steps=STEPS), log=log)
+        course = self.points.course._replace(limits=self.limits._replace(max_steps=STEPS))
+        return self.points._replace(course=course, log=log)
 
     def matrices(self) -> FloatArray:
         """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
@@ -82,7 +91,7 @@ class Case:
         found = np.empty((STATES, 8, len(self.q_start)))
         for k in range(STATES):
             operators_at(self.model, Q[k], work.H_hat)
-            A = self.points.task.A_star
+            A = self.points.law.task.A_star
             found[k] = np.concatenate([(work.H_hat @ A[0]).T, (work.H_hat @ A[1]).T])
         return found
 

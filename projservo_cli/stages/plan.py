@@ -9,17 +9,16 @@ from scipy.optimize import least_squares
 
 from projservo_cli.config import Config
 from projservo_cli.config.models import Trajectory
-from projservo_cli.control.law import State, new_state
+from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.geometry.mechanisms import span_of
-from projservo_cli.loop.trial import begin, new_stage
-from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
-from projservo_cli.stages.scenario import Scenario, Shown, scenario_of
+from projservo_cli.loop.trial import begin
+from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, in_sense
+from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.world import face_numbers
-from projservo_cli.task.face import Task, center_of, face_plane, require_found
+from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.margins import (
     BEHIND,
     CONSTRAINTS,
@@ -34,6 +33,7 @@ from projservo_cli.task.margins import (
 )
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.planning import Path, least_time, plan_path
+from projservo_cli.task.target import Shown
 from projservo_cli.task.trajectory import profile_shares
 from projservo_cli.task.visibility import (
     arc_minimum,
@@ -178,12 +178,9 @@ def _partitioned(
     Returns the state with face and joint motions, the task in the frame of the model, translation and
     rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
     """
-    n, m = len(shown.q_start), shown.s_start.shape[1] - shown.pins
     task, seen = shown.task(model), straight_views(model.lens, shown.s_start)
-    span = span_of(model, task.A_star)
-    state, stage = new_state(n, m, span=span), new_stage(model, m, lower, upper, span)
-    status, parts, arrives = begin(model, task, seen, shown.q_start, rehearses(profile), state, stage)
-    require_found(status, 0)
+    bounds = (lower, upper) if rehearses(profile) else None
+    state, parts, arrives = begin(model, task, seen, shown.q_start, bounds)
     return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
 
 
@@ -372,4 +369,4 @@ def rotation_sense(scenario: Scenario) -> FloatArray:
         return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands).rotation_sense()
     ends = scenario.model, scenario.ends
     state, _, parts, _ = _partitioned(*ends, trajectory.profile, joints.lower, joints.upper)
-    return signed(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])
+    return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

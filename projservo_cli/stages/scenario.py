@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from projservo_cli.config.models import Task as TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.step import Limits
-from projservo_cli.loop.summary import Ends
 from projservo_cli.records import (
     BODY_LAWS,
     METRIC_LAWS,
@@ -27,7 +25,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.robots.simulated import METRIC_A_INF, NEVER, NO_PINS, Disturbance, Plant
+from projservo_cli.robots.simulated import METRIC_A_INF, NEVER, NO_PINS, Disturbance, Ends, Plant
 from projservo_cli.stages.world import (
     Joints,
     Truth,
@@ -38,10 +36,10 @@ from projservo_cli.stages.world import (
     limit_passed,
     truth_of,
 )
-from projservo_cli.task.body import Body, body_of
-from projservo_cli.task.face import Task, center_of, cyclic_order, face_plane, task_from_images
+from projservo_cli.task.body import NO_BODY, Body, body_of
+from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.margins import Demands
-from projservo_cli.task.target import task_from_body
+from projservo_cli.task.target import Shown
 
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
@@ -50,31 +48,6 @@ CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN
 def generator(seed: int, stream: int) -> np.random.Generator:
     """Random numbers of one stream of a seed."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-
-
-class Shown(NamedTuple):
-    """Start and goal of a task as images show them."""
-
-    q_start: FloatArray  # (n,) joint readings at the start, rad or m, with the offset if there is one
-    s_start: FloatArray
-    s_star: FloatArray  # s_start, s_star: (2, b, 2) px of the face, then of its pins; NaN where unknown
-    center: int  # position of the centre marker within the face, or ``MIDPOINT``
-    pins: int = 0  # how many of the markers are not on the face
-    body: Body | None = None  # of all of them, to measure with; None to measure point by point
-
-    def by_points(self) -> "Shown":
-        """What they show of the face alone, to be measured point by point."""
-        m = self.s_start.shape[1] - self.pins
-        s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
-        return Shown(self.q_start, s_start, s_star, self.center)
-
-    def task(self, model: Model) -> Task:
-        """The task that they show to a model; a WorkFailed if they do not show where the face is."""
-        if self.body is None:
-            face = self.by_points()
-            return task_from_images(model, face.s_start, face.s_star, self.center)
-        m = self.s_start.shape[1] - self.pins
-        return task_from_body(model, self.body, *self[:4], m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +173,7 @@ def scenario_of(config: Config, calibration: Calibration | None = None) -> Scena
         assert calibration is not None
         observed = _observed(config, calibration)
         sigma_px = max(sigma_px, calibration.sigma_fitted_px)
-    body: Body | None = None
+    body = NO_BODY
     pins: tuple[int, ...] = ()
     if not _by_points(config, calibration):
         known = observed if calibration is None else tuple(calibration.marker.tolist())

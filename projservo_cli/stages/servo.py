@@ -11,14 +11,13 @@ import numpy as np
 
 from projservo_cli.config import Config
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains, new_state
+from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains, Law, new_state
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span, span_of
-from projservo_cli.loop.compiled import run as run_compiled
-from projservo_cli.loop.python import BuiltInLaw, LoopLaw
-from projservo_cli.loop.python import run as run_in_python
+from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.loop.summary import MM, Summary, path_deviation, summary
+from projservo_cli.loop.summary import MM, Summary, path_deviation, summarize
 from projservo_cli.records import (
     REPLAN,
     Calibration,
@@ -39,9 +38,7 @@ from projservo_cli.stages import own_robot
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.task.face import Task, center_of
-from projservo_cli.task.following import followed
-
-SUBSAMPLES = 50  # points of a joint step at which the deviation between samples is measured
+from projservo_cli.task.target import followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +61,7 @@ class Outcome:
     def summary(self) -> Summary:
         """Numbers of the run; NaN where they need a truth that nobody knows."""
         period, ends = self.scenario.gains.period, self.scenario.true_ends
-        return summary(self.plant, self.log, self.steps, self.limited, period, ends)
+        return summarize(self.plant, self.log, self.steps, self.limited, period, ends)
 
     def deviation_mm(self) -> float:
         """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
@@ -72,7 +69,7 @@ class Outcome:
         if not np.isfinite(goal).all():
             return math.nan
         start = self.log.H[0] @ np.array(center_of(self.plant.M, self.plant.center))
-        between = path_deviation(self.plant, self.log, self.steps, period, start, goal, SUBSAMPLES)
+        between = path_deviation(self.plant, self.log, self.steps, period, start, goal)
         return max(MM * between, self.summary.center_deviation_at_samples_mm)
 
     def trace(self) -> Trace:
@@ -247,13 +244,12 @@ def _drive_compiled(
     span = span_of(model, task.A_star)
     state = new_state(n, m, observed, span)
     sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
-    state.memory.rotation[:] = in_span(span, model, ends.q_start, sense)
+    state.driven[:] = in_span(span, model, ends.q_start, sense)
     log = new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
     plant = scenario.plant_of(law)
     noise = scenario.noise_of(law, scenario.config.seed, limits.max_steps + 1)
-    code, steps = run_compiled(
-        CODES[law], model, task, gains, limits, plant, noise, ends.q_start.copy(), state, log
-    )
+    built_in, course = Law(CODES[law], model, task, gains), Course(plant, limits, ends.q_start.copy())
+    code, steps = run_compiled(built_in, course, noise, state, log)
     return Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
 
 
@@ -356,5 +352,5 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
     believed = scenario.believed_by(law)
     built_in = BuiltInLaw(CODES[law], believed, _task_for(scenario, plan, law, replans, believed), gains)
     sense = in_span(built_in.state.work.span, believed, ends.q_start, plan.rotation_sense())
-    built_in.state.memory.rotation[:] = sense
+    built_in.state.driven[:] = sense
     return built_in

@@ -13,9 +13,8 @@ from projservo_cli.config import Config
 from projservo_cli.config.models import Goal
 from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, Robot
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
-from projservo_cli.loop.summary import Ends
 from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
-from projservo_cli.robots.simulated import Arm, roll_axis
+from projservo_cli.robots.simulated import Arm, Ends, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
 
 

@@ -13,8 +13,9 @@ from threadpoolctl import threadpool_limits
 from projservo_cli.config import Config, digest
 from projservo_cli.control import CODES
 from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.step import RUNNING, VERDICTS
-from projservo_cli.loop.trial import NUMBERS, VERDICT, Setting, new_desk, trials
+from projservo_cli.loop.trial import NUMBERS, VERDICT, Setting, Trials
 from projservo_cli.records import BODY_LAWS, Calibration, FloatArray, IntArray, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
@@ -22,7 +23,6 @@ from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
 from projservo_cli.sweep.design import RUNS, Design, name_of_run
-from projservo_cli.task.body import NO_BODY
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
 ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
@@ -214,20 +214,15 @@ TOGETHER = 16
 
 def _setting_of(scenario: Scenario, law: str) -> Setting:
     """All that compiled runs of a law share whose seeds differ."""
-    body, model = scenario.exact.body, scenario.model
     return Setting(
         CODES[law],
-        model,
+        scenario.model,
         scenario.believed_by(law),
-        NO_BODY if body is None else body,
+        scenario.exact.body,
         law in BODY_LAWS,
         rehearses(scenario.config.trajectory.profile),
         scenario.gains,
-        scenario.limits,
-        scenario.plant_of(law),
-        scenario.joints.lower,
-        scenario.joints.upper,
-        scenario.exact.q_start,
+        Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
         scenario.true_ends,
     )
 
@@ -235,18 +230,16 @@ def _setting_of(scenario: Scenario, law: str) -> Setting:
 def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
     """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
     setting = _setting_of(scenario, law)
-    desk = new_desk(setting, len(scenario.numbers))
+    trials = Trials(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))
     for first in range(0, len(seeds), TOGETHER):
         running, instants = list(range(first, min(first + TOGETHER, len(seeds)))), INSTANTS
         while running:  # those that outlast their noise are made anew with more
-            drawn = min(instants, setting.limits.max_steps + 1)
+            drawn = min(instants, scenario.limits.max_steps + 1)
             shown = [scenario.shown_at(seeds[i]) for i in running]
             images = np.array([(ends.s_start, ends.s_star) for ends in shown])
             noise = np.array([scenario.noise_of(law, seeds[i], drawn) for i in running])
-            numbers = np.empty((len(running), len(NUMBERS)))
-            trials(setting, images, noise, desk, numbers)
-            found[running] = numbers
+            found[running] = trials.numbers(images, noise)
             running = [i for i in running if found[i, VERDICT] == RUNNING]
             instants *= FURTHER
     return found

@@ -29,7 +29,7 @@ from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.records import BoolArray, FloatArray, Model
 
-Vec3 = tuple[float, float, float]
+_Vec3 = tuple[float, float, float]
 Row = tuple[float, float, float, float, float, float, float]
 # Products of the columns of (J, e) with those of J, upper triangle by rows.
 Sums = tuple[
@@ -40,12 +40,8 @@ NOTHING: Sums = (
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
     0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
 )  # fmt: skip
-# A step that moves the images by less than this, px rms a coordinate, is the last: what it leaves is
-# its square over the size of the body in the image, a few thousandths of a pixel.
-SETTLED_PX = 0.5
-MOST_STEPS = 2
 # A coordinate of which the others leave less than this share, squared, is not determined.
-RANK_TOLERANCE = 1e-7
+_RANK_TOLERANCE = 1e-7
 
 
 class Body(NamedTuple):
@@ -65,7 +61,7 @@ class Body(NamedTuple):
     shown: BoolArray  # (2, m) views of the markers that the goal showed
 
 
-class Until(NamedTuple):
+class _Until(NamedTuple):
     """When a fit ends."""
 
     shown_only: bool  # leave out views that the goal did not show
@@ -73,10 +69,18 @@ class Until(NamedTuple):
     most_steps: int  # the fit after so many steps is taken as it is
 
 
-class Fit(NamedTuple):
+# In the loop, by the views that the goal showed or by all: what a step of half a pixel leaves is its square
+# over the size of the body in the image, a few thousandths of a pixel.
+SHOWN, SEEN = _Until(True, 0.5, 2), _Until(False, 0.5, 2)
+# At the goal, to round-off.
+SETTLED = _Until(False, 1e-6, 30)
+
+
+class _Fit(NamedTuple):
     """Displacement that markers say, and how well they agree."""
 
     found: bool  # False where the markers that were seen do not determine it
+    settled: bool  # whether the last step was short enough
     H: Mat4  # displacement from the reference
     before: float
     after: float  # before, after: sum of squared residuals of the prediction and of the fit, px²
@@ -127,11 +131,6 @@ def body_of(model: Model, M: FloatArray) -> Body:
     )
 
 
-def new_normal() -> FloatArray:
-    """Workspace of the normal equations, for one fit at a time."""
-    return np.zeros((COORDINATES, COORDINATES + 1))
-
-
 @inline
 def _accumulate(N: Sums, a: Row, b: Row) -> Sums:
     """Sums after two more rows (J, e) of Jacobian and residual."""
@@ -164,7 +163,7 @@ def _put_sums(N: FloatArray, sums: Sums) -> None:
 
 
 @merged
-def solve_normal(N: FloatArray, tolerance: float) -> bool:
+def _solve_normal(N: FloatArray, tolerance: float) -> bool:
     """Solution of symmetric positive definite equations by the root-free Cholesky factorisation, in place.
 
     N : (6, 7) upper triangle of the matrix, and the right-hand side in the last column, which the solution
@@ -199,7 +198,9 @@ def solve_normal(N: FloatArray, tolerance: float) -> bool:
 
 
 @inline
-def _image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float) -> Row:
+def _image_row(
+    t: _Vec3, t_depth: _Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float
+) -> Row:
     """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
 
     t, t_depth : numerator and denominator of the coordinate under the translations.
@@ -220,18 +221,13 @@ def _image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn:
 
 
 @merged
-def normal_equations(
+def _normal_equations(
     P: FloatArray, body: Body, s: FloatArray, H: Mat4, shown_only: bool, normal: FloatArray
 ) -> tuple[float, int]:
     """Normal equations of the displacement exp(ξ) after which H carries the markers to their images.
 
-    P : (2, 3, 4) cameras.
-    body : as calibrated.
-    s : (2, k, 2) pixels of the first k markers, NaN where unseen.
-    H : displacement from the reference about which the images are linear in ξ.
-    shown_only : leave out views that the goal did not show.
-    normal : (6, 7) on return the equations.
-    Returns sum of squared residuals, px², and the number of markers seen, counted once a view.
+    Arguments as of ``fit_body``; the images are linear in ξ about H, and the equations are in ``normal`` on
+    return. Returns sum of squared residuals, px², and the number of markers seen, counted once a view.
     """
     N = NOTHING
     squares = 0.0
@@ -287,7 +283,7 @@ def _displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
 
 
 @njit
-def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: Until, normal: FloatArray) -> Fit:
+def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, normal: FloatArray) -> _Fit:
     """Displacement of least reprojection error over all markers seen, by Gauss–Newton steps.
 
     Any markers do that determine six coordinates: three that one camera sees, in general position.
@@ -295,29 +291,32 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: Until, no
     P : (2, 3, 4) cameras.
     s : (2, k, 2) pixels of the first k markers, NaN where unseen.
     H : predicted displacement from the reference.
+    until : ``SHOWN``, ``SEEN`` or ``SETTLED``.
     normal : (6, 7) workspace of the normal equations.
     """
     before = 0.0
     after = 0.0
     views = 0
+    settled = False
     for step in range(until.most_steps):
-        squares, views = normal_equations(P, body, s, H, until.shown_only, normal)
+        squares, views = _normal_equations(P, body, s, H, until.shown_only, normal)
         if step == 0:
             before = squares
         gradient = (
             normal[0, 6], normal[1, 6], normal[2, 6],
             normal[3, 6], normal[4, 6], normal[5, 6],
         )  # fmt: skip
-        if not solve_normal(normal, RANK_TOLERANCE):
-            return Fit(False, H, before, before, views)
+        if not _solve_normal(normal, _RANK_TOLERANCE):
+            return _Fit(False, False, H, before, before, views)
         fall = 0.0
         for i in range(COORDINATES):
             fall += gradient[i] * normal[i, COORDINATES]
         H = _displaced(body, H, normal)
         after = max(0.0, squares - fall)
-        if fall <= until.settled_px * until.settled_px * (2 * views):
+        settled = fall <= until.settled_px * until.settled_px * (2 * views)
+        if settled:
             break
-    return Fit(True, H, before, after, views)
+    return _Fit(True, settled, H, before, after, views)
 
 
 @njit

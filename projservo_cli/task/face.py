@@ -8,7 +8,6 @@ import numpy as np
 from projservo_cli.geometry import stereo
 from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, sub, unit, vec
 from projservo_cli.geometry.jit import composed, njit
-from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, put_points
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
@@ -108,9 +107,8 @@ def _put_order(A: FloatArray, order: IntArray, angle: FloatArray) -> bool:
     offset from the midpoint that is longest, and along the one that lies farthest off it. The order begins
     with the first marker and goes on to the lower of its neighbours, whatever the frame.
 
-    A : (m, 4) points of the face scaled to a_inf·A = 1, three or more.
-    order : (m,) on return the indices.
-    angle : (m,) workspace.
+    A : (m, 4) points scaled to a_inf·A = 1, three or more; order : (m,) on return the indices; angle : (≥m,)
+        workspace.
     """
     m = A.shape[0]
     middle = center_of(A, MIDPOINT)
@@ -153,10 +151,9 @@ def _longest_offset(A: FloatArray, middle: Vec4, axis: Vec4) -> Vec4:
 
 
 def cyclic_order(A: FloatArray) -> IntArray:
-    """Order of the face markers around their midpoint, as of ``_put_order``.
+    """Order (m,) of markers around their midpoint, as of ``_put_order``, for points (m, 4), a_inf·A = 1.
 
-    A : (m, 4) points of the face scaled to a_inf·A = 1.
-    Returns (m,) indices. Raises WorkFailed if there are fewer than three points or they lie on one line.
+    Raises WorkFailed if there are fewer than three points or they lie on one line.
     """
     _require_three(len(A))
     order = np.zeros(len(A), dtype=np.int64)
@@ -166,33 +163,25 @@ def cyclic_order(A: FloatArray) -> IntArray:
 
 
 def _require_three(m: int) -> None:
-    """Refuse a face of fewer than three markers."""
     if m < 3:
         raise WorkFailed(f"a face needs three markers or more, not {m}: add to markers.face")
 
 
 @composed
 def put_task(
-    P: FloatArray,
-    a_inf: FloatArray,
-    start: FloatArray,
-    goal: FloatArray,
-    A: FloatArray,
-    angle: FloatArray,
-    task: Task,
+    model: Model, shown: FloatArray, task: Task, A: FloatArray, angle: FloatArray
 ) -> tuple[int, int]:
     """What the images at start and goal say of a task: target points, order of the markers, visible side.
 
-    P, a_inf : (2, 3, 4), (4,) cameras and plane at infinity of the model.
-    start, goal : (2, ≥m, 2) straight pixels, the m markers of the face first.
+    shown : (2, 2, ≥m, 2) straight pixels at the start and at the goal, the m markers of the face first.
+    task : as of ``new_task``; on return with the rest.
     A : (m, 4) on return the face at the start.
-    angle : (m,) workspace.
-    task : with target pixels, fundamental matrix and optical centres; on return with the rest.
+    angle : (≥m,) workspace.
     Returns what is wrong, ``FOUND`` for nothing, and with which marker.
     """
-    lost = put_points(P, task.F, a_inf, start, A)
+    lost = put_points(model.P, task.F, model.a_inf, shown[0], A)
     if lost < 0:
-        lost = put_points(P, task.F, a_inf, goal, task.A_star)
+        lost = put_points(model.P, task.F, model.a_inf, shown[1], task.A_star)
     if lost >= 0:
         return NO_POINT, lost
     if not _put_order(task.A_star, task.order, angle):
@@ -208,20 +197,14 @@ def put_task(
 
 
 def require_found(status: int, detail: int) -> None:
-    """Say what is wrong with the images of a task.
-
-    Raises WorkFailed if the status is not ``FOUND``.
-    """
+    """Say by WorkFailed what is wrong with the images of a task, if anything."""
     if status != FOUND:
         raise WorkFailed(PROBLEMS[status].format(detail))
 
 
 def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
-    """A task whose target is not known yet.
+    """A task with pixels (2, m, 2) of the face at the goal, whose target points are not known yet.
 
-    model : calibrated (or metric) model.
-    s_star : (2, m, 2) pixels of the face at the goal.
-    center : index of the centre marker, or ``MIDPOINT``.
     Raises WorkFailed if there are fewer than three markers, or both cameras are in one place.
     """
     m = s_star.shape[1]
@@ -235,18 +218,3 @@ def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
         optical_centers(model.P, model.a_inf),
         np.zeros(2),
     )
-
-
-def task_from_images(model: Model, s_start: FloatArray, s_star: FloatArray, center: int) -> Task:
-    """What the laws know of a task, from images alone.
-
-    model : calibrated (or metric) model.
-    s_start, s_star : (2, m, 2) pixels of the face at the start and at the goal.
-    center : index of the centre marker, or ``MIDPOINT``.
-    Raises WorkFailed if a marker cannot be triangulated, the face is degenerate, or a camera looks along it.
-    """
-    task = new_task(model, s_star, center)
-    start, goal = straight_views(model.lens, s_start), straight_views(model.lens, s_star)
-    A, angle = np.zeros_like(task.A_star), np.zeros(len(task.A_star))
-    require_found(*put_task(model.P, model.a_inf, start, goal, A, angle, task))
-    return task

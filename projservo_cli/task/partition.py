@@ -23,7 +23,7 @@ from projservo_cli.geometry.algebra import (
     unit,
     vec,
 )
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,
     Work,
@@ -39,10 +39,16 @@ from projservo_cli.task.visibility import CONTINUITY_BAND, HALF_TURN_TOLERANCE, 
 COINCIDENT = 1e-14
 
 
-class Memory(NamedTuple):
-    """What a law carries from one step to the next."""
+class Split(NamedTuple):
+    """Arrays in which a task is partitioned."""
 
-    rotation: FloatArray  # (2, n) joint motions of the last rotations r and p, in the sense they were driven
+    work: Work  # the operators at the current joints in ``H_hat``
+    A: FloatArray  # (m, 4) current points of the face, a_inf·A = 1
+    A_t: FloatArray
+    A_r: FloatArray  # A_t, A_r: (m, 4) on return the target without the translation, and without both
+    q_hat: FloatArray  # (≥3, n) on return joint motions t, r, p; (≥3, 6) coordinates in the span of an arm
+    # (2, n) joint motions of the last rotations r and p in the sense they were driven: the memory of a law
+    driven: FloatArray
 
 
 class Parts(NamedTuple):
@@ -60,26 +66,19 @@ class Parts(NamedTuple):
     A_c: Vec4  # centre of the face
 
 
+_NOWHERE: Vec4 = (0.0, 0.0, 0.0, 0.0)
+# Partition of a task that could not be measured.
+NO_PARTS = Parts(
+    False, 0.0, 0.0, 0.0, NO_OPERATOR, NO_OPERATOR, NO_OPERATOR, _NOWHERE, _NOWHERE, _NOWHERE
+)  # fmt: skip
+
+
 class _Face(NamedTuple):
     """Points (m, 4) of the face, its oriented plane and its centre."""
 
     A: FloatArray
     a: Vec4
     A_c: Vec4
-
-
-@merged
-def no_parts() -> Parts:
-    """Partition of a task that could not be measured."""
-    nothing = (0.0, 0.0, 0.0, 0.0)
-    return Parts(False, 0.0, 0.0, 0.0, NO_OPERATOR, NO_OPERATOR, NO_OPERATOR, nothing, nothing, nothing)
-
-
-@merged
-def _clear(q_hat: FloatArray) -> None:
-    """Set a joint motion to zero."""
-    for i in range(q_hat.shape[0]):
-        q_hat[i] = 0.0
 
 
 @merged
@@ -108,7 +107,7 @@ def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tu
     """
     D = sub(A_cs, A_c)
     if dot(D, D) <= COINCIDENT * COINCIDENT * dot(A_cs, A_cs):
-        _clear(q_hat)
+        q_hat[:] = 0.0
         return True, 0.0, NO_OPERATOR
     found, H_t = translation_mechanism(work, A_c, D, q_hat)
     a_cs = axpy(-dot(D, A_cs) / dot(A_cs, A_cs), A_cs, D)
@@ -124,7 +123,7 @@ def translation_part(work: Work, A_c: Vec4, A_cs: Vec4, q_hat: FloatArray) -> tu
 
 @merged
 def onto_plane_part(
-    work: Work, task: Task, face: _Face, a_t: Vec4, q_hat: FloatArray, memory: Memory
+    work: Work, task: Task, face: _Face, a_t: Vec4, q_hat: FloatArray, driven: FloatArray
 ) -> tuple[bool, float, Mat4]:
     """Rotation of the face onto the translated target plane, [RH00] eqs. (9), (13)–(15).
 
@@ -139,7 +138,7 @@ def onto_plane_part(
     D = axpy(-dot(D, A_c) / dot(A_c, A_c), A_c, D)
     if dot(D, D) <= COINCIDENT * COINCIDENT:
         if same >= 0.0:
-            _clear(q_hat)
+            q_hat[:] = 0.0
             return True, 0.0, NO_OPERATOR
         first = sub(vec(A[task.order[0]]), A_c)
         if dot(first, first) <= COINCIDENT * COINCIDENT * dot(A_c, A_c):
@@ -157,7 +156,7 @@ def onto_plane_part(
         _negate(q_hat)
         H_r = multiple(-1.0, H_r)
         theta = -theta
-    theta = choose_sense(a, a_t, H_r, theta, task, _agreement(q_hat, memory.rotation[0]) < 0.0)
+    theta = choose_sense(a, a_t, H_r, theta, task, _agreement(q_hat, driven) < 0.0)
     return True, theta, H_r
 
 
@@ -193,7 +192,7 @@ def _oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool,
 
 @merged
 def _within_plane_part(
-    work: Work, face: _Face, A_r: FloatArray, q_hat: FloatArray, memory: Memory
+    work: Work, face: _Face, A_r: FloatArray, q_hat: FloatArray, driven: FloatArray
 ) -> tuple[bool, float, Mat4]:
     """Rotation of the face within its plane, [RH00] eqs. (10), (13)–(15).
 
@@ -235,7 +234,7 @@ def _within_plane_part(
     if math.pi - abs(theta) <= HALF_TURN_TOLERANCE:
         theta = abs(theta)
     if math.pi - abs(theta) < CONTINUITY_BAND:
-        previous = _agreement(q_hat, memory.rotation[1])
+        previous = _agreement(q_hat, driven)
         if theta > 0.0 and previous < 0.0:
             theta -= 2.0 * math.pi
         elif theta < 0.0 and previous > 0.0:
@@ -243,19 +242,13 @@ def _within_plane_part(
     return True, theta, H_p
 
 
-@internal
-def partition(
-    work: Work, task: Task, A: FloatArray, A_t: FloatArray, A_r: FloatArray, q_hat: FloatArray, memory: Memory
-) -> Parts:
+@njit
+def partition(task: Task, split: Split) -> Parts:
     """Partition of the remaining task, [RH00] eqs. (8)–(16).
 
-    work : operators at the current joints in ``work.H_hat``.
-    task : target and visibility.
-    A : (m, 4) current points of the face, a_inf·A = 1.
-    A_t, A_r : (m, 4) on return the target without the translation, and without both.
-    q_hat : (≥3, n) on return the joint motions t, r, p.
-    memory : sense of the last rotations, updated.
+    task : target and visibility; split : operators, face and the sense of the last rotations, updated.
     """
+    work, A, q_hat = split.work, split.A, split.q_hat
     A_c = center_of(A, task.center)
     A_cs = center_of(task.A_star, task.center)
     a = face_plane(A, task.order, A_c)
@@ -264,29 +257,19 @@ def partition(
     a_t = unit(axpy(tau, apply_transposed(H_t, a_star), a_star))
     for k in range(A.shape[0]):
         A_ks = vec(task.A_star[k])
-        put_vec(A_t[k], axpy(-tau, apply(H_t, A_ks), A_ks))
+        put_vec(split.A_t[k], axpy(-tau, apply(H_t, A_ks), A_ks))
     face = _Face(A, a, A_c)
-    theta_r = 0.0
-    theta_p = 0.0
-    H_r = NO_OPERATOR
-    H_p = NO_OPERATOR
+    theta_r, theta_p = 0.0, 0.0
+    H_r, H_p = NO_OPERATOR, NO_OPERATOR
     if found:
-        found, theta_r, H_r = onto_plane_part(work, task, face, a_t, q_hat[1], memory)
+        found, theta_r, H_r = onto_plane_part(work, task, face, a_t, q_hat[1], split.driven[0])
     if found:
         back = rotation(H_r, -theta_r)
         for k in range(A.shape[0]):
-            put_vec(A_r[k], apply(back, vec(A_t[k])))
-        found, theta_p, H_p = _within_plane_part(work, face, A_r, q_hat[2], memory)
+            put_vec(split.A_r[k], apply(back, vec(split.A_t[k])))
+        found, theta_p, H_p = _within_plane_part(work, face, split.A_r, q_hat[2], split.driven[1])
     if found:
         for i in range(q_hat.shape[1]):
-            memory.rotation[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]
-            memory.rotation[1, i] = q_hat[2, i] if theta_p >= 0.0 else -q_hat[2, i]
+            split.driven[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]
+            split.driven[1, i] = q_hat[2, i] if theta_p >= 0.0 else -q_hat[2, i]
     return Parts(found, tau, theta_r, theta_p, H_t, H_r, H_p, a, a_t, A_c)
-
-
-@njit
-def partition_now(
-    work: Work, task: Task, A: FloatArray, A_t: FloatArray, A_r: FloatArray, q_hat: FloatArray, memory: Memory
-) -> Parts:
-    """The same for callers in Python: what laws need none of, and takes long to compile."""
-    return partition(work, task, A, A_t, A_r, q_hat, memory)

@@ -1,17 +1,18 @@
-"""The task as all markers of the body show it: teaching by showing."""
+"""What laws are given as their task: by the face, by all markers of the body, and with a plan to follow."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, mul, translation
+from projservo_cli.geometry.algebra import mul, translation
 from projservo_cli.geometry.jit import composed
-from projservo_cli.geometry.kinematics import forward, operators_at
+from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.kinematics import forward, operators_at, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.geometry.mechanisms import OWN, Span, Work, span_of, workspace
-from projservo_cli.records import FloatArray, Model
-from projservo_cli.task.body import Body, Until, carry, fit_body, new_normal
+from projservo_cli.geometry.mechanisms import span_of, workspace
+from projservo_cli.records import FloatArray, InputError, Model, Plan, WorkFailed
+from projservo_cli.task.body import NO_BODY, SETTLED, Body, carry, fit_body
 from projservo_cli.task.face import (
     FOUND,
     MISFIT_GOAL,
@@ -24,120 +25,141 @@ from projservo_cli.task.face import (
     put_task,
     require_found,
 )
-from projservo_cli.task.partition import Memory, partition_now
-from projservo_cli.task.trajectory import turned
+from projservo_cli.task.partition import Split, partition
+from projservo_cli.task.trajectory import Reference, both_rotations, trajectory_displacement
 
-# A fit ends where a step moves the images by less than this, px rms a coordinate.
-SETTLED_SIGHT_PX = 1e-6
-MOST_SIGHT_STEPS = 30
-SETTLED, TOO_FEW, UNSETTLED = range(3)  # how it ended
-
-
-class Bench(NamedTuple):
-    """Workspace in which a task is measured."""
-
-    work: Work  # arrays of the kernels
-    # A, A_t, A_r: (m, 4) the face at the start, the target without translation, and without both
-    A: FloatArray
-    A_t: FloatArray
-    A_r: FloatArray
-    q_hat: FloatArray  # (3, k) joint motions t, r, p, or coordinates in the span
-    memory: Memory  # of the partition
-    normal: FloatArray  # (6, 7) of the fit of the body
-    angle: FloatArray  # (m,) of the order of the markers
+# A last period that is shorter than this share of one is none.
+_ROUND_OFF = 1e-9
+# Share of a period over which image velocities are differences: what it leaves is the curvature of the
+# image paths in so much of a period, a millionth of a pixel, far above round-off.
+_DIFFERENCE = 1e-4
 
 
-def new_bench(n: int, m: int, span: Span = OWN) -> Bench:
-    """Workspace for n joints and m markers of the face; an arm of n ≠ 6 joints has a span."""
-    work = workspace(n, 4 * m, span)
-    k = len(work.basis)
-    A, A_t, A_r = np.zeros((3, m, 4))
-    return Bench(work, A, A_t, A_r, np.zeros((3, k)), Memory(np.zeros((2, k))), new_normal(), np.zeros(m))
+class Shown(NamedTuple):
+    """Start and goal of a task as images show them: teaching by showing."""
 
+    q_start: FloatArray  # (n,) joint readings at the start, rad or m, with the offset if there is one
+    s_start: FloatArray
+    s_star: FloatArray  # s_start, s_star: (2, b, 2) px of the face, then of its pins; NaN where unknown
+    center: int  # position of the centre marker within the face, or ``MIDPOINT``
+    pins: int = 0  # how many of the markers are not on the face
+    body: Body = NO_BODY  # of all of them, to measure with; none to measure point by point
 
-def task_from_body(
-    model: Model,
-    body: Body,
-    q_start: FloatArray,
-    s_start: FloatArray,
-    s_star: FloatArray,
-    center: int,
-    m: int,
-) -> Task:
-    """What the laws know of a task, from images of the whole body.
+    def by_points(self) -> "Shown":
+        """What they show of the face alone, to be measured point by point."""
+        m = self.s_start.shape[1] - self.pins
+        s_start, s_star = (np.ascontiguousarray(s[:, :m]) for s in (self.s_start, self.s_star))
+        return Shown(self.q_start, s_start, s_star, self.center)
 
-    model, body : calibrated.
-    q_start : (n,) joints at the start, rad or m.
-    s_start, s_star : (2, b, 2) pixels of the body at the start and at the goal, the m of the face first,
-        which both cameras must see; of the others NaN where unseen.
-    center : index of the centre marker, or ``MIDPOINT``.
-    m : markers of the face.
-    Raises WorkFailed if the face cannot be triangulated, a motion is not unique or the markers do not agree
-    on a place of the body.
-    """
-    shown = np.zeros(s_star.shape[:2], dtype=np.bool_)
-    task = new_task(model, s_star[:, :m], center)._replace(body=body._replace(shown=shown))
-    start, goal = straight_views(model.lens, s_start), straight_views(model.lens, s_star)
-    bench = new_bench(len(q_start), m)
-    require_found(*put_task(model.P, model.a_inf, start, goal, bench.A, bench.angle, task))
-    bench = new_bench(len(q_start), m, span_of(model, task.A_star))
-    require_found(*put_body_task(model, q_start, start, goal, bench, task))
-    return task
+    def task(self, model: Model) -> Task:
+        """What laws with a model, calibrated or metric, know of the task.
+
+        Raises WorkFailed if a marker of the face cannot be triangulated, the face is degenerate or a camera
+        looks along it; with a body, if a motion is not unique or the markers do not agree on a place of it.
+        """
+        m, n = self.s_start.shape[1] - self.pins, len(self.q_start)
+        shown = np.array([straight_views(model.lens, s) for s in (self.s_start, self.s_star)])
+        unseen = np.zeros((2, len(self.body.M)), dtype=np.bool_)
+        task = new_task(model, self.s_star[:, :m], self.center)._replace(
+            body=self.body._replace(shown=unseen)
+        )
+        require_found(*put_task(model, shown, task, np.zeros((m, 4)), np.zeros(m)))
+        if len(self.body.M) > 0:
+            work = workspace(n, 4 * m, span_of(model, task.A_star))
+            k = len(work.basis)
+            A, A_t, A_r = np.zeros((3, m, 4))
+            split = Split(work, A, A_t, A_r, np.zeros((3, k)), np.zeros((2, k)))
+            normal = np.zeros((COORDINATES, COORDINATES + 1))
+            require_found(*put_body_task(model, self.q_start, shown, task, split, normal))
+        return task
 
 
 @composed
 def put_body_task(
-    model: Model, q_start: FloatArray, start: FloatArray, goal: FloatArray, bench: Bench, task: Task
+    model: Model, q_start: FloatArray, shown: FloatArray, task: Task, split: Split, normal: FloatArray
 ) -> tuple[int, int]:
     """Points of a task at the goal by the whole body instead of the face alone.
 
     The goal is found from the start by the partition of the task, which the triangulated face
     determines, and fitted to all markers seen there.
 
-    start, goal : (2, b, 2) straight pixels of the body, NaN where unseen.
-    bench : on return with the face at the start.
+    shown : (2, 2, b, 2) straight pixels of the body at the start and at the goal, NaN where unseen.
     task : as ``put_task`` leaves it, with the body; on return with its points and the views that were shown.
+    split : on return with the face at the start.
+    normal : (6, 7) workspace of the fit of the body.
     Returns what is wrong, ``FOUND`` for nothing, and how many markers were seen, counted once a view.
     """
-    ended, views, H_start = settled(model.P, task.body, start, forward(model, q_start), bench.normal)
-    if ended != SETTLED:
-        return UNSEEN_START if ended == TOO_FEW else MISFIT_START, views
-    operators_at(model, q_start, bench.work.H_hat)
-    carry(task.body, H_start, bench.A)
-    bench.memory.rotation[:] = 0.0
-    parts = partition_now(bench.work, task, bench.A, bench.A_t, bench.A_r, bench.q_hat, bench.memory)
+    goal = shown[1]
+    there = fit_body(model.P, task.body, shown[0], forward(model, q_start), SETTLED, normal)
+    if not there.settled:
+        return MISFIT_START if there.found else UNSEEN_START, there.views
+    operators_at(model, q_start, split.work.H_hat)
+    carry(task.body, there.H, split.A)
+    split.driven[:] = 0.0
+    parts = partition(task, split)
     if not parts.found:
         return NOT_UNIQUE, 0
-    turn = turned(parts.H_r, parts.H_p, parts.theta_r, parts.theta_p)
-    H_guess = mul(mul(translation(parts.H_t, parts.tau), turn), H_start)
-    ended, views, H_star = settled(model.P, task.body, goal, H_guess, bench.normal)
-    if ended != SETTLED:
-        return UNSEEN_GOAL if ended == TOO_FEW else MISFIT_GOAL, views
-    carry(task.body, H_star, task.A_star)
+    turn = both_rotations(parts.H_r, parts.H_p, parts.theta_r, parts.theta_p)
+    guess = mul(mul(translation(parts.H_t, parts.tau), turn), there.H)
+    fit = fit_body(model.P, task.body, goal, guess, SETTLED, normal)
+    if not fit.settled:
+        return MISFIT_GOAL if fit.found else UNSEEN_GOAL, fit.views
+    carry(task.body, fit.H, task.A_star)
     for view in range(2):
         for k in range(goal.shape[1]):
             task.body.shown[view, k] = math.isfinite(goal[view, k, 0]) and math.isfinite(goal[view, k, 1])
-    return FOUND, views
+    return FOUND, fit.views
 
 
-@composed
-def settled(P: FloatArray, body: Body, s: FloatArray, H: Mat4, normal: FloatArray) -> tuple[int, int, Mat4]:
-    """Displacement of least reprojection error, from a predicted one.
+def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -> Task:
+    """The task with the plan to follow, [RH00] section 4.
 
-    P : (2, 3, 4) cameras.
-    s : (2, b, 2) straight pixels, NaN where unseen.
-    H : prediction.
-    normal : (6, 7) workspace.
-    Returns ``SETTLED``, ``TOO_FEW`` markers seen, or ``UNSETTLED`` after the most steps; markers seen,
-    counted once a; view; the displacement.
+    model : calibrated, in whose frame the plan was made; period : of the control, s; rate : factor of every
+        command.
+    Raises InputError if the plan has no time; WorkFailed if the joints cannot follow it.
     """
-    views = 0
-    for _ in range(MOST_SIGHT_STEPS):
-        fit = fit_body(P, body, s, H, Until(False, SETTLED_SIGHT_PX, 1), normal)
-        views = fit.views
-        if not fit.found:
-            return TOO_FEW, views, H
-        H = fit.H
-        if fit.before - fit.after <= SETTLED_SIGHT_PX * SETTLED_SIGHT_PX * (2 * views):
-            return SETTLED, views, H
-    return UNSETTLED, views, H
+    times = _instants(plan, period)
+    mu, q, A, s = _followed_at(model, task, plan, times)
+    until_next = np.append(np.diff(times), 0.0)
+    _, _, _, s_next = _followed_at(model, task, plan, times + _DIFFERENCE * until_next)
+    amplitudes = np.array([plan.tau, plan.theta_r, plan.theta_p])
+    A, s, ahead = (np.ascontiguousarray(x) for x in (A, s, (s_next - s) / _DIFFERENCE))
+    return task._replace(reference=Reference(plan.H_hat, amplitudes, mu, q, A, s, ahead, rate))
+
+
+def _instants(plan: Plan, period: float) -> FloatArray:
+    """Times (k,), k ≥ 2, one control period apart, the last that at which the plan arrives, s."""
+    if not np.isfinite(plan.q).all():
+        raise WorkFailed(
+            "the joints cannot follow the planned motion to its end, so that there is nothing to track: "
+            "choose another trajectory.profile, or control.without_plan replan to drive without a plan"
+        )
+    if plan.duration is None:
+        raise InputError(
+            "no joint that the plan moves has a speed limit that gives it a time in which to follow it: set "
+            "trajectory.duration_s"
+        )
+    count = max(1, math.ceil(plan.duration / period - _ROUND_OFF))
+    return np.asarray(np.minimum(np.arange(count + 1) * period, plan.duration))
+
+
+def _followed_at(
+    model: Model, task: Task, plan: Plan, times: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Shares (k, 3), joints (k, n), points (k, m, 4) and straight pixels (k, 2, m, 2) at times (k,), s.
+
+    The points are those that the planned displacement carries to where the face should be. What the plan
+    is off at the goal is taken back along the path: points where they were measured one by one, and
+    images by what the calibration is off there, so that both arrive where the goal was shown.
+    """
+    sigma = np.interp(times, plan.time, plan.sigma) if plan.time[-1] > 0.0 else np.ones(len(times))
+    mu, q = (
+        np.stack([np.interp(sigma, plan.sigma, row) for row in rows.T], axis=1) for rows in (plan.mu, plan.q)
+    )
+    amplitudes = plan.tau, plan.theta_r, plan.theta_p
+    H_d = trajectory_displacement(plan.H_hat, amplitudes, np.append(mu, np.ones((1, 3)), axis=0))
+    H_d, H_goal = np.swapaxes(H_d[:-1], 1, 2), H_d[-1].T
+    A = plan.A @ H_d + sigma[:, None, None] * (task.A_star - plan.A @ H_goal)
+    off = straight_views(model.lens, task.s_star) - project(model.P, task.A_star)
+    s = np.moveaxis(project(model.P, A), 0, 1) + sigma[:, None, None, None] * off
+    return mu, q, A @ np.linalg.inv(H_d), s

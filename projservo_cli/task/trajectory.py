@@ -4,12 +4,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, as_array, mat, mul, rotation, translation
+from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, put_vec, rotation, translation, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.records import FloatArray
 
 # Share of the path that a part driven first, or last, has to itself.
-PLATEAU = 0.5
+_PLATEAU = 0.5
 PROFILES = ("linear", "exponential", "rotation_first", "translation_first", "planar_first")
 
 
@@ -31,8 +31,8 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
     if profile == "exponential":
         share = np.expm1(-5.0 * sigma) / np.expm1(-5.0)
         return np.stack([share, share, share], axis=1)
-    early = np.minimum(sigma / PLATEAU, 1.0)
-    late = np.maximum((sigma - PLATEAU) / (1.0 - PLATEAU), 0.0)
+    early = np.minimum(sigma / _PLATEAU, 1.0)
+    late = np.maximum((sigma - _PLATEAU) / (1.0 - _PLATEAU), 0.0)
     share = min(1.0, pure_translation)
     t, r, p = {
         "linear": (sigma, sigma, sigma),
@@ -44,7 +44,7 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
 
 
 @njit
-def turned(H_r: Mat4, H_p: Mat4, theta_r: float, theta_p: float) -> Mat4:
+def both_rotations(H_r: Mat4, H_p: Mat4, theta_r: float, theta_p: float) -> Mat4:
     """Rotations of the planned displacement, exp(θ_r Ĥ_r) exp(θ_p Ĥ_p) of [RH00] eq. (17)."""
     return mul(rotation(H_r, theta_r), rotation(H_p, theta_p))
 
@@ -54,21 +54,19 @@ def displaced(H_hat: FloatArray, amplitudes: FloatArray, mu_t: float, mu_r: floa
     """Planned displacement at shares of the parts, [RH00] eqs. (17), (18)."""
     shift = translation(mat(H_hat[0]), mu_t * float(amplitudes[0]))
     theta_r, theta_p = mu_r * float(amplitudes[1]), mu_p * float(amplitudes[2])
-    return mul(shift, turned(mat(H_hat[1]), mat(H_hat[2]), theta_r, theta_p))
+    return mul(shift, both_rotations(mat(H_hat[1]), mat(H_hat[2]), theta_r, theta_p))
 
 
 def trajectory_displacement(
     H_hat: FloatArray, amplitudes: tuple[float, float, float], mu: FloatArray
 ) -> FloatArray:
-    """Planned displacement of the face, [RH00] eqs. (17), (18).
+    """Planned displacements (..., 4, 4) of the face at shares (..., 3), [RH00] eqs. (17), (18).
 
-    H_hat : (3, 4, 4) operators t, r, p.
-    amplitudes : τ in the unit of Ĥ_t, θ_r and θ_p in rad.
-    mu : (3,) shares.
-    Returns (4, 4) displacement exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p).
+    H_hat : (3, 4, 4) operators t, r, p; amplitudes : τ in the unit of Ĥ_t, θ_r and θ_p in rad.
     """
-    H_hat = np.ascontiguousarray(H_hat, dtype=np.float64)
-    return as_array(displaced(H_hat, np.array(amplitudes, dtype=np.float64), *(float(share) for share in mu)))
+    H_hat, sizes = np.ascontiguousarray(H_hat), np.array(amplitudes, dtype=np.float64)
+    found = [displaced(H_hat, sizes, *shares) for shares in mu.reshape(-1, 3).tolist()]
+    return np.array(found).reshape(*mu.shape[:-1], 4, 4)
 
 
 class Reference(NamedTuple):
@@ -107,7 +105,7 @@ def following(reference: Reference) -> bool:
 
 
 @merged
-def place(reference: Reference, clock: float) -> tuple[int, float]:
+def _place(reference: Reference, clock: float) -> tuple[int, float]:
     """Row before a time in periods, and how far on towards the next; the plan stays where it arrived."""
     last = reference.mu.shape[0] - 1
     i = min(int(clock), last - 1)
@@ -115,7 +113,7 @@ def place(reference: Reference, clock: float) -> tuple[int, float]:
 
 
 @merged
-def between(column: FloatArray, i: int, x: float) -> float:
+def _between(column: FloatArray, i: int, x: float) -> float:
     """Value between two rows; the rows themselves to the bit."""
     return (1.0 - x) * float(column[i]) + x * float(column[i + 1])
 
@@ -123,22 +121,51 @@ def between(column: FloatArray, i: int, x: float) -> float:
 @internal
 def planned(reference: Reference, clock: float) -> Mat4:
     """Displacement from the start that is planned until a time in periods, [RH00] eqs. (17), (18)."""
-    i, x = place(reference, clock)
-    mu_t = between(reference.mu[:, 0], i, x)
-    mu_r = between(reference.mu[:, 1], i, x)
-    mu_p = between(reference.mu[:, 2], i, x)
+    i, x = _place(reference, clock)
+    mu_t = _between(reference.mu[:, 0], i, x)
+    mu_r = _between(reference.mu[:, 1], i, x)
+    mu_p = _between(reference.mu[:, 2], i, x)
     return displaced(reference.H_hat, reference.amplitudes, mu_t, mu_r, mu_p)
+
+
+@merged
+def put_aim(
+    reference: Reference, clock: float, lead: float, A: FloatArray, s: FloatArray, q_ahead: FloatArray
+) -> None:
+    """Write where the face should be now, where its images should go, and how the joints lead there.
+
+    For the image-based law, whose command is −λ J⁺ (s − s_aim), the planned velocity ṡ is fed forward by
+    aiming ahead: s_aim = s + ṡ/λ.
+
+    clock : time in periods.
+    lead : 1/λ in periods.
+    A : (m, 4) on return the face; s : (2, m, 2) straight pixels to aim at; q_ahead : (n,) joint motion in
+        the next period, rad or m.
+    """
+    i, x = _place(reference, clock)
+    j, y = _place(reference, clock + 1.0)
+    H = planned(reference, clock)
+    for k in range(A.shape[0]):
+        for c in range(4):
+            A[k, c] = _between(reference.A[:, k, c], i, x)
+        put_vec(A[k], apply(H, vec(A[k])))
+        for view in range(2):
+            for c in range(2):
+                here = _between(reference.s[:, view, k, c], i, x)
+                s[view, k, c] = here + lead * _between(reference.s_ahead[:, view, k, c], i, x)
+    for l in range(q_ahead.shape[0]):
+        q_ahead[l] = _between(reference.q[:, l], j, y) - _between(reference.q[:, l], i, x)
 
 
 @merged
 def planned_step(reference: Reference, clock: float, share: float) -> Mat4:
     """Displacement that the plan makes from a time on in a share of a period."""
     mu = reference.mu
-    i, x = place(reference, clock)
+    i, x = _place(reference, clock)
     H_r, H_p = mat(reference.H_hat[1]), mat(reference.H_hat[2])
-    theta_r = between(mu[:, 1], i, x) * float(reference.amplitudes[1])
-    theta_p = between(mu[:, 2], i, x) * float(reference.amplitudes[2])
-    tau = between(mu[:, 0], i, x) * float(reference.amplitudes[0])
+    theta_r = _between(mu[:, 1], i, x) * float(reference.amplitudes[1])
+    theta_p = _between(mu[:, 2], i, x) * float(reference.amplitudes[2])
+    tau = _between(mu[:, 0], i, x) * float(reference.amplitudes[0])
     turned_back = mul(rotation(H_p, -theta_p), rotation(H_r, -theta_r))
     return mul(
         planned(reference, clock + share), mul(turned_back, translation(mat(reference.H_hat[0]), -tau))

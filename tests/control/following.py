@@ -6,9 +6,8 @@ import numpy as np
 
 from projservo_cli.records import NO_LENS
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.scenario import Shown
-from projservo_cli.task.following import followed
 from projservo_cli.task.margins import within
+from projservo_cli.task.target import Shown, followed
 from tests.known import asked
 from tests.scene import GAINS, Run, limits
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.control import CODES
-from projservo_cli.control.law import LOST, OK, new_state
+from projservo_cli.control.law import LOST, OK
 from projservo_cli.geometry.kinematics import image_jacobian
-from projservo_cli.loop.python import bind, bound_command
+from projservo_cli.loop.python import BuiltInLaw
 from tests.samples import frame, operators, poe
 from tests.scene import GAINS, scene
 
@@ -22,9 +22,7 @@ def instant(types, m, seed):
 
 
 def commanded(law, sc, s, q, G=None):
-    state = new_state(len(q), s.shape[1])
-    status = bound_command(bind(CODES[law], sc.seen(G), sc.task(G), GAINS, state), s, q)
-    return status, state.q_dot
+    return BuiltInLaw(CODES[law], sc.seen(G), sc.task(G), GAINS)(s, q)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -74,9 +72,8 @@ def test_laws_need_no_metric_frame(law, types):
         assert status == OK
         assert q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
     scaled = sc.model._replace(P=sc.model.P * np.array([-3.0, 1e-3])[:, None, None])
-    state = new_state(6, 4)
-    bound_command(bind(CODES[law], scaled, sc.task(), GAINS, state), s, q)
-    assert state.q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
+    _, q_dot = BuiltInLaw(CODES[law], scaled, sc.task(), GAINS)(s, q)
+    assert q_dot == pytest.approx(wanted, abs=1e-8 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("law", list(CODES))

@@ -7,11 +7,10 @@ import pytest
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
 from projservo_cli.records import MODES_OF, TRACK, InputError, WorkFailed
-from projservo_cli.task.following import followed
+from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import (
     NO_REFERENCE,
     following,
-    place,
     planned_step,
     trajectory_displacement,
 )
@@ -71,7 +70,6 @@ def test_the_reference_ends_at_the_goal_that_was_shown():
     assert reference.A[-1] @ goal.T == pytest.approx(task.A_star, abs=1e-12)
     assert reference.s[-1] == pytest.approx(sc.s_star, abs=1e-9)
     assert (reference.s_ahead[-1] == 0.0).all()
-    assert place(reference, 1e9) == (len(reference.mu) - 2, 1.0)
     # The velocity times a period, against what the images move in one: to the curvature of their paths.
     moved = np.diff(reference.s, axis=0)
     assert reference.s_ahead[:-1] == pytest.approx(moved, abs=0.1 * np.abs(moved).max())

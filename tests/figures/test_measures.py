@@ -5,11 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from projservo_cli.control.law import OK
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.loop.step import on_plateau, plateau_stretch
+from projservo_cli.loop.step import PLATEAU, Instant, new_log, plateau_stretch, verdict_at
 from projservo_cli.report import material as measures
 from projservo_cli.report.claims import claims_of
 from tests.figures.cases import SPECS, case, geometric
+from tests.scene import limits
 
 
 def test_decay_factors_of_a_geometric_sequence_end_above_the_least_value():
@@ -42,6 +44,15 @@ def test_gap_of_parallel_paths_is_their_distance_whatever_their_sampling():
     straight = np.array([[0.0, 0.0], [10.0, 0.0]])
     detour = np.array([[0.0, 0.0], [5.0, 4.0], [10.0, 0.0]])
     assert measures.path_gap(straight, detour) == pytest.approx(4.0, 1e-14)
+
+
+def on_plateau(error, k, window):
+    """Whether a run whose last instant is k ends so."""
+    log = new_log(6, 4, len(error), 5)
+    log.judged[: len(error)], log.begun[:2] = error, 1.0
+    now = Instant(True, False, 1.0, OK, np.zeros(6))
+    bounds = limits(image_px=0.0, diverged_factor=1e9, plateau_steps=window, max_steps=k)
+    return verdict_at(log, k, now, bounds) == PLATEAU
 
 
 @given(st.lists(st.sampled_from([0.5, 0.95, 0.9999, 1.0, 1.01]), min_size=0, max_size=60), st.integers(1, 20))

@@ -7,7 +7,8 @@ import numpy as np
 from projservo_cli.config import load_config
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.stages.world import truth_of
-from projservo_cli.task.face import MIDPOINT, task_from_images
+from projservo_cli.task.face import MIDPOINT
+from projservo_cli.task.target import Shown
 
 CALLS = []
 
@@ -102,9 +103,9 @@ class DirectThree:
 
     def __init__(self, setup):
         model = setup.calibration.model()
-        task = task_from_images(model, setup.s_start, setup.s_star, MIDPOINT)
+        task = Shown(setup.plan.q_start, setup.s_start, setup.s_star, MIDPOINT).task(model)
         self.law = BuiltInLaw(0, model, task, setup.gains)
-        self.law.state.memory.rotation[:] = setup.plan.rotation_sense()
+        self.law.state.driven[:] = setup.plan.rotation_sense()
 
     def __call__(self, s, q):
         return self.law(s, q)[1]

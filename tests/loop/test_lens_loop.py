@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES
 from projservo_cli.geometry.lens import bent
-from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.loop.python import run as run_python
 from projservo_cli.records import LAWS, METRIC_LAWS
-from projservo_cli.robots.simulated import AnalyticPlant
 from tests.samples import frame
-from tests.scene import GAINS, STEP, Run, limits, with_pins
+from tests.scene import STEP, Run, limits, with_pins
 from tests.scene import scene as scene_of
 
 # Centres away from the face, where a lens bends more.
@@ -55,22 +51,6 @@ def test_the_body_is_measured_through_the_lens():
     assert (runs[1].log.fit[:, 2] == 18).all()
     # The fit of the body stops within 1e-7 rad of where it would settle.
     assert runs[1].log.q == pytest.approx(runs[0].log.q, abs=1e-7)
-
-
-def test_both_loops_are_equal_to_the_bit_through_a_lens(rng):
-    sc, bounds = through_lenses(scene()), limits(max_steps=20)
-    noise = 0.3 * rng.normal(size=(21, 2, 4, 2))
-    for law in ("stacked",):
-        compiled = Run(sc, law, bounds=bounds, noise=noise, G=frame(2))
-        built_in = BuiltInLaw(
-            CODES[law], sc.seen(frame(2)), sc.task(frame(2)), GAINS._replace(speed=bounds.speed)
-        )
-        _, steps, log = run_python(
-            built_in, AnalyticPlant(sc.plant, sc.q_start, noise), sc.s_star, GAINS.period, bounds
-        )
-        assert steps == compiled.steps
-        assert log.q[: steps + 1].tobytes() == compiled.full.q[: steps + 1].tobytes()
-        assert log.s[: steps + 1].tobytes() == compiled.full.s[: steps + 1].tobytes()
 
 
 def test_markers_beyond_the_turn_of_a_lens_are_lost():

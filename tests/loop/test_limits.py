@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from projservo_cli.control import CODES
-from projservo_cli.loop.python import BuiltInLaw, run
-from projservo_cli.loop.step import VERDICTS, shorten, stands_still
+from projservo_cli.loop.python import BuiltInLaw, run_in_python
+from projservo_cli.loop.step import VERDICTS
 from projservo_cli.robots.simulated import AnalyticPlant
-from tests.loop.test_python_loop import same_logs
+from tests.loop.test_python_loop import in_python, same_logs
 from tests.scene import GAINS, STEP, Run, limits, scene
 
 STOP = {"stop_at_joint_limit": True}
@@ -54,9 +54,7 @@ def test_both_loops_end_at_the_limit_alike(law, sigma, rng):
     bounds = limits(max_steps=200, **STOP)
     noise = sigma * rng.normal(size=(201, 2, 4, 2))
     compiled = Run(sc, law, gains, bounds, noise)
-    built_in = BuiltInLaw(CODES[law], sc.model, sc.task(), gains._replace(speed=bounds.speed))
-    plant = AnalyticPlant(sc.plant, sc.q_start, noise)
-    code, steps, log = run(built_in, plant, sc.s_star, GAINS.period, bounds)
+    code, steps, log = in_python(sc, law, bounds, noise, gains=gains)
     assert (VERDICTS[code], steps) == (compiled.verdict, compiled.steps)
     assert compiled.verdict == "joint limit"
     assert (log.q[: steps + 1] <= sc.plant.upper).all()
@@ -67,7 +65,7 @@ def test_a_scaled_run_stops_at_the_limit_too():
     sc, gains = narrowed()
     built_in = BuiltInLaw(CODES["exact"], sc.model, sc.task(), gains)
     plant = AnalyticPlant(sc.plant, sc.q_start, np.zeros((401, 2, 4, 2)))
-    code, _, _ = run(built_in, plant, sc.s_star, GAINS.period, limits(**STOP), 0.25)
+    code, _, _ = run_in_python(built_in, plant, sc.s_star, GAINS.period, limits(**STOP), 0.25)
     assert VERDICTS[code] == "joint limit"
     assert 0 <= sc.plant.upper[2] - plant.q[2] < 1e-5
 
@@ -83,18 +81,3 @@ def test_limits_beside_the_path_change_nothing():
     lower[2] = sc.q_start[2] + 0.1 * STEP[2]
     returning = Run(sc, "exact", gains._replace(lower=lower), limits(**STOP))
     np.testing.assert_array_equal(returning.log.q, free.log.q)
-
-
-def test_a_step_is_shortened_to_the_first_limit():
-    lower, upper = np.array([-1.0, -2.0, -np.inf]), np.array([1.0, 2.0, np.inf])
-    dq = np.array([0.5, -1.0, 40.0])
-    assert shorten(np.array([0.8, 0.0, 0.0]), dq, lower, upper) == 0
-    np.testing.assert_allclose(dq, [0.2, -0.4, 16.0], rtol=1e-11)
-    assert shorten(np.zeros(3), dq, lower, upper) == -1
-    beyond = np.array([1.1, 0.0, 0.0])
-    back, out = np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.1, 0.0])
-    assert shorten(beyond, back, lower, upper) == -1
-    assert back[0] == -0.3  # it may return
-    assert shorten(beyond, out, lower, upper) == 0
-    assert stands_still(out)
-    assert not stands_still(back)

@@ -11,14 +11,15 @@ import pytest
 from scipy.linalg import expm
 
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, Gains, new_state
+from projservo_cli.control.law import ERRORS, Gains, Law, new_state
 from projservo_cli.geometry.algebra import IDENTITY, as_array
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.loop.compiled import run
+from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FREE, Model
 from projservo_cli.robots.simulated import METRIC_A_INF, Plant, pose_after
-from projservo_cli.task.face import center_of, cyclic_order, face_plane, task_from_images
+from projservo_cli.task.face import center_of, cyclic_order, face_plane
+from projservo_cli.task.target import Shown
 from tests.samples import displacement, hat, pixels
 
 P = np.array([np.c_[np.eye(3), [0.15, 0, 0]], np.c_[np.eye(3), [-0.15, 0, 0]]])
@@ -58,9 +59,11 @@ def drive(law, perturbation, max_steps=3000):
     gains = Gains(GAIN, GAIN, GAIN, GAIN, 1.0, GAIN, PERIOD, 0.9)
     ends = Limits(np.full(6, math.inf), CONVERGED_RMS, 10.0, 20, max_steps, False, False)
     state, log = new_state(6, 5), new_log(6, 5, max_steps, len(ERRORS))
-    task = task_from_images(plant.model, pixels(P, M), pixels(P, M_star), -1)
+    task = Shown(np.zeros(6), pixels(P, M), pixels(P, M_star), -1).task(plant.model)
     noise = np.zeros((max_steps + 1, 2, 5, 2))
-    verdict, steps = run(CODES[law], plant.model, task, gains, ends, plant, noise, np.zeros(6), state, log)
+    verdict, steps = run_compiled(
+        Law(CODES[law], plant.model, task, gains), Course(plant, ends, np.zeros(6)), noise, state, log
+    )
     return VERDICTS[verdict], steps, log
 
 

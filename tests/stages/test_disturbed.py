@@ -5,7 +5,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.control import CODES
-from projservo_cli.loop.python import BuiltInLaw, run
+from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.records import InputError
 from projservo_cli.robots.simulated import AnalyticPlant
@@ -50,7 +50,7 @@ def test_both_loops_suffer_alike(overrides, pins):
     compiled = Run(sc, "exact", bounds=bounds, noise=noise, task=task)
     plant = AnalyticPlant(sc.plant, sc.q_start, noise)
     law = BuiltInLaw(CODES["exact"], sc.model, task, GAINS._replace(speed=bounds.speed))
-    code, steps, log = run(law, plant, sc.s_star, GAINS.period, bounds)
+    code, steps, log = run_in_python(law, plant, sc.s_star, GAINS.period, bounds)
     assert (VERDICTS[code], steps) == (compiled.verdict, compiled.steps)
     same_logs(log, compiled.full, steps)
 

@@ -5,10 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.loop.step import plateau_stretch
-from projservo_cli.loop.summary import angle_between
-from tests.samples import displacement
 from tests.stages.cases import Case, case
 
 
@@ -90,11 +87,3 @@ def test_plateau_is_the_longest_stretch_without_a_fall():
     assert plateau_stretch(100 * 0.9 ** np.arange(30), 5) is None
     assert plateau_stretch(np.ones(3), 5) is None
     assert np.diff(plateau_stretch(np.ones(30), 5)) == 29
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, math.pi - 1e-7, math.pi])
-def test_angle_between_rotations(angle):
-    """Accurate at both ends, where an arc cosine would lose half its digits."""
-    start = displacement([0.3, 0.2, -0.5], [0, 0, 0])
-    goal = displacement([0, angle, 0], [1, 2, 3]) @ start
-    assert angle_between(as_mat(start), as_mat(goal)) == pytest.approx(angle, abs=1e-14)

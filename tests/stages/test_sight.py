@@ -10,11 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.config.models import Noise
-from projservo_cli.geometry.algebra import as_mat
-from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.task.body import NO_BODY
 from tests.known import driven
 from tests.stages.cases import Case, case
 
@@ -63,10 +62,9 @@ def steady(law, sigma, observation, runs):
         verdicts[trace.verdict] += 1
         assert trace.observation == observation
         gap = 1e3 * np.linalg.norm(trace.center[TAIL:] - example.goal_center, axis=1)
-        turn = [
-            math.degrees(angle_between(as_mat(pose), as_mat(example.scenario.true_ends.goal_pose)))
-            for pose in trace.pose[TAIL:]
-        ]
+        R = trace.pose[TAIL:, :3, :3]
+        turned = np.swapaxes(R, 1, 2) @ example.scenario.true_ends.goal_pose[:3, :3]
+        turn = np.degrees(Rotation.from_matrix(turned).magnitude())
         position.append(np.mean(gap**2))
         rotation.append(np.mean(np.square(turn)))
     return np.sqrt([np.mean(position), np.mean(rotation)]), verdicts
@@ -123,11 +121,11 @@ def test_the_body_is_the_default_but_for_the_laws_that_need_points():
 def test_a_calibration_that_is_not_usable_has_no_body_unless_one_is_asked_for():
     example, calibration, _ = calibrated()
     points = Case("paper", ["control.observation=points"])
-    assert scenario_of(points.config, calibration).exact.body is None
+    assert scenario_of(points.config, calibration).exact.body is NO_BODY
     poor = replace(calibration, usable=False)
-    assert scenario_of(example.config, poor).exact.body is None
+    assert scenario_of(example.config, poor).exact.body is NO_BODY
     asked = Case("paper", ["control.observation=body"])
-    assert scenario_of(asked.config, poor).exact.body is not None
+    assert scenario_of(asked.config, poor).exact.body is not NO_BODY
 
 
 def test_only_markers_that_the_calibration_knows_are_used():

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from projservo_cli.control.law import new_state
+from projservo_cli.control.law import new_state, split_of
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
-from projservo_cli.task.partition import partition_now
+from projservo_cli.task.partition import partition
 from tests.samples import arm, displacement, in_frame, operators, pixels
 
 SQUARE = np.array(
@@ -57,11 +57,12 @@ class Split:
         self.task = make_task(self.model, self.A, self.A_star, center)
         self.state = new_state(len(types), len(A))
         self.state.work.H_hat[:] = operators(self.model, q)
-        memory = self.state.memory if memory is None else memory
-        s = self.state
-        self.parts = partition_now(s.work, self.task, self.A, s.A_t, s.A_r, s.q_hat, memory)
-        self.memory = memory
-        self.q_hat = s.q_hat[:3].copy()
+        self.state.A[:] = self.A
+        if memory is not None:
+            self.state.driven[:] = memory
+        self.parts = partition(self.task, split_of(self.state))
+        self.memory = self.state.driven
+        self.q_hat = self.state.q_hat[:3].copy()
         self.H_hat = [as_array(H) for H in (self.parts.H_t, self.parts.H_r, self.parts.H_p)]
 
     @property

@@ -144,10 +144,11 @@ def test_half_a_turn_goes_on_in_the_sense_it_began(part):
 
     first = Split(SQUARE, task(-1e-3))
     driven = first.amplitudes[part] * first.q_hat[part]
-    memory = first.memory
+    memory = first.memory.copy()
     # Exactly opposite faces leave the axis of the first rotation open: not a step of its sequence.
     for excess in (1e-3, -2e-3, 3e-3, 0.0 if part == 2 else 1e-6, 1e-3):
         following = Split(SQUARE, task(excess), memory=memory)
+        memory = following.memory
         step = following.amplitudes[part] * following.q_hat[part]
         assert step @ driven > 0.99 * (driven @ driven)
         assert pytest.approx(following.A_star, abs=1e-9) == following.A @ reassembled(following).T

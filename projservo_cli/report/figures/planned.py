@@ -32,7 +32,7 @@ def _data_steep(material: Material) -> Data:
     plan = material.plan
     mu = np.stack([np.minimum(plan.sigma / STEEP, 1.0), plan.sigma, plan.sigma], axis=1)
     amplitudes = (plan.tau, plan.theta_r, plan.theta_p)
-    H_d = np.array([trajectory_displacement(plan.H_hat, amplitudes, row) for row in mu])
+    H_d = trajectory_displacement(plan.H_hat, amplitudes, mu)
     s = np.array([project(material.calibrated.P, plan.A @ H.T, material.calibrated.lens) for H in H_d])
     carried = np.array([np.linalg.solve(H.T, plan.a) for H in H_d])
     margin = carried @ plan.optical_center.T / (plan.optical_center @ plan.a)
