@@ -12,7 +12,7 @@ from pathlib import Path
 
 from projservo_cli.config import Config, digest
 from projservo_cli.records import InputError, names_of
-from projservo_cli.report.values import CLAIMS_FILE, PAGE_FILE
+from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.stages.world import has_task
 from projservo_cli.store import SERVO, Run
 

@@ -57,11 +57,8 @@ def report(folder: Folder, formats: Sequence[str], progress: Progress) -> tuple[
 
 
 def _drawn(picture: _Picture, folder: Path, formats: Sequence[str]) -> Iterator[Path]:
-    with style.styled():
-        figure = style.new_figure(picture.height, 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH)
-        picture.draw(picture.data, figure)
-        style.arrange(figure)
-        made = style.contents(figure, formats)
+    width = 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH
+    made = style.contents(style.drawn(picture.draw, picture.data, picture.height, width), formats)
     for kind, content in made.items():
         path = folder / f"{picture.name}.{kind}"
         with replacing(path) as temporary:

@@ -7,7 +7,6 @@ import pytest
 
 from projservo_cli.cli.words import summary
 from projservo_cli.records import WorkFailed
-from projservo_cli.report.values import scalars
 from projservo_cli.stages import calibrate, plan, servo
 from tests.control.tracking import run_of
 from tests.known import configured
@@ -84,7 +83,7 @@ def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
     assert trace.unplanned == "no joints can follow the plan: too near to something"
     assert alone.unplanned == ""
     np.testing.assert_array_equal(trace.q, alone.q)
-    words = " ".join(" ".join(summary("servo", {"laws": [scalars(trace)]})).split())
+    words = " ".join(" ".join(summary("servo", {"laws": [vars(trace)]})).split())
     assert "driven without a plan: no joints can follow the plan: too near to something" in words
 
 

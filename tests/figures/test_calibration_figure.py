@@ -8,7 +8,6 @@ from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.config import load_config
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
-from projservo_cli.report.figures import calibration
 from projservo_cli.report.material import Fit
 from projservo_cli.stages import calibrate, chain
 from projservo_cli.stages.steps import steps_for
@@ -27,20 +26,16 @@ def fitted():
     return Fit(*reversed(calibrate.run(configured("paper"))[:2]))
 
 
-def shifted(name="paper", **fields):
+def shifted(name="paper", size=1.0, **fields):
     """A calibration and images that are what it predicts, but for one shift in each view."""
     known = dataclasses.replace(case(name)[2].calibration, **fields)
     q = case(name)[2].observation.q
-    images = predict(known, q) + SHIFT_PX[:, None]
+    images = predict(known, q) + size * SHIFT_PX[:, None]
     return Fit(known, Observation(np.arange(len(q)) + 100, known.marker, q, images))
 
 
 def drawn(fit):
-    with style.styled():
-        figure = style.new_figure(SPEC.height)
-        SPEC.draw(SPEC.data(fit), figure)
-        style.arrange(figure)
-    return figure
+    return style.drawn(SPEC.draw, SPEC.data(fit), SPEC.height)
 
 
 def bars(axes):
@@ -111,30 +106,32 @@ def test_held_out_errors_take_the_place_of_those_in_the_fit():
 
 
 def test_information_is_the_inverse_of_the_covariance_without_its_null_space():
-    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(9, 9)))[0]
-    spread = np.array([0.0, 0.0, 0.0, 1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0])
-    values = calibration.information(basis * spread @ basis.T)
-    # round-off of the largest eigenvalue over the smallest: 4 · 1e-16 · 9 / 1e-6
-    np.testing.assert_allclose(values, [1e6, 1e3, 2.0, 0.5, 0.5, 0.25], rtol=1e-8)
-    assert calibration.information(np.full((4, 4), np.nan)).size == 0
+    size = len(case()[2].calibration.covariance)
+    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(size, size)))[0]
+    spread = np.zeros(size)
+    spread[:6] = 1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0
+    values = SPEC.data(shifted(covariance=basis * spread @ basis.T))["information"]
+    # round-off of the largest eigenvalue over the smallest: 4 · 1e-16 · 200 / 1e-6
+    np.testing.assert_allclose(values, [1e6, 1e3, 2.0, 0.5, 0.5, 0.25], rtol=1e-6)
 
 
 def test_a_residual_and_the_error_of_its_prediction_make_up_the_noise():
-    np.testing.assert_allclose(
-        calibration.expected_residual(np.array([0.0, 3.0, 5.0, 6.0]), 5.0), [5, 4, 0, 0]
-    )
+    fit = shifted()
+    predicted, expected = drawn(fit).axes[3].lines[0].get_data()
+    np.testing.assert_allclose(predicted**2 + expected**2, fit.calibration.sigma_px**2)
     J = np.random.default_rng(2).normal(size=(12, 3))
     hat = J @ np.linalg.pinv(J)
     rest = np.diag((np.eye(12) - hat) @ (np.eye(12) - hat).T)  # covariance of residuals at unit noise
-    np.testing.assert_allclose(calibration.expected_residual(np.sqrt(np.diag(hat)), 1.0) ** 2, rest)
+    np.testing.assert_allclose(np.diag(hat) + rest, 1.0)
 
 
-@pytest.mark.parametrize("extent", [40.0, 640.0, 5472.0])
-@pytest.mark.parametrize("size", [1e-9, 0.03, 0.5, 4.0])
-def test_arrows_are_magnified_by_a_round_factor_to_a_visible_length(extent, size):
-    factor = calibration.magnification(np.array([size, -size]), extent)
-    length = factor * size * np.sqrt(2.0) / (0.04 * extent)
-    assert 0.4 - 1e-9 <= length <= 1.0 + 1e-9  # the steps 1, 2, 5 are at most 2.5 apart
+@pytest.mark.parametrize("size", [1e-6, 0.05, 1.0, 8.0])
+def test_arrows_are_magnified_by_a_round_factor_to_a_visible_length(size):
+    fit = shifted(size=size)
+    extent = np.ptp(fit.observation.images, axis=(0, 2)).max()
+    factor = float(SPEC.data(fit)["factor"])
+    length = factor * size * np.sqrt(0.15) / (0.04 * extent)  # rms of both coordinates
+    assert 0.4 - 1e-6 <= length <= 1.0 + 1e-6  # the steps 1, 2, 5 are at most 2.5 apart
     assert round(factor / 10.0 ** np.floor(np.log10(factor) + 1e-9), 9) in (1.0, 2.0, 5.0)
 
 

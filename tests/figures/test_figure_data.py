@@ -7,9 +7,9 @@ from projservo_cli.geometry.displacement import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import PRISMATIC, REVOLUTE
 from projservo_cli.report import style
-from projservo_cli.report.figures import path, planned, scene
+from projservo_cli.report.figures import planned, scene
 from projservo_cli.report.figures.drift import drift_tables
-from projservo_cli.report.material import percent, title
+from projservo_cli.report.material import along_line, percent, title
 from projservo_cli.robots.truth import camera_center, look_at_camera
 from projservo_cli.task.trajectory import trajectory_displacement
 from tests.figures.cases import GAINS, SPECS, case
@@ -111,14 +111,15 @@ def test_skeleton_passes_the_axes_of_revolute_joints():
 
 
 def test_corners_of_a_viewing_pyramid_are_seen_at_the_corners_of_the_image(material):
-    size = material.plant.image_size
-    for P in material.plant.model.P:
-        corners = scene.pyramid(P, size, 0.2)[1:]
+    model, size = material.plant.model, material.plant.image_size
+    pyramids = data_of("scene", material)["pyramids"]
+    for P, (center, *corners) in zip(model.P, pyramids, strict=True):
+        np.testing.assert_allclose(center, camera_center(P), atol=1e-12)
         m = np.c_[corners, np.ones(4)] @ P.T
         expected = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
         np.testing.assert_allclose(m[:, :2] / m[:, 2:], expected, atol=1e-8)
-        depth = m[:, 2] / np.linalg.norm(P[2, :3])
-        np.testing.assert_allclose(depth, 0.2, rtol=1e-12)
+        np.testing.assert_allclose(m[:, 2], m[0, 2], rtol=1e-12)
+        assert m[0, 2] > 0
 
 
 def test_scene_without_a_known_goal_has_none():
@@ -136,14 +137,21 @@ def test_scene_shows_the_tool_of_the_robot_at_the_face(material):
     np.testing.assert_allclose(data["line"][1], material.goal_center(trace), atol=1e-12)
 
 
-def test_drift_table_holds_each_run_at_its_place():
-    studies = case()[2].studies
-    drift, at_samples, converged = drift_tables(studies)
+def test_drift_table_holds_each_run_at_its_place_and_paths_run_through_the_instants():
+    material = case()[2]
+    drift, at_samples, converged = drift_tables(material.studies)
     assert drift.shape == (2, 2, 2, len(GAINS))
-    trace = studies.sweep["direct_two", "calibrated", True, GAINS[0]]
+    trace = material.studies.sweep["direct_two", "calibrated", True, GAINS[0]]
     assert drift[1, 1, 1, 0] == trace.center_deviation_mm
     assert at_samples[1, 1, 1, 0] == trace.center_deviation_at_samples_mm
     assert not converged.any()  # four steps are too few
+    path = data_of("drift", material)["path_mm_direct_two_2"]
+    assert len(path) > 4 * len(trace.center)
+    instants = along_line(trace.center, trace.center[0], material.goal_center(trace))
+    for instant in 1e3 * np.stack(instants, axis=1):
+        assert np.abs(path - instant).max(axis=1).min() < 1e-9
+    # both sample the same curve, at different points
+    assert path[:, 1].max() == pytest.approx(trace.center_deviation_mm, rel=1e-2)
 
 
 def test_translation_error_is_normalised_to_100():
@@ -205,20 +213,18 @@ def test_the_map_of_sight_is_the_margin_of_the_displaced_face(material):
 
 
 def test_numbers_on_the_map_of_sight_keep_off_the_path(material):
-    figure = style.new_figure(6.0)
     data = data_of("path", material)
-    SPECS["fig14_path"].draw(data, figure)
+    figure = style.drawn(SPECS["fig14_path"].draw, data, 6.0)
     for axes in figure.axes[:2]:
         for text in axes.texts:
-            assert np.linalg.norm(data["mu"][:, :2] - text.get_position(), axis=1).min() > path.LABEL
+            assert np.linalg.norm(data["mu"][:, :2] - text.get_position(), axis=1).min() > planned.LABEL
     assert sum(len(axes.texts) for axes in figure.axes[:2]) > 0
 
 
 def test_margins_that_grow_a_hundredfold_leave_the_others_to_be_read(material):
-    data, figure = data_of("path", material), style.new_figure(6.0)
+    data = data_of("path", material)
     data["along"][-1, 3] = 200.0
-    SPECS["fig14_path"].draw(data, figure)
-    axes = figure.axes[3]
+    axes = style.drawn(SPECS["fig14_path"].draw, data, 6.0).axes[3]
     one, zero, most = (axes.transData.transform((0.0, y))[1] for y in (1.0, 0.0, 200.0))
     assert one - zero > 0.15 * (most - zero)
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from projservo_cli.report.material import PAGE_FILE
 from projservo_cli.report.page import write_comparison
-from projservo_cli.report.values import PAGE_FILE
 from projservo_cli.stages import report as extras
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")

@@ -1,6 +1,6 @@
 """Diagnostics of a calibration: what the fit leaves of the images, and what the data determine."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -15,20 +15,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _RIGHT, _BOTH = 1, 2
-# Length of an arrow of the rms residual, as a share of the extent of what was seen.
-_ARROW = 0.04
-# Shares of χ² between which the residuals of a pose are expected.
-_BAND = (0.025, 0.975)
+_ARROW = 0.04  # length of an arrow of the rms residual, as a share of the extent of what was seen
+_BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
 _RESIDUAL: style.Look = {"color": style.BLUE}
 _WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
-_LEFT_OUT: style.Look = {
-    "color": style.VERMILION,
-    "marker": "x",
-    "linestyle": "none",
-    "markersize": 4,
-    "markeredgewidth": 0.9,
-}
+_LEFT_OUT: style.Look = {"color": style.VERMILION, "marker": "x", "linestyle": "none"}
+_LEFT_OUT |= {"markersize": 4, "markeredgewidth": 0.9}
 _MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
 
 
@@ -36,11 +29,10 @@ def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
-    seen, renamed = _by_marker(calibration, observation)
-    read: BoolArray = np.asarray(np.isfinite(seen).all(axis=-1))
-    lost = renamed | ~np.isfinite(predicted).all(axis=-1)
-    out: BoolArray = np.logical_or(_left_out(calibration, observation), lost)
-    used: BoolArray = np.logical_and(read, ~out)
+    seen, left_out = _readings(calibration, observation)
+    read: BoolArray = np.all(np.isfinite(seen), axis=-1)
+    out = left_out | ~np.isfinite(predicted).all(axis=-1)
+    used = read & ~out
     residual = seen - predicted
     result: Data = {
         "sigma_px": np.array(calibration.sigma_px),
@@ -48,7 +40,7 @@ def _data(fit: Fit) -> Data:
         "excitation": calibration.excitation,
         "prismatic": np.array([letter == "P" for letter in calibration.joint_types]),
         "weak": calibration.weak,
-        "information": information(calibration.covariance),
+        "information": _information(calibration.covariance),
         "parameters": np.array(len(calibration.covariance)),
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
@@ -56,9 +48,8 @@ def _data(fit: Fit) -> Data:
     if fit.held_out is None:
         result |= _by_pose(used, residual, prediction_variance(calibration, observation.q))
     else:  # from fits that have not seen the pose; predicted with the noise of the held-out reading
-        held_out = fit.held_out
-        predictable: BoolArray = np.asarray(np.isfinite(held_out.residual).all(axis=-1))
-        result |= _by_pose(predictable, held_out.residual, held_out.predicted**2)
+        predictable: BoolArray = np.all(np.isfinite(fit.held_out.residual), axis=-1)
+        result |= _by_pose(predictable, fit.held_out.residual, fit.held_out.predicted**2)
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
     for v, view in enumerate(VIEWS):
         others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
@@ -66,30 +57,24 @@ def _data(fit: Fit) -> Data:
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
         result[f"left_out_{view}"] = np.concatenate([seen[:, v][(read & out)[:, v]], others])
     extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
-    result["factor"] = np.array(magnification(result["residual"], extent))
+    result["factor"] = np.array(_magnification(result["residual"], extent))
     return result
 
 
-def _by_marker(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
-    """Pixels (K, 2, m, 2) of the calibrated markers, and which of them were read under another number."""
+def _readings(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
+    """Pixels (K, 2, m, 2) of the calibrated markers, and which of them (K, 2, m) the fit left out.
+
+    Those are outliers, poses whose joints are in doubt, and markers that were read under another number.
+    """
     column = {int(number): j for j, number in enumerate(observation.marker)}
     seen = observation.images[:, :, [column[int(number)] for number in calibration.marker]]
-    renamed = np.zeros(seen.shape[:3], dtype=np.bool_)
-    for pose, number, _ in calibration.swapped:
-        rows = observation.pose == pose
-        renamed |= rows[:, None, None] & (calibration.marker == number)
-    return seen, renamed
-
-
-def _left_out(calibration: Calibration, observation: Observation) -> BoolArray:
-    """Readings (K, 2, m) that the fit did not use: outliers, and poses whose joints are in doubt."""
-    out = np.zeros((len(observation.pose), 2, len(calibration.marker)), dtype=np.bool_)
-    for pose, number, view in calibration.outlier:
-        views = np.array([view != _RIGHT, view in (_RIGHT, _BOTH)])
-        rows = observation.pose == pose
-        out |= rows[:, None, None] & views[:, None] & (calibration.marker == number)
+    out = np.zeros(seen.shape[:3], dtype=np.bool_)
     out[np.isin(observation.pose, calibration.suspect[:, 0])] = True
-    return out
+    renamed = ((pose, number, _BOTH) for pose, number, _ in calibration.swapped)
+    for pose, number, view in (*calibration.outlier, *renamed):
+        views = np.array([view != _RIGHT, view in (_RIGHT, _BOTH)])
+        out |= (observation.pose == pose)[:, None, None] & views[:, None] & (calibration.marker == number)
+    return seen, out
 
 
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
@@ -102,19 +87,14 @@ def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Dat
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
-
-    def mean(squares: FloatArray) -> FloatArray:
+    found: Data = {}
+    for name, squares in (("pose_predicted_px", variance), ("pose_residual_px", residual**2)):
         total = np.where(used[..., None], squares, 0.0).sum(axis=(1, 2, 3))[poses]
-        return np.asarray(total / count)
-
-    return {
-        "pose_predicted_px": np.sqrt(mean(variance)),
-        "pose_residual_px": np.sqrt(mean(residual**2)),
-        "pose_coordinates": count,
-    }
+        found[name] = np.sqrt(total / count)
+    return found | {"pose_coordinates": count}
 
 
-def information(covariance: FloatArray) -> FloatArray:
+def _information(covariance: FloatArray) -> FloatArray:
     """Eigenvalues of the information matrix, falling: the covariance's that are not zero, inverted.
 
     Zero are the gauge directions, and those across the constraint that all operators are conjugate
@@ -129,7 +109,7 @@ def information(covariance: FloatArray) -> FloatArray:
     return np.asarray(1.0 / spread[spread > floor])
 
 
-def expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
+def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
     """Rms residual (L,) that a fit leaves where its own prediction errs by so much, px per coordinate.
 
     A least-squares residual is noise less the error of the fitted prediction, which it follows:
@@ -140,7 +120,7 @@ def expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(sigma**2 - predicted**2, 0.0)))
 
 
-def magnification(residual: FloatArray, extent: float) -> float:
+def _magnification(residual: FloatArray, extent: float) -> float:
     """Factor 1, 2 or 5 times a power of ten that makes the rms residual visible in an image.
 
     residual : (N,) px per coordinate; extent : width or height of what was seen, px.
@@ -185,36 +165,22 @@ def _draw(data: Data, figure: "Figure") -> None:
 
 
 def _arrows(axes: "Axes", data: Data, view: str) -> None:
-    seen, residual, out = data[f"seen_{view}"], data[f"residual_{view}"], data[f"left_out_{view}"]
-    tips = seen + float(data["factor"]) * residual
-    axes.quiver(
-        *seen.T,
-        *(tips - seen).T,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        width=0.0022,
-        headwidth=4.0,
-        headlength=5.0,
-        headaxislength=4.0,
-        **_RESIDUAL,
-    )
+    seen, out = data[f"seen_{view}"], data[f"left_out_{view}"]
+    arrows = float(data["factor"]) * data[f"residual_{view}"]
+    pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
+    heads: Any = {"width": 0.0022, "headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.0}
+    axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
     axes.plot(*out.T, **_LEFT_OUT)
-    style.image_axes(axes, f"{view}: {len(seen)} readings, {len(out)} left out")
-    style.frame_pixels(axes, np.concatenate([seen, tips, out]))
+    title = f"{view}: {len(seen)} readings, {len(out)} left out"
+    style.image_axes(axes, title, np.concatenate([seen, seen + arrows, out]))
 
 
 def _histogram(axes: "Axes", data: Data) -> None:
     """Density of the residuals beside the normal one of the noise model."""
     residual, sigma = data["residual"], float(data["sigma_px"])
     widest = max(4.0 * sigma, float(np.abs(residual).max(initial=0.0)))
-    axes.hist(
-        residual,
-        bins=np.linspace(-widest, widest, _BINS + 1).tolist(),
-        density=bool(residual.size),
-        color=style.SKY,
-        linewidth=0,
-    )
+    bins = np.linspace(-widest, widest, _BINS + 1).tolist()
+    axes.hist(residual, bins, density=bool(residual.size), color=style.SKY, linewidth=0)
     x = np.linspace(-widest, widest, 401)
     axes.plot(x, np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)), **_MODEL)
     title = f"noise model {sigma:.3g} px, χ²/dof {float(data['chi2_per_dof']):.3g}"
@@ -235,7 +201,7 @@ def _poses(axes: "Axes", data: Data) -> None:
         return _without_covariance(axes)
     most = 1.06 * float(predicted.max(initial=0.0))
     x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
-    expected = x if held_out else expected_residual(x, sigma)
+    expected = x if held_out else _expected_residual(x, sigma)
     coordinates = float(np.median(data["pose_coordinates"])) if predicted.size else 1.0
     low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(_BAND)) / coordinates)
     axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)

@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from projservo_cli.records import BoolArray, FloatArray, Report
+from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.records import BoolArray, FloatArray, Report, Trace
 from projservo_cli.report import style
 from projservo_cli.report.material import (
     DIRECT,
@@ -13,7 +14,6 @@ from projservo_cli.report.material import (
     Material,
     Studies,
     along_line,
-    center_path,
     registered,
     title,
 )
@@ -21,15 +21,13 @@ from projservo_cli.report.material import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Share of the largest deviation of the best run below which nothing is drawn.
-_LEAST_SHARE = 0.05
+_LEAST_SHARE = 0.05  # of the largest deviation of the best run, below which nothing is drawn
 _PATH_POINTS = 400
-# Runs with a longer joint step, rad or m, wind the arm up: their path is drawn at the instants only.
-_WHIRL = np.pi
-# Modes whose largest distances differ by more than this are shown on a logarithmic scale, down to a share
-# of the least of them.
-_WIDE, _LEAST_OF_MODES = 10.0, 0.02
+_WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
+_WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a share of the least of them
+_LEAST_OF_MODES = 0.02
 _WAY, _OFF = "way along the straight line (mm)", "distance from it (mm)"
+_RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
 _OPERATORS = ("true", "calibrated")
 _LIMITED: style.Look = {"color": style.SKY, "linewidth": 2.4}
 # Largest deviations by operators and limit, both 0 or 1.
@@ -52,16 +50,14 @@ def drift_tables(studies: Studies | None) -> tuple[FloatArray, FloatArray, BoolA
     for (law, operators, limited, gain), trace in sweep.items():
         where = DIRECT.index(law), _OPERATORS.index(operators), int(limited), gains.index(gain)
         converged[where] = trace.verdict == "converged"
-        if trace.center_deviation_mm is not None and trace.center_deviation_at_samples_mm is not None:
-            drift[where] = trace.center_deviation_mm
-            at_samples[where] = trace.center_deviation_at_samples_mm
+        drift[where] = trace.center_deviation_mm  # None becomes NaN
+        at_samples[where] = trace.center_deviation_at_samples_mm
     return drift, at_samples, converged
 
 
 def _data(material: Material) -> Data:
     """Paths of the centre with calibrated operators, and the largest deviations of all runs."""
-    studies = material.studies
-    assert studies is not None
+    studies = material.extra
     result: Data = {
         "gain": np.array(studies.gains),
         "drift_mm": drift_tables(studies)[0],
@@ -72,12 +68,25 @@ def _data(material: Material) -> Data:
         for i, (gain, limited) in enumerate(cases):
             trace = studies.sweep[law, "calibrated", limited, gain]
             whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > _WHIRL
-            points = trace.center if whirls else center_path(material, trace)
+            points = trace.center if whirls else _center_path(material, trace)
             way, off = along_line(points, trace.center[0], material.goal_center(trace))
             used = np.unique(np.linspace(0, len(points) - 1, _PATH_POINTS).round().astype(int))
             result[f"whirls_{law}_{i}"] = np.array(whirls)
             result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([way, off], axis=1)[used]
     return result
+
+
+def _center_path(material: Material, trace: Trace) -> FloatArray:
+    """True centre (k, 3) along a run, m, between the instants too, where the joints move linearly."""
+    amount = np.abs(np.diff(trace.q, axis=0)).max(axis=1, initial=0.0)
+    points = [trace.center[0]]
+    for k, most in enumerate(amount):
+        parts = max(1, int(np.ceil(most / _RESOLUTION)))
+        for share in np.arange(1, parts) / parts:
+            q = trace.q[k] + share * (trace.q[k + 1] - trace.q[k])
+            points.append((forward_kinematics(material.plant.model, q) @ material.middle)[:3])
+        points.append(trace.center[k + 1])
+    return np.array(points)
 
 
 @registered(
@@ -97,25 +106,23 @@ def _draw(data: Data, figure: "Figure") -> None:
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
     looks = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
-    for row, law in enumerate(DIRECT):
+    for (path_axes, most), deviation, law in zip(axes, data["drift_mm"], DIRECT, strict=True):
         paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
         least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
         for path, look in zip(paths, looks, strict=True):
-            way, off = path.T
-            axes[row, 0].plot(way, np.maximum(off, least), **look)
-        axes[row, 0].set_title(f"{TITLES[law]}: path of the centre, calibrated operators")
-        axes[row, 0].set(xlabel=_WAY, ylabel=_OFF)
-        style.log_scale(axes[row, 0])
-        axes[row, 0].set_ylim(bottom=least)
+            path_axes.plot(path[:, 0], np.maximum(path[:, 1], least), **look)
+        path_axes.set(title=f"{TITLES[law]}: path of the centre, calibrated operators")
+        path_axes.set(xlabel=_WAY, ylabel=_OFF)
+        style.log_scale(path_axes)
+        path_axes.set_ylim(bottom=least)
         for (operators, limited), look in _MAXIMA.items():
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
-            axes[row, 1].plot(gains, data["drift_mm"][row, operators, limited], markersize=size, **look)
-        axes[row, 1].set_xscale("log")
-        axes[row, 1].set_xticks(gains, [f"{gain:g}" for gain in gains])
-        axes[row, 1].minorticks_off()
-        style.log_scale(axes[row, 1])
-        labels = {"xlabel": "gain per step (1)", "ylabel": "largest distance (mm)"}
-        axes[row, 1].set(title=f"{TITLES[law]}: largest distance", **labels)
+            most.plot(gains, deviation[operators, limited], markersize=size, **look)
+        most.set(title=f"{TITLES[law]}: largest distance", xscale="log")
+        most.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
+        most.set_xticks(gains, [f"{gain:g}" for gain in gains])
+        most.minorticks_off()
+        style.log_scale(most)
     limit = f"{float(data['step_limit_deg']):g}° per step"
     legend = {f"gain {gain:g} per step": look for gain, look in zip(gains, looks, strict=False)}
     legend[f"{gains.max():g} and {limit}"] = _LIMITED
@@ -131,17 +138,15 @@ def drift_rows(report: Report) -> list[dict[str, Any]]:
     rows = []
     for index in np.ndindex(report.drift_mm.shape):
         law, operators, limited, gain = index
-        values = {
-            "drift_mm": float(report.drift_mm[index]),
-            "drift_at_samples_mm": float(report.drift_at_samples_mm[index]),
-        }
+        drift, at_samples = float(report.drift_mm[index]), float(report.drift_at_samples_mm[index])
         rows.append(
             {
                 "law": DIRECT[law],
                 "operators": _OPERATORS[operators],
                 "limit_deg_per_step": report.step_limit_deg if limited else None,
                 "gain_per_step": float(report.gain_per_step[gain]),
-                **{name: value if np.isfinite(value) else None for name, value in values.items()},
+                "drift_mm": drift if np.isfinite(drift) else None,
+                "drift_at_samples_mm": at_samples if np.isfinite(at_samples) else None,
                 "converged": bool(report.drift_converged[index]),
             }
         )

@@ -25,31 +25,23 @@ _CAMERAS: dict[str, style.Look] = {
 
 def _data(material: Material) -> Data:
     """Joints, faces and cameras in metres; the robot at the start as a polyline through its axes."""
-    plant, robot, plan = material.plant, material.robot, material.plan
-    start = forward_kinematics(plant.model, plan.q_start)
+    plant, robot, q = material.plant, material.robot, material.plan.q_start
+    start = forward_kinematics(plant.model, q)
     face = plant.M[plant.order]
+    tool = (start @ robot.base_tool)[:3, 3]
     result: Data = {
-        "robot": skeleton(
-            joint_operators(plant.model, plan.q_start), robot.joint_types, (start @ robot.base_tool)[:3, 3]
-        ),
+        "robot": skeleton(joint_operators(plant.model, q), robot.joint_types, tool),
         "face_start": (face @ start.T)[:, :3],
-        "cameras": np.stack([camera_center(P) for P in plant.model.P]),
     }
-    result["pyramids"] = pyramids(plant, result["face_start"])
-    goal = _goal(material)
-    if goal is not None:
+    shown = pyramids(plant, result["face_start"])
+    result |= {"cameras": shown[:, 0], "pyramids": shown}
+    goals = (trace.goal_pose for trace in material.traces.values() if np.isfinite(trace.goal_pose).all())
+    if (pose := next(goals, None)) is not None:
+        goal = pose @ np.linalg.inv(robot.base_tool)
         result["face_goal"] = (face @ goal.T)[:, :3]
-        centers = [np.array(center_of(plant.M @ H.T, plant.center))[:3] for H in (start, goal)]
-        result["line"] = np.stack(centers)
+        centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
+        result["line"] = np.array(centers)
     return result
-
-
-def _goal(material: Material) -> FloatArray | None:
-    """True displacement of the face at the goal, where a run knows it."""
-    for trace in material.traces.values():
-        if np.isfinite(trace.goal_pose).all():
-            return trace.goal_pose @ np.linalg.inv(material.robot.base_tool)
-    return None
 
 
 def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArray:
@@ -73,21 +65,18 @@ def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArra
 
 
 def pyramids(plant: Plant, face: FloatArray) -> FloatArray:
-    """Viewing pyramids (2, 5, 3) of both cameras, m; their length goes by the distance of a face (m, 3)."""
-    centers = np.stack([camera_center(P) for P in plant.model.P])
+    """Optical centre and image corners (2, 5, 3) of both metric cameras, m.
+
+    The corners are drawn at a depth in front of the camera that goes by the distance of a face (m, 3).
+    """
+    P = plant.model.P
+    centers = np.stack([camera_center(camera) for camera in P])[:, None]
     depth = _PYRAMID * float(np.linalg.norm(face.mean(axis=0) - centers.mean(axis=0)))
-    return np.stack([pyramid(P, plant.image_size, depth) for P in plant.model.P])
-
-
-def pyramid(P: FloatArray, image_size: FloatArray, depth: float) -> FloatArray:
-    """Centre and four image corners (5, 3) of a metric camera (3, 4), m, at a depth in front of it."""
-    center = camera_center(P)
-    width, height = image_size - 0.5
+    width, height = plant.image_size - 0.5
     corners = np.array([[-0.5, -0.5, 1], [width, -0.5, 1], [width, height, 1], [-0.5, height, 1]])
-    scale = np.linalg.norm(P[2, :3])
-    sign = np.sign(np.linalg.det(P[:, :3]))
-    rays = np.linalg.solve(P[:, :3], corners.T).T * scale * sign
-    return np.concatenate([center[None], center + depth * rays])
+    scale = np.linalg.norm(P[:, 2, :3], axis=1) * np.sign(np.linalg.det(P[:, :, :3]))
+    rays = np.linalg.solve(P[:, :, :3], corners.T).swapaxes(1, 2) * scale[:, None, None]
+    return np.concatenate([centers, centers + depth * rays], axis=1)
 
 
 @registered(
@@ -106,11 +95,10 @@ def _draw(data: Data, figure: "Figure") -> None:
     axes.computed_zorder = False
     robot: style.Look = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
     axes.plot(*data["robot"].T, **robot)
-    for pyramid, look in zip(data["pyramids"], _CAMERAS.values(), strict=True):
-        corners = style.closed(pyramid[1:])
-        axes.plot(*corners.T, **look)
-        for corner in corners[:-1]:
-            axes.plot(*np.stack([pyramid[0], corner]).T, **look)
+    for (center, *corners), look in zip(data["pyramids"], _CAMERAS.values(), strict=True):
+        axes.plot(*style.closed(np.stack(corners)).T, **look)
+        for corner in corners:
+            axes.plot(*np.stack([center, corner]).T, **look)
     axes.plot(*style.closed(data["face_start"]).T, **style.START)
     looks = {"robot at the start": robot, "face at the start": style.START}
     shown = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
