@@ -260,14 +260,9 @@ def _second_order_drift(
 
     Under the product of exponentials of [RH00] eq. (6) a point M has the second derivatives
     Ĥ_i Ĥ_j M, i ≤ j. Joint i is given its own term and half of each term it shares with another
-    joint; contributions are counted along the direction of their sum, so that they add up to its
-    length.
-
-    H_hat : (n, 4, 4) metric operators at the current joints.
-    joint_step : (n,) joint step, rad or m.
-    center : (4,) centre, m.
-    line : (3,) unit direction of the line.
-    Returns (n,) signed contributions, m.
+    joint; contributions (n,) are counted along the direction of their sum, so that they add up to its
+    length. With metric operators (n, 4, 4) at the current joints, a step (n,), rad or m, the centre (4,), m,
+    and the unit direction (3,) of the line.
     """
     acceleration = np.einsum("iab,jbc,c->ija", H_hat, H_hat, center)[..., :3]
     ordered = np.tri(len(H_hat), dtype=np.bool_).T[..., None]
@@ -279,10 +274,7 @@ def _second_order_drift(
 
 
 def _composition(lambdas: FloatArray, distance: FloatArray) -> _Claim:
-    """Whether both sides of [RH00] eq. (22) agree, and to which order they do.
-
-    lambdas : (k,) shares of the task; distance : (k,) of the centre between both sides, m.
-    """
+    """Whether both sides of [RH00] eq. (22) agree at shares of the task, and to which order they do."""
     small = np.argsort(lambdas)[:3]
     order = ""
     if (distance[small] > 0).all():

@@ -151,10 +151,9 @@ class FigureSpec:
     name: str  # of its files
     title: str  # what it shows, in a phrase
     paper: str  # the figure of the paper it follows, and its section
-    height: float  # inches
-    # data, draw: what makes it, from a ``Material``; from a ``Fit`` where it needs no task
-    data: Callable[[Any], Data]
+    data: Callable[[Any], Data]  # from a ``Material``; from a ``Fit`` where it needs no task
     draw: Callable[[Data, "Figure"], None]
+    height: float = 4.0  # inches; a drawing may choose another
     alt: str = ""  # what can be seen, for those who do not see it; by default the title
     laws: tuple[str, ...] = ()  # whose traces it shows: all of them, or any of them where ``any_law`` is set
     any_law: bool = False
@@ -194,12 +193,12 @@ _Draw = Callable[[Data, "Figure"], None]
 
 
 def registered(
-    name: str, title: str, paper: str, height: float, data: Callable[[Any], Data], **needs: Any
+    name: str, title: str, paper: str, data: Callable[[Any], Data], **needs: Any
 ) -> Callable[[_Draw], _Draw]:
     """Decorator that registers what a function draws as a figure; arguments are those of ``FigureSpec``."""
 
     def register(draw: _Draw) -> _Draw:
-        REGISTER[name] = FigureSpec(name, title, paper, height, data, draw, **needs)
+        REGISTER[name] = FigureSpec(name, title, paper, data, draw, **needs)
         return draw
 
     return register

@@ -4,9 +4,10 @@ import base64
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -340,25 +341,14 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, str]]:
         yield path, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def _picture_rows(views: list[_View]) -> dict[str, list[list[_Picture | None]]]:
-    """Figures by section, a row for each, an entry for each run; None where a run lacks it."""
-    rows: dict[str, list[list[_Picture | None]]] = {}
-    for section in SECTIONS:
-        numbered = [{picture.number: picture for picture in view.pictures[section]} for view in views]
-        names = sorted({number for own in numbered for number in own}, key=int)
-        rows[section] = [[own.get(number) for own in numbered] for number in names]
+def _side_by_side(columns: Iterable[Iterable[Any]], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
+    """What several runs have, by a key: an entry for each run, None where it has none."""
+    columns = list(columns)
+    rows: dict[Any, list[Any]] = {}
+    for k, column in enumerate(columns):
+        for item in column:
+            rows.setdefault(key(item), [None] * len(columns))[k] = item
     return rows
-
-
-def _claim_rows(views: list[_View]) -> list[dict[str, Any]]:
-    """Claims of all runs: what is claimed, where, when it holds, and what each run measured."""
-    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
-    for v, view in enumerate(views):
-        for claim in view.claims:
-            key = (claim["claim"], claim["source"], claim["criterion"])
-            row = rows.setdefault(key, {**claim, "runs": [None] * len(views)})
-            row["runs"][v] = claim
-    return list(rows.values())
 
 
 @cache
@@ -407,8 +397,13 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
 
 
 def _write(path: Path, views: list[_View]) -> None:
+    claims = _side_by_side((v.claims for v in views), itemgetter("claim", "source", "criterion"))
+    pictures = {}
+    for section in SECTIONS:
+        numbered = _side_by_side((v.pictures[section] for v in views), attrgetter("number"))
+        pictures[section] = [numbered[number] for number in sorted(numbered, key=int)]
     text = template("page.html").render(
-        views=views, claims=_claim_rows(views), differences=_differences(views), pictures=_picture_rows(views)
+        views=views, claims=claims, differences=_differences(views), pictures=pictures
     )
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")

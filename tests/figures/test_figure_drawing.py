@@ -55,21 +55,16 @@ def test_no_text_is_clipped_by_the_figure_or_lies_on_another(figures, name, monk
 def test_legend_covers_no_axes(figures):
     for name, figure in figures.items():
         legend = figure.legends[0].get_window_extent()
-        for axes in figure.axes:
-            # the axes of the scene fill the figure; what is drawn in them is tested below
-            assert name == "fig03_scene" or not axes.get_window_extent().overlaps(legend), name
-
-
-def test_scene_stands_above_its_legend(figures):
-    figure = figures["fig03_scene"]
-    axes = figure.axes[0]
-    extent = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
-    corners = np.array([*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)])
-    m = axes.get_proj() @ corners
-    shown = axes.transData.transform((m[:2] / m[3]).T)
-    assert shown[:, 1].min() >= figure.legends[0].get_window_extent().y1
-    assert (shown >= 0).all()
-    assert (shown <= figure.bbox.get_points()[1]).all()
+        if name != "fig03_scene":
+            assert not any(axes.get_window_extent().overlaps(legend) for axes in figure.axes), name
+            continue
+        (axes,) = figure.axes  # fill the figure; what is drawn in them counts
+        extent = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
+        m = axes.get_proj() @ [*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)]
+        shown = axes.transData.transform((m[:2] / m[3]).T)
+        assert shown[:, 1].min() >= legend.y1
+        assert (shown >= 0).all()
+        assert (shown <= figure.bbox.get_points()[1]).all()
 
 
 def test_axes_have_units(figures):

@@ -78,15 +78,11 @@ class Reader(HTMLParser):
         assert self.open == [self.root], [element.tag for element in self.open]
 
     def handle_starttag(self, tag, attrs):
-        names = [name for name, _ in attrs]
-        assert len(set(names)) == len(names), (tag, attrs)
+        assert len(dict(attrs)) == len(attrs), (tag, attrs)
         element = Element(tag, dict(attrs))
         self.open[-1].children.append(element)
         if tag not in VOID:
             self.open.append(element)
-
-    def handle_startendtag(self, tag, attrs):
-        self.open[-1].children.append(Element(tag, dict(attrs)))
 
     def handle_endtag(self, tag):
         assert self.open.pop().tag == tag

@@ -78,12 +78,9 @@ def _readings(calibration: Calibration, observation: Observation) -> tuple[Float
 
 
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
-    """Predicted and actual error of each pose with a reading, rms per coordinate.
+    """Predicted and actual error (L,) of each pose with a reading, rms per coordinate, and their number.
 
-    used : (K, 2, m) readings that count.
-    residual : (K, 2, m, 2) px.
-    variance : (K, 2, m, 2) variance of the prediction, px².
-    Returns ``pose_predicted_px``, ``pose_residual_px`` (L,) and ``pose_coordinates`` (L,), their number.
+    Of the readings ``used`` (K, 2, m), with residual (K, 2, m, 2), px, and variance of the prediction, px².
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
@@ -98,9 +95,7 @@ def _information(covariance: FloatArray) -> FloatArray:
     """Eigenvalues of the information matrix, falling: the covariance's that are not zero, inverted.
 
     Zero are the gauge directions, and those across the constraint that all operators are conjugate
-    to rigid motions by one matrix. Empty for a method without covariance.
-
-    covariance : (d, d) of P, H_hat_0 and M.
+    to rigid motions by one matrix. Empty for a method without a covariance (d, d) of P, H_hat_0 and M.
     """
     if not np.isfinite(covariance).all():
         return np.zeros(0)
@@ -114,17 +109,12 @@ def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
 
     A least-squares residual is noise less the error of the fitted prediction, which it follows:
     variance σ² − p²; D. A. Belsley, E. Kuh, R. E. Welsch, "Regression Diagnostics", 1980, section 2.1.
-
-    predicted : (L,) predicted error p, px per coordinate; sigma : noise σ, px per coordinate.
     """
     return np.asarray(np.sqrt(np.maximum(sigma**2 - predicted**2, 0.0)))
 
 
 def _magnification(residual: FloatArray, extent: float) -> float:
-    """Factor 1, 2 or 5 times a power of ten that makes the rms residual visible in an image.
-
-    residual : (N,) px per coordinate; extent : width or height of what was seen, px.
-    """
+    """Factor 1, 2 or 5 times a power of ten that makes the rms of residuals (N,) visible in an extent, px."""
     rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
     if rms == 0.0:
         return 1.0
@@ -137,8 +127,8 @@ def _magnification(residual: FloatArray, extent: float) -> float:
     "fig13_calibration",
     "What the calibration leaves of the images, and what the data determine",
     "beside the paper's",
-    7.8,
     _data,
+    height=7.8,
     task=False,
     alt="Residuals as arrows in both images; their histogram beside the noise model; rms residual "
     "of each pose over its predicted error; range of each joint; eigenvalues of the information "
@@ -198,7 +188,8 @@ def _poses(axes: "Axes", data: Data) -> None:
         ylabel="rms residual (px)",
     )
     if not np.isfinite(predicted).all():
-        return _without_covariance(axes)
+        _without_covariance(axes)
+        return
     most = 1.06 * float(predicted.max(initial=0.0))
     x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
     expected = x if held_out else _expected_residual(x, sigma)
@@ -209,7 +200,6 @@ def _poses(axes: "Axes", data: Data) -> None:
     axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
-    return None
 
 
 def _excitation(axes: "Axes", data: Data) -> None:
@@ -240,11 +230,13 @@ def _spectrum(axes: "Axes", data: Data) -> None:
     values = data["information"]
     title = f"information, {len(values)} of {int(data['parameters'])} directions free"
     axes.set(title=title, xlabel="direction (best to worst)", ylabel="eigenvalue (1)")
-    if not values.size:
-        return _without_covariance(axes)
-    axes.plot(np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8)
-    style.log_scale(axes)
-    return None
+    if values.size:
+        axes.plot(
+            np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8
+        )
+        style.log_scale(axes)
+    else:
+        _without_covariance(axes)
 
 
 def _without_covariance(axes: "Axes") -> None:

@@ -46,8 +46,8 @@ def _time(trace: Trace) -> FloatArray:
     "fig09_errors_two",
     "Control errors of directTWO, without and with the limit",
     "Fig. 9, section 6",
-    4.2,
     _data_two,
+    height=4.2,
     studies=True,
     alt="Translation and rotation error of directTWO over time, on a linear and on a logarithmic "
     "scale, without a limit and with one.",
@@ -108,8 +108,8 @@ def _data_three(material: Material) -> Data:
     "fig10_errors_three",
     "Control errors of directTHREE, projective beside Euclidean model",
     "Fig. 10, section 6",
-    4.8,
     _data_three,
+    height=4.8,
     studies=True,
     goal=True,
     alt="Translation and rotation errors of directTHREE over time with the projective and the "
@@ -178,7 +178,6 @@ def _data_joints(material: Material) -> Data:
     "fig12_joints",
     "Joint trajectories without and with the limit",
     "Fig. 12, section 6",
-    4.8,
     _data_joints,
     studies=True,
     alt="The joints and their steps over time under directTHREE, without a limit and with one.",

@@ -70,8 +70,8 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
     "fig01_partition",
     "The task as a translation, a rotation onto the target plane and one within it",
     "Fig. 1, section 4.1",
-    3.0,
     _data_partition,
+    height=3.0,
     alt="Three panels in the left image: the face moved along a straight line, turned onto the "
     "target plane, and turned within it.",
 )
@@ -141,8 +141,8 @@ def _data_visibility(material: Material) -> Data:
     "fig02_visibility",
     "Where the face changes visibility, and both senses of the rotation onto the plane",
     "Fig. 2, section 4.2",
-    7.4,
     _data_visibility,
+    height=7.4,
     alt="For each camera: the face turned onto the target plane in both senses, and its visibility "
     "margin over the angle and over the translation, with the values at which it is zero.",
 )

@@ -80,11 +80,9 @@ def _rendered(material: Material, mu: FloatArray, s: FloatArray, margin: FloatAr
 
 
 def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
-    """Camera (3, 4) midway between two metric cameras, looking along the roll axis of the rig, px.
+    """Camera (3, 4) midway between metric cameras (2, 3, 4), looking along the roll axis of the rig, px.
 
     Its focal length is the mean of both, its principal point the middle of the image.
-
-    P : (2, 3, 4) metric cameras; image_size : (2,) px.
     """
     center, z = roll_axis(P)
     Q = (
@@ -106,7 +104,6 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     "fig05_planned",
     "The planned motion from between the cameras",
     "Fig. 5, section 6",
-    3.6,
     _data_linear,
     alt="The face at several moments of the planned motion, seen from between the cameras; beside "
     "it the shares of translation and rotations that are done and the visibility margin of both "
@@ -116,7 +113,6 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     "fig06_planned_steep",
     "The planned motion with a steep translation",
     "Fig. 6, section 6",
-    3.6,
     _data_steep,
     alt="As the figure before, with a translation that is driven first: the face at several "
     "moments, the shares of the motions and the visibility margins.",
@@ -181,8 +177,7 @@ def _data_path(material: Material) -> Data:
 def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     """Least distance of a marker from the border of each image, px, where μ_p is best for both.
 
-    mu : (k,) shares of t and of r.
-    Returns (2, k, k) distances over μ_t and μ_r, negative outside.
+    It is (2, k, k) over the shares mu (k,) of t and of r, negative outside.
     """
     plan, P, lens = material.plan, material.calibrated.P, material.calibrated.lens
     turns = np.linspace(0.0, 1.0, _TURNS)
@@ -207,8 +202,8 @@ def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     "fig14_path",
     "Where each camera sees the face, and the planned path among it",
     "beside the paper's, after section 4.3",
-    6.0,
     _data_path,
+    height=6.0,
 )
 def _draw_path(data: Data, figure: "Figure") -> None:
     """Above the map of each camera with the path, below the shares and the margins along it."""

@@ -47,12 +47,8 @@ def _data(material: Material) -> Data:
 def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArray:
     """Points (k, 3) of a polyline from the base over all revolute axes to the tool, m.
 
-    From each point the perpendicular is dropped onto the next axis; a prismatic joint has a
-    direction but no place.
-
-    H_hat : (n, 4, 4) metric operators at the current joints.
-    joint_types : (n,) ``REVOLUTE`` or ``PRISMATIC``.
-    tool : (3,) place of the tool, m.
+    From each point the perpendicular is dropped onto the next axis, known by the metric operators
+    (n, 4, 4) at the current joints; a prismatic joint has a direction but no place.
     """
     points = [np.zeros(3)]
     for operator, kind in zip(H_hat, joint_types, strict=True):
@@ -83,8 +79,8 @@ def pyramids(plant: Plant, face: FloatArray) -> FloatArray:
     "fig03_scene",
     "Robot, stereo rig, and the face at the start and at the goal",
     "Fig. 3, section 6",
-    4.4,
     _data,
+    height=4.4,
     alt="The robot's arm at the start in three dimensions, both cameras, the face at the start and "
     "at the goal, and the straight line of its centre between them.",
 )
