@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
-from projservo_cli.report.figures.drift import drift_tables
+from projservo_cli.report.figures.drift import study_numbers
 from projservo_cli.report.material import (
     DIRECT,
     TITLES,
@@ -93,9 +93,12 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[_Cl
         return
     first = _SETTLING_STEPS + int(np.flatnonzero(trace.speed_factor < 1.0).max(initial=0))
     gain = (gains.gain_t, gains.gain_s if law == "direct_two" else min(gains.gain_r, gains.gain_p))
-    curves = ((material.center_distance(trace), _LEAST_DISTANCE), (trace.theta_s, _LEAST_ANGLE))
+    curves = (
+        (material.center_distance(trace)[first:], _LEAST_DISTANCE),
+        (trace.theta_s[first:], _LEAST_ANGLE),
+    )
     measured, holds = "too few settled steps", None
-    settled = [values[first:][: _first(values[first:] <= least)] for values, least in curves]
+    settled = [late[np.logical_and.accumulate(late > least)] for late, least in curves]
     if min(len(values) for values in settled) > _LEAST_STEPS:
         slopes = [np.polyfit(np.arange(len(values)), np.log(values), 1)[0] for values in settled]
         rates = [(1.0 - math.exp(slope)) / trace.period for slope in slopes]
@@ -116,11 +119,6 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[_Cl
         f"factor of every settled step within {_FACTOR_TOLERANCE:.0%} of 1 - gain·period",
         holds,
     )
-
-
-def _first(chosen: BoolArray) -> int | None:
-    """Index of the first one that is chosen; None where none is."""
-    return int(chosen.argmax()) if chosen.any() else None
 
 
 def _model_difference(trace: Trace, metric: Trace) -> float:
@@ -178,7 +176,7 @@ _SAMPLING = 1e-3
 
 def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     """Claims of sections 5.2, 6 and 7 about drift; none where the goal pose is unknown."""
-    drift = drift_tables(studies)[0]
+    drift = study_numbers(studies)["drift_mm"]
     if not np.isfinite(drift).all():
         return
     gains = ", ".join(f"{gain:g}" for gain in studies.gains)
@@ -214,8 +212,7 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
 def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
     """Drift over the period; the longest turn in a step says how far apart the samples can be."""
     periods = np.array(studies.periods)
-    for law in DIRECT:
-        values = np.array([studies.rate[law, period].center_deviation_mm for period in periods], float)
+    for law, values in zip(DIRECT, study_numbers(studies)["period_drift_mm"], strict=True):
         if len(periods) < 2 or not (values > 0).all():
             continue
         order = np.polyfit(np.log(periods), np.log(values), 1)[0]
@@ -383,7 +380,15 @@ def _direct(material: Material) -> Iterator[_Claim]:
             gap <= _SMALL_SHARE * diagonal,
         )
     if DIRECT[0] in traces:
-        yield _level(material, traces[DIRECT[0]])
+        travel, variation = np.ptp(material.center_image(traces[DIRECT[0]]), axis=0).T
+        yield _Claim(
+            "The centre moves horizontally in the images: its ordinate stays constant",
+            "section 6, Fig. 11",
+            f"ordinate varies by {variation[0]:.1f} and {variation[1]:.1f} px while the abscissa travels "
+            f"{travel[0]:.0f} and {travel[1]:.0f} px (left, right)",
+            f"variation at most {_LEVEL_SHARE:.0%} of the travel",
+            bool((variation <= _LEVEL_SHARE * travel).all()),
+        )
 
 
 def _path_gap(first: FloatArray, second: FloatArray) -> float:
@@ -401,19 +406,6 @@ def _to_polyline(points: FloatArray, path: FloatArray) -> FloatArray:
     offset = points[:, None] - start
     share = np.clip((offset * way).sum(axis=2) / square, 0.0, 1.0)
     return np.asarray(np.linalg.norm(offset - share[..., None] * way, axis=2).min(axis=1))
-
-
-def _level(material: Material, trace: Trace) -> _Claim:
-    image = material.center_image(trace)
-    travel, variation = np.ptp(image, axis=0).T
-    return _Claim(
-        "The centre moves horizontally in the images: its ordinate stays constant",
-        "section 6, Fig. 11",
-        f"ordinate varies by {variation[0]:.1f} and {variation[1]:.1f} px while the abscissa travels "
-        f"{travel[0]:.0f} and {travel[1]:.0f} px (left, right)",
-        f"variation at most {_LEVEL_SHARE:.0%} of the travel",
-        bool((variation <= _LEVEL_SHARE * travel).all()),
-    )
 
 
 def claims_of(material: Material, share: FloatArray, distance: FloatArray) -> list[_Claim]:

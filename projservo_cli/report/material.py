@@ -88,8 +88,7 @@ class Fit:
 
     calibration: Calibration  # the calibration
     observation: Observation  # what it was made from
-    # its cross-validation, if there is one
-    held_out: CrossValidation | None = field(default=None, kw_only=True)
+    held_out: CrossValidation | None = field(default=None, kw_only=True)  # its cross-validation, if any
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,16 +242,14 @@ def stage_object(stage: str, run: Run, config: Config, laws: Sequence[str]) -> d
 
 def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str]) -> dict[str, Any]:
     """The JSON object of a stage that could not be made, or lacks what it needs."""
-    result: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
+    found: dict[str, Any] = {"run": run.path.resolve(), "reason": reason, "failed": at}
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
-        return result | {"usable": False, "lens": None} | numbers | lists
-    if stage == "plan":
-        return result | {"feasible": False}
+        return found | {"usable": False, "lens": None} | numbers | lists
     if stage == "servo":
-        return result | {"laws": [_scalars(run.traces[law]) for law in laws]}
-    return result
+        found["laws"] = [_scalars(run.traces[law]) for law in laws]
+    return found | {"feasible": False} if stage == "plan" else found
 
 
 def _scalars(record: Any) -> dict[str, Any]:

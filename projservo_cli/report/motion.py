@@ -5,7 +5,7 @@ The view is drawn by plotly and has a time slider; the animation has a column a 
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -21,9 +21,6 @@ from projservo_cli.report.page import template
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.robots.truth import Robot
 from projservo_cli.task.face import center_of
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 MOST_INSTANTS = 60
 _DOTS = 9  # on the planned path
@@ -170,9 +167,9 @@ def _figure(motion: _Motion) -> Any:
         changed |= {f"scene.{axis}axis.range": limits for axis, limits in _extent(motion, run).items()}
         menu.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
     first: dict[str, Any] = menu[0]["args"][1]
+    buttons = first["updatemenus[1].buttons"]
     left = {"x": 0.0, "xanchor": "left"}
-    playing = {"type": "buttons", "direction": "left", "showactive": False}
-    playing["buttons"] = first["updatemenus[1].buttons"]
+    playing = {"type": "buttons", "direction": "left", "showactive": False, "buttons": buttons}
     layout = {
         "height": _HEIGHT,
         "margin": {"l": 10, "r": 10, "t": 60, "b": 10},
@@ -250,16 +247,10 @@ def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
     robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
     robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})
     fan = np.arange(1, run.face.shape[1] - 1)
-    face = go.Mesh3d(
-        **_places(run.face[k]),
-        i=(0 * fan).tolist(),
-        j=fan.tolist(),
-        k=(fan + 1).tolist(),
-        color=_HIDDEN if run.hidden[k].any() else _SEEN,
-        flatshading=True,
-        name="face",
-        hoverinfo="name",
-    )
+    triangles = {"i": (0 * fan).tolist(), "j": fan.tolist(), "k": (fan + 1).tolist()}
+    color = _HIDDEN if run.hidden[k].any() else _SEEN
+    look = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
+    face = go.Mesh3d(**_places(run.face[k]), **triangles, **look)
     return robot, face, _line(go, run.markers[k], "markers", style.GREY)
 
 
@@ -327,7 +318,7 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
     width = max(_LEAST_WIDTH, _PANEL * len(traces) + 0.5)
     columns: list[list[_Panel]] = []
 
-    def draw(runs: Mapping[str, Trace], figure: "Figure") -> None:
+    def draw(runs: Mapping[str, Trace], figure: "style.Figure") -> None:
         axes = figure.subplots(2, len(runs), squeeze=False, sharex=True, sharey=True)
         for column, (name, run) in zip(axes.T, runs.items(), strict=True):
             for view, (panel, camera) in enumerate(zip(column, VIEWS, strict=True)):

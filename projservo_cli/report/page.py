@@ -4,6 +4,7 @@ import base64
 import json
 import math
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
@@ -20,14 +21,7 @@ from projservo_cli.files import inside, replacing
 from projservo_cli.records import Plan, Report, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.drift import drift_rows
-from projservo_cli.report.material import (
-    ANIMATION_FILE,
-    PAGE_FILE,
-    VIEW_FILE,
-    VIEWS,
-    stage_object,
-    title,
-)
+from projservo_cli.report.material import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, VIEWS, stage_object, title
 from projservo_cli.report.style import FORMATS, power_of_ten
 from projservo_cli.store import Run
 
@@ -56,38 +50,43 @@ def _number(value: Any, digits: int = 3) -> Markup:
     return Markup('<data value="{}">{}</data>').format(repr(plain), _short(plain, digits))
 
 
-def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> list[str]:
+def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:
     """Whether a calibration is good, why, and which joint is known worst, a sentence each.
 
     ``estimated`` says that the noise was estimated from the same images, so that χ² alone decides nothing.
     """
-    words = [f"{'Usable' if found['usable'] else 'Not usable'}: {found['reason']}."]
+    yield f"{'Usable' if found['usable'] else 'Not usable'}: {found['reason']}."
     if math.isfinite(found["chi2_per_dof"]) and found["dof"] > 0:
         low, high = (_short(bound) for bound in chi2_band(found["dof"]))
         chi2, sigma = _short(found["chi2_per_dof"]), _short(found["sigma_px"])
-        words.append(
+        yield (
             f"χ² per degree of freedom is {chi2} at {sigma} px of noise per coordinate, with {found['dof']} "
             f"degrees of freedom; where model and noise are true it stays within {low} and {high}."
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
-    words.append(_worst_joint(found))
+    yield _worst_joint(found)
     if found["predicted_rms_px"] is not None and found["predicted_p99_px"] is not None:
         rms, bound = _short(found["predicted_rms_px"]), _short(found["predicted_p99_px"])
-        words.append(
+        yield (
             f"Within the ranges of the joints images are expected to err by {rms} px rms, and in 99 of 100 "
             f"calibrations by less than {bound} px."
         )
-    left_out = (
+    for name, what, one, many in (
         ("outliers", "reading", "left out as an outlier", "left out as outliers"),
         ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
         ("swapped", "marker", "was renumbered", "were renumbered"),
-    )
-    for name, what, one, many in left_out:
+    ):
         if count := len(found[name]):
-            words.append(f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}.")
+            yield f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}."
     if "cross_validation" in found:
-        words.append(_held_out_words(found["cross_validation"]))
-    return words
+        value = found["cross_validation"]
+        names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")
+        rms, predicted, median, p95 = (_short(value[name]) for name in names)
+        yield (
+            f"Held out, in {value['folds']} parts of {value['unit']}: rms {rms} px where noise and "
+            f"covariance predict {predicted} px, median {median} px, 95th percentile {p95} px. "
+            f"{value['reason'][:1].upper()}{value['reason'][1:].rstrip('.')}."
+        )
 
 
 def _worst_joint(found: Mapping[str, Any]) -> str:
@@ -100,17 +99,6 @@ def _worst_joint(found: Mapping[str, Any]) -> str:
         f"Joint {worst + 1} is known worst: {reach} from the reference it adds {_short(noise)} times the "
         f"pixel noise to predicted images; a joint is weak above {WEAK_NOISE:g}, so this one is "
         f"{'weak' if noise > WEAK_NOISE else 'well determined'}."
-    )
-
-
-def _held_out_words(value: Mapping[str, Any]) -> str:
-    """How well poses were predicted that the fit had not seen, in a sentence or two."""
-    names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")
-    rms, predicted, median, p95 = (_short(value[name]) for name in names)
-    reason = value["reason"][:1].upper() + value["reason"][1:].rstrip(".")
-    return (
-        f"Held out, in {value['folds']} parts of {value['unit']}: rms {rms} px where noise and covariance "
-        f"predict {predicted} px, median {median} px, 95th percentile {p95} px. {reason}."
     )
 
 
@@ -288,7 +276,7 @@ def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
         *lens,
         ("time", found["seconds"], "s"),
     ]
-    return found | {"words": _calibration_words(found, estimated=estimated), "numbers": numbers}
+    return found | {"words": list(_calibration_words(found, estimated=estimated)), "numbers": numbers}
 
 
 def _visibility(plan: Plan) -> dict[str, Any]:
@@ -304,12 +292,9 @@ def _visibility(plan: Plan) -> dict[str, Any]:
 
 
 def _law(trace: dict[str, Any], config: Config) -> dict[str, Any]:
-    return trace | {
-        "title": title(name_of(trace["law"], trace["mode"])),
-        "words": _law_words(trace),
-        "converged": trace["verdict"] == "converged",
-        "must": trace["law"] in config.control.must_converge,
-    }
+    told = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
+    must = trace["law"] in config.control.must_converge
+    return trace | told | {"converged": trace["verdict"] == "converged", "must": must}
 
 
 def _drift(report: Report) -> dict[str, Any] | None:
@@ -383,14 +368,13 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
 
     Raises InputError if a configuration cannot be read or the page cannot be written.
     """
-    base = path.parent.resolve()
-    views = []
+    base, views = path.parent.resolve(), []
     for k, run in enumerate(runs, 1):
-        folder = os.path.relpath(run.path.parent.resolve(), base)
-        views.append(_view(run, folder=Path(folder).as_posix() + "/", prefix=f"run{k}-"))
-    shared = {view.name for view in views if sum(view.name == other.name for other in views) > 1}
+        folder = Path(os.path.relpath(run.path.parent.resolve(), base)).as_posix()
+        views.append(_view(run, folder=f"{folder}/", prefix=f"run{k}-"))
+    shared = Counter(view.name for view in views)
     named = [
-        view._replace(name=f"{view.name} ({view.folder.rstrip('/')})") if view.name in shared else view
+        view._replace(name=f"{view.name} ({view.folder[:-1]})") if shared[view.name] > 1 else view
         for view in views
     ]
     _write(path, named)

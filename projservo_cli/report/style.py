@@ -15,8 +15,8 @@ import numpy as np
 from projservo_cli.records import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
 
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
@@ -30,7 +30,7 @@ BLACK, ORANGE, BLUE, SKY = "#000000", "#E69F00", "#0072B2", "#56B4E9"
 VERMILION, GREEN, PURPLE = "#D55E00", "#009E73", "#CC79A7"
 GREY, PALE = "#999999", "#DDDDDD"
 # Colour, line style and marker change together, so that a curve is known without its colour.
-CURVES: tuple[tuple[str, Any, str], ...] = (
+_CURVES: tuple[tuple[str, Any, str], ...] = (
     (BLACK, "-", "o"),
     (VERMILION, (0, (5, 1.5)), "s"),
     (BLUE, (0, (1, 1)), "^"),
@@ -163,7 +163,7 @@ def legend_below(figure: "Figure", looks: Mapping[str, Look], columns: int) -> N
 
 def curve(index: int, *, marker: bool = False) -> Look:
     """Look of the curve of a number: colour, line style and, if asked for, marker."""
-    color, style, symbol = CURVES[index % len(CURVES)]
+    color, style, symbol = _CURVES[index % len(_CURVES)]
     look = {"color": color, "linestyle": style}
     return look | {"marker": symbol} if marker else look
 
@@ -201,11 +201,6 @@ def log_scale(axes: "Axes") -> None:
 def power_of_ten(exponent: int) -> str:
     """A power of ten as it is written by hand."""
     return "10" + str(exponent).translate(_SUPERSCRIPTS)
-
-
-def signed(value: float, decimals: int = 1) -> str:
-    """Number with a typographic minus."""
-    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def closed(polygon: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,16 +17,8 @@ from projservo_cli.records import InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.figures.drift import drift_rows, drift_tables
-from projservo_cli.report.material import (
-    ANIMATION_FILE,
-    CLAIMS_FILE,
-    DIRECT,
-    VIEW_FILE,
-    Fit,
-    Material,
-    Studies,
-)
+from projservo_cli.report.figures.drift import drift_rows, study_numbers
+from projservo_cli.report.material import ANIMATION_FILE, CLAIMS_FILE, VIEW_FILE, Fit, Material, Studies
 from projservo_cli.report.motion import motion_of, plotly, write_animation, write_view
 from projservo_cli.report.page import write_page
 from projservo_cli.stages import Progress, silent
@@ -82,7 +74,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
         step_limit_deg=STEP_LIMIT_DEG,
         share=share,
         composition_mm=1e3 * distance,
-        **_numbers(studies),
+        **study_numbers(studies),
     )
     content = {"claims": report.claims, "drift": drift_rows(report), "left_out": report.left_out}
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
@@ -123,21 +115,6 @@ def _material(
         bench.scenario.limits.plateau_steps,
         held_out=run.cross_validation,
     )
-
-
-def _numbers(studies: Studies | None) -> dict[str, Any]:
-    """What the record of a report holds of the extra runs."""
-    periods, rate = (studies.periods, studies.rate) if studies else ((), {})
-    drift, at_samples, converged = drift_tables(studies)
-    rows = [[rate[law, period].center_deviation_mm for period in periods] for law in DIRECT]
-    return {
-        "gain_per_step": np.array(studies.gains if studies else ()),
-        "drift_mm": drift,
-        "drift_at_samples_mm": at_samples,
-        "drift_converged": converged,
-        "period": np.array(periods),
-        "period_drift_mm": np.array(rows, dtype=np.float64),
-    }
 
 
 def draw_all(

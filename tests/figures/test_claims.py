@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.loop.step import on_plateau, plateau_stretch
 from projservo_cli.report.claims import claims_of
-from projservo_cli.report.material import along_line, curve_difference
-from tests.figures.cases import SPECS, case, geometric
+from projservo_cli.report.material import curve_difference
+from tests.figures.cases import SPECS, case
 
 FITTED, FREE = ("direct_two", "calibrated", True), ("direct_three", "calibrated", False)
 
@@ -31,7 +31,7 @@ def test_decay_is_judged_by_the_steps_after_the_limit_and_above_what_the_calibra
     trace, gains = material.studies.own[FITTED], material.studies.gains_of_laws
     factors = 1.0 - gains.gain_t * trace.period, 1.0 - gains.gain_s * trace.period
     count = 200
-    way, theta = (geometric(start, factor, count) for start, factor in zip((0.5, 3.0), factors, strict=True))
+    way, theta = 0.5 * factors[0] ** np.arange(count), 3.0 * factors[1] ** np.arange(count)
     way[:37] = theta[:37] = 5.0  # before twenty steps have passed since the last limited command
     speed = np.ones(count)
     speed[[3, 17]] = 0.5
@@ -138,7 +138,7 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
     still = dataclasses.replace(
         trace,
         stop_error=judged,
-        image_error=geometric(100.0, 0.9, count),
+        image_error=100.0 * 0.9 ** np.arange(count),
         s=np.repeat(trace.s[:1], count, axis=0),
         self_occluded=np.zeros((count, 2), dtype=bool),
     )
@@ -149,14 +149,7 @@ def test_the_plateau_that_is_drawn_and_claimed_is_that_of_the_verdict():
     assert claim.criterion.startswith("image error falls < 1 % in 5 steps")
 
 
-def test_way_along_a_line_and_distance_from_it():
-    points = np.array([[0.0, 0, 0], [3.0, 4.0, 0], [5.0, 0, 2.0]])
-    way, off = along_line(points, np.zeros(3), np.array([10.0, 0, 0]))
-    np.testing.assert_allclose(way, [0, 3, 5], atol=1e-15)
-    np.testing.assert_allclose(off, [0, 4, 2], atol=1e-15)
-
-
 def test_curves_that_differ_by_the_sense_of_a_half_turn_are_compared_by_size():
-    curve = geometric(np.pi, 0.9, 20)
+    curve = np.pi * 0.9 ** np.arange(20)
     np.testing.assert_allclose(curve_difference(curve, -curve[:15] + 1e-3), np.full(15, 1e-3), rtol=1e-9)
     assert curve_difference(curve, curve).max() == 0

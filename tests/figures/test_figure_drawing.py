@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from projservo_cli.report import style
 from tests.figures.cases import SPECS, case
@@ -17,28 +18,18 @@ def figures(request):
     return {name: drawn(spec, material) for name, spec in SPECS.items()}
 
 
-def drawn_texts(figure, monkeypatch):
-    """Every text that is really drawn, and where, in pixels; ticks beyond the limits are not."""
-    from matplotlib.text import Text
-
-    found = []
-    draw = Text.draw
+@pytest.mark.parametrize("name", NAMES)
+def test_no_text_is_clipped_by_the_figure_or_lies_on_another(figures, name, monkeypatch):
+    figure, found, draw = figures[name], [], Text.draw
 
     def record(self, renderer, *args, **kwargs):
         if self.get_visible() and self.get_text().strip():
             found.append((self.get_text(), self.get_window_extent(renderer)))
         return draw(self, renderer, *args, **kwargs)
 
-    monkeypatch.setattr(Text, "draw", record)
+    monkeypatch.setattr(Text, "draw", record)  # what is really drawn: ticks beyond the limits are not
     with style.styled():
         figure.canvas.draw()
-    return found
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_text_is_clipped_by_the_figure_or_lies_on_another(figures, name, monkeypatch):
-    figure = figures[name]
-    found = drawn_texts(figure, monkeypatch)
     assert len(found) > 5
     for i, (text, extent) in enumerate(found):
         low, high = extent.get_points()

@@ -9,7 +9,6 @@ from projservo_cli.report import motion
 from tests.fake_records import fake
 from tests.figures.cases import case
 
-SIZE = (1280, 1024)
 PALE_ORANGE = "#F0C566"  # of what is hidden, on paper, as all frames show it
 
 
@@ -24,12 +23,11 @@ def run(end=4, hidden=(2,), verdict="converged"):
 
 @pytest.fixture
 def frames(tmp_path, monkeypatch):
-    """Pixels of so many frames of an animation, at equal steps of its time."""
+    """Pixels of so many frames of an animation of named runs, at equal steps of its time."""
 
-    def written(runs, count):
+    def written(count, **runs):
         monkeypatch.setattr(motion, "FRAMES", count)
-        named = runs if isinstance(runs, dict) else {f"law {k}": one for k, one in enumerate(runs)}
-        motion.write_animation(tmp_path / "film.gif", named, np.arange(4), SIZE, lambda *_: None)
+        motion.write_animation(tmp_path / "film.gif", runs, np.arange(4), (1280, 1024), lambda *_: None)
         with Image.open(tmp_path / "film.gif") as film:
             return [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
 
@@ -43,25 +41,24 @@ def count(pixels, color):
 
 def test_the_direct_law_stands_beside_the_classical_ones(frames):
     traces = case()[2].traces
-    some = {name: traces[name] for name in ("direct_three", "stacked", "blockwise", "euclidean_points")}
-    (all_of_them,), (four,) = frames(traces, 1), frames(some, 1)
-    np.testing.assert_array_equal(all_of_them, four)
-    direct, alone = ("direct_two", "exact"), ("stacked",)
-    for names, width in ((direct, 510), (alone, 400)):
-        (pixels,) = frames({name: traces[name] for name in names}, 1)
+    beside = ("direct_three", "stacked", "blockwise", "euclidean_points")
+    shown = [frames(1, **{name: traces[name] for name in names})[0] for names in (traces, beside)]
+    np.testing.assert_array_equal(*shown)
+    for names, width in ((("direct_two", "exact"), 510), (("stacked",), 400)):
+        (pixels,) = frames(1, **{name: traces[name] for name in names})
         assert abs(pixels.shape[1] - width) <= 1
 
 
 def test_the_film_lasts_as_long_as_the_longest_run_that_converged(frames):
-    ends = [
-        frames([run(80, verdict="plateau"), run(9, verdict=other)], 2)[-1] for other in ("converged", "x")
-    ]
-    short, whole = (count(end[:, : end.shape[1] // 2], motion.SEEN) for end in ends)
-    assert short < 0.6 * whole  # of the way of the first run, 9 s and 80 s
+    slow, ends = run(80, verdict="plateau"), []
+    for verdict in ("converged", "diverged"):
+        end = frames(2, slow=slow, quick=run(9, verdict=verdict))[-1]
+        ends.append(count(end[:, : end.shape[1] // 2], motion.SEEN))
+    assert ends[0] < 0.6 * ends[1]  # of the way of the first run, 9 s and 80 s
 
 
 def test_the_face_moves_and_hidden_instants_are_marked(frames):
-    first, hidden, last = frames([run()], 3)
+    first, hidden, last = frames(3, one=run())
     assert abs(first.shape[1] - 400) <= 1  # room for the legend
     assert (first != last).any(axis=2).sum() > 500
     # The legend has some of the colour; the filled face and the word beside it are more.
@@ -77,7 +74,7 @@ def test_the_face_moves_and_hidden_instants_are_marked(frames):
 def test_markers_that_were_not_seen_are_told_and_leave_the_rest(frames):
     lost, whole = run(hidden=()), run(hidden=())
     lost.s[3, 1] = np.nan
-    first, last = zip(*(frames([one], 5)[3:] for one in (lost, whole)), strict=True)
+    first, last = zip(*(frames(5, one=one)[3:] for one in (lost, whole)), strict=True)
     upper, lower = np.array_split(np.abs(first[0].astype(int) - first[1]).max(axis=2) > 60, 2)
     assert lower.sum() > 200  # the word, and the face that is gone, in the image of the right camera alone
     assert not upper.any()

@@ -51,21 +51,15 @@ def test_the_ends_of_the_task_and_the_planned_path_between_them(shown):
     np.testing.assert_allclose(scene.planned[[0, -1]], [trace.center[0], middle], atol=1e-6)
 
 
-def test_a_goal_of_which_only_images_are_known_is_not_drawn(shown):
-    truth, material, _ = shown
-    unknown = np.full((4, 4), np.nan)
-    traces = {"stacked": dataclasses.replace(material.traces["stacked"], goal_pose=unknown)}
-    scene = motion_of(truth.robot, material.plant, truth.M, material.plan, traces)
-    assert scene.goal is None
-
-
 def test_instants_miss_neither_the_quick_beginning_nor_the_end_of_a_long_run(shown):
     truth, material, _ = shown
     trace, count = material.traces["stacked"], 2001
     share = 1.0 - np.exp(-np.arange(count) / 20.0)  # as good as still after a tenth
     q = trace.q[0] + share[:, None] * (trace.q[-1] - trace.q[0])
-    long = dataclasses.replace(trace, q=q, self_occluded=np.zeros((count, 2), dtype=bool))
+    hidden, unknown = np.zeros((count, 2), dtype=bool), np.full((4, 4), np.nan)
+    long = dataclasses.replace(trace, q=q, self_occluded=hidden, goal_pose=unknown)
     scene = motion_of(truth.robot, material.plant, truth.M, material.plan, {"stacked": long})
+    assert scene.goal is None  # of which only images are known
     chosen = np.round(scene.runs["stacked"].seconds / trace.period)
     assert (chosen[0], chosen[-1]) == (0, 2000)
     assert len(chosen) <= MOST_INSTANTS

@@ -6,7 +6,7 @@ import pytest
 
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.claims import claims_of
-from projservo_cli.report.figures.drift import drift_tables
+from projservo_cli.report.figures.drift import study_numbers
 from projservo_cli.report.material import DIRECT
 from projservo_cli.stages import report, steps, studies
 from projservo_cli.store import Result, Run, load, save
@@ -254,7 +254,7 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         "The image error does not decay exponentially",
         *(of_paper if name == "paper" else ()),
     } <= {claim.claim for claim in claims if claim.holds}
-    assert drift_tables(material.studies)[2].all()  # converged
+    assert study_numbers(material.studies)["drift_converged"].all()  # converged
 
 
 @pytest.mark.volume

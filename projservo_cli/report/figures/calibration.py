@@ -1,6 +1,6 @@
 """Diagnostics of a calibration: what the fit leaves of the images, and what the data determine."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -9,10 +9,6 @@ from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _RIGHT, _BOTH = 1, 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a share of the extent of what was seen
@@ -134,7 +130,7 @@ def _magnification(residual: FloatArray, extent: float) -> float:
     "of each pose over its predicted error; range of each joint; eigenvalues of the information "
     "matrix.",
 )
-def _draw(data: Data, figure: "Figure") -> None:
+def _draw(data: Data, figure: "style.Figure") -> None:
     """Residuals over both images; their histogram and error of each pose; excitation and information."""
     panels = figure.subplots(3, 2, height_ratios=(1.15, 1.0, 0.9))
     for axes, view in zip(panels[0], VIEWS, strict=True):
@@ -154,7 +150,7 @@ def _draw(data: Data, figure: "Figure") -> None:
     style.legend_below(figure, looks, 3)
 
 
-def _arrows(axes: "Axes", data: Data, view: str) -> None:
+def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
     seen, out = data[f"seen_{view}"], data[f"left_out_{view}"]
     arrows = float(data["factor"]) * data[f"residual_{view}"]
     pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
@@ -165,7 +161,7 @@ def _arrows(axes: "Axes", data: Data, view: str) -> None:
     style.image_axes(axes, title, np.concatenate([seen, seen + arrows, out]))
 
 
-def _histogram(axes: "Axes", data: Data) -> None:
+def _histogram(axes: "style.Axes", data: Data) -> None:
     """Density of the residuals beside the normal one of the noise model."""
     residual, sigma = data["residual"], float(data["sigma_px"])
     widest = max(4.0 * sigma, float(np.abs(residual).max(initial=0.0)))
@@ -177,7 +173,7 @@ def _histogram(axes: "Axes", data: Data) -> None:
     axes.set(title=title, xlabel="residual (px)", ylabel="density (1/px)")
 
 
-def _poses(axes: "Axes", data: Data) -> None:
+def _poses(axes: "style.Axes", data: Data) -> None:
     """Residual of each pose over its predicted error, beside what the noise model leads one to expect."""
     predicted, residual = data["pose_predicted_px"], data["pose_residual_px"]
     sigma = float(data["sigma_px"])
@@ -202,7 +198,7 @@ def _poses(axes: "Axes", data: Data) -> None:
     axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
 
 
-def _excitation(axes: "Axes", data: Data) -> None:
+def _excitation(axes: "style.Axes", data: Data) -> None:
     """Range of each joint, revolute in deg on the left, prismatic in m on the right."""
     prismatic, weak = data["prismatic"], data["weak"]
     mixed = bool(prismatic.any() and not prismatic.all())
@@ -225,7 +221,7 @@ def _excitation(axes: "Axes", data: Data) -> None:
     axes.set_title(f"excitation, {int(weak.sum())} of {len(weak)} joints weak")
 
 
-def _spectrum(axes: "Axes", data: Data) -> None:
+def _spectrum(axes: "style.Axes", data: Data) -> None:
     """Information along each direction that the images determine, falling; the last is the worst."""
     values = data["information"]
     title = f"information, {len(values)} of {int(data['parameters'])} directions free"
@@ -239,7 +235,7 @@ def _spectrum(axes: "Axes", data: Data) -> None:
         _without_covariance(axes)
 
 
-def _without_covariance(axes: "Axes") -> None:
+def _without_covariance(axes: "style.Axes") -> None:
     """Say why a panel is empty."""
     axes.set(xticks=[], yticks=[])
     axes.text(0.5, 0.5, "the method has no covariance", ha="center", va="center", transform=axes.transAxes)

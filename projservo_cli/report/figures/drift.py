@@ -1,11 +1,11 @@
 """How far the centre drifts from its straight line: for several gains, Fig. 8 of [RH00], and by mode."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.records import BoolArray, FloatArray, Report, Trace
+from projservo_cli.records import FloatArray, Report, Trace
 from projservo_cli.report import style
 from projservo_cli.report.material import (
     DIRECT,
@@ -17,9 +17,6 @@ from projservo_cli.report.material import (
     registered,
     title,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _LEAST_SHARE = 0.05  # of the largest deviation of the best run, below which nothing is drawn
 _PATH_POINTS = 400
@@ -39,20 +36,30 @@ _MAXIMA: dict[tuple[int, int], style.Look] = {
 }
 
 
-def drift_tables(studies: Studies | None) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Largest deviation of the centre, mm, all along and at the samples alone, and what converged.
+def study_numbers(studies: Studies | None) -> dict[str, Any]:
+    """What a ``Report`` holds of the extra runs, NaN where the goal pose is unknown.
 
-    Each by law, operators (true, calibrated), limit (no, yes) and gain; NaN where the goal pose is unknown.
+    Laws, operators, limits and gains are in the order of its tables.
     """
-    gains, sweep = (studies.gains, studies.sweep) if studies is not None else ((), {})
-    shape = (len(DIRECT), 2, 2, len(gains))
+    gains, periods = (studies.gains, studies.periods) if studies is not None else ((), ())
+    shape = (len(DIRECT), len(_OPERATORS), 2, len(gains))
     drift, at_samples, converged = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.bool_)
-    for (law, operators, limited, gain), trace in sweep.items():
+    by_period = np.full((len(DIRECT), len(periods)), np.nan)
+    for (law, operators, limited, gain), trace in (studies.sweep if studies is not None else {}).items():
         where = DIRECT.index(law), _OPERATORS.index(operators), int(limited), gains.index(gain)
         converged[where] = trace.verdict == "converged"
         drift[where] = trace.center_deviation_mm  # None becomes NaN
         at_samples[where] = trace.center_deviation_at_samples_mm
-    return drift, at_samples, converged
+    for (law, period), trace in (studies.rate if studies is not None else {}).items():
+        by_period[DIRECT.index(law), periods.index(period)] = trace.center_deviation_mm
+    return {
+        "gain_per_step": np.array(gains),
+        "drift_mm": drift,
+        "drift_at_samples_mm": at_samples,
+        "drift_converged": converged,
+        "period": np.array(periods),
+        "period_drift_mm": by_period,
+    }
 
 
 def _data(material: Material) -> Data:
@@ -60,7 +67,7 @@ def _data(material: Material) -> Data:
     studies = material.extra
     result: Data = {
         "gain": np.array(studies.gains),
-        "drift_mm": drift_tables(studies)[0],
+        "drift_mm": study_numbers(studies)["drift_mm"],
         "step_limit_deg": np.array(studies.step_limit_deg),
     }
     for law in DIRECT:
@@ -101,7 +108,7 @@ def _center_path(material: Material, trace: Trace) -> FloatArray:
     "for several gains, and the largest distance over the gain, with true and calibrated "
     "operators, with and without a limit.",
 )
-def _draw(data: Data, figure: "Figure") -> None:
+def _draw(data: Data, figure: "style.Figure") -> None:
     """One row a law: left the paths, right the largest deviation over the gain."""
     axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
     gains = data["gain"]
@@ -174,7 +181,7 @@ def _data_modes(material: Material) -> Data:
     goal=True,
     alt="Distance of the centre from its straight line over the way along it, one curve a law and mode.",
 )
-def _draw_modes(data: Data, figure: "Figure") -> None:
+def _draw_modes(data: Data, figure: "style.Figure") -> None:
     """Distance of the centre from its line over the way along it, one curve a run."""
     axes, names = figure.subplots(), [str(name) for name in data["names"]]
     for i, name in enumerate(names):

@@ -1,26 +1,15 @@
 """Figs. 9, 10 and 12 of [RH00]: control errors and joints under direct control, over time."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.material import (
-    Data,
-    Material,
-    curve_difference,
-    percent,
-    registered,
-)
+from projservo_cli.report.material import Data, Material, curve_difference, percent, registered
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# What is drawn of an error on a logarithmic scale: five decades below its start.
-_DECADES = 1e-5
+_DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
 _FAINT: style.Look = {"linewidth": 0.8, "alpha": 0.55}
 _DOTTED = (0, (1, 1.2))
+_KERNEL = r"$\tau$, unit-norm kernel (8), "
 _WAYS = (("free", False), ("limited", True))  # without and with the limit of the joint speed
 
 
@@ -52,7 +41,7 @@ def _time(trace: Trace) -> FloatArray:
     alt="Translation and rotation error of directTWO over time, on a linear and on a logarithmic "
     "scale, without a limit and with one.",
 )
-def _draw_two(data: Data, figure: "Figure") -> None:
+def _draw_two(data: Data, figure: "style.Figure") -> None:
     """Above τ, below θ_s; left as in the paper, right on a logarithmic scale."""
     axes = figure.subplots(2, 2, sharex=True)
     looks: dict[str, style.Look] = {
@@ -115,22 +104,22 @@ def _data_three(material: Material) -> Data:
     alt="Translation and rotation errors of directTHREE over time with the projective and the "
     "Euclidean model, and the differences between both.",
 )
-def _draw_three(data: Data, figure: "Figure") -> None:
+def _draw_three(data: Data, figure: "style.Figure") -> None:
     """Above τ and what separates it from the truth, below the angles and their differences."""
     axes = figure.subplots(2, 2, sharex=True)
     (translation, off), (rotation, difference) = axes
     t, t_metric = data["t_s"], data["t_s_metric"]
     t_common = max(t, t_metric, key=len)
-    looks: dict[str, style.Look] = {
-        "distance": {"color": style.SKY, "linewidth": 3.2},
-        "tau_affine": {"color": style.BLACK},
-        "tau": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
-        "tau_metric": {"color": style.BLACK, "linestyle": _DOTTED},
+    looks: dict[str, tuple[str, style.Look]] = {
+        "distance": ("true distance", {"color": style.SKY, "linewidth": 3.2}),
+        "tau_affine": (r"$\tau$, scale fixed through $a_\infty$", {"color": style.BLACK}),
+        "tau": (_KERNEL + "projective", {"color": style.VERMILION, "linestyle": (0, (4, 1.5))}),
+        "tau_metric": (_KERNEL + "Euclidean", {"color": style.BLACK, "linestyle": _DOTTED}),
     }
-    for name, look in looks.items():
+    for name, (_, look) in looks.items():
         translation.plot(t_metric if name == "tau_metric" else t, data[name], **look)
-    for name in ("tau_affine", "tau"):
-        off.plot(t, np.abs(data[name] - data["distance"]), **looks[name])
+        if name in ("tau_affine", "tau"):
+            off.plot(t, np.abs(data[name] - data["distance"]), **look)
     some = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
     for name, color, marker in (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s")):
         rotation.plot(t, data[f"{name}_deg"], color=color)
@@ -146,11 +135,7 @@ def _draw_three(data: Data, figure: "Figure") -> None:
     rotation.set(title="rotation errors", xlabel="time (s)", ylabel="angle (deg)")
     difference.set(title="projective less Euclidean model", xlabel="time (s)", ylabel="difference (deg)")
     points: style.Look = {"color": style.BLACK, "marker": "o", "linestyle": "none", "fillstyle": "none"}
-    legend = {
-        "true distance": looks["distance"],
-        r"$\tau$, scale fixed through $a_\infty$": looks["tau_affine"],
-        r"$\tau$, unit-norm kernel (8), projective": looks["tau"],
-        r"$\tau$, unit-norm kernel (8), Euclidean": looks["tau_metric"],
+    legend = dict(looks.values()) | {
         r"$\theta_r$, projective model": {"color": style.BLACK},
         r"$\theta_p$, projective model": {"color": style.VERMILION},
         r"$\theta_r$, $\theta_p$, Euclidean": points,
@@ -182,7 +167,7 @@ def _data_joints(material: Material) -> Data:
     studies=True,
     alt="The joints and their steps over time under directTHREE, without a limit and with one.",
 )
-def _draw_joints(data: Data, figure: "Figure") -> None:
+def _draw_joints(data: Data, figure: "style.Figure") -> None:
     """Left without, right with the limit; joints above, their steps below, per kind of joint."""
     prismatic = data["prismatic"]
     both = ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))

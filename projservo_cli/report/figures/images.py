@@ -1,7 +1,5 @@
 """Figs. 4, 7 and 11 of [RH00], and the overview: paths and errors of the markers in both images."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
@@ -18,9 +16,6 @@ from projservo_cli.report.material import (
     percent,
     registered,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
@@ -72,7 +67,7 @@ def _data_classical(material: Material) -> Data:
     "to goal, with the stretches in which the face is hidden and in which the image error "
     "stands still.",
 )
-def _draw_classical(data: Data, figure: "Figure") -> None:
+def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
     laws, size = [law for law in CLASSICAL if f"s_{law}" in data], data["image_size"]
     shown = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
@@ -124,7 +119,7 @@ def _data_direct(material: Material) -> Data:
     laws=DIRECT,
     alt="Paths of the markers in both camera images under directTHREE and directTWO.",
 )
-def _draw_direct(data: Data, figure: "Figure") -> None:
+def _draw_direct(data: Data, figure: "style.Figure") -> None:
     """Both laws over one another, one panel a camera."""
     runs = [data[f"s_{law}"] for law in DIRECT]
     figure.set_figheight(_PANEL_WIDTH * style.aspect(np.concatenate(runs)) + 1.05)
@@ -167,7 +162,7 @@ def _data_errors(material: Material) -> Data:
     goal=True,
     alt="For each camera: the errors of u and v of every marker and of the centre over time.",
 )
-def _draw_errors(data: Data, figure: "Figure") -> None:
+def _draw_errors(data: Data, figure: "style.Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick."""
     axes = figure.subplots(1, 2, sharey=True)
     t = data["t_s"]
@@ -223,7 +218,7 @@ def _data_overview(material: Material) -> Data:
     "for directTHREE and the stacked law, with the stretches in which the face is hidden. "
     "Right: control errors of directTHREE and image errors of both laws over time.",
 )
-def _draw_overview(data: Data, figure: "Figure") -> None:
+def _draw_overview(data: Data, figure: "style.Figure") -> None:
     """Left the images of both cameras, right the errors."""
     shown = [
         np.concatenate(

@@ -1,7 +1,5 @@
 """Figs. 1 and 2 of [RH00]: the parts of the task in the images, and where they change visibility."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from projservo_cli.geometry.displacement import exp_rotation
@@ -10,10 +8,6 @@ from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Material, registered
 from projservo_cli.task.face import cyclic_order
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _ARC_POINTS, _SENSE_POINTS = 61, 181
 _SHIFTED: style.Look = {"color": style.VERMILION, "linestyle": (0, (1, 1))}
@@ -75,11 +69,11 @@ def _axis(H_hat: FloatArray, A_c: FloatArray, A: FloatArray) -> FloatArray:
     alt="Three panels in the left image: the face moved along a straight line, turned onto the "
     "target plane, and turned within it.",
 )
-def _draw_partition(data: Data, figure: "Figure") -> None:
+def _draw_partition(data: Data, figure: "style.Figure") -> None:
     """Three panels, one a part."""
     panels = figure.subplots(1, 3, width_ratios=[1.1, 1, 1])
     targets = {"A_star": style.GOAL, "A_t": _SHIFTED, "A_r": _TURNED}
-    onto, within = (style.signed(angle) for angle in data["angles_deg"])
+    onto, within = (_signed(angle) for angle in data["angles_deg"])
     moved = np.stack([data["A_t"], data["A_star"]])
     parts = (
         ("translation of the centre", moved, ("A_t", "A_star")),
@@ -146,7 +140,7 @@ def _data_visibility(material: Material) -> Data:
     alt="For each camera: the face turned onto the target plane in both senses, and its visibility "
     "margin over the angle and over the translation, with the values at which it is zero.",
 )
-def _draw_visibility(data: Data, figure: "Figure") -> None:
+def _draw_visibility(data: Data, figure: "style.Figure") -> None:
     """Per camera: the images along both senses of θ_r, and the margin over θ_r and over τ."""
     axes = figure.subplots(3, 2, height_ratios=[1.9, 1.0, 0.9])
     for view, name in enumerate(VIEWS):
@@ -161,18 +155,18 @@ def _draw_visibility(data: Data, figure: "Figure") -> None:
         _translation(axes[2, view], data, view)
     looks = {"face at the start": style.START}
     for angle, look in zip(data["theta_deg"][:, -1], _SENSES, strict=True):
-        looks[rf"sense $\theta_r$ = {style.signed(angle)}°"] = look
+        looks[rf"sense $\theta_r$ = {_signed(angle)}°"] = look
     looks |= {"hidden from this camera": _HIDDEN, r"$\theta_0^\pm$, $\tau_0$": _ZERO}
     looks["end of the motion"] = {"color": style.BLACK, "marker": "s", "linestyle": "none"}
     style.legend_below(figure, looks, 3)
 
 
-def _angle(axes: "Axes", data: Data, view: int) -> None:
+def _angle(axes: "style.Axes", data: Data, view: int) -> None:
     angles, zeros = data["theta_deg"], data["theta_0_deg"][view]
     for theta, margin, look in zip(angles, data["theta_margin"][..., view], _SENSES, strict=True):
         _margin(axes, theta, margin, look)
         axes.plot(theta[-1:], margin[-1:], "s", color=look["color"])
-    changes = " and ".join(f"{style.signed(angle)}°" for angle in zeros)
+    changes = " and ".join(f"{_signed(angle)}°" for angle in zeros)
     zeros = (zeros[:, None] + np.array([-360.0, 0.0, 360.0])).ravel()
     zeros = zeros[(zeros >= angles.min()) & (zeros <= angles.max())]
     axes.plot(zeros, np.zeros_like(zeros), **_ZERO)
@@ -181,18 +175,23 @@ def _angle(axes: "Axes", data: Data, view: int) -> None:
     axes.set(xlabel=r"$\theta_r$ (deg)", ylabel=_MARGIN)
 
 
-def _translation(axes: "Axes", data: Data, view: int) -> None:
+def _translation(axes: "style.Axes", data: Data, view: int) -> None:
     share, margin, zero = data["tau_share"], data["tau_margin"][:, view], data["tau_0_share"][view]
     _margin(axes, share, margin, {"color": style.BLACK})
     axes.plot([1.0], np.interp([1.0], share, margin), "s", color=style.BLACK)
     axes.plot([zero], [0.0], **_ZERO)
-    known = rf"$\tau_0$ = {style.signed(zero, 2)} $\tau$"
+    known = rf"$\tau_0$ = {_signed(zero, 2)} $\tau$"
     axes.set_title(known if np.isfinite(zero) else "visibility never changes")
     axes.set(xlim=(share[0], share[-1]), xlabel=r"translation as share of $\tau$ (1)", ylabel=_MARGIN)
 
 
-def _margin(axes: "Axes", x: FloatArray, margin: FloatArray, look: style.Look) -> None:
+def _margin(axes: "style.Axes", x: FloatArray, margin: FloatArray, look: style.Look) -> None:
     """A visibility margin over the share of a motion, and where the face is hidden by it."""
     axes.plot(x, np.where(margin > 0, np.nan, margin), **_HIDDEN)
     axes.plot(x, margin, **look)
     axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
+
+
+def _signed(value: float, decimals: int = 1) -> str:
+    """Number with a typographic minus."""
+    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}")

@@ -1,7 +1,7 @@
 """Figs. 5 and 6 of [RH00]: planned motions seen from between the cameras; and the path among all motions."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +15,6 @@ from projservo_cli.report.material import VIEWS, Data, Material, registered
 from projservo_cli.robots.truth import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 STEEP = 0.35  # share of the path at which the steep profile has done the translation
 _FACES = 9
@@ -117,7 +113,7 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     alt="As the figure before, with a translation that is driven first: the face at several "
     "moments, the shares of the motions and the visibility margins.",
 )
-def _draw_planned(data: Data, figure: "Figure") -> None:
+def _draw_planned(data: Data, figure: "style.Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
     from matplotlib import colormaps
 
@@ -148,7 +144,7 @@ def _draw_planned(data: Data, figure: "Figure") -> None:
     style.legend_below(figure, {**_SHARES, **cameras, "first marker of the face": first}, 6)
 
 
-def _columns(axes: "Axes", x: FloatArray, values: FloatArray, looks: Iterable[style.Look]) -> None:
+def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, looks: Iterable[style.Look]) -> None:
     """Each column of values (k, c) over x (k,), in a look of its own."""
     for column, look in zip(values.T, looks, strict=True):
         axes.plot(x, column, **look)
@@ -205,7 +201,7 @@ def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
     _data_path,
     height=6.0,
 )
-def _draw_path(data: Data, figure: "Figure") -> None:
+def _draw_path(data: Data, figure: "style.Figure") -> None:
     """Above the map of each camera with the path, below the shares and the margins along it."""
     axes = figure.subplots(2, 2, height_ratios=[1.5, 1.0])
     for view, name in enumerate(VIEWS):
@@ -230,7 +226,7 @@ def _draw_path(data: Data, figure: "Figure") -> None:
     style.legend_below(figure, {**looks, **_SHARES, **_MARGINS}, 4)
 
 
-def _map(axes: "Axes", data: Data, view: int) -> None:
+def _map(axes: "style.Axes", data: Data, view: int) -> None:
     share = data["share"]
     for name, look in _REGIONS.items():
         finite = np.maximum(data[name][view], -1e6)

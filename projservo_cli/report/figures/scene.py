@@ -1,6 +1,6 @@
 """Fig. 3 of [RH00]: robot, stereo rig and face at the start and at the goal."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +12,7 @@ from projservo_cli.robots.simulated import Plant
 from projservo_cli.robots.truth import camera_center
 from projservo_cli.task.face import center_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# Length of the drawn viewing pyramids, as a share of the distance to the face.
-_PYRAMID = 0.16
+_PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
 _CAMERAS: dict[str, style.Look] = {
     "left camera": {"color": style.BLUE, "linewidth": 1.0},
     "right camera": {"color": style.ORANGE, "linewidth": 1.0},
@@ -84,8 +80,10 @@ def pyramids(plant: Plant, face: FloatArray) -> FloatArray:
     alt="The robot's arm at the start in three dimensions, both cameras, the face at the start and "
     "at the goal, and the straight line of its centre between them.",
 )
-def _draw(data: Data, figure: "Figure") -> None:
+def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
+    from matplotlib.ticker import MultipleLocator
+
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
@@ -105,16 +103,7 @@ def _draw(data: Data, figure: "Figure") -> None:
         axes.plot(*data["line"].T, **line)
         looks |= {"face at the goal": goal, "straight line of the centre": line}
         shown.append(data["face_goal"])
-    extent = _frame(axes, np.concatenate(shown), data["cameras"].mean(axis=0))
-    figure.set_layout_engine()
-    style.legend_below(figure, looks | _CAMERAS, 3)
-    _fit(axes, figure, extent)
-
-
-def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
-    """Equal scales on all axes, seen from the side of the rig; returns the extent (3, 2) shown, m."""
-    from matplotlib.ticker import MultipleLocator
-
+    points = np.concatenate(shown)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = 0.05 * (high - low).max()
     extent = np.stack([low - pad, high + pad], axis=1)
@@ -123,12 +112,14 @@ def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
         getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
         getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(0.25 if b - a < 0.75 else 0.5))
     axes.tick_params(pad=0)
-    towards = rig - points.mean(axis=0)
+    towards = data["cameras"].mean(axis=0) - points.mean(axis=0)  # from the side of the rig
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
-    return extent
+    figure.set_layout_engine()
+    style.legend_below(figure, looks | _CAMERAS, 3)
+    _fit(axes, figure, extent)
 
 
-def _fit(axes: Any, figure: "Figure", extent: FloatArray) -> None:
+def _fit(axes: Any, figure: "style.Figure", extent: FloatArray) -> None:
     """Show the scene as large as its labels and the room above the legend allow."""
     corners = np.array([*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)])
     size = np.ptp(extent, axis=1)

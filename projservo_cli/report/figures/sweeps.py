@@ -1,23 +1,16 @@
 """Figures of a sweep: success over a value, over start offsets, and how far from the goal runs end."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from projservo_cli.report import style
 from projservo_cli.report.material import Data
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
-
-def draw_success(data: Data, figure: "Figure") -> None:
-    """Success of each law with its interval, over ``x``.
-
-    ``data`` has the label of the axis as ``label``, and for each law ``<law>.x``, ``.rate``, ``.low``
-    and ``.high``.
-    """
+def draw_success(data: Data, figure: "style.Figure") -> None:
+    """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
     axes = figure.add_subplot()
     laws = _laws(data, ".rate")
     looks = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
@@ -31,7 +24,7 @@ def draw_success(data: Data, figure: "Figure") -> None:
     style.legend_below(figure, looks, min(3, len(laws)))
 
 
-def draw_basin(data: Data, figure: "Figure") -> None:
+def draw_basin(data: Data, figure: "style.Figure") -> None:
     """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
 
     ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
@@ -57,7 +50,7 @@ def draw_basin(data: Data, figure: "Figure") -> None:
     figure.colorbar(mesh, ax=panels.tolist(), label="converged (%)")
 
 
-def draw_final_errors(data: Data, figure: "Figure") -> None:
+def draw_final_errors(data: Data, figure: "style.Figure") -> None:
     """Share of the runs of each law that end within a distance of the goal.
 
     ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
@@ -66,8 +59,8 @@ def draw_final_errors(data: Data, figure: "Figure") -> None:
     looks = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
     for law, look in looks.items():
         axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **look)
-    axes.set(xlabel="distance of the centre from the goal at the end (mm)", ylabel="runs within it (%)")
-    axes.set(xscale="log", ylim=(-3, 103))
+    label = "distance of the centre from the goal at the end (mm)"
+    axes.set(xlabel=label, ylabel="runs within it (%)", xscale="log", ylim=(-3, 103))
     style.legend_below(figure, looks, min(3, len(looks)))
 
 
