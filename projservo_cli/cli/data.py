@@ -55,7 +55,7 @@ def record_table(
     from projservo_cli.cli.configuration import given_overrides, shipped
     from projservo_cli.config import load_config
     from projservo_cli.files import working_in
-    from projservo_cli.stages.record import prepare, record
+    from projservo_cli.stages.record import new_recording, record
     from projservo_cli.tables import read_joints
 
     settings = load_config(config or shipped(), given_overrides(options))
@@ -63,12 +63,12 @@ def record_table(
     if motions is not None:
         types = settings.robot.joint_types if settings.robot is not None else None
         poses = read_joints(motions, types, joint_unit)
-    recording = prepare(settings, output, motions=poses, force=force)
+    recording = new_recording(settings, output, motions=poses, force=force)
     if dry_run:
         _tell_recording(console, recording)
         return
     with working_in(output.parent, name=f".{output.name}.lock"):
-        recording = prepare(settings, output, motions=poses, force=force)
+        recording = new_recording(settings, output, motions=poses, force=force)
         if recording.pending and confirm:
             console.confirm("record", settings.plant)
         if recording.found and recording.pending:

@@ -168,11 +168,11 @@ def bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> Non
     from projservo_cli import provenance
     from projservo_cli.cli.configuration import shipped
     from projservo_cli.config import load_config
-    from projservo_cli.stages.bench import Case, measure
+    from projservo_cli.stages.bench import Case, timings
 
     console.say("compiling kernels where they are not in the cache, then measuring: half a minute")
     settings = load_config(config or shipped(), sets)
-    result = measure(Case(settings))
+    result = timings(Case(settings))
     collected = provenance.collect(seed=settings.seed)
     machine = {name: collected[name] for name in _MACHINE}
     console.tell({**result, "machine": machine}, _timed(result, machine))

@@ -317,7 +317,7 @@ def _make_steps(chain: _Chain) -> None:
     """Make what has to be made, stop at the first failure, keep what was made until then."""
     from projservo_cli.config import to_yaml
     from projservo_cli.records import WorkFailed
-    from projservo_cli.stages.chain import make
+    from projservo_cli.stages.chain import make_result
     from projservo_cli.store import save
 
     console = chain.console
@@ -329,7 +329,7 @@ def _make_steps(chain: _Chain) -> None:
         if step.why:
             console.detail(f"{step.name}: making it")
             try:
-                chain.run, dropped = make(step, chain.config, chain.run, chain.laws, console.progress)
+                chain.run, dropped = make_result(step, chain.config, chain.run, chain.laws, console.progress)
             except WorkFailed as error:
                 chain.failed, chain.reason = step.name, " ".join(str(error).split())
                 return
@@ -361,16 +361,15 @@ def _say_compilation(chain: _Chain) -> None:
 def _suggestions(chain: _Chain, count: int) -> dict[str, Any]:
     """Further poses for the calibration, as JSON values; the list of them is written beside the run."""
     from projservo_cli.records import WorkFailed
-    from projservo_cli.stages.calibrate import suggested, write_suggestions
+    from projservo_cli.stages.calibrate import suggest_motions
 
     calibration, config = chain.run.calibration, chain.config
+    path = chain.run.path.parent / "suggestions.csv"
     try:
-        found = suggested(config, chain.run.observation, calibration, count)
+        found = suggest_motions(config, chain.run.observation, calibration, count, path)
     except WorkFailed as error:
         return {"suggestions": [], "suggestions_reason": str(error)}
-    path = chain.run.path.parent / "suggestions.csv"
     unit = config.data.joint_unit if config.data is not None else None
-    write_suggestions(found, path, [letter == "P" for letter in calibration.joint_types], unit)
     keys = ("q", "from_pose", "delta", "variance_before", "variance_after")
     return {
         "suggestions": [{key: getattr(one, key) for key in keys} for one in found],

@@ -51,9 +51,8 @@ def sweep(
     from projservo_cli.files import require_writable, working_in
     from projservo_cli.records import InputError
     from projservo_cli.sweep.design import read_design
-    from projservo_cli.sweep.driver import run as run_sweep
     from projservo_cli.sweep.engine import Cluster, Engine
-    from projservo_cli.sweep.folder import Folder
+    from projservo_cli.sweep.folder import Folder, run_sweep
 
     design = read_design(load_sweep(config, sets))
     folder = Folder(output or Path("results") / design.sweep.name)
@@ -100,7 +99,7 @@ def tell_report(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
     from projservo_cli.records import InputError
     from projservo_cli.report.style import FORMATS
     from projservo_cli.sweep.folder import Folder
-    from projservo_cli.sweep.report import report
+    from projservo_cli.sweep.statistics import report
 
     for name in _UNUSED:
         if options[name]:
@@ -108,7 +107,7 @@ def tell_report(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
             raise InputError(f"--{flag}: not used by report {sweep}, which is of a sweep")
     folder = Folder(sweep)
     with working_in(folder.path):
-        found, files = report(folder, FORMATS, console.progress)
+        found, files = report(folder.assembled(), FORMATS, console.progress)
     value = {"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]}
     names = ", ".join(path.name for path in files)
     console.tell(value, [*_words(found), wrapped(f"files: {folder.path}: {names}")])

@@ -5,14 +5,15 @@ least times, which a busy machine disturbs the least.
 """
 
 import itertools
-import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from timeit import timeit
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from projservo_cli.config import Config
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, new_state
 from projservo_cli.geometry.kinematics import operators_at
@@ -20,65 +21,42 @@ from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.loop.compiled import Job, many_steps
 from projservo_cli.loop.compiled import run as run_compiled
 from projservo_cli.loop.python import bind, bound_command
-from projservo_cli.loop.step import Limits, new_log
+from projservo_cli.loop.step import new_log
 from projservo_cli.records import LAWS, FloatArray
 from projservo_cli.robots.simulated import Plant
-from projservo_cli.stages.scenario import gains_of, limits_of, plant_of, start_and_goal
-from projservo_cli.stages.world import joints_of, truth_of
-from projservo_cli.task.body import body_of
+from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.face import Task
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
 
 STATES, STEPS, PIECE, ROUNDS = 256, 150, 64, 200
 NOISE_PX = 0.5
-BODY = "exact, body"
+BODY, CODE = "exact, body", CODES["direct_three"]
 
 
 class Case:
     """A noisy run of 256 states of a simulated task and all that a step needs, with the true model."""
 
-    def __init__(self, config: "Config") -> None:
-        truth = truth_of(config)
-        joints, pins = joints_of(config), [truth.number[i] for i in truth.pins]
-        shown, _ = start_and_goal(config, truth, pins)
-        self.m, self.q_start, self.model = len(truth.face), shown.q_start, truth.model
-        self.gains = gains_of(config, joints)
-        self.limits = limits_of(config, joints, config.noise.servo_px)._replace(
+    def __init__(self, config: Config) -> None:
+        body = {"control": config.control.model_copy(update={"observation": "body"})}
+        scenario = scenario_of(config.model_copy(update=body))
+        shown, gains = scenario.exact, scenario.gains
+        self.m, self.q_start, self.model, self.gains = scenario.m, shown.q_start, scenario.model, gains
+        self.limits = scenario.limits._replace(
             image_px=1e-9, max_steps=STATES - 1, stop_at_border=False, stop_at_joint_limit=False
         )
-        self.plant = plant_of(config, truth, shown.q_start)
-        self.task = shown.task(self.model)
-        order = [*truth.face, *truth.pins]
-        body = body_of(self.model, truth.M[order])
-        self.body_task = shown._replace(body=body).task(self.model)
-        self.body_plant = self.plant._replace(pins=truth.of(pins))
-        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, 2, len(order), 2))
-        self.points = self._states(self.task, self.plant)
-        self.whole = self._states(self.body_task, self.body_plant)
-        self.state = new_state(len(self.q_start), self.m)
-        self.bound = bind(CODES["direct_three"], self.model, self.task, self.gains, self.state)
+        seen = 2, len(scenario.numbers), 2
+        self.noise = NOISE_PX * np.random.default_rng(0).standard_normal((STATES, *seen))
+        self.whole = self._run(shown.task(self.model), scenario.plant_of("exact"))
+        self.points = self._run(shown.by_points().task(self.model), scenario.plant_of("stacked"))
+        state = new_state(len(self.q_start), self.m)
+        self.bound = bind(CODE, self.model, self.points.task, gains, state)
 
-    def job(self, task: Task, plant: Plant, limits: Limits) -> Job:
-        """One run of direct_three with a state and a log of its own."""
+    def _run(self, task: Task, plant: Plant) -> Job:
+        """A run, whose log has the states that are cycled through."""
         n, seen = len(self.q_start), self.m + len(plant.pins)
-        return Job(
-            CODES["direct_three"],
-            self.model,
-            task,
-            self.gains,
-            limits,
-            plant,
-            np.ascontiguousarray(self.noise[:, :, :seen]),
-            self.q_start.copy(),
-            new_state(n, self.m),
-            new_log(n, seen, limits.max_steps, len(ERRORS)),
-        )
-
-    def _states(self, task: Task, plant: Plant) -> Job:
-        """A run whose log has the states that are cycled through."""
-        job = self.job(task, plant, self.limits)
+        noise = np.ascontiguousarray(self.noise[:, :, :seen])
+        log = new_log(n, seen, self.limits.max_steps, len(ERRORS))
+        start, state = self.q_start.copy(), new_state(n, self.m)
+        job = Job(CODE, self.model, task, self.gains, self.limits, plant, noise, start, state, log)
         run_compiled(*job)
         return job
 
@@ -94,7 +72,8 @@ class Case:
 
     def whole_run(self) -> Job:
         """A run of 150 steps, traced."""
-        return self.job(self.task, self.plant, self.limits._replace(max_steps=STEPS))
+        log = new_log(len(self.q_start), self.m, STEPS, len(ERRORS))
+        return self.points._replace(limits=self.limits._replace(max_steps=STEPS), log=log)
 
     def matrices(self) -> FloatArray:
         """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
@@ -103,19 +82,12 @@ class Case:
         found = np.empty((STATES, 8, len(self.q_start)))
         for k in range(STATES):
             operators_at(self.model, Q[k], work.H_hat)
-            A = self.task.A_star
+            A = self.points.task.A_star
             found[k] = np.concatenate([(work.H_hat @ A[0]).T, (work.H_hat @ A[1]).T])
         return found
 
 
-def seconds(function: Callable[[], object]) -> float:
-    """Time of one call, s."""
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
-
-
-def measure(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
+def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
     """Time everything so many rounds; see the schema of ``projservo bench --json``."""
     matrices = itertools.cycle(case.matrices())
     whole = case.whole_run()
@@ -130,7 +102,10 @@ def measure(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
         for function, _ in timed.values():
             function()
         table = 1e6 * np.array(
-            [[seconds(function) / count for function, count in timed.values()] for _ in range(rounds)]
+            [
+                [timeit(function, number=1) / count for function, count in timed.values()]
+                for _ in range(rounds)
+            ]
         )
     svd = float(table[:, 0].min())
     times = {name: _times(table[:, i], svd) for i, name in enumerate(timed)}

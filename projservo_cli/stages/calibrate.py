@@ -1,37 +1,31 @@
 """Stage calibrate: trial motions or a recorded table in, projective kinematics out."""
 
 import csv
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from projservo_cli.calibration import Region, Solution, Suggestion, calibrate, cross_validate, suggest
+from projservo_cli.config import Config
+from projservo_cli.config.nominal import read_nominal
 from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, calibration_seed, generator
+from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, generator
 from projservo_cli.stages.world import (
     Truth,
     image_size_of,
     joints_of,
-    outside,
+    limit_passed,
     reference_of,
-    robot_of,
     truth_of,
 )
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
+from projservo_cli.tables import read_table
 
 
-def trial_motions(config: "Config") -> FloatArray:
-    """Joint readings (k, n) of the reference and of every single-joint trial, rad or m.
-
-    Raises InputError if a trial would pass a joint limit, or no reference is set.
-    """
+def trial_motions(config: Config) -> FloatArray:
+    """Joint readings (k, n) of the reference and of every single-joint trial, rad or m."""
     settings = config.calibration
     vector = reference_of(config)
     if vector is None:
@@ -44,7 +38,7 @@ def trial_motions(config: "Config") -> FloatArray:
         for offset in np.linspace(-amplitude, amplitude, settings.frames_per_joint):
             q = reference.copy()
             q[i] += offset
-            if wrong := outside(q, joints.lower, joints.upper):
+            if wrong := limit_passed(q, joints.lower, joints.upper):
                 raise InputError(
                     f"calibration: in a trial {wrong}: choose another calibration.reference or a smaller "
                     "amplitude"
@@ -53,11 +47,21 @@ def trial_motions(config: "Config") -> FloatArray:
     return np.array(rows)
 
 
-def simulate(config: "Config", truth: Truth) -> Observation:
+def _seed(config: Config) -> int:
+    """Seed of the trial motions and of all that is random in their evaluation."""
+    return config.seed if config.calibration.seed is None else config.calibration.seed
+
+
+def trial_noise(config: Config, poses: int, markers: int) -> FloatArray:
+    """Pixel noise (poses, 2, markers, 2) of the trial motions, px."""
+    drawn = generator(_seed(config), CALIBRATION_NOISE).standard_normal((poses, 2, markers, 2))
+    return config.noise.calibration_px * drawn
+
+
+def simulate(config: Config, truth: Truth) -> Observation:
     """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
     q = trial_motions(config)
-    rng = generator(calibration_seed(config), CALIBRATION_NOISE)
-    noise = config.noise.calibration_px * rng.standard_normal((len(q), 2, len(truth.number), 2))
+    noise = trial_noise(config, len(q), len(truth.number))
     images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)
 
@@ -71,7 +75,7 @@ def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
 
 
 def run(
-    config: "Config", *, progress: Progress = silent
+    config: Config, *, progress: Progress = silent
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from simulated trial motions, or from the recorded table of the configuration.
 
@@ -79,19 +83,16 @@ def run(
     InputError if the table or the configuration cannot be used; WorkFailed if the data do not support a
     calibration.
     """
-    from projservo_cli.config.nominal import read_nominal
-
-    settings = config.calibration
+    settings, seed = config.calibration, _seed(config)
     init = read_nominal(settings.init) if settings.init is not None else None
     observation, types, sigma_px = _observed(config)
     held_out: list[CrossValidation] = []
 
     def hold_out(solution: Solution, noise_px: float) -> None:
         """Cross-validate the solution while it is at hand."""
-        folds = settings.cross_validate
-        assert folds is not None
+        assert settings.cross_validate is not None
         tell = partial(progress, "cross-validation")
-        held_out.append(cross_validate(solution, noise_px, folds, calibration_seed(config), tell))
+        held_out.append(cross_validate(solution, noise_px, settings.cross_validate, seed, tell))
 
     calibration = calibrate(
         observation,
@@ -100,7 +101,7 @@ def run(
         sigma_px=sigma_px,
         source="recorded" if config.recorded else "simulated",
         image_size=image_size_of(config),
-        seed=calibration_seed(config),
+        seed=seed,
         lens=settings.lens,
         init=init,
         fitted=hold_out if settings.cross_validate is not None else None,
@@ -109,10 +110,8 @@ def run(
     return observation, calibration, held_out[0] if held_out else None
 
 
-def _observed(config: "Config") -> tuple[Observation, str, float | None]:
+def _observed(config: Config) -> tuple[Observation, str, float | None]:
     """What is to be explained, the types of the joints, and the noise if it is known, px."""
-    from projservo_cli.tables import read_table
-
     if config.data is not None:
         observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
         types = config.joint_types or "R" * observation.q.shape[1]
@@ -127,24 +126,36 @@ def _observed(config: "Config") -> tuple[Observation, str, float | None]:
 WIDER, FARTHER = 0.15, 1.0
 
 
-def suggested(
-    config: "Config", observation: Observation, calibration: Calibration, count: int
+def suggest_motions(
+    config: Config, observation: Observation, calibration: Calibration, count: int, path: Path
 ) -> tuple[Suggestion, ...]:
-    """Poses that reduce the variance of predictions most, within the joint limits where they are known.
+    """Write poses that reduce the variance of predictions most, within the joint limits where they are known.
 
     Predictions are judged over the range of the recorded readings, a little widened. Candidates lie in
-    the same range, or for a simulated robot in one three times as wide.
+    the same range, or for a simulated robot in one three times as wide. ``path`` becomes a list of motions, a
+    row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
 
-    Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose shows the
-    markers to both views.
+    Raises InputError if the method of the calibration has no covariance, or the list cannot be written;
+    WorkFailed if no pose shows the markers to both views.
     """
     image = _image(config, observation)
     targets = _region(config, observation.q, WIDER, image)
     candidates = targets if config.recorded else _region(config, observation.q, FARTHER, image)
-    return suggest(calibration, observation, candidates, targets, count, generator(config.seed, SUGGESTIONS))
+    rng = generator(config.seed, SUGGESTIONS)
+    found = suggest(calibration, observation, candidates, targets, count, rng)
+    turn = np.degrees(1.0) if config.data is not None and config.data.joint_unit == "deg" else 1.0
+    scale = np.array([turn if kind == "R" else 1.0 for kind in calibration.joint_types])
+    joints = [f"q{i}" for i in range(1, len(scale) + 1)]
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*joints, "from_pose", *(f"delta_{name}" for name in joints)])
+        for one in found:
+            q, delta = (map(repr, (scale * values).tolist()) for values in (one.q, one.delta))
+            writer.writerow([*q, one.from_pose, *delta])
+    return found
 
 
-def _image(config: "Config", observation: Observation) -> FloatArray:
+def _image(config: Config, observation: Observation) -> FloatArray:
     """Corners (2, 2, 2) of both images, px; where their size is not known, of where markers were seen."""
     size = image_size_of(config)
     if size is not None:
@@ -153,32 +164,12 @@ def _image(config: "Config", observation: Observation) -> FloatArray:
     return np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)
 
 
-def _region(config: "Config", q: FloatArray, share: float, image: FloatArray) -> Region:
+def _region(config: Config, q: FloatArray, share: float, image: FloatArray) -> Region:
     """The range of readings (K, n), widened at each end by a share of it as far as the limits allow."""
     span = np.ptp(q, axis=0)
     low, high = q.min(axis=0) - share * span, q.max(axis=0) + share * span
-    if config.robot is not None:
-        robot = robot_of(config.robot)
-        # A recorded robot may have been where its configured limits do not reach.
-        low = np.maximum(low, np.minimum(robot.lower, q.min(axis=0)))
-        high = np.minimum(high, np.maximum(robot.upper, q.max(axis=0)))
+    joints = joints_of(config, "R" * q.shape[1])
+    # A recorded robot may have been where its configured limits do not reach.
+    low = np.maximum(low, np.minimum(joints.lower, q.min(axis=0)))
+    high = np.minimum(high, np.maximum(joints.upper, q.max(axis=0)))
     return Region(low, high, image)
-
-
-def write_suggestions(
-    found: Sequence[Suggestion], path: Path, prismatic: Sequence[bool], joint_unit: str | None
-) -> None:
-    """Write suggestions as a list of motions, a row each: q1 … qN, from_pose, delta_q1 … delta_qN.
-
-    prismatic : (n,) which joints are prismatic.
-    joint_unit : unit of the revolute joints, ``deg``, else rad.
-    Raises InputError if it cannot be written.
-    """
-    scale = np.where(np.array(prismatic) | (joint_unit != "deg"), 1.0, np.degrees(1.0))
-    joints = [f"q{i}" for i in range(1, len(scale) + 1)]
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*joints, "from_pose", *(f"delta_{name}" for name in joints)])
-        for one in found:
-            q, delta = (map(repr, (scale * values).tolist()) for values in (one.q, one.delta))
-            writer.writerow([*q, one.from_pose, *delta])

@@ -1,11 +1,14 @@
 """Stage plan: the task's partition, where the face stays visible, and a motion that keeps it so."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from projservo_cli.config import Config
+from projservo_cli.config.models import Trajectory
 from projservo_cli.control.law import State, new_state
 from projservo_cli.geometry.algebra import vec
 from projservo_cli.geometry.displacement import as_array, composed_angle
@@ -16,7 +19,7 @@ from projservo_cli.geometry.mechanisms import span_of
 from projservo_cli.loop.trial import begin, new_stage
 from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, signed
 from projservo_cli.stages.scenario import Scenario, Shown, scenario_of
-from projservo_cli.stages.world import face_numbers, image_size_of, joints_of
+from projservo_cli.stages.world import face_numbers
 from projservo_cli.task.face import Task, center_of, face_plane, require_found
 from projservo_cli.task.margins import (
     BEHIND,
@@ -40,33 +43,16 @@ from projservo_cli.task.visibility import (
     visibility_translation,
 )
 
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-
-CONSTRAINED = "constrained"
 VIEWS = ("left", "right")
 
 
-class Profile(NamedTuple):
-    """The motion that is asked for."""
-
-    name: str = "linear"  # which part is driven when
-    delta: float = 0.9  # share of τ_0 that a pure translation may use
-    samples: int = 101  # points of the path
-    # time it is given, s; None for as little as the joint-speed limit lets it take
-    duration: float | None = None
-    ramp: float = 0.0  # time in which it comes up to its pace, and to rest again at its end, s
-
-
-def _timed(shortest: FloatArray, sigma: FloatArray, profile: Profile) -> FloatArray:
+def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
     """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
 
     Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
-
-    Raises WorkFailed if the joints would be too fast.
     """
-    duration = profile.duration
-    eased = from_rest(shortest, profile.ramp)
+    duration, ramp = trajectory.duration_s, trajectory.ramp_s
+    eased = _from_rest(shortest, ramp)
     least = float(eased[-1])
     if duration is None:
         return eased
@@ -76,11 +62,11 @@ def _timed(shortest: FloatArray, sigma: FloatArray, profile: Profile) -> FloatAr
             "or more: give it longer, or null for as short as that"
         )
     if not least > 0.0:
-        eased = from_rest(sigma * duration, profile.ramp)
+        eased = _from_rest(sigma * duration, ramp)
     return np.asarray(eased * (duration / eased[-1]))
 
 
-def from_rest(time: FloatArray, ramp: float) -> FloatArray:
+def _from_rest(time: FloatArray, ramp: float) -> FloatArray:
     """Times (s,) of a motion that comes up to its pace evenly in so many s, and so to rest again at its end.
 
     The pace, seconds of ``time`` a second, is a trapezoid, of a short motion a triangle of the same slope:
@@ -155,64 +141,56 @@ def _least(path: Path) -> tuple[FloatArray, FloatArray]:
     return np.array([column[i] for column, i in zip(values, where, strict=True)]), path.mu[where]
 
 
-def demands_of(config: "Config", joint_types: str = "") -> Demands:
-    """What the planned motion must keep to, as configured.
+class _Found(NamedTuple):
+    """A motion that was found for a task."""
 
-    joint_types : one letter a joint, where the configuration does not tell.
-    """
-    joints = joints_of(config, joint_types)
-    return Demands(
-        joints.lower,
-        joints.upper,
-        joints.speed,
-        np.array(image_size_of(config) or (math.inf, math.inf), dtype=np.float64),
-        config.trajectory.border_px,
-        config.trajectory.least_condition,
-    )
+    judged: Path  # where the constraints were looked at
+    motion: Path  # as it is stored, at the instants sigma
+    shortest: FloatArray  # (s,) times of the motion as fast as the joints can go, s; NaN where nothing limits
 
 
-def _motion(reaching: Reaching, profile: Profile, pure_translation: float) -> tuple[Path, Path, FloatArray]:
-    """Motion of a profile: the path by which it is judged, its samples, and their times (s,), s.
+def _coupled(reaching: Reaching, sigma: FloatArray) -> _Found:
+    """Shares of translation and rotations that keep all constraints, [RH00] section 4.3."""
+    judged = plan_path(reaching)
+    mu = judged.at(sigma)
+    motion = Path(judged.reaching, mu, along(judged.reaching, mu))
+    if judged.holds() and not motion.holds():  # between the places that were looked at
+        judged = motion
+    return _Found(judged, motion, sigma * judged.duration())
 
-    pure_translation : most share of the translation before any rotation, δ τ_0 / τ.
-    Raises WorkFailed if the joints would be too fast.
-    """
-    sigma = np.linspace(0.0, 1.0, profile.samples)
-    if profile.name == CONSTRAINED:
-        judged = plan_path(reaching)
-        mu, duration = judged.at(sigma), judged.duration()
-        motion = Path(judged.reaching, mu, along(judged.reaching, mu))
-        if judged.holds() and not motion.holds():  # between the places that were looked at
-            judged = motion
-        return judged, motion, _timed(sigma * duration, sigma, profile)
-    mu = profile_shares(profile.name, sigma, pure_translation)
-    motion = Path(reaching, mu, along(reaching, mu))
-    speed = reaching.demands.speed
-    shortest = least_time(speed, motion.along.q)
-    return motion, motion, _timed(shortest if np.isfinite(speed).any() else np.nan * sigma, sigma, profile)
+
+# Ways to a motion that search for one; the other profiles are shares of the paper, taken as they are.
+_SEARCHED: dict[str, Callable[[Reaching, FloatArray], _Found]] = {"constrained": _coupled}
+
+
+def _given(profile: str, reaching: Reaching, sigma: FloatArray, pure_translation: float) -> _Found:
+    """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
+    mu = profile_shares(profile, sigma, pure_translation)
+    motion, speed = Path(reaching, mu, along(reaching, mu)), reaching.demands.speed
+    shortest = least_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
+    return _Found(motion, motion, shortest)
 
 
 def _partitioned(
-    model: Model, shown: Shown, rehearse: bool, bounds: tuple[FloatArray, FloatArray]
+    model: Model, shown: Shown, profile: str, lower: FloatArray, upper: FloatArray
 ) -> tuple[State, Task, Parts, str]:
-    """Measure and partition the task at its start; ``rehearse`` half turns within joint limits.
+    """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
-    Returns state: with the face and the joint motions; task: in the frame of the model; parts: translation
-    and rotations, a half turn in the sense that was rehearsed; note: what to say of the rehearsal. Raises
-    WorkFailed if a marker cannot be triangulated or a motion is not unique.
+    Returns the state with face and joint motions, the task in the frame of the model, translation and
+    rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
     """
     n, m = len(shown.q_start), shown.s_start.shape[1] - shown.pins
     task, seen = shown.task(model), straight_views(model.lens, shown.s_start)
     span = span_of(model, task.A_star)
-    state, stage = new_state(n, m, span=span), new_stage(model, m, *bounds, span)
-    status, parts, arrives = begin(model, task, seen, shown.q_start, rehearse, state, stage)
+    state, stage = new_state(n, m, span=span), new_stage(model, m, lower, upper, span)
+    status, parts, arrives = begin(model, task, seen, shown.q_start, rehearses(profile), state, stage)
     require_found(status, 0)
     return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
 
 
 def rehearses(profile: str) -> bool:
-    """Whether half turns are rehearsed; the profile constrained compares both senses by itself."""
-    return profile != CONSTRAINED
+    """Whether half turns are rehearsed; a way that searches compares both senses by itself."""
+    return profile not in _SEARCHED
 
 
 def _joint_motions(state: State) -> FloatArray:
@@ -231,15 +209,10 @@ STAGES = 20
 
 
 def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: FloatArray) -> None:
-    """Refuse a task whose goal the joints cannot bring the face to.
+    """Refuse a task whose goal leaves more than ``LEFT_PX`` wherever the joints bring the face.
 
-    The joints that bring the face nearest to its planned images, in px, are carried along the plan.
-
-    model : calibrated model.
-    A : (m, 4) face at the start.
-    q_start : (n,) joints there, rad or m.
-    images : (s, 2, m, 2) planned pixels of the face.
-    Raises WorkFailed if more than ``LEFT_PX`` of image error are left at the goal.
+    The joints that bring the face A (m, 4) nearest to its planned images (s, 2, m, 2), in px, are carried
+    along the plan from those at the start (n,).
     """
     M = A @ np.linalg.inv(forward_kinematics(model, q_start)).T
     q = q_start
@@ -258,7 +231,7 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         )
 
 
-def run(config: "Config", calibration: Calibration) -> Plan:
+def run(config: Config, calibration: Calibration) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
     Raises InputError if the configuration lacks the task or the face; WorkFailed if the task cannot be
@@ -271,50 +244,42 @@ def run(config: "Config", calibration: Calibration) -> Plan:
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    scenario, trajectory = scenario_of(config, calibration), config.trajectory
-    return plan_task(
-        calibration.model(),
-        scenario.ends,
-        Profile(
-            trajectory.profile,
-            trajectory.delta,
-            trajectory.samples,
-            trajectory.duration_s,
-            trajectory.ramp_s,
-        ),
-        demands_of(config, calibration.joint_types),
-    )
+    scenario = scenario_of(config, calibration)
+    return plan_task(scenario.model, scenario.ends, config.trajectory, scenario.demands)
 
 
-def plan_task(model: Model, shown: Shown, profile: Profile, demands: Demands) -> Plan:
+def plan_task(model: Model, shown: Shown, trajectory: Trajectory, demands: Demands) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
-    model : calibrated model.
-    shown : start and goal.
-    profile : the motion that is asked for.
+    trajectory : the motion that is asked for.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
     Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
     fast.
     """
-    rehearse, bounds, face = rehearses(profile.name), (demands.lower, demands.upper), shown.by_points()
-    state, task, parts, note = _partitioned(model, shown, rehearse, bounds)
+    profile, sigma, face = trajectory.profile, np.linspace(0.0, 1.0, trajectory.samples), shown.by_points()
+    state, task, parts, note = _partitioned(model, shown, profile, demands.lower, demands.upper)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
-    tau_limit = min((profile.delta * t for t in tau_0 if t > 0.0), default=math.inf)
+    tau_limit = min((trajectory.delta * t for t in tau_0 if t > 0.0), default=math.inf)
     reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start)
-    judged, motion, time = _motion(reaching, profile, tau_limit / parts.tau if parts.tau > 0.0 else 1.0)
+    if profile in _SEARCHED:
+        judged, motion, shortest = _SEARCHED[profile](reaching, sigma)
+    else:
+        share = tau_limit / parts.tau if parts.tau > 0.0 else 1.0
+        judged, motion, shortest = _given(profile, reaching, sigma, share)
+    time = _timed(shortest, sigma, trajectory)
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     view = motion.along.view
     if len(shown.q_start) < COORDINATES:
         _require_in_span(model, state.A, shown.q_start, view.s)
     sense, sense_margin = _senses(parts, task)
     feasible, constraint, reason = _verdict_of(judged)
-    if profile.name != CONSTRAINED:
-        feasible, reason = _in_sight(profile.name, motion.along)
+    if profile not in _SEARCHED:
+        feasible, reason = _in_sight(profile, motion.along)
     least, least_mu = _least(judged)
     return Plan(
-        profile=profile.name,
+        profile=profile,
         feasible=feasible,
         reason=reason + note,
         tau=tau,
@@ -324,7 +289,7 @@ def plan_task(model: Model, shown: Shown, profile: Profile, demands: Demands) ->
         constraint=constraint,
         duration=float(time[-1]) if math.isfinite(time[-1]) else None,
         tau_limit=tau_limit,
-        sigma=np.linspace(0.0, 1.0, profile.samples),
+        sigma=sigma,
         time=time,
         mu=motion.mu,
         H_d=view.H_d,
@@ -373,11 +338,10 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
     other = parts.theta_r - math.copysign(2.0 * math.pi, parts.theta_r)
     senses = np.array(sorted((parts.theta_r, other), key=abs))
     margins = np.zeros((2, 2))
-    for view in range(2):
-        c_0, c_s, c_c = margin_coefficients(parts.a, parts.H_r, vec(task.O[view]))
-        sign = task.visible[view] / abs(c_0 + c_c)
-        for i in range(2):
-            margins[i, view] = arc_minimum(sign * c_0, sign * c_s, sign * c_c, senses[i])
+    for view, O in enumerate(task.O):
+        c = np.array(margin_coefficients(parts.a, parts.H_r, vec(O)))
+        c_0, c_s, c_c = (c * (task.visible[view] / abs(c[0] + c[2]))).tolist()
+        margins[:, view] = [arc_minimum(c_0, c_s, c_c, sense) for sense in senses.tolist()]
     return senses, margins
 
 
@@ -403,21 +367,10 @@ def _in_sight(profile: str, found: Along) -> tuple[bool, str]:
 
 
 def rotation_sense(scenario: Scenario) -> FloatArray:
-    """Joint motions (2, n) of both rotations in the sense that the plan takes.
-
-    Only the profile constrained needs the whole plan for it.
-
-    Raises WorkFailed if the task cannot be partitioned.
-    """
-    config, calibration = scenario.config, scenario.calibration
-    profile = config.trajectory.profile
-    if profile == CONSTRAINED:
-        return run(config, calibration).rotation_sense()
-    joints = joints_of(config, calibration.joint_types)
-    state, _, parts, _ = _partitioned(
-        calibration.model(),
-        scenario.ends,
-        rehearses(profile),
-        (joints.lower, joints.upper),
-    )
+    """Joint motions (2, n) of both rotations in the sense of the plan; few profiles need all of that."""
+    trajectory, joints = scenario.config.trajectory, scenario.joints
+    if not rehearses(trajectory.profile):
+        return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands).rotation_sense()
+    ends = scenario.model, scenario.ends
+    state, _, parts, _ = _partitioned(*ends, trajectory.profile, joints.lower, joints.upper)
     return signed(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

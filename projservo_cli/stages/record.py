@@ -3,22 +3,17 @@
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from projservo_cli.config import digest
+from projservo_cli.config import Config, digest
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.yours import Robot, at_rest_after
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.calibrate import images_at, trial_motions
-from projservo_cli.stages.own_robot import drive_to, foreign_robot, near, step_limit
-from projservo_cli.stages.scenario import CALIBRATION_NOISE, calibration_seed, generator
-from projservo_cli.stages.world import Truth, joints_of, outside, truth_of
+from projservo_cli.stages.calibrate import images_at, trial_motions, trial_noise
+from projservo_cli.stages.own_robot import ARRIVED, drive_to, foreign_robot
+from projservo_cli.stages.world import Truth, joints_of, limit_passed, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
 DEPENDS_ON = (
@@ -29,12 +24,7 @@ SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 
 
 class SimulatedRobot:
-    """The robot of a configuration, with given pixel noise.
-
-    truth : robot, rig and markers.
-    q_start : (n,) first joints, rad or m.
-    noise : (k, 2, m, 2) px, added to each observation in turn.
-    """
+    """The robot of a configuration, from joints (n,) on, with noise (k, 2, m, 2) px for each look in turn."""
 
     def __init__(self, truth: Truth, q_start: FloatArray, noise: FloatArray) -> None:
         self._truth = truth
@@ -91,8 +81,8 @@ class _Recording:
         )
 
 
-def prepare(
-    config: "Config", path: Path, *, motions: JointList | None = None, force: bool = False
+def new_recording(
+    config: Config, path: Path, *, motions: JointList | None = None, force: bool = False
 ) -> _Recording:
     """What there is to record, and what of it the table holds already.
 
@@ -110,7 +100,7 @@ def prepare(
     if motions is not None:
         joints = joints_of(config)
         for pose, q in zip(motions.pose, motions.q, strict=True):
-            if wrong := outside(q, joints.lower, joints.upper):
+            if wrong := limit_passed(q, joints.lower, joints.upper):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
     key = digest(config, DEPENDS_ON)[:16]
@@ -131,14 +121,15 @@ def _resume(recording: _Recording) -> None:
         raise InputError(f"{path}: has other markers than the configuration; {remedy}")
     column = np.searchsorted(table.marker, recording.marker)
     for k, pose in enumerate(table.pose.tolist()):
-        if not 0 <= pose < len(recording.targets) or not near(table.q[k], recording.targets[pose]):
+        known = 0 <= pose < len(recording.targets)
+        if not known or np.abs(table.q[k] - recording.targets[pose]).max() > ARRIVED:
             raise InputError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
         recording.q[pose], recording.images[pose] = table.q[k], table.images[k][:, column]
     recording.found = len(recording.q)
 
 
 def record(
-    config: "Config",
+    config: Config,
     recording: _Recording,
     robot: Robot | None = None,
     *,
@@ -151,17 +142,15 @@ def record(
     Raises InputError if the table cannot be written; WorkFailed if the robot fails or does not arrive where
     it was sent.
     """
+    joints = joints_of(config)
     if robot is None and config.plant.use is not None:
-        robot = foreign_robot(config, joints_of(config), len(recording.marker))
-    driven = robot or simulated(config, recording)
-    limit = step_limit(config, joints_of(config))
+        robot = foreign_robot(config, joints, len(recording.marker))
+    driven = robot or _simulated(config, recording)
     total, saved, took, unsaved = len(recording.targets), time.monotonic(), 0.0, False
     try:
         with at_rest_after(driven):
             for pose in recording.pending:
-                recording.commands += drive_to(
-                    driven, recording.targets[pose], limit, config.control.period_s
-                )
+                recording.commands += drive_to(driven, recording.targets[pose], config, joints, "record")
                 recording.q[pose], recording.images[pose] = driven.joints(), driven.observe()
                 unsaved = True
                 progress("record", len(recording.q), total)
@@ -176,9 +165,7 @@ def record(
             recording.save()
 
 
-def simulated(config: "Config", recording: _Recording) -> SimulatedRobot:
+def _simulated(config: Config, recording: _Recording) -> SimulatedRobot:
     """The robot of a configuration at its reference, with the noise that ``calibrate`` would add."""
-    truth = truth_of(config)
-    rng = generator(calibration_seed(config), CALIBRATION_NOISE)
-    noise = rng.standard_normal((len(recording.targets), 2, len(truth.number), 2))
-    return SimulatedRobot(truth, recording.targets[0], config.noise.calibration_px * noise[recording.pending])
+    noise = trial_noise(config, len(recording.targets), len(recording.marker))
+    return SimulatedRobot(truth_of(config), recording.targets[0], noise[recording.pending])

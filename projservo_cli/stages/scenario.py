@@ -7,11 +7,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration import predict
+from projservo_cli.config import Config
+from projservo_cli.config.models import Task as TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.step import Limits
@@ -32,18 +34,15 @@ from projservo_cli.stages.world import (
     Truth,
     center_index,
     face_numbers,
+    image_size_of,
     joints_of,
-    outside,
+    limit_passed,
     truth_of,
-    turned,
 )
 from projservo_cli.task.body import Body, body_of
 from projservo_cli.task.face import Task, center_of, cyclic_order, face_plane, task_from_images
+from projservo_cli.task.margins import Demands
 from projservo_cli.task.target import task_from_body
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-    from projservo_cli.config.models import Task as TaskSettings
 
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
@@ -52,11 +51,6 @@ CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN
 def generator(seed: int, stream: int) -> np.random.Generator:
     """Random numbers of one stream of a seed."""
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-
-
-def calibration_seed(config: "Config") -> int:
-    """Seed of the trial motions and of all that is random in their evaluation."""
-    return config.seed if config.calibration.seed is None else config.calibration.seed
 
 
 class Shown(NamedTuple):
@@ -76,10 +70,7 @@ class Shown(NamedTuple):
         return Shown(self.q_start, s_start, s_star, self.center)
 
     def task(self, model: Model) -> Task:
-        """The task that they show to a model.
-
-        Raises WorkFailed if they do not show where the face or its body is.
-        """
+        """The task that they show to a model; a WorkFailed if they do not show where the face is."""
         if self.body is None:
             face = self.by_points()
             return task_from_images(model, face.s_start, face.s_star, self.center)
@@ -91,13 +82,15 @@ class Shown(NamedTuple):
 class Scenario:
     """What the runs of a configuration with a calibration take place in."""
 
-    config: "Config"
-    calibration: Calibration
+    config: Config
+    calibration: Calibration | None  # None: laws are given the true model
     truth: Truth | None  # robot, rig and markers as they are; None for a robot that is not simulated
     joints: Joints  # as the laws take them
     numbers: tuple[int, ...]  # of the markers by which the face is measured, those of the face first
+    observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
     exact: Shown  # start and goal without noise; predicted for a robot that is not simulated
     true_ends: Ends  # where the true robot holds the tool; NaN where nobody knows
+    noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
     gains: Gains
     limits: Limits  # gains, limits: of the laws, and when a run ends
 
@@ -119,10 +112,25 @@ class Scenario:
         """Numbers of the markers that a law observes."""
         return self.numbers if law in BODY_LAWS else self.numbers[: self.m]
 
+    @cached_property
+    def model(self) -> Model:
+        """The calibrated model, or the true one where nothing is calibrated."""
+        if self.calibration is not None:
+            return self.calibration.model()
+        assert self.truth is not None
+        return self.truth.model
+
+    @cached_property
+    def demands(self) -> Demands:
+        """What the planned motion must keep to, as configured."""
+        size = np.array(image_size_of(self.config) or (math.inf, math.inf), dtype=np.float64)
+        limits, trajectory = self.joints[1:], self.config.trajectory
+        return Demands(*limits, size, trajectory.border_px, trajectory.least_condition)
+
     def believed_by(self, law: str) -> Model:
         """The model that a law is given: the calibrated one, or for a metric law the true one."""
         if law not in METRIC_LAWS:
-            return self.calibration.model()
+            return self.model
         if None in (self.config.robot, self.config.rig):
             raise InputError(
                 f"{law} is given the metric model of robot and rig: set robot and rig, or leave it out of "
@@ -131,10 +139,7 @@ class Scenario:
         return truth_of(self.config).model
 
     def plant_of(self, law: str) -> Plant:
-        """The simulated robot as a law sees it, and what befalls it.
-
-        Raises WorkFailed if a camera sees the face edge-on at the start.
-        """
+        """The simulated robot as a law sees it, and what befalls it."""
         assert self.truth is not None
         plant = plant_of(self.config, self.truth, self.exact.q_start)
         M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
@@ -176,46 +181,59 @@ class Scenario:
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
 
-def scenario_of(config: "Config", calibration: Calibration) -> Scenario:
+def scenario_of(config: Config, calibration: Calibration | None = None) -> Scenario:
     """Make the scenario of a configuration, of its simulated robot or of the one in ``plant.use``.
 
-    Raises InputError if the configuration lacks a part of it, naming the key to set; WorkFailed if the goal
-    cannot be reached or seen, or the body not be measured with.
+    Without a calibration laws are given the true model of the simulated robot. Raises InputError if the
+    configuration lacks a part of it, naming the key to set; WorkFailed if the goal cannot be reached or
+    seen, or the body not be measured with.
     """
     truth = truth_of(config) if config.plant.use is None else None
-    face, known = face_numbers(config), calibration.marker.tolist()
-    there = observed(config, calibration) if truth is None else truth.number
-    joints = joints_of(config, calibration.joint_types)
+    face = face_numbers(config)
+    if config.task is None:
+        raise InputError("this stage needs a task: set task.start and task.goal")
+    joints = joints_of(config, "" if calibration is None else calibration.joint_types)
+    assert config.markers is not None
+    center, sigma_px = center_index(config.markers), config.noise.servo_px
+    if truth is not None:
+        observed = truth.number
+    else:
+        assert calibration is not None
+        observed = _observed(config, calibration)
+        sigma_px = max(sigma_px, calibration.sigma_fitted_px)
     body: Body | None = None
     pins: tuple[int, ...] = ()
     if not _by_points(config, calibration):
-        pins = tuple(number for number in there if number in known and number not in face)
-        body = _body(calibration, tuple(known.index(number) for number in (*face, *pins)))
-    exact, ends = (
-        _predicted_ends(config, calibration, joints, (*face, *pins))
-        if truth is None
-        else start_and_goal(config, truth, pins)
-    )
+        known = observed if calibration is None else tuple(calibration.marker.tolist())
+        pins = tuple(number for number in observed if number in known and number not in face)
+        body = _body(calibration or truth, tuple(known.index(number) for number in (*face, *pins)))
+    if truth is not None:
+        exact, ends = _simulated_ends(config.task, joints.types, truth, pins, center)
+    else:
+        assert calibration is not None
+        exact, ends = _predicted_ends(config, calibration, joints, (*face, *pins), center)
     return Scenario(
         config,
         calibration,
         truth,
         joints,
         (*face, *pins),
+        observed,
         exact._replace(body=body),
         ends,
-        gains_of(config, joints),
-        limits_of(config, joints, noise_px(config, calibration)),
+        sigma_px,
+        _gains(config, joints),
+        _limits(config, joints, sigma_px),
     )
 
 
-def idealized(config: "Config") -> "Config":
+def idealized(config: Config) -> Config:
     """A configuration without noise and disturbances in the loop."""
     noise = config.noise.model_copy(update={"servo_px": 0.0})
     return config.model_copy(update={"noise": noise, "disturbance": type(config.disturbance)()})
 
 
-def gains_of(config: "Config", joints: Joints) -> Gains:
+def _gains(config: Config, joints: Joints) -> Gains:
     """Gains and limits of the laws."""
     c, endless = config.control, np.full(len(joints.types), math.inf)
     stop = _ends_at_joint_limits(config)
@@ -235,7 +253,7 @@ def gains_of(config: "Config", joints: Joints) -> Gains:
     )
 
 
-def limits_of(config: "Config", joints: Joints, sigma_px: float) -> Limits:
+def _limits(config: Config, joints: Joints, sigma_px: float) -> Limits:
     """When a run ends and what bounds its commands; noise widens the tolerance of the image error."""
     noise_px = config.stop.noise_factor * sigma_px
     return Limits(
@@ -251,75 +269,54 @@ def limits_of(config: "Config", joints: Joints, sigma_px: float) -> Limits:
     )
 
 
-def _ends_at_joint_limits(config: "Config") -> bool:
+def _ends_at_joint_limits(config: Config) -> bool:
     """Whether a run ends at a joint limit; a robot that is not simulated is never driven beyond one."""
     return config.plant.use is not None or config.plant.joint_limits == "stop"
 
 
-def noise_px(config: "Config", calibration: Calibration) -> float:
-    """Pixel noise in the loop; of a robot that is not simulated no less than the calibration left."""
-    given = config.noise.servo_px
-    return given if config.plant.use is None else max(given, calibration.sigma_fitted_px)
-
-
-def _by_points(config: "Config", calibration: Calibration) -> bool:
+def _by_points(config: Config, calibration: Calibration | None) -> bool:
     """Whether the face is measured point by point: as configured, else where no body is calibrated well."""
     if config.control.observation is None:
-        return not calibration.usable  # such a body is worse than none
+        return calibration is None or not calibration.usable  # such a body is worse than none
     return config.control.observation == "points"
 
 
 @lru_cache(maxsize=64)
-def _body(calibration: Calibration, indices: tuple[int, ...]) -> Body:
+def _body(known: Calibration | Truth, indices: tuple[int, ...]) -> Body:
     """Body of markers of a calibration, by their indices in it, the same for every run with it."""
-    return body_of(calibration.model(), calibration.M[list(indices)])
+    model = known.model if isinstance(known, Truth) else known.model()
+    return body_of(model, known.M[list(indices)])
 
 
-def observed(config: "Config", calibration: Calibration) -> list[int]:
+def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
     """Numbers of the markers that a robot in ``plant.use`` observes, in its order."""
     known = config.markers.known if config.markers is not None else None
-    numbers = list(known) if known is not None else calibration.marker.tolist()
+    numbers = tuple(calibration.marker.tolist()) if known is None else known
     for number in face_numbers(config):
         if number not in numbers:
-            raise InputError(f"markers.face: marker {number} is not among those observed, {numbers}")
+            raise InputError(f"markers.face: marker {number} is not among those observed, {[*numbers]}")
     return numbers
-
-
-def start_and_goal(config: "Config", truth: Truth, pins: Sequence[int] = ()) -> tuple[Shown, Ends]:
-    """Start and goal of the simulated task without noise, seen by the face and markers of given numbers.
-
-    Raises InputError if the configuration has no task; WorkFailed if the goal cannot be reached.
-    """
-    task, center = _task_of(config)
-    return _simulated_ends(task, joints_of(config).types, truth, tuple(pins), center)
-
-
-def _task_of(config: "Config") -> tuple["TaskSettings", int]:
-    """The task, and which marker of the face is its centre."""
-    if config.task is None:
-        raise InputError("this stage needs a task: set task.start and task.goal")
-    return config.task, center_index(config)
 
 
 @lru_cache(maxsize=2048)
 def _simulated_ends(
-    task: "TaskSettings", types: str, truth: Truth, pins: tuple[int, ...], center: int
+    task: TaskSettings, types: str, truth: Truth, pins: tuple[int, ...], center: int
 ) -> tuple[Shown, Ends]:
     """What the ends of a task look like, for any seed and noise."""
     M_pins, robot = truth.of(pins), truth.robot
 
     def images(q: FloatArray, key: str) -> FloatArray:
         """Both apart, so that the face has the same bits with any pins."""
-        if wrong := outside(q, robot.lower, robot.upper):
+        if wrong := limit_passed(q, robot.lower, robot.upper):
             raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
-    shown, q_goal = _shown(task, types, len(pins), center, images, lambda q: turned(truth, q, task.goal))
+    shown, q_goal = _shown(task, types, len(pins), center, images, lambda q: truth.turned(q, task.goal))
     return shown, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal)
 
 
 def _shown(
-    task: "TaskSettings",
+    task: TaskSettings,
     types: str,
     pins: int,
     center: int,
@@ -350,10 +347,11 @@ def _unknown(base_tool: FloatArray) -> Ends:
 
 
 def _predicted_ends(
-    config: "Config", calibration: Calibration, joints: Joints, numbers: Sequence[int]
+    config: Config, calibration: Calibration, joints: Joints, numbers: Sequence[int], center: int
 ) -> tuple[Shown, Ends]:
     """Start and goal of a robot that is not simulated, as the calibration predicts their images."""
-    task, center = _task_of(config)
+    task = config.task
+    assert task is not None
     m, known = len(face_numbers(config)), calibration.marker.tolist()
     columns = [known.index(number) for number in numbers]
     for vector, key in ((task.start, "task.start"), (task.goal.joints, "task.goal.joints")):
@@ -361,7 +359,7 @@ def _predicted_ends(
             raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")
 
     def images(q: FloatArray, key: str) -> FloatArray:
-        if wrong := outside(q, joints.lower, joints.upper):
+        if wrong := limit_passed(q, joints.lower, joints.upper):
             raise InputError(f"{key}: {wrong}: choose another")
         s = predict(calibration, q[None])[0][:, columns]
         if np.isnan(s[:, :m]).any():
@@ -371,13 +369,13 @@ def _predicted_ends(
     def turn(q: FloatArray) -> FloatArray:
         if config.robot is None:
             raise InputError("task.goal.turn_deg needs the model of the robot: give joints or images instead")
-        return turned(truth_of(config), q, task.goal)
+        return truth_of(config).turned(q, task.goal)
 
     shown, _ = _shown(task, joints.types, len(numbers) - m, center, images, turn)
     return shown, _unknown(np.full((4, 4), np.nan))
 
 
-def plant_of(config: "Config", truth: Truth, q_start: FloatArray) -> Plant:
+def plant_of(config: Config, truth: Truth, q_start: FloatArray) -> Plant:
     """The truth as the loop sees it from the joints q_start (n,), undisturbed.
 
     Raises WorkFailed if a camera sees the face edge-on there.
@@ -412,7 +410,7 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
     )
 
 
-def _disturbance(config: "Config", n: int) -> Disturbance:
+def _disturbance(config: Config, n: int) -> Disturbance:
     """What befalls the joints and the images of a robot of n joints."""
     given = config.disturbance
     bump, frozen = given.bump, given.frozen_joint

@@ -1,19 +1,24 @@
 """Stage servo: one control law in closed loop with a robot, from the start of the task to its verdict."""
 
 import copy
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
+from projservo_cli.config import Config
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, Gains, new_state
+from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains, new_state
+from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span, span_of
 from projservo_cli.loop.compiled import run as run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw
 from projservo_cli.loop.python import run as run_in_python
-from projservo_cli.loop.step import VERDICTS, new_log
+from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
+from projservo_cli.loop.summary import MM, Summary, path_deviation, summary
 from projservo_cli.records import (
     REPLAN,
     Calibration,
@@ -28,20 +33,150 @@ from projservo_cli.records import (
 from projservo_cli.results import ImageModel, image_model
 from projservo_cli.robots import plugins
 from projservo_cli.robots.plugins import what_failed
-from projservo_cli.robots.simulated import AnalyticPlant
+from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.robots.yours import DrivenRobot, at_rest_after
 from projservo_cli.stages import own_robot
+from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.trace import Run, trace_of
+from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.following import followed
 
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
+SUBSAMPLES = 50  # points of a joint step at which the deviation between samples is measured
 
 
-def run(
-    config: "Config", calibration: Calibration, plan: Plan, name: str, *, progress: object = None
-) -> Trace:
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """A run as it ended."""
+
+    scenario: Scenario
+    verdict: str
+    disturbance: str  # verdict, disturbance: the verdict, and why the images no longer agree where that is it
+    steps: int  # commands sent
+    log: Log  # what was recorded
+    limited: float  # how often visibility limited the translation
+    plant: Plant  # that was driven; of a robot that is not simulated what the calibration takes it for
+    law: str = ""
+    mode: str = REPLAN  # law, mode: what it is a run of
+    planned_s: float | None = None  # when the plan that it followed arrives, s
+    unplanned: str = ""  # why it went without the plan that it was to follow
+
+    @cached_property
+    def summary(self) -> Summary:
+        """Numbers of the run; NaN where they need a truth that nobody knows."""
+        period, ends = self.scenario.gains.period, self.scenario.true_ends
+        return summary(self.plant, self.log, self.steps, self.limited, period, ends)
+
+    def deviation_mm(self) -> float:
+        """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
+        goal, period = self.scenario.true_ends.goal, self.scenario.gains.period
+        if not np.isfinite(goal).all():
+            return math.nan
+        start = self.log.H[0] @ np.array(center_of(self.plant.M, self.plant.center))
+        between = path_deviation(self.plant, self.log, self.steps, period, start, goal, SUBSAMPLES)
+        return max(MM * between, self.summary.center_deviation_at_samples_mm)
+
+    def trace(self) -> Trace:
+        """Record of the run."""
+        scenario, log, steps = self.scenario, self.log, self.steps
+        rows = steps + 1
+        before, after, views = log.fit[:rows].T
+        errors, H, read = log.errors[:rows], log.H[:rows], log.read[:rows]
+        # A law that follows a plan measures what is left to where the plan is, not to the goal.
+        remaining = _left(log, steps) if self.mode == REPLAN else (None, None)
+        joint = int(log.events[2])
+        stretch = plateau_stretch(log.judged[:rows], scenario.limits.plateau_steps)
+        s_star = scenario.ends.by_points().s_star
+        simulated = scenario.truth is not None
+        center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
+        told = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
+        numbers: dict[str, Any] = {n: None if math.isnan(told[n]) else told[n] for n in _TOLD}
+        return Trace(
+            **numbers,
+            law=self.law,
+            mode=self.mode,
+            planned_s=self.planned_s,
+            verdict=self.verdict,
+            reason=self.disturbance or _reason(self, joint, remaining),
+            steps=steps,
+            period=scenario.gains.period,
+            observation="points" if np.isnan(views).all() else "body",
+            translation_left=remaining[0],
+            rotation_left_deg=remaining[1],
+            plateau_steps=0 if stretch is None else stretch[1] - stretch[0],
+            limit_joint=joint,
+            q=log.q[:rows],
+            q_read=None if np.array_equal(read, log.q[:rows]) else read,
+            s=np.ascontiguousarray(log.s[:rows, :, : s_star.shape[1]]),
+            s_star=s_star,
+            image_error=log.error[:rows],
+            stop_error=log.judged[:rows],
+            tau=errors[:, 0],
+            tau_affine=errors[:, 1],
+            theta_r=errors[:, 2],
+            theta_p=errors[:, 3],
+            theta_s=errors[:, 4],
+            prediction_px=_rms(before, 2.0 * views),
+            fit_px=_rms(after, 2.0 * views - COORDINATES),
+            views_used=views,
+            q_dot=log.q_dot[:steps],
+            speed_factor=log.factor[:steps],
+            self_occluded=log.hidden[:rows] > 0.5,
+            pose=H @ scenario.true_ends.base_tool,
+            goal_pose=scenario.true_ends.goal_pose,
+            center=center if simulated else np.full_like(center, np.nan),
+            unplanned=self.unplanned,
+            untested="" if simulated else untested(scenario),
+        )
+
+
+# Numbers of a trace that are those of the summary of its run, and one more.
+_TOLD = [field.name for field in fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}]
+
+
+def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
+    """Share of the translation and rotation, deg, that were left; None where the law measures neither."""
+    first, last = (float(log.errors[k, TAU_AFFINE]) for k in (0, steps))
+    turn = float(log.errors[steps, THETA_S])
+    share = last / first if first > 0.0 and math.isfinite(last) else None
+    return share, math.degrees(turn) if math.isfinite(turn) else None
+
+
+def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
+    """Root of the mean of sums of squares; NaN where the count is not positive."""
+    mean = np.full(squares.shape, math.nan)
+    np.divide(squares, count, out=mean, where=count > 0.0)
+    return np.asarray(np.sqrt(mean))
+
+
+def _reason(run: Outcome, joint: int, remaining: tuple[float | None, float | None]) -> str:
+    """Why a run ended, in a sentence."""
+    log, steps, limits = run.log, run.steps, run.scenario.limits
+    error, first = float(log.judged[steps]), float(log.judged[0])
+    within = tolerance(limits, float(log.fit[steps, 2]))
+    share, turn = remaining
+    left = [
+        *([] if share is None else [f"{share:.1%} of the translation"]),
+        *([] if turn is None else [f"{turn:.3g} deg of rotation"]),
+        f"an image error of {error:.3g} px",
+    ]
+    return {
+        "converged": f"image error {error:.3g} px is within {within:.3g} px",
+        "plateau": f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
+        f"{limits.plateau_steps} steps: a local minimum",
+        "max steps": f"no step left; image error {error:.3g} px was still changing",
+        "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
+        f"{limits.diverged_factor:g}-fold",
+        "left image": f"a face marker left an image at step {steps}",
+        "behind camera": f"a face marker passed behind a camera at step {steps}",
+        "markers lost": f"the law could not measure the face at step {steps}: a marker was not seen"
+        + (f", {limits.lost_steps} periods after the last that was" if limits.lost_steps else ""),
+        "joint limit": f"joint {joint + 1} stands at its limit, {float(log.read[steps, joint]):.6g} (rad or "
+        f"m), and the task would take it beyond; {' and '.join(left)} are left",
+        "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
+    }[run.verdict]
+
+
+def run(config: Config, calibration: Calibration, plan: Plan, name: str) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
@@ -49,11 +184,10 @@ def run(
     WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``control.without_plan`` refuses to go without.
     """
-    scenario = scenario_of(config, calibration)
-    return trace_of(scenario, drive(scenario, plan, name))
+    return drive(scenario_of(config, calibration), plan, name).trace()
 
 
-def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Model | None = None) -> Run:
+def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Model | None = None) -> Outcome:
     """Drive the run of a name to its verdict.
 
     plan : of the task; a built-in law that does not follow it needs but the joint motions (2, n) of its
@@ -79,30 +213,36 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
         run = _driven_in_python(scenario, controller, simulated)
     else:
         run = _drive_compiled(scenario, plan, law, replans, believed)
-    return run._replace(law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
+    return replace(run, law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
 
 
-def _in_compiled_loop(config: "Config", law: str) -> bool:
+def _in_compiled_loop(config: Config, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
     return law in CODES and config.plant.speed_scale == 1.0
 
 
-def sense_is_enough(config: "Config", name: str) -> bool:
+def sense_is_enough(config: Config, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
     return mode == REPLAN and _in_compiled_loop(config, law)
 
 
+def _task_for(scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, model: Model) -> Task:
+    """The task as a built-in law with a model is given it, with the plan where it follows that."""
+    task = scenario.shown_to(law).task(model)
+    if replans:
+        return task
+    assert isinstance(plan, Plan)
+    return followed(model, task, plan, scenario.gains.period, scenario.config.plant.speed_scale)
+
+
 def _drive_compiled(
     scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, believed: Model | None
-) -> Run:
+) -> Outcome:
     """Drive a built-in law on the simulated robot in the compiled loop."""
     model = scenario.believed_by(law) if believed is None else believed
     ends, gains, limits = scenario.ends, scenario.gains, scenario.limits
-    task = scenario.shown_to(law).task(model)
-    if not replans:
-        assert isinstance(plan, Plan)
-        task = followed(model, task, plan, gains.period, 1.0)
+    task = _task_for(scenario, plan, law, replans, model)
     n, m, observed = len(ends.q_start), scenario.m, len(scenario.numbers_of(law))
     span = span_of(model, task.A_star)
     state = new_state(n, m, observed, span)
@@ -114,25 +254,25 @@ def _drive_compiled(
     code, steps = run_compiled(
         CODES[law], model, task, gains, limits, plant, noise, ends.q_start.copy(), state, log
     )
-    return Run(VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
+    return Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
 
 
-def _driven_in_python(scenario: Scenario, law: LoopLaw, plant: AnalyticPlant | DrivenRobot) -> Run:
+def _driven_in_python(scenario: Scenario, law: LoopLaw, plant: AnalyticPlant | DrivenRobot) -> Outcome:
     """Drive any law on any plant, every command scaled."""
     gains, scale = scenario.gains, scenario.config.plant.speed_scale
     s_star = scenario.ends.by_points().s_star
     code, steps, log = run_in_python(law, plant, s_star, gains.period, scenario.limits, scale)
     limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
-    return Run(VERDICTS[code], plant.disturbance, steps, log, limited, plant.plant)
+    return Outcome(scenario, VERDICTS[code], plant.disturbance, steps, log, limited, plant.plant)
 
 
-def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Run:
+def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
     """Drive the robot of ``plant.use`` to the start of the task and from there under a law.
 
     Before the first motion, what the robot sees must agree with the calibration where it stands. The
     robot is stopped on every way out.
     """
-    if not scenario.calibration.usable:
+    if scenario.calibration is None or not scenario.calibration.usable:
         raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
     controller = _law_for(scenario, plan, law, replans)
     robot, driven = own_robot.connected(scenario, law)
@@ -140,13 +280,7 @@ def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
         wrong = driven.fits()
         if wrong:
             raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-        own_robot.drive_to(
-            driven,
-            scenario.ends.q_start,
-            own_robot.step_limit(scenario.config, scenario.joints),
-            scenario.gains.period,
-            "servo",
-        )
+        own_robot.drive_to(driven, scenario.ends.q_start, scenario.config, scenario.joints, "servo")
         return _driven_in_python(scenario, controller, driven)
 
 
@@ -212,18 +346,15 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
     """
     gains, ends = scenario.gains, scenario.ends.by_points()
     if law not in CODES:
+        assert scenario.calibration is not None
         known = scenario.calibration.marker.tolist()
         face = np.array([known.index(number) for number in scenario.numbers[: scenario.m]])
         model = image_model(scenario.calibration)
-        setup = LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period)
-        # What a law writes to must not be what other laws are given.
-        own = copy.deepcopy(setup)
-        return ForeignLaw(plugins.make("law", law, ("__call__",), (own,), {}), f"law {law}")
+        # Its own: what a law writes to must not be what other laws are given.
+        setup = copy.deepcopy(LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period))
+        return ForeignLaw(plugins.make("law", law, ("__call__",), (setup,), {}), f"law {law}")
     believed = scenario.believed_by(law)
-    task = scenario.shown_to(law).task(believed)
-    if not replans:
-        task = followed(believed, task, plan, gains.period, scenario.config.plant.speed_scale)
-    built_in = BuiltInLaw(CODES[law], believed, task, gains)
-    span, sense = built_in.state.work.span, plan.rotation_sense()
-    built_in.state.memory.rotation[:] = in_span(span, believed, ends.q_start, sense)
+    built_in = BuiltInLaw(CODES[law], believed, _task_for(scenario, plan, law, replans, believed), gains)
+    sense = in_span(built_in.state.work.span, believed, ends.q_start, plan.rotation_sense())
+    built_in.state.memory.rotation[:] = sense
     return built_in

@@ -9,12 +9,14 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from projservo_cli.config import Config, digest
+from projservo_cli import provenance
+from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.records import InputError, names_of
 from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.stages.world import has_task
-from projservo_cli.store import SERVO, Run
+from projservo_cli.store import SERVO, Result, Run
 
 STAGES = ("calibrate", "plan", "servo", "report")
 # What of the configuration each stage depends on, beside the stage before it.
@@ -46,8 +48,8 @@ class Step:
     stage: str  # name of the stage
     law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty
     key: str  # what the key of the result will be
-    why: str  # why it has to be made; empty where the stored one is up to date
     inputs: dict[str, str]  # files read and their hashes
+    why: str = ""  # why it has to be made; empty where the stored one is up to date
 
     @property
     def name(self) -> str:
@@ -71,19 +73,16 @@ def steps_for(
     if not has_task(config) and set(named) <= {"calibrate", "report"}:
         stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
     steps: list[Step] = []
-    for stage, law, key, inputs in _keys(config, run, laws or config.control.laws, stages):
-        step = Step(stage, law, key, "", inputs)
-        remade = any(before.why for before in steps if before.stage != stage)
-        steps.append(replace(step, why=_reason(step, run, force and stage in named, remade)))
+    for step in _needed(config, run, laws or config.control.laws, stages):
+        remade = any(before.why for before in steps if before.stage != step.stage)
+        steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
     if steps[0].why and not force:
         _keep_recorded(config, run)
     return steps
 
 
-def _keys(
-    config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
-) -> Iterator[tuple[str, str, str, dict[str, str]]]:
-    """Stage, run, key and input hashes of every result of the stages, each key made from those before."""
+def _needed(config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]) -> Iterator[Step]:
+    """Every result of the stages with its key, each made from those before."""
     inputs = _file_hashes(config, run)
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     for stage in stages:
@@ -91,7 +90,7 @@ def _keys(
         for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
             extra = {"before": before, "law": law}
             keys.append(digest(config, DEPENDS_ON[stage], without=NOT_HASHED[stage], extra=extra))
-            yield stage, law, keys[-1], inputs if stage == "calibrate" else {}
+            yield Step(stage, law, keys[-1], inputs if stage == "calibrate" else {})
         before = [*keys]
 
 
@@ -144,3 +143,10 @@ def _keep_recorded(config: Config, run: Run) -> None:
         f"{run.path}: its calibration comes from recorded data and would be replaced by a simulated one; "
         "choose another folder with -o, give the table with --data, or use --force"
     )
+
+
+def result_of(step: Step, config: Config, *made: Any) -> Result:
+    """The result that consists of what its stage made."""
+    labels = ("observation", "calibration", "cross_validation") if step.stage == "calibrate" else ("",)
+    records = {label: record for label, record in zip(labels, made, strict=True) if record is not None}
+    return Result(step.key, to_yaml(config), provenance.collect(seed=config.seed), step.inputs, records)

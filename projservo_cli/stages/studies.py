@@ -3,10 +3,12 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from itertools import product
+from typing import Any
 
 import numpy as np
 
+from projservo_cli.config import Config
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.displacement import (
     as_array,
@@ -19,15 +21,11 @@ from projservo_cli.geometry.displacement import (
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.plan import Profile, plan_task
+from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
 from projservo_cli.stages.servo import drive
-from projservo_cli.stages.trace import trace_of
 from projservo_cli.stages.world import Truth, truth_of
 from projservo_cli.task.margins import within
-
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
 
 GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)
@@ -64,7 +62,7 @@ class Comparison:
             prismatic = self.truth.robot.joint_types == PRISMATIC
             speed = np.where(prismatic, limits.speed, math.radians(STEP_LIMIT_DEG) / gains.period)
         scenario = replace(self.scenario, gains=gains, limits=limits._replace(speed=speed))
-        return trace_of(scenario, drive(scenario, self.sense, law, self.models[operators]))
+        return drive(scenario, self.sense, law, self.models[operators]).trace()
 
 
 def projective_twin(model: Model) -> Model:
@@ -80,12 +78,8 @@ def projective_twin(model: Model) -> Model:
     )
 
 
-def comparison_of(config: "Config", calibration: Calibration, plan: Plan) -> Comparison:
-    """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
-
-    Raises InputError, WorkFailed if the configuration describes no simulated task, or the task cannot be
-    done.
-    """
+def comparison_of(config: Config, calibration: Calibration, plan: Plan) -> Comparison:
+    """Set up the extra runs; images are without noise, but for a goal that is known by them alone."""
     truth_of(config)  # refuses what lacks a part of the simulation
     control = config.control.model_copy(update={"observation": "points"})
     scenario = scenario_of(idealized(config).model_copy(update={"control": control}), calibration)
@@ -109,60 +103,40 @@ def run_studies(
     periods: Sequence[float] = PERIODS_S,
     progress: Progress = silent,
 ) -> Studies:
-    """Make all extra runs.
+    """Make all extra runs, over gains per step, and over periods, s, at the configured gains.
 
-    gains : gains per step to sweep.
-    periods : periods to sweep at the configured gains, s; those with a gain of 1 a step or more, which no
-        loop survives, are left out.
-    progress : told how far it is.
-    Raises WorkFailed if the task cannot be partitioned with one of the models.
+    Periods with a gain of 1 a step or more, which no loop survives, are left out. Raises WorkFailed if the
+    task cannot be partitioned with one of the models.
     """
-    own = bench.scenario.gains
+    own, limits = bench.scenario.gains, (False, True)
     most = max(own.gain_t, own.gain_r, own.gain_p, own.gain_s)
     periods = [period for period in periods if most * period < 1.0]
-    sweep_cases = [
-        (law, operators, limited, gain)
-        for law in DIRECT
-        for operators in ("true", "calibrated")
-        for limited in (False, True)
-        for gain in gains
+    both = ("true", "calibrated")
+    cases: list[tuple[Any, Gains, str, bool]] = [
+        *((case, _with_gain(own, case[3]), *case[1:3]) for case in product(DIRECT, both, limits, gains)),
+        *((case, own, *case[1:]) for case in product(DIRECT, bench.models, limits)),
+        *((case, own._replace(period=case[1]), "true", False) for case in product(DIRECT, periods)),
     ]
-    own_cases = [(law, kind, limited) for law in DIRECT for kind in bench.models for limited in (False, True)]
-    rate_cases = [(law, period) for law in DIRECT for period in periods]
-    total = len(sweep_cases) + len(own_cases) + len(rate_cases)
-    sweep, by_model, rate = {}, {}, {}
-    for done, (law, operators, limited, gain) in enumerate(sweep_cases):
-        progress("studies", done, total)
-        trace = bench.run(law, operators, _with_gain(own, gain), limited=limited)
-        sweep[law, operators, limited, gain] = trace
-    for done, (law, operators, limited) in enumerate(own_cases, len(sweep)):
-        progress("studies", done, total)
-        by_model[law, operators, limited] = bench.run(law, operators, own, limited=limited)
-    for done, (law, period) in enumerate(rate_cases, len(sweep) + len(by_model)):
-        progress("studies", done, total)
-        rate[law, period] = bench.run(law, "true", own._replace(period=period), limited=False)
-    progress("studies", total, total)
+    made: dict[Any, Trace] = {}
+    for done, (case, chosen, operators, limited) in enumerate(cases):
+        progress("studies", done, len(cases))
+        made[case] = bench.run(case[0], operators, chosen, limited=limited)
+    progress("studies", len(cases), len(cases))
+    sweep, by_model, rate = ({c: trace for c, trace in made.items() if len(c) == n} for n in (4, 3, 2))
     return Studies(tuple(gains), tuple(periods), own, STEP_LIMIT_DEG, sweep, by_model, rate)
 
 
-def metric_plan(bench: Comparison, delta: float) -> Plan:
-    """The task partitioned with the true metric model, so that its operators are in metres.
-
-    Raises WorkFailed if the task cannot be partitioned.
-    """
-    robot = bench.truth.robot
-    return plan_task(
-        bench.models["true"],
-        bench.scenario.ends,
-        Profile("linear", delta, 2),
-        within(robot.lower, robot.upper),
-    )
+def metric_plan(bench: Comparison) -> Plan:
+    """The task partitioned with the true metric model, so that its operators are in metres."""
+    short = {"profile": "linear", "samples": 2, "duration_s": None}
+    trajectory, robot = bench.scenario.config.trajectory.model_copy(update=short), bench.truth.robot
+    shown, limits = bench.scenario.ends, within(robot.lower, robot.upper)
+    return plan_task(bench.models["true"], shown, trajectory, limits)
 
 
 def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> tuple[FloatArray, FloatArray]:
-    """How far both sides of [RH00] eq. (22) differ when the task is taken in shares λ.
+    """How far both sides of [RH00] eq. (22) differ when a metric plan is taken in shares λ of τ and θ_s.
 
-    plan : metric plan; lambdas : shares of τ and θ_s.
     Returns distance: (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m; norm:
     (k,) Frobenius norm of the difference of both displacements, m and rad mixed.
     """

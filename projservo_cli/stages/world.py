@@ -4,10 +4,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.config import Config
+from projservo_cli.config.models import Goal
+from projservo_cli.config.robot import Camera, JointVector, Markers, Rig
+from projservo_cli.config.robot import Robot as DescribedRobot
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.loop.summary import Ends
 from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model
@@ -23,11 +27,10 @@ from projservo_cli.robots.truth import (
 )
 from projservo_cli.task.face import MIDPOINT, center_of
 
-if TYPE_CHECKING:
-    from projservo_cli.config import Config
-    from projservo_cli.config.models import Goal
-    from projservo_cli.config.robot import Camera, JointVector, Markers, Rig
-    from projservo_cli.config.robot import Robot as DescribedRobot
+
+def reference_of(config: Config) -> JointVector | None:
+    """Joints around which the trial motions are made."""
+    return config.calibration.reference or (config.task.start if config.task is not None else None)
 
 
 class Joints(NamedTuple):
@@ -39,7 +42,7 @@ class Joints(NamedTuple):
     speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
 
 
-def outside(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
+def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
     """Which of the readings (n,) lies beyond its limits, in words; empty where none does."""
     for i in np.flatnonzero((q < lower) | (q > upper)):
         limits = f"{lower[i]:.6g} to {upper[i]:.6g} (rad or m)"
@@ -47,13 +50,7 @@ def outside(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
     return ""
 
 
-def reference_of(config: "Config") -> "JointVector | None":
-    """Joints around which the trial motions are made."""
-    start = config.task.start if config.task is not None else None
-    return config.calibration.reference or start
-
-
-def joints_of(config: "Config", default_types: str = "") -> Joints:
+def joints_of(config: Config, default_types: str = "") -> Joints:
     """Joints of the robot; of the calibration's ``default_types`` where the configuration does not tell."""
     vector = reference_of(config)
     types = config.joint_types or default_types or "R" * (len(vector.joints) if vector is not None else 0)
@@ -67,12 +64,12 @@ def joints_of(config: "Config", default_types: str = "") -> Joints:
     return Joints(types, lower, upper, speed)
 
 
-def has_task(config: "Config") -> bool:
+def has_task(config: Config) -> bool:
     """Whether there is a robot with a task; a recorded run may be reported on without."""
     return not config.recorded or None not in (config.robot, config.rig, config.markers, config.task)
 
 
-def image_size_of(config: "Config") -> tuple[int, int] | None:
+def image_size_of(config: Config) -> tuple[int, int] | None:
     """Width and height of the images, px, if they are known."""
     if config.data is not None and config.data.image_size_px is not None:
         return config.data.image_size_px
@@ -124,12 +121,25 @@ class Truth:
         """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
         return self.robot.pose(q) @ self._from_tool
 
+    def turned(self, q_start: FloatArray, goal: Goal) -> FloatArray:
+        """Joints (n,) after a turn about the roll axis of the rig and a small displacement of the tool."""
+        assert goal.turn_deg is not None
+        point, direction = roll_axis(self.P)
+        pose = rotation_about_axis(point, direction, math.radians(goal.turn_deg)) @ self.robot.pose(q_start)
+        if goal.perturbation is not None:
+            v = np.array(goal.perturbation.rotation_rad)
+            t = np.array(goal.perturbation.translation_m)
+            angle = float(np.linalg.norm(v))
+            turn = rotation_about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
+            pose = pose @ rigid(np.eye(3), t) @ turn
+        return inverse_kinematics(self.robot, pose, q_start)
+
     @cached_property
     def _from_tool(self) -> FloatArray:
         return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
 
 
-def face_numbers(config: "Config") -> tuple[int, ...]:
+def face_numbers(config: Config) -> tuple[int, ...]:
     """Numbers of the face markers."""
     if config.markers is None or config.markers.face is None:
         raise InputError(
@@ -138,15 +148,14 @@ def face_numbers(config: "Config") -> tuple[int, ...]:
     return config.markers.face
 
 
-def center_index(config: "Config") -> int:
+def center_index(markers: Markers) -> int:
     """Position of the centre marker within the face, or ``MIDPOINT``."""
-    face = face_numbers(config)
-    assert config.markers is not None
-    center = config.markers.center
-    return MIDPOINT if center == "midpoint" else face.index(center)
+    return (
+        MIDPOINT if markers.center == "midpoint" or not markers.face else markers.face.index(markers.center)
+    )
 
 
-def truth_of(config: "Config") -> Truth:
+def truth_of(config: Config) -> Truth:
     """Build the truth, or find it again where it was built for another seed or task.
 
     Raises InputError if the configuration lacks a part of it, naming the key to set.
@@ -161,24 +170,24 @@ def truth_of(config: "Config") -> Truth:
 
 
 @lru_cache(maxsize=16)
-def _built(described: "DescribedRobot", rig: "Rig", markers: "Markers") -> Truth:
-    robot = robot_of(described)
+def _built(described: DescribedRobot, rig: Rig, markers: Markers) -> Truth:
+    robot = _robot_of(described)
     numbers = markers.known
     assert numbers is not None
     points = np.c_[np.array(markers.positions_m), np.ones(len(numbers))]
     face = markers.face or ()
     return Truth(
         robot,
-        np.array([camera_of(rig.left), camera_of(rig.right)]),
+        np.array([_camera_of(rig.left), _camera_of(rig.right)]),
         points @ robot.base_tool.T,
         numbers,
         tuple(numbers.index(number) for number in face),
-        face.index(markers.center) if face and markers.center != "midpoint" else MIDPOINT,
+        center_index(markers),
         np.array(rig.image_size_px, dtype=np.float64),
     )
 
 
-def robot_of(described: "DescribedRobot") -> Robot:
+def _robot_of(described: DescribedRobot) -> Robot:
     """Robot of a DH table or of screws."""
     limits = described.limits
     if described.dh is not None:
@@ -202,7 +211,7 @@ def robot_of(described: "DescribedRobot") -> Robot:
     )
 
 
-def camera_of(camera: "Camera") -> FloatArray:
+def _camera_of(camera: Camera) -> FloatArray:
     """Camera (3, 4) to px of its matrix or its look-at description."""
     if camera.matrix is not None:
         P = np.array(camera.matrix)
@@ -218,17 +227,3 @@ def camera_of(camera: "Camera") -> FloatArray:
     return look_at_camera(
         camera.focal_px, camera.principal_point_px, camera.position_m, camera.target_m, camera.up
     )
-
-
-def turned(truth: Truth, q_start: FloatArray, goal: "Goal") -> FloatArray:
-    """Joints after a turn about the roll axis of the rig and a small displacement of the tool, rad or m."""
-    assert goal.turn_deg is not None
-    point, direction = roll_axis(truth.P)
-    pose = rotation_about_axis(point, direction, math.radians(goal.turn_deg)) @ truth.robot.pose(q_start)
-    if goal.perturbation is not None:
-        v = np.array(goal.perturbation.rotation_rad)
-        t = np.array(goal.perturbation.translation_m)
-        angle = float(np.linalg.norm(v))
-        turn = rotation_about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
-        pose = pose @ rigid(np.eye(3), t) @ turn
-    return inverse_kinematics(truth.robot, pose, q_start)

@@ -15,12 +15,14 @@ import shutil
 import typing
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter, ValidationError
 
 from projservo_cli.files import replacing
 from projservo_cli.records import SIZES, InputError
@@ -221,17 +223,14 @@ def _array(data: Any, dims: tuple[str, ...], hint: Any, sizes: dict[str, int]) -
 
 def _value(name: str, value: Any, hint: Any) -> Any:
     """A number, a text, or texts and mappings in JSON, as the field declares it."""
-    wrong = ValueError(f"{name} is not of type {getattr(hint, '__name__', hint)}")
-    if hint in (bool, int, float):
-        if isinstance(value, str) or (hint is not float and int(value) != value):
-            raise wrong
-        return hint(value)
-    if not isinstance(value, str):
-        raise wrong
-    if hint is str:
-        return value
-    entries, element = json.loads(value), typing.get_args(hint)[0]
-    kind = typing.get_origin(element) or element
-    if not isinstance(entries, list) or not all(isinstance(entry, kind) for entry in entries):
-        raise wrong
-    return tuple(entries)
+    adapter = _adapter(hint)
+    validate = adapter.validate_json if typing.get_origin(hint) is tuple else adapter.validate_python
+    try:
+        return validate(value)
+    except ValidationError as error:
+        raise ValueError(f"{name} is not of type {getattr(hint, '__name__', hint)}") from error
+
+
+@cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(hint)

@@ -38,10 +38,7 @@ Heading = tuple[str, str, str, str]
 
 
 def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Trace]) -> None:
-    """Write rows and traces, as a whole or not at all.
-
-    Raises InputError if the file cannot be written.
-    """
+    """Write rows and traces, as a whole or not at all."""
     with new_file(path) as file:
         if traces:
             with labelled(file) as groups:
@@ -162,10 +159,7 @@ class SweepTable:
         return np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
 
     def trace(self, run: int) -> Trace:
-        """Trace of a run that was kept.
-
-        Raises InputError if it was not.
-        """
+        """Trace of a run that was kept; an InputError if it was not."""
         with opened(self.path, _AGAIN) as file:
             if f"{_TRACES}/{run}" not in file:
                 raise InputError(f"{self.path}: the trace of run {run} was not kept; list it under traces")

@@ -1,9 +1,9 @@
 """Sweeps: closed-loop runs over a grid of configurations and random draws.
 
 The plan of the package. ``design`` says what run number i is: an ordinary configuration, whose seeds,
-random task (``tasks``) and drawn values depend on the number alone. ``runs`` makes a part, some hundred
-runs with consecutive numbers, and is a function of its argument alone, so that any process on any machine
-may call it. ``engine`` hands parts to threads and processes here or to a Dask cluster. ``folder`` knows
-from the files what is done, and makes one run anew as an ordinary run file. ``driver`` ties them together.
-``statistics`` reads the table, ``report`` writes them and draws.
+random task and drawn values depend on the number alone. ``runs`` makes a part, some hundred runs with
+consecutive numbers, and is a function of its argument alone, so that any process on any machine may call
+it. ``engine`` hands parts to threads and processes here or to a Dask cluster. ``folder`` knows from the
+files what is done, has the rest made, and makes one run anew as an ordinary run file. ``statistics`` reads
+the table, and draws.
 """

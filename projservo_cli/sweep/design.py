@@ -12,17 +12,100 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from projservo_cli.calibration.prediction import displacements, image_points, moved_points
 from projservo_cli.config import Config, Override, digest, load_config, to_yaml
 from projservo_cli.config.models import Goal, Task
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
-from projservo_cli.records import FloatArray, InputError, IntArray, law_and_mode, names_of
+from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.records import (
+    PRISMATIC,
+    FloatArray,
+    InputError,
+    IntArray,
+    WorkFailed,
+    law_and_mode,
+    names_of,
+)
+from projservo_cli.robots.truth import METRIC_A_INF
 from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
-from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.tasks import random_tasks
+from projservo_cli.stages.world import Truth, truth_of
+
+RANGE = 0.9
+LEAST_COSINE = math.cos(math.radians(75.0))
+STRATA = 6
+BATCH = 2_000
+MOST_DRAWS = 20_000_000
 
 
-def changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
+def random_tasks(
+    truth: Truth, q_front: FloatArray, count: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Draw tasks within sight of both cameras, one of each sixth of half a turn in turn.
+
+    q_front : (n,) joints at which the cameras see the front of the face, rad or m.
+    Returns joints (count, n) at start and goal, rad or m.
+    """
+    robot = truth.robot
+    middle, half = 0.5 * (robot.lower + robot.upper), 0.5 * RANGE * (robot.upper - robot.lower)
+    if not np.isfinite(half).all():
+        raise InputError("random tasks need joint limits: set limits of every joint of the robot")
+    front = math.copysign(1.0, float(_cosines(truth, _poses(truth, q_front[None]))[0, 0]))
+    quota = [count // STRATA + (i < count % STRATA) for i in range(STRATA)]
+    found: list[list[tuple[FloatArray, FloatArray]]] = [[] for _ in range(STRATA)]
+    waiting: list[tuple[FloatArray, FloatArray]] = []
+    drawn = 0
+    while any(len(tasks) < most for tasks, most in zip(found, quota, strict=True)):
+        if drawn >= MOST_DRAWS:
+            raise WorkFailed(
+                f"of {drawn} joint vectors too few show the face to both cameras for {count} tasks: "
+                "turn the cameras towards the workspace or ask for fewer"
+            )
+        q = middle + half * rng.uniform(-1.0, 1.0, (BATCH, len(middle)))
+        drawn += BATCH
+        poses = _poses(truth, q)
+        waiting += [(q[i], poses[i, :3, :3]) for i in _accepted(truth, poses, front)]
+        while len(waiting) >= 2:
+            (start, R), (goal, R_goal) = waiting.pop(0), waiting.pop(0)
+            angle = math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(R.T @ R_goal)) - 1.0))))
+            stratum = min(STRATA - 1, int(STRATA * angle / math.pi))
+            if len(found[stratum]) < quota[stratum]:
+                found[stratum].append((start, goal))
+    tasks = [tasks[k] for k in range(max(quota)) for tasks in found if k < len(tasks)]
+    starts, goals = (np.array(column) for column in zip(*tasks, strict=True))
+    return starts, goals
+
+
+def _poses(truth: Truth, q: FloatArray) -> FloatArray:
+    """Displacements (k, 4, 4) from the reference at joints (k, n), [RH00] eq. (6) for many at once."""
+    robot = truth.robot
+    E = displacements(robot.H_hat_0, robot.joint_types == PRISMATIC, q - robot.q_reference)
+    return np.swapaxes(moved_points(E, np.eye(4))[0], 1, 2)
+
+
+def _cosines(truth: Truth, poses: FloatArray) -> FloatArray:
+    """Cosine (k, 2) of the angle between the normal of the face and the rays to the optical centres."""
+    M = truth.M_face[:, :3]
+    middle = M.mean(axis=0) if truth.center < 0 else M[truth.center]
+    normal = np.linalg.svd(M - M.mean(axis=0))[2][2]
+    rays = optical_centers(truth.P, METRIC_A_INF)[:, :3] - (
+        poses[:, None, :3, :3] @ middle + poses[:, None, :3, 3]
+    )
+    rays = rays / np.linalg.norm(rays, axis=2, keepdims=True)
+    return np.asarray(np.einsum("kvi,ki->kv", rays, poses[:, :3, :3] @ normal))
+
+
+def _accepted(truth: Truth, poses: FloatArray, front: float) -> IntArray:
+    """Indices of the poses that show the face to both cameras."""
+    m = image_points(truth.P, truth.M_face @ np.swapaxes(poses, 1, 2))
+    before = (m[..., 2] > 0.0).all(axis=(1, 2))
+    facing = (front * _cosines(truth, poses) >= LEAST_COSINE).all(axis=1)
+    pixels = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+    inside = ((pixels >= -0.5) & (pixels <= truth.image_size - 0.5)).all(axis=(1, 2, 3))
+    return np.flatnonzero(before & facing & inside)
+
+
+def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
     """A configuration with other values, or an InputError that calls them by what they are of."""
     resolved = config.model_dump(mode="json")
     changes = [_override(what, key, value) for key, value in values.items()]
@@ -58,12 +141,7 @@ def _overrides(what: str, key: str, value: Any) -> list[Override]:
 RUNS, CALIBRATIONS, TASKS, VALUES, CALIBRATION_VALUES = range(5)
 
 
-def seed_of(seed: int, stream: int, number: int) -> int:
-    """Seed of one of many draws."""
-    return int(np.random.SeedSequence(seed, spawn_key=(stream, number)).generate_state(1, np.uint64)[0] >> 1)
-
-
-def sample(distribution: Distribution, rng: np.random.Generator) -> Any:
+def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
     """One value; always as many random numbers, whatever the distribution."""
     uniform, normal = rng.random(), rng.standard_normal()
     if distribution.uniform is not None:
@@ -87,14 +165,14 @@ class _Axis(NamedTuple):
     values: tuple[Any, ...]
 
 
-class _Numbers(NamedTuple):
-    """Where run number ``run`` stands: its cell, its number in the cell, and those of what it shares."""
+class _Places(NamedTuple):
+    """Where runs stand, arrays (k,): their cells, their numbers in them, and those of what they share."""
 
-    run: int
-    cell: int
-    draw: int
-    calibration: int
-    task: int
+    run: IntArray
+    cell: IntArray
+    draw: IntArray
+    calibration: IntArray
+    task: IntArray  # −1 for the task of the base
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +181,12 @@ class Design:
 
     sweep: SweepConfig  # its configuration
     bases: tuple[tuple[str, str], ...]  # name and resolved YAML of each base
+
+    @classmethod
+    def made_of(cls, recipe: Mapping[str, Any]) -> "Design":
+        """The design that a recipe is of."""
+        bases = tuple((str(name), str(text)) for name, text in recipe["bases"])
+        return cls(SweepConfig.model_validate(recipe["sweep"]), bases)
 
     @cached_property
     def axes(self) -> tuple[_Axis, ...]:
@@ -127,7 +211,7 @@ class Design:
 
     @cached_property
     def recipe(self) -> dict[str, Any]:
-        """All there is, as JSON values; ``from_recipe`` makes the design of it."""
+        """All there is, as JSON values; ``made_of`` makes the design of it."""
         return {"sweep": self.sweep.model_dump(mode="json"), "bases": [list(base) for base in self.bases]}
 
     @cached_property
@@ -138,22 +222,19 @@ class Design:
         text = json.dumps([values, self.recipe["bases"]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
-    def numbers(self, run: int) -> _Numbers:
-        """Where a run stands; an InputError where there is none."""
+    def numbers(self, run: int) -> tuple[int, int, int, int]:
+        """Cell of a run, and the numbers of its draw, calibration and task; an InputError without one."""
         if not 0 <= run < self.total:
             raise InputError(f"run {run}: the sweep {self.sweep.name} has runs 0 to {self.total - 1}")
-        return _Numbers(run, *(int(number[0]) for number in self.placed(np.array([run])).values()))
+        _, cell, draw, calibration, task = (int(of_run[0]) for of_run in self.placed(np.array([run])))
+        return cell, draw, calibration, task
 
-    def placed(self, runs: IntArray) -> dict[str, IntArray]:
-        """Where runs (k,) stand, by the names of ``_Numbers`` after the first."""
+    def placed(self, runs: IntArray) -> _Places:
+        """Where runs (k,) stand."""
         cell, draw = np.divmod(runs, self.sweep.runs)
         tasks = self.sweep.tasks
-        return {
-            "cell": cell,
-            "draw": draw,
-            "calibration": draw % self.sweep.calibrations,
-            "task": draw % tasks.random if tasks else np.full_like(draw, -1),
-        }
+        task = draw % tasks.random if tasks else np.full_like(draw, -1)
+        return _Places(runs, cell, draw, draw % self.sweep.calibrations, task)
 
     def values(self, cell: int) -> dict[str, Any]:
         """Value of each axis in a cell."""
@@ -194,8 +275,8 @@ class Design:
         config = self.cell(cell)
         drawn = self._drawn(CALIBRATION_VALUES, calibration)
         if drawn:
-            config = changed(config, drawn, f"calibration {calibration}")
-        seed = seed_of(self.sweep.seed, CALIBRATIONS, calibration)
+            config = _changed(config, drawn, f"calibration {calibration}")
+        seed = self.seed(CALIBRATIONS, calibration)
         update = {"calibration": config.calibration.model_copy(update={"seed": seed})}
         return config.model_copy(update=update)
 
@@ -224,32 +305,34 @@ class Design:
         count = self.sweep.tasks.random
         q_front = np.array(config.task.start.values(config.robot.joint_types))
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
-        tasks = random_tasks(truth_of(config), q_front, count, rng)
-        return tasks.q_start, tasks.q_goal
+        return random_tasks(truth_of(config), q_front, count, rng)
 
     def config(self, run: int) -> Config:
         """Configuration of a run."""
-        at = self.numbers(run)
-        config = self.calibrated(at.cell, at.calibration)
-        drawn = self._drawn(VALUES, at.draw)
+        cell, draw, calibration, task = self.numbers(run)
+        config = self.calibrated(cell, calibration)
+        drawn = self._drawn(VALUES, draw)
         if drawn:
-            config = changed(config, drawn, f"run {run}")
-        update: dict[str, Any] = {"seed": seed_of(self.sweep.seed, RUNS, at.draw)}
-        if at.task >= 0:
+            config = _changed(config, drawn, f"run {run}")
+        update: dict[str, Any] = {"seed": self.seed(RUNS, draw)}
+        if task >= 0:
             assert config.task is not None
-            start, goal = (
-                JointVector(joints=tuple(q[at.task].tolist()), unit="rad")
-                for q in self.tasks(self.base_of(at.cell))
-            )
+            ends = self.tasks(self.base_of(cell))
+            start, goal = (JointVector(joints=tuple(q[task].tolist()), unit="rad") for q in ends)
             offset = config.task.start_offset  # stays
             update["task"] = Task(start=start, start_offset=offset, goal=Goal(joints=goal))
         return config.model_copy(update=update)
 
     def drawn(self, run: int) -> dict[str, Any]:
         """Values drawn for a run and for its calibration, in the order of ``random``."""
-        at = self.numbers(run)
-        found = self._drawn(VALUES, at.draw) | self._drawn(CALIBRATION_VALUES, at.calibration)
+        _, draw, calibration, _ = self.numbers(run)
+        found = self._drawn(VALUES, draw) | self._drawn(CALIBRATION_VALUES, calibration)
         return {key: found[key] for key in self.sweep.random}
+
+    def seed(self, stream: int, number: int) -> int:
+        """Seed of one of many draws."""
+        sequence = np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number))
+        return int(sequence.generate_state(1, np.uint64)[0] >> 1)
 
     def _drawn(self, stream: int, number: int) -> dict[str, Any]:
         """Values of the keys that a stream is for: whether the calibration depends on them."""
@@ -258,7 +341,7 @@ class Design:
         if not keys:
             return {}
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number)))
-        return {key: sample(self.sweep.random[key], rng) for key in keys}
+        return {key: _sample(self.sweep.random[key], rng) for key in keys}
 
 
 def read_design(sweep: SweepConfig) -> Design:
@@ -271,14 +354,8 @@ def read_design(sweep: SweepConfig) -> Design:
     for cell in range(design.cells):
         design.cell(cell)
     for draw in range(min(3, sweep.runs) if sweep.random else 0):
-        changed(design.cell(0), design.drawn(draw), f"run {draw}")
+        _changed(design.cell(0), design.drawn(draw), f"run {draw}")
     return design
-
-
-def from_recipe(recipe: Mapping[str, Any]) -> Design:
-    """The design that a recipe is of."""
-    bases = tuple((str(name), str(text)) for name, text in recipe["bases"])
-    return Design(SweepConfig.model_validate(recipe["sweep"]), bases)
 
 
 def name_of_run(config: Config) -> str:

@@ -1,4 +1,4 @@
-"""The folder of a sweep: what it is of, how far it is, and one of its runs anew.
+"""The folder of a sweep: what it is of, how far it is, how it is filled, and one of its runs anew.
 
 A manifest says what all else is of. While a sweep runs there is a file for each part; a part that is there
 is done, so after any end the same command goes on with the others. The table is assembled from them, and
@@ -6,28 +6,41 @@ when it is complete they are removed. Calibrations stay, to make any run anew.
 """
 
 import json
+import math
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from projservo_cli import provenance
 from projservo_cli.config import Config, to_yaml
 from projservo_cli.files import replacing
+from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
-from projservo_cli.stages.steps import steps_for
-from projservo_cli.store import TABLE, Result, Run, SweepTable, assemble, load, save
-from projservo_cli.sweep.design import Design, from_recipe
-from projservo_cli.sweep.engine import versions
-from projservo_cli.sweep.runs import columns_of
+from projservo_cli.stages import Progress, calibrate
+from projservo_cli.stages.steps import result_of, steps_for
+from projservo_cli.store import Result, Run, load, save
+from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
+from projservo_cli.sweep.design import Design, name_of_run
+from projservo_cli.sweep.engine import Engine, versions
+from projservo_cli.sweep.runs import Part, columns_of, is_compiled, run_part
 
 REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
+PARTS = 4  # of each worker at least
+# Runs that take a second or two, by whether many have all but their images in common.
+SHARED, OWN = 2_000, 100
+CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
+SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
+# Indices of the machine code of the closed loop, by whether many runs are made in one call.
+LOOPS = ("compiled.run-*.nbi", "trial.without_rehearsal-*.nbi")
 
 
-class Status(NamedTuple):
+class _Status(NamedTuple):
     """How far a sweep is: runs that are stored, and in all; ``complete`` when its parts are gone too."""
 
     done: int
@@ -36,7 +49,7 @@ class Status(NamedTuple):
     complete: bool = False
 
 
-class Calibrated(NamedTuple):
+class _Calibrated(NamedTuple):
     """What became of the calibration of a key: records, or why there are none."""
 
     key: str
@@ -71,7 +84,7 @@ class Folder:
             if self.part(first, last) not in stored:
                 yield first, last
 
-    def status(self, design: Design, *, force: bool = False) -> Status:
+    def status(self, design: Design, *, force: bool = False) -> _Status:
         """How far a sweep is.
 
         Raises InputError if the folder holds another sweep, or one made with other versions, and ``force`` is
@@ -83,12 +96,12 @@ class Folder:
                 f"{self.table}: its {self.manifest.name} is missing; choose another folder or use --force"
             )
         if force or not self.manifest.exists():
-            return Status(0, total, 0)
+            return _Status(0, total, 0)
         chunk = self._chunk(design)
         if self.table.exists() and SweepTable(self.table).rows == total:
-            return Status(total, total, chunk, complete=not self.stored())
+            return _Status(total, total, chunk, complete=not self.stored())
         left = sum(last - first for first, last in self.missing(design, chunk))
-        return Status(total - left, total, chunk)
+        return _Status(total - left, total, chunk)
 
     def _chunk(self, design: Design) -> int:
         """Runs of a part; refuses what was made of another configuration, or with versions of other bits."""
@@ -119,7 +132,7 @@ class Folder:
 
     def design(self) -> Design:
         """The design of the sweep that the folder holds."""
-        return from_recipe(self._read()["recipe"])
+        return Design.made_of(self._read()["recipe"])
 
     def begin(self, design: Design, chunk: int) -> None:
         """Write the manifest."""
@@ -149,6 +162,12 @@ class Folder:
         }
         assemble(self.table, self.stored(), columns, attributes)
 
+    def assembled(self) -> Path:
+        """The table of the runs that are done."""
+        if self.stored():
+            self.assemble(self.design())
+        return self.table
+
     def calibration(self, key: str) -> Path:
         """The run file that holds a calibration, or beside which a file says why there is none."""
         return self.path / "calibrations" / f"{key[:20]}.h5"
@@ -161,19 +180,15 @@ class Folder:
             if not any(self.calibration(key).with_suffix(kind).exists() for kind in (".h5", REFUSED))
         ]
 
-    def keep_calibration(self, made: Calibrated) -> None:
+    def keep_calibration(self, made: _Calibrated) -> None:
         """Store a calibration as a run file of its own, or why there is none."""
         path = self.calibration(made.key)
         if made.records is None:
             with replacing(path.with_suffix(REFUSED)) as temporary:
                 temporary.write_text(made.reason + "\n", encoding="utf-8")
             return
-        names = ("observation", "calibration", "cross_validation")
-        records = {name: one for name, one in zip(names, made.records, strict=True) if one is not None}
         (step,) = steps_for(made.config, Run(path), ["calibrate"])
-        origin = provenance.collect(seed=made.config.seed)
-        text = to_yaml(made.config)
-        save(Run(path, text, {"calibrate": Result(step.key, text, origin, step.inputs, records)}))
+        save(Run(path, to_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
 
     def calibrations(self, design: Design) -> dict[str, Calibration | None]:
         """Calibrations by their key, None where one was refused; without covariance, which no run needs."""
@@ -197,13 +212,130 @@ def run_of(target: str) -> tuple[Config, Result | None]:
         raise InputError(f"--from {target}: expected SWEEP:INDEX, such as results/sweep_noise:17")
     folder = Folder(sweep)
     design = folder.design()
-    at = design.numbers(int(index))
-    config = design.config(at.run).model_copy(update={"name": f"{design.sweep.name}-{at.run}"})
-    path = folder.calibration(design.calibration_key(at.cell, at.calibration))
+    run = int(index)
+    cell, _, number, _ = design.numbers(run)
+    config = design.config(run).model_copy(update={"name": f"{design.sweep.name}-{run}"})
+    path = folder.calibration(design.calibration_key(cell, number))
     refused = path.with_suffix(REFUSED)
     if refused.exists():
-        raise WorkFailed(f"run {at.run}: {refused.read_text(encoding='utf-8').strip()}")
+        raise WorkFailed(f"run {run}: {refused.read_text(encoding='utf-8').strip()}")
     if not path.exists():
         return config, None
     (step,) = steps_for(config, Run(path), ["calibrate"])
     return config, replace(load(path).results["calibrate"], key=step.key)
+
+
+def run_sweep(
+    design: Design,
+    folder: Folder,
+    engine: Engine,
+    progress: Progress,
+    say: Callable[[str], None],
+    *,
+    force: bool = False,
+) -> _Status:
+    """Make the runs of a sweep that are not stored yet, and the table.
+
+    Raises InputError if the folder holds another sweep, a file cannot be written, or a drawn value is
+    invalid; WorkFailed if tasks cannot be drawn, or workers are lost again and again; what was stored is
+    kept; KeyboardInterrupt after the table of what was stored has been assembled.
+    """
+    status = folder.status(design, force=force)
+    if status.complete:
+        return status
+    if force:
+        folder.clear()
+    try:
+        for base in range(len(design.bases) if design.sweep.tasks else 0):
+            design.tasks(base)  # or say that there are none, before anything else is made
+        _compile_once(design, engine, say)
+        _make_calibrations(design, folder, engine, progress)
+        if status.done:
+            say(f"{status.done} of {status.total} runs are stored already")
+        _make_parts(design, folder, engine, status, progress)
+    except KeyboardInterrupt:
+        if folder.stored():
+            folder.assemble(design)
+        raise
+    finally:
+        engine.close()
+    folder.assemble(design)
+    shutil.rmtree(folder.parts)
+    return _Status(design.total, design.total, status.chunk, complete=True)
+
+
+def _make_calibrations(design: Design, folder: Folder, engine: Engine, progress: Progress) -> None:
+    """Make the calibrations that are missing."""
+    wanted = folder.missing_calibrations(design)
+    most = 1 + len(wanted) // CALIBRATIONS
+    with closing(engine.completed(_calibrate, wanted, most=most)) as calibrated:
+        for count, one in enumerate(calibrated):
+            folder.keep_calibration(one)
+            progress("calibrations", count + 1, len(wanted))
+
+
+def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status, progress: Progress) -> None:
+    """Make the parts that are missing."""
+    calibrations, threads = folder.calibrations(design), _shares_settings(design)
+    chunk = status.chunk or design.sweep.chunk
+    if not chunk:
+        chunk = min(SHARED if threads else OWN, math.ceil(design.total / (PARTS * engine.workers)))
+    if not status.chunk:
+        folder.begin(design, chunk)
+
+    def part(first: int, last: int) -> Part:
+        at = design.placed(np.arange(first, last))
+        pairs = set(zip(at.cell.tolist(), at.calibration.tolist(), strict=True))
+        keys = {design.calibration_key(*pair) for pair in pairs}
+        return Part(design, first, last, {key: calibrations[key] for key in keys})
+
+    done, left = 0, status.total - status.done
+    progress("runs", 0, left)
+    parts = (part(*pair) for pair in folder.missing(design, chunk))
+    with closing(engine.completed(run_part, parts, threads=threads)) as made_parts:
+        for made in made_parts:
+            write_part(folder.part(made.first, made.last), made.columns, made.traces)
+            done += made.last - made.first
+            progress("runs", done, left)
+
+
+def _shares_settings(design: Design) -> bool:
+    """Whether all runs are compiled ones, of which many differ in nothing but their images."""
+    tasks = design.sweep.tasks.random if design.sweep.tasks is not None else 1
+    settings = math.lcm(design.sweep.calibrations, tasks)
+    if design.sweep.random or settings > SETTINGS or design.sweep.runs < settings:
+        return False
+    return all(is_compiled(design, design.cell(cell)) for cell in range(design.cells))
+
+
+def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
+    """Make the calibration of a key, on one thread like all that must be the same to the bit."""
+    with threadpool_limits(1):
+        try:
+            return _Calibrated(*wanted, calibrate.run(wanted[1]))
+        except WorkFailed as error:
+            return _Calibrated(*wanted, None, str(error))
+
+
+def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
+    """Fill an empty cache by one process, where several would each compile the same.
+
+    That process ends here: the compiler keeps hundreds of megabytes.
+    """
+    loop = LOOPS[is_compiled(design, design.cell(0))]
+    if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
+        return
+    say("compiling kernels, once, before the processes start")
+    with closing(engine.completed(_first_runs, [design])) as made:
+        list(made)
+
+
+def _first_runs(design: Design) -> None:
+    """One calibration and a run of each law with it, for the kernels they leave."""
+    made = _calibrate((design.calibration_key(0, 0), design.calibrated(0, 0)))
+    calibration = None if made.records is None else made.records[1]
+    cells = range(design.cells // len(design.bases))
+    by_law = {name_of_run(design.cell(cell)): cell for cell in reversed(cells)}
+    for cell in by_law.values():
+        run = cell * design.sweep.runs
+        run_part(Part(design, run, run + 1, {design.calibration_key(cell, 0): calibration}))

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.config import Config
+from projservo_cli.config import Config, digest
 from projservo_cli.control import CODES
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.step import RUNNING, VERDICTS
@@ -20,8 +20,8 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
-from projservo_cli.stages.trace import deviation_between_samples_mm, summary_of, trace_of
-from projservo_cli.sweep.design import RUNS, Design, name_of_run, seed_of
+from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
+from projservo_cli.sweep.design import RUNS, Design, name_of_run
 from projservo_cli.task.body import NO_BODY
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
@@ -84,14 +84,15 @@ def columns_of(design: Design) -> tuple[Column, ...]:
 
 def _input(name: str, values: Sequence[Any], about: str) -> Column:
     """A column of values that are given: of numbers where all are, else of texts."""
-    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
-        return Column(name, "f8", "1", about)
-    return _text(name, [_shown(value) for value in values], about)
+    shown = [_shown(value) for value in values]
+    if any(isinstance(value, str) for value in shown):
+        return _text(name, [str(value) for value in shown], about)
+    return Column(name, "f8", "1", about)
 
 
-def _shown(value: Any) -> str:
-    """A value as text, texts as they are."""
-    return value if isinstance(value, str) else json.dumps(value)
+def _shown(value: Any) -> Any:
+    """Numbers and texts as they are, everything else as text."""
+    return value if type(value) in (int, float, str) else json.dumps(value)
 
 
 _Columns = dict[str, npt.NDArray[Any]]
@@ -133,14 +134,16 @@ def run_part(part: Part) -> _Made:
     with threadpool_limits(1):  # with more, sums may be taken in another order
         for these in _alike(design, runs):
             rows = these - part.first
-            at = design.numbers(int(these[0]))
-            calibration = part.calibrations[design.calibration_key(at.cell, at.calibration)]
-            _put(table, rows, _inputs(design, at.run))
+            first = int(these[0])
+            cell, _, number, _ = design.numbers(first)
+            calibration = part.calibrations[design.calibration_key(cell, number)]
+            inputs = design.values(cell) | design.drawn(first)
+            _put(table, rows, {name: _shown(value) for name, value in inputs.items()})
             if calibration is None:
                 _put(table, rows, {"verdict": NOT_CALIBRATED, "usable": 0})
                 continue
             _put(table, rows, {"usable": int(calibration.usable)})
-            config = design.config(at.run)
+            config = design.config(first)
             if is_compiled(design, config):
                 _put(table, rows, _measured(config, calibration, table["seed"][rows]))
                 these = np.array([run for run in these if run in wanted], dtype=np.int64)
@@ -155,8 +158,8 @@ def run_part(part: Part) -> _Made:
 def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
     """Runs in groups that differ in their seeds alone."""
     at = design.placed(runs)
-    drawn = at["draw"] if design.sweep.random else np.zeros_like(runs)
-    keys = np.stack([at["cell"], at["calibration"], at["task"], drawn])
+    drawn = at.draw if design.sweep.random else np.zeros_like(runs)
+    keys = np.stack([at.cell, at.calibration, at.task, drawn])
     _, group = np.unique(keys, axis=1, return_inverse=True)
     order = np.argsort(group, kind="stable")
     yield from (runs[these] for these in np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
@@ -178,9 +181,9 @@ def _numbered(design: Design, runs: IntArray) -> _Columns:
         for column in columns_of(design)
     }
     at = design.placed(runs)
-    for name, number in ({"run": runs} | at).items():
+    for name, number in at._asdict().items():
         table[name][:] = number
-    table["seed"][:] = [seed_of(design.sweep.seed, RUNS, number) for number in at["draw"].tolist()]
+    table["seed"][:] = [design.seed(RUNS, number) for number in at.draw.tolist()]
     return table
 
 
@@ -190,19 +193,10 @@ def _put(table: _Columns, rows: IntArray, values: Mapping[str, Any]) -> None:
         table[name][rows] = value.encode() if isinstance(value, str) else value
 
 
-def _inputs(design: Design, run: int) -> dict[str, Any]:
-    """Values of the grid and drawn ones, by column."""
-    values = design.values(design.numbers(run).cell) | design.drawn(run)
-    return {
-        name: _shown(value) if not isinstance(value, (int, float)) or isinstance(value, bool) else value
-        for name, value in values.items()
-    }
-
-
 def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict[str, Any]:
     """What is measured of compiled runs, by column."""
     try:
-        numbers = numbers_of(scenario_of(config, calibration), name_of_run(config), seeds.tolist())
+        numbers = _numbers_of(scenario_of(config, calibration), name_of_run(config), seeds.tolist())
     except WorkFailed:
         return {"verdict": NOT_STARTED}
     found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
@@ -220,7 +214,7 @@ TOGETHER = 16
 
 def _setting_of(scenario: Scenario, law: str) -> Setting:
     """All that compiled runs of a law share whose seeds differ."""
-    body, model = scenario.exact.body, scenario.calibration.model()
+    body, model = scenario.exact.body, scenario.model
     return Setting(
         CODES[law],
         model,
@@ -238,11 +232,8 @@ def _setting_of(scenario: Scenario, law: str) -> Setting:
     )
 
 
-def numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
-    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone.
-
-    Raises WorkFailed if the task cannot be begun, whatever the seed.
-    """
+def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
+    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
     setting = _setting_of(scenario, law)
     desk = new_desk(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))
@@ -272,22 +263,38 @@ def _interned(design: Design) -> Design:
     return _designs[design.key]
 
 
+_senses: dict[str, FloatArray] = {}
+MOST_SENSES = 4_096  # that are kept
+
+
+def _sense(scenario: Scenario, calibration_key: str) -> FloatArray:
+    """Sense of the rotations; laws on the same images share one that takes a plan, 0.2 to 0.4 s."""
+    config = scenario.config
+    if rehearses(config.trajectory.profile):
+        return rotation_sense(scenario)
+    key = digest(config, DEPENDS_ON["plan"], without=NOT_HASHED["plan"], extra={"before": calibration_key})
+    if key not in _senses:
+        if len(_senses) == MOST_SENSES:
+            _senses.clear()
+        _senses[key] = rotation_sense(scenario)
+    return _senses[key]
+
+
 def _run(
     design: Design, run: int, calibration: Calibration, *, keep: bool
 ) -> tuple[dict[str, Any], Trace | None]:
     """What is measured of one run, by column, and its trace where it is kept."""
     config = design.config(run)
-    name = name_of_run(config)
+    name, (cell, _, number, _) = name_of_run(config), design.numbers(run)
     try:
         scenario = scenario_of(config, calibration)
-        plan = (
-            rotation_sense(scenario) if sense_is_enough(config, name) else planning.run(config, calibration)
-        )
-        made = drive(scenario, plan, name)
+        if sense_is_enough(config, name):
+            made = drive(scenario, _sense(scenario, design.calibration_key(cell, number)), name)
+        else:
+            made = drive(scenario, planning.run(config, calibration), name)
     except WorkFailed:
         return {"verdict": NOT_STARTED}, None
-    summary = summary_of(scenario, made)
-    row = {"verdict": made.verdict, "steps": made.steps, **summary._asdict()}
+    row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}
     if design.sweep.between_samples:
-        row[BETWEEN.name] = deviation_between_samples_mm(scenario, made, summary)
-    return row, trace_of(scenario, made) if keep else None
+        row[BETWEEN.name] = made.deviation_mm()
+    return row, made.trace() if keep else None

@@ -1,17 +1,24 @@
 """Statistics of a sweep: how often runs arrive, how they end, and laws compared on the same tasks."""
 
+import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations, pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import binomtest
 
 from projservo_cli.config.sweep import LAW
+from projservo_cli.files import replacing
 from projservo_cli.records import BoolArray
-from projservo_cli.store import SweepTable
+from projservo_cli.report import style
+from projservo_cli.report.material import Data
+from projservo_cli.stages import Progress
+from projservo_cli.store.sweep_table import SweepTable
+from projservo_cli.tables import to_csv
 
 SUCCESS = "converged"
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -26,23 +33,8 @@ MEASURES = (
 PAIRED = ("steps", "position_error_mm", "path_length_ratio")
 
 
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Interval of 95 % for a share of which so many of so many were seen; NaN where none was.
-
-    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
-    Journal of the American Statistical Association 22 (1927), p. 209.
-    """
-    if count == 0:
-        return math.nan, math.nan
-    interval = binomtest(successes, count).proportion_ci(0.95, "wilson")
-    return float(interval.low), float(interval.high)
-
-
-class Rows:
-    """Columns of a table as they are needed, and what follows from them.
-
-    table : of a sweep.
-    """
+class _Rows:
+    """Columns of the table of a sweep as they are needed, and what follows from them."""
 
     def __init__(self, table: SweepTable) -> None:
         self.table = table
@@ -58,6 +50,8 @@ class Rows:
     def _derived(self, name: str) -> npt.NDArray[Any]:
         if name == "success":
             return np.asarray(self.table.column("verdict") == SUCCESS)
+        if name == LAW and LAW not in self.table.names:  # where an axis of another name sets it
+            return np.full(self.table.rows, "all")
         if name == "self_occluded":
             return (self["self_occluded_steps_left"] > 0) | (self["self_occluded_steps_right"] > 0)
         if name == "left_image":
@@ -80,7 +74,7 @@ class Rows:
             yield int(cell), self["cell"] == cell
 
 
-def statistics(rows: Rows) -> dict[str, Any]:
+def _statistics(rows: _Rows) -> dict[str, Any]:
     """Statistics of every cell, and laws against each other, as JSON values."""
     return {
         "cells": [
@@ -90,7 +84,7 @@ def statistics(rows: Rows) -> dict[str, Any]:
     }
 
 
-def _of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
+def _of_runs(rows: _Rows, these: BoolArray) -> dict[str, Any]:
     """Statistics of some runs; quantiles of those that converged."""
     count, good = int(these.sum()), these & rows["success"]
     successes = int(good.sum())
@@ -99,12 +93,22 @@ def _of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
         "runs": count,
         "converged": successes,
         "success_rate": successes / count,
-        "success_interval": wilson(successes, count),
+        "success_interval": _interval(successes, count),
         "self_occluded_rate": float(rows["self_occluded"][these].mean()),
         "left_image_rate": float(rows["left_image"][these].mean()),
         "verdicts": dict(zip(verdicts.tolist(), counts.tolist(), strict=True)),
         "quantiles": {name: _quantiles(rows[name][good]) for name in MEASURES},
     }
+
+
+def _interval(successes: int, count: int) -> tuple[float, float]:
+    """Interval of 95 % for a share of which so many of so many were seen.
+
+    Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference",
+    Journal of the American Statistical Association 22 (1927), p. 209.
+    """
+    interval = binomtest(successes, count).proportion_ci(0.95, "wilson")
+    return float(interval.low), float(interval.high)
 
 
 def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
@@ -114,7 +118,7 @@ def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
     return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}
 
 
-def _paired(rows: Rows) -> Iterator[dict[str, Any]]:
+def _paired(rows: _Rows) -> Iterator[dict[str, Any]]:
     """Each two laws on the same tasks with the same noise, in every combination of the other values."""
     names = [name for name, _ in rows.axes]
     if LAW not in names:
@@ -130,7 +134,7 @@ def _paired(rows: Rows) -> Iterator[dict[str, Any]]:
             yield {**values, "laws": [first, second], **_compared(rows, one, laws[second][1])}
 
 
-def _compared(rows: Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
+def _compared(rows: _Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
     """Runs of two laws that share their draws: how often which arrives, and differences where both do.
 
     The probabilities are of the exact test of McNemar and of the sign test: how often a difference as
@@ -160,14 +164,80 @@ def _chance(first: int, second: int) -> float:
     return float(binomtest(first, first + second).pvalue) if first + second else 1.0
 
 
-def success_by(rows: Rows, name: str, edges: Sequence[float] | None = None) -> Mapping[str, dict[str, Any]]:
-    """Success of each law over a column: at each of its values, or within edges.
+STATISTICS = "statistics.json"
+OFFSET = "task.start_offset."
+ANGLES = tuple(range(0, 181, 30))
+BINS = 8  # of a value that is drawn
+POINTS = 2_000  # of a curve
 
-    Returns for each law arrays (k,): x, runs, rate, low and high of the interval.
+
+class _Picture(NamedTuple):
+    """A figure: the name of its files, its numbers, how it is drawn, its height in inches."""
+
+    name: str
+    data: Data
+    draw: Any
+    height: float
+
+
+def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
+    """Write statistics and figures of the table of a sweep beside it; the statistics and the files."""
+    table, folder = SweepTable(path), path.parent
+    rows = _Rows(table)
+    found = {"runs": table.rows, "total": table.attributes["total"], **_statistics(rows)}
+    text = json.dumps(found, indent=1, allow_nan=False) + "\n"
+    files = [_written(folder / STATISTICS, text.encode())]
+    pictures = list(_pictures(rows))
+    for done, picture in enumerate(pictures):
+        progress("figures", done, len(pictures))
+        made = {**_drawn(picture, formats), "csv": to_csv(picture.data).encode()}
+        files += [_written(folder / f"{picture.name}.{kind}", made[kind]) for kind in made]
+    progress("figures", len(pictures), len(pictures))
+    return found, files
+
+
+def _written(path: Path, content: bytes) -> Path:
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+    return path
+
+
+def _drawn(picture: _Picture, formats: Sequence[str]) -> dict[str, bytes]:
+    width = 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH
+    return style.contents(style.drawn(picture.draw, picture.data, picture.height, width), formats)
+
+
+def _pictures(rows: _Rows) -> Iterator[_Picture]:
+    """Every figure that the columns of a sweep allow."""
+    axes = {name: values for name, values in rows.axes if len(values) > 1 and _numeric(values)}
+    for name in axes:
+        yield _Picture(f"success_over_{name}", _success(rows, name, name, None), _draw_success, 2.9)
+    drawn = [name for name in rows.table.names if name in rows.table.attributes["random"]]
+    for name in (name for name in drawn if rows[name].dtype.kind == "f"):
+        edges = np.linspace(rows[name].min(), np.nextafter(rows[name].max(), math.inf), BINS + 1)
+        yield _Picture(f"success_over_{name}", _success(rows, name, name, edges.tolist()), _draw_success, 2.9)
+    if np.nanmax(rows["rotation_deg"], initial=0.0) - np.nanmin(rows["rotation_deg"], initial=180.0) > 1.0:
+        data = _success(rows, "rotation_deg", "rotation from start to goal (deg)", [*ANGLES[:-1], 180.1])
+        yield _Picture("success_over_rotation", data, _draw_success, 2.9)
+    offsets = [name for name in axes if name.startswith(OFFSET)]
+    if len(offsets) >= 2:
+        yield _Picture("basin", _basin(rows, offsets[0], offsets[1]), _draw_basin, 4.0)
+    errors = _final_errors(rows)
+    if errors:
+        yield _Picture("final_error", errors, _draw_final_errors, 2.9)
+
+
+def _numeric(values: Sequence[Any]) -> bool:
+    return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
+
+
+def _success(rows: _Rows, name: str, label: str, edges: Sequence[float] | None) -> Data:
+    """Success of each law over a column, at each of its values or within edges.
+
+    Of each law ``x``, ``runs``, ``rate``, and ``low`` and ``high`` of the interval (k,).
     """
-    x, success = rows[name], rows["success"]
-    law = rows[LAW] if LAW in rows.table.names else np.full(len(x), "all")
-    found: dict[str, dict[str, Any]] = {}
+    x, success, law = rows[name], rows["success"], rows[LAW]
+    data: Data = {"label": np.array(label)}
     for one in dict.fromkeys(law.tolist()):
         mine = law == one
         bins = (
@@ -175,13 +245,100 @@ def success_by(rows: Rows, name: str, edges: Sequence[float] | None = None) -> M
             if edges is None
             else [(0.5 * (low + high), mine & (x >= low) & (x < high)) for low, high in pairwise(edges)]
         )
-        rows_of = [(at, int(these.sum()), int((these & success).sum())) for at, these in bins if these.any()]
-        intervals = np.array([wilson(good, count) for _, count, good in rows_of]).reshape(-1, 2)
-        found[one] = {
-            "x": np.array([at for at, _, _ in rows_of]),
-            "runs": np.array([count for _, count, _ in rows_of]),
-            "rate": np.array([good / count for _, count, good in rows_of]),
-            "low": intervals[:, 0],
-            "high": intervals[:, 1],
-        }
-    return found
+        counted = [(at, int(these.sum()), int((these & success).sum())) for at, these in bins if these.any()]
+        at, count, good = (np.array([row[i] for row in counted]) for i in range(3))
+        low, high = np.array([_interval(*pair) for pair in zip(good, count, strict=True)]).reshape(-1, 2).T
+        columns = {"x": at, "runs": count, "rate": good / count, "low": low, "high": high}
+        data |= {f"{one}.{key}": values for key, values in columns.items()}
+    return data
+
+
+def _basin(rows: _Rows, first: str, second: str) -> Data:
+    x, y, begun = np.unique(rows[first]), np.unique(rows[second]), rows["steps"] >= 0
+    data: Data = {"x": x, "y": y, "label_x": np.array(first), "label_y": np.array(second)}
+    for law in dict.fromkeys(rows[LAW].tolist()):
+        mine = rows[LAW] == law
+        share = np.full((len(y), len(x)), np.nan)
+        for i, j in np.ndindex(*share.shape):
+            these = mine & begun & (rows[first] == x[j]) & (rows[second] == y[i])
+            if these.any():
+                share[i, j] = rows["success"][these].mean()
+        data[f"{law}.share"] = share
+    return data
+
+
+def _final_errors(rows: _Rows) -> Data:
+    data: Data = {}
+    for law in dict.fromkeys(rows[LAW].tolist()):
+        errors = rows["position_error_mm"][rows[LAW] == law]
+        finite = np.sort(errors[np.isfinite(errors)])
+        if len(finite):
+            shown = np.unique(np.linspace(0, len(finite) - 1, POINTS).astype(np.int64))
+            data[f"{law}.error"] = np.maximum(finite[shown], 1e-6)
+            data[f"{law}.share"] = (shown + 1) / len(errors)
+    return data
+
+
+def _draw_success(data: Data, figure: "style.Figure") -> None:
+    """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
+    axes = figure.add_subplot()
+    laws = _laws(data, ".rate")
+    looks = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
+    span = max(float(np.ptp(data[f"{law}.x"])) for law in laws) or 1.0
+    for i, law in enumerate(laws):
+        x, rate = data[f"{law}.x"], data[f"{law}.rate"]
+        beside = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
+        reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
+        axes.errorbar(x + beside, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **looks[law])
+    axes.set(xlabel=str(data["label"]), ylabel="converged (%), bars: 95 %", ylim=(-3, 103))
+    style.legend_below(figure, looks, min(3, len(laws)))
+
+
+def _draw_basin(data: Data, figure: "style.Figure") -> None:
+    """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
+
+    ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
+    """
+    figure.set_layout_engine("constrained")  # leaves the scale of colours its room
+    laws = _laws(data, ".share")
+    columns = min(3, len(laws))
+    panels = figure.subplots(
+        math.ceil(len(laws) / columns), columns, sharex=True, sharey=True, squeeze=False
+    ).ravel()
+    x, y = _edges(data["x"]), _edges(data["y"])
+    mesh: Any = None
+    for axes, law in zip(panels, laws, strict=False):
+        mesh = axes.pcolormesh(x, y, 100.0 * data[f"{law}.share"], vmin=0, vmax=100)
+        axes.grid(visible=False)
+        axes.set(title=law, facecolor=style.PALE)  # pale where no run can begin
+        axes.set_xticks(data["x"][:: max(1, len(data["x"]) // 5)])
+        axes.set_yticks(data["y"][:: max(1, len(data["y"]) // 5)])
+    for axes in panels[len(laws) :]:
+        axes.set_visible(False)
+    figure.supxlabel(str(data["label_x"]), fontsize=8)
+    figure.supylabel(str(data["label_y"]), fontsize=8)
+    figure.colorbar(mesh, ax=panels.tolist(), label="converged (%)")
+
+
+def _draw_final_errors(data: Data, figure: "style.Figure") -> None:
+    """Share of the runs of each law that end within a distance of the goal.
+
+    ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
+    """
+    axes = figure.add_subplot()
+    looks = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
+    for law, look in looks.items():
+        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **look)
+    label = "distance of the centre from the goal at the end (mm)"
+    axes.set(xlabel=label, ylabel="runs within it (%)", xscale="log", ylim=(-3, 103))
+    style.legend_below(figure, looks, min(3, len(looks)))
+
+
+def _laws(data: Data, ending: str) -> list[str]:
+    return [name.removesuffix(ending) for name in data if name.endswith(ending)]
+
+
+def _edges(x: Any) -> Any:
+    """Edges of the cells around sorted places."""
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])

@@ -3,7 +3,6 @@
 import json
 import shutil
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 from projservo_cli import calibration, cli, files
 from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed, law_and_mode
-from projservo_cli.stages import chain, steps
+from projservo_cli.stages import calibrate, plan, report, servo, steps
 from projservo_cli.tables import read_table
 from tests.fake_records import fake
 
@@ -47,9 +46,6 @@ class Stages:
     reported: list[tuple[list[str], str]] = field(default_factory=list)
     gone: bool = False
 
-    def module(self, stage: str) -> Any:
-        return SimpleNamespace(run=getattr(self, stage))
-
     def _make(self, name: str) -> None:
         if name in self.fails:
             raise self.fails[name]
@@ -79,7 +75,7 @@ class Stages:
         }
         return fake(Plan, config.seed, {"joint": len(calibration.q_reference)}, **given)
 
-    def servo(self, config: Any, calibration: Any, plan: Any, law: str, *, progress: Any) -> Any:
+    def servo(self, config: Any, calibration: Any, plan: Any, law: str) -> Any:
         self._make(law)
         name, mode = law_and_mode(law)
         given = {"law": name, "mode": mode, "verdict": self.verdicts.get(law, "converged")}
@@ -111,7 +107,10 @@ class Answer:
 def pretend(patch, folder):
     """Pretended stages, in a folder with a configuration and a table."""
     pretended = Stages()
-    patch.setattr(chain, "stage_module", pretended.module)
+    patch.setattr(calibrate, "run", lambda *given, **named: pretended.calibrate(*given, **named))
+    patch.setattr(plan, "run", lambda *given: pretended.plan(*given))
+    patch.setattr(servo, "run", lambda *given: pretended.servo(*given))
+    patch.setattr(report, "run", lambda *given, **named: pretended.report(*given, **named))
     patch.setattr(steps, "missing", lambda run: pretended.gone)
     patch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
     patch.chdir(folder)

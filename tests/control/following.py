@@ -5,10 +5,11 @@ import math
 import numpy as np
 
 from projservo_cli.records import NO_LENS
-from projservo_cli.stages.plan import Profile, plan_task
+from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import Shown
 from projservo_cli.task.following import followed
 from projservo_cli.task.margins import within
+from tests.known import asked
 from tests.scene import GAINS, Run, limits
 
 SPEED = math.radians(30.0)
@@ -20,8 +21,8 @@ def planned(sc, G=None, profile="linear", duration=None, speed=SPEED, ramp=0.0):
     n = len(sc.q_start)
     demands = within(np.full(n, -9.0), np.full(n, 9.0))._replace(speed=np.full(n, speed))
     shown = Shown(sc.q_start, sc.s_start, sc.s_star, sc.plant.center)
-    asked = Profile(profile, duration=duration, ramp=ramp)
-    return plan_task(model._replace(lens=NO_LENS), shown, asked, demands)
+    motion = asked(profile, duration=duration, ramp=ramp)
+    return plan_task(model._replace(lens=NO_LENS), shown, motion, demands)
 
 
 def tracked(sc, G=None, plan=None, rate=1.0, task=None):

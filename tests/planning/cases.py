@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from projservo_cli.stages.plan import Profile, demands_of, plan_task
+from projservo_cli.stages.plan import plan_task
 from projservo_cli.task.margins import Reaching
+from tests.known import asked
 from tests.stages.cases import case
 
 
@@ -11,7 +12,7 @@ def reaching_of(name, model=None, border_px=20.0):
     """A shipped task, its partition taken from the linear plan of the model."""
     example = case(name)
     plan = example.plan if model is None else example.planned(model)
-    demands = demands_of(example.config)._replace(border_px=border_px)
+    demands = example.scenario.demands._replace(border_px=border_px)
     return Reaching(
         example.truth.model if model is None else model,
         demands,
@@ -30,6 +31,6 @@ def constrained(name, model=None, samples=101, **demands):
     return plan_task(
         example.truth.model if model is None else model,
         example.ends,
-        Profile("constrained", samples=samples),
-        demands_of(example.config)._replace(**demands),
+        asked("constrained", samples),
+        example.scenario.demands._replace(**demands),
     )

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.stages.plan import Profile, demands_of, plan_task
+from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import Shown
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
+from tests.known import asked, known_scenario
 
 pytestmark = pytest.mark.volume
 
@@ -42,9 +43,9 @@ def planned(name, task, overrides, **demands):
     truth = truth_of(config)
     q_start, q_goal = np.radians(task)
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
-    asked = demands_of(config)._replace(**demands)
+    wanted = known_scenario(config).demands._replace(**demands)
     shown = Shown(q_start, s_start, s_star, truth.center)
-    return plan_task(truth.model, shown, Profile("constrained"), asked)
+    return plan_task(truth.model, shown, asked("constrained"), wanted)
 
 
 def test_a_camera_that_is_passed_too_closely():

@@ -10,7 +10,7 @@ from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import record as stage
 from projservo_cli.stages.calibrate import simulate
-from projservo_cli.stages.own_robot import drive_to, step_limit
+from projservo_cli.stages.own_robot import drive_to
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.store import load
 from projservo_cli.tables import read_joints, read_table
@@ -94,7 +94,7 @@ def test_the_table_grows_while_the_robot_moves(monkeypatch):
     monkeypatch.setattr(stage, "SAVE_EVERY", 0.0)
     config = load_config(UR5, ["calibration.frames_per_joint=2"])
     path, sizes = Path("t.csv"), []
-    recording = stage.prepare(config, path)
+    recording = stage.new_recording(config, path)
     monkeypatch.setattr(recording, "save", lambda: sizes.append(len(recording.q)))
     stage.record(config, recording)
     assert sizes[0] < 13
@@ -177,14 +177,13 @@ class Watched(stage.SimulatedRobot):
 
 def test_every_step_keeps_the_speed_limit_and_the_joint_limits():
     config = load_config(STANFORD)
-    recording = stage.prepare(config, Path("t.csv"))
+    recording = stage.new_recording(config, Path("t.csv"))
     noise = np.zeros((49, 2, 10, 2))
     robot = Watched(truth_of(config), recording.targets[0], noise)
     stage.record(config, recording, robot)
     steps = np.array(robot.steps)
     limit = np.array([125 * np.pi / 180 * 0.04] * 6)
     limit[2] = 0.5 * 0.04
-    np.testing.assert_allclose(step_limit(config, joints_of(config)), limit, rtol=1e-15)
     assert (np.abs(steps) <= limit * (1 + 1e-12)).all()
     assert recording.commands == len(steps)
     path = recording.targets[0] + np.cumsum(steps, axis=0)
@@ -206,7 +205,7 @@ class Stuck(Watched):
 
 def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept():
     config = load_config(UR5)
-    recording = stage.prepare(config, Path("t.csv"))
+    recording = stage.new_recording(config, Path("t.csv"))
     robot = Stuck(truth_of(config), recording.targets[0], np.zeros((49, 2, 10, 2)))
     with pytest.raises(WorkFailed, match=r"joint 1 was sent to 3.73.* and stands at 3.7 "):
         stage.record(config, recording, robot)
@@ -224,8 +223,9 @@ def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo)
 
 def test_no_limit_is_one_step():
     config = load_config(UR5, ["control.joint_speed_limit_deg_s=null"])
-    assert np.isinf(step_limit(config, joints_of(config))).all()
+    joints = joints_of(config)
+    assert np.isinf(joints.speed).all()
     robot = Watched(truth_of(config), np.zeros(6), np.zeros((1, 2, 10, 2)))
     target = np.array([1.0, -2.0, 0.1, 1e-9, 0.0, 3.0])
-    assert drive_to(robot, target, np.full(6, np.inf), 0.04) <= 2
+    assert drive_to(robot, target, config, joints, "record") <= 2
     np.testing.assert_array_equal(robot.joints(), target)

@@ -10,7 +10,7 @@ from projservo_cli.geometry.kinematics import joint_operators, project
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots.truth import rotation_about_axis
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.scenario import start_and_goal
+from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 
@@ -101,7 +101,7 @@ def test_the_redundant_arm_makes_the_least_motion(points):
 def test_a_task_beyond_the_joints_is_refused_with_what_is_left(name, axis):
     """The face turned where it is by 20°, about an axis that these joints do not turn it about."""
     truth = truth_of(planned(name)[0])
-    q = start_and_goal(planned(name)[0], truth)[0].q_start
+    q = scenario_of(planned(name)[0]).exact.q_start
     M = truth.M_face @ (truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool)).T
     M = M @ rotation_about_axis(M[:, :3].mean(axis=0), np.array(axis, dtype=float), np.radians(20.0)).T
     images = {side: s.tolist() for side, s in zip(("left", "right"), project(truth.P, M), strict=True)}

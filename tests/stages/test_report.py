@@ -171,7 +171,7 @@ def test_a_report_needs_a_plan(tmp_path):
 
 def test_both_sides_of_eq_22_agree_to_first_order_only():
     _, bench, material = case()
-    plan = studies.metric_plan(bench, 0.9)
+    plan = studies.metric_plan(bench)
     lambdas = np.array([0.02, 0.01, 0.005])
     distance, norm = studies.composition_error(plan, lambdas)
     # the third order adds a few per mille at λ = 0.02
@@ -229,13 +229,13 @@ def test_a_claim_follows_its_number():
 @pytest.mark.parametrize("name", ["paper", "ur5"])
 def test_claims_of_a_whole_run_with_exact_operators(name):
     """All runs to their end: every claim has its number, and those that follow from the mathematics hold."""
-    config, bench, material = case(name, 2000, whole=True)
+    _, bench, material = case(name, 2000, whole=True)
     of_paper = (
         "The image error does not even decay monotonically",
         "stacked Jacobians: runs through self-occlusion, then converges",
         "Euclidean points: runs through self-occlusion, then converges",
     )
-    plan = studies.metric_plan(bench, config.trajectory.delta)
+    plan = studies.metric_plan(bench)
     claims = claims_of(material, np.array(studies.LAMBDAS), studies.composition_error(plan)[0])
     assert len({claim.claim for claim in claims}) == len(claims) >= 24
     for claim in claims:

@@ -1,14 +1,14 @@
 """The simulated truth: other software's robots, start and goal, and what is refused."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.scenario import calibration_seed, generator, plant_of, start_and_goal
-from projservo_cli.stages.world import camera_of, truth_of
+from projservo_cli.stages.calibrate import trial_noise
+from projservo_cli.stages.scenario import plant_of, scenario_of
+from projservo_cli.stages.world import truth_of
 from tests.known import configured as loaded
 from tests.known import known_scenario
 from tests.stages.cases import case
@@ -46,7 +46,7 @@ def test_turn_about_the_roll_axis_of_the_rig(turn_deg):
     """Start and goal differ by that rotation about the axis midway between the cameras."""
     config = loaded("paper", f"task.goal.turn_deg={turn_deg}")
     truth = truth_of(config)
-    shown, ends = start_and_goal(config, truth)
+    shown, ends = scenario_of(config).exact, scenario_of(config).true_ends
     T = ends.goal_pose @ np.linalg.inv(truth.robot.pose(shown.q_start))
     axis = np.array([-1.0, 0, 0])  # the cameras look along −x of the base, symmetric about y = 0
     eigenvalues = np.linalg.eigvals(T[:3, :3])
@@ -85,7 +85,7 @@ def test_the_benchmark_is_within_its_promised_dimensions():
 def test_a_camera_is_given_up_to_scale(scale):
     """Any multiple, of either sign, is the camera whose depths are positive metres."""
     P = case("ur5").truth.P[0]
-    there = camera_of(SimpleNamespace(matrix=(scale * P).tolist()))
+    there = truth_of(loaded("ur5", f"rig.left={{matrix: {(scale * P).tolist()}}}")).P[0]
     assert there == pytest.approx(P, rel=1e-8)
 
 
@@ -104,9 +104,15 @@ REFUSED = {
 @pytest.mark.parametrize("what", REFUSED)
 def test_what_the_robot_cannot_reach_is_refused(what):
     name, override, message = REFUSED[what]
-    config = loaded(name, override)
     with pytest.raises(WorkFailed, match=rf"task\.{message}"):
-        start_and_goal(config, truth_of(config))
+        scenario_of(loaded(name, override))
+
+
+@pytest.mark.parametrize("section", ["robot", "rig", "markers", "task"])
+def test_missing_parts_are_named(section):
+    bare = case("ur5").config.model_copy(update={section: None})
+    with pytest.raises(InputError, match=f"set {section}"):
+        scenario_of(bare)
 
 
 def test_perturbation_displaces_the_goal_by_what_it_says():
@@ -116,67 +122,39 @@ def test_perturbation_displaces_the_goal_by_what_it_says():
     assert 5e-4 < np.linalg.norm(gap[:3, :3] - np.eye(3)) / math.sqrt(2) < 2e-3
 
 
-def test_streams_of_noise_are_independent_and_repeatable():
-    config = loaded("ur5")
-    draws = [generator(config.seed, stream).standard_normal(4) for stream in (0, 1, 2)]
-    assert np.abs(np.diff(draws, axis=0)).min() > 0
-    assert generator(config.seed, 1).standard_normal(4).tolist() == draws[1].tolist()
-    other = generator(2, 1).standard_normal(4)
-    assert np.abs(other - draws[1]).min() > 0
-
-
-def test_servo_noise_is_on_start_and_goal_images():
-    clean = case("ur5").ends
-    noisy = known_scenario(loaded("ur5", "noise.servo_px=0.5")).ends
-    for a, b in ((clean.s_start, noisy.s_start), (clean.s_star, noisy.s_star)):
-        assert 0.2 < np.std(b - a) < 0.9
-
-
 def test_a_face_that_shows_the_cameras_different_sides_is_refused():
     """Turned all around by one joint, the face passes through poses that no task can start from."""
     example = case("ur5")
-    refused = 0
-    seen = set()
+    refused, seen, truth = 0, set(), example.truth
     for turn in np.linspace(0, 2 * math.pi, 60):
         q = example.ends.q_start + turn * np.eye(6)[4]
-        M = (
-            example.truth.M_face
-            @ (example.truth.robot.pose(q) @ np.linalg.inv(example.truth.robot.base_tool)).T
-        )
+        M = truth.M_face @ (truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool)).T
         normal = np.cross(M[1, :3] - M[0, :3], M[2, :3] - M[0, :3])
         sides = np.sign((example.plan.optical_center[:, :3] - M[0, :3]) @ normal)
         if sides[0] != sides[1]:
             refused += 1
             with pytest.raises(WorkFailed, match="different sides"):
-                plant_of(example.config, example.truth, q)
+                plant_of(example.config, truth, q)
         else:
-            seen.add(float(plant_of(example.config, example.truth, q).visible[0]))
+            seen.add(float(plant_of(example.config, truth, q).visible[0]))
     assert refused > 0
     assert seen == {-1.0, 1.0}
 
 
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [("robot", "set robot"), ("rig", "set rig"), ("markers", r"markers"), ("task", "set task")],
-)
-def test_missing_parts_are_named(section, message):
-    bare = case("ur5").config.model_copy(update={section: None})
-    with pytest.raises(InputError, match=message):
-        start_and_goal(bare, truth_of(bare))
-
-
 def test_an_offset_moves_the_start_and_leaves_the_goal():
-    plain = loaded("paper")
-    moved = loaded("paper", "task.start_offset={joints: [1, -2, 3, 0, 0, 0], unit: deg}")
-    truth = truth_of(plain)
-    (start, goal), (there, same) = start_and_goal(plain, truth), start_and_goal(moved, truth_of(moved))
-    assert np.allclose(np.degrees(there.q_start - start.q_start), [1, -2, 3, 0, 0, 0], atol=1e-12)
-    assert np.array_equal(goal.goal_pose, same.goal_pose)
+    offset = "task.start_offset={joints: [1, -2, 3, 0, 0, 0], unit: deg}"
+    plain, moved = (scenario_of(loaded("paper", *sets)) for sets in ((), (offset,)))
+    step = np.degrees(moved.exact.q_start - plain.exact.q_start)
+    assert np.allclose(step, [1, -2, 3, 0, 0, 0], atol=1e-12)
+    assert np.array_equal(plain.true_ends.goal_pose, moved.true_ends.goal_pose)
 
 
-def test_the_seed_of_the_calibration_is_its_own():
+def test_noise_is_on_start_and_goal_images_and_that_of_trials_has_a_seed_of_its_own():
     """The noise of the trials follows calibration.seed, that of the loop follows seed."""
+    clean, noisy = case("ur5").ends, known_scenario(loaded("ur5", "noise.servo_px=0.5")).ends
+    for a, b in ((clean.s_start, noisy.s_start), (clean.s_star, noisy.s_star)):
+        assert 0.2 < np.std(b - a) < 0.9
     own, other, both = (loaded("ur5", *sets) for sets in ((), ("calibration.seed=7",), ("seed=7",)))
-    seeds = [calibration_seed(config) for config in (own, other, both)]
-    assert seeds[1] == seeds[2] != seeds[0]
+    noise = [trial_noise(config, 2, 3).ravel().tolist() for config in (own, other, both)]
+    assert noise[1] == noise[2] != noise[0]
     assert other.seed == own.seed

@@ -1,5 +1,6 @@
 """A run as an object: what its calibration predicts, against the run's own data and differences."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -8,12 +9,12 @@ import numpy as np
 import pytest
 
 import projservo_cli
-from projservo_cli import cli, store
+from projservo_cli import cli
 from projservo_cli.config import load_config
-from projservo_cli.records import Calibration, InputError, Plan, Trace
+from projservo_cli.records import InputError
 from projservo_cli.stages.world import truth_of
-from projservo_cli.store import Result, Run, save
-from tests.fake_records import fake
+from projservo_cli.store import save
+from tests.store.sound import sound_run
 
 STANFORD = Path(__file__).parents[2] / "configs" / "stanford.yaml"
 
@@ -75,39 +76,27 @@ def test_points_behind_a_camera_have_no_pixels_and_those_at_infinity_vanishing_p
         np.testing.assert_allclose(calibration.project(point), limit, rtol=1e-6)
 
 
-@pytest.mark.parametrize("q", [np.zeros(5), np.zeros((2, 7)), np.zeros((1, 1, 6)), np.full(6, np.nan), 1.0])
-def test_other_numbers_of_joints_are_refused(run, q):
-    for function in (run.calibration.predict, run.calibration.jacobian):
-        with pytest.raises(InputError, match="expected 6 finite numbers"):
-            function(q)
+def test_other_numbers_of_joints_or_coordinates_are_refused(run):
+    for q in (np.zeros(5), np.zeros((2, 7)), np.zeros((1, 1, 6)), np.full(6, np.nan), 1.0):
+        for function in (run.calibration.predict, run.calibration.jacobian):
+            with pytest.raises(InputError, match="expected 6 finite numbers"):
+                function(q)
+    for points in (np.zeros(3), np.zeros((4, 3)), 1.0):
+        with pytest.raises(InputError, match="four homogeneous coordinates"):
+            run.calibration.project(points)
 
 
-@pytest.mark.parametrize("points", [np.zeros(3), np.zeros((4, 3)), 1.0])
-def test_points_without_four_coordinates_are_refused(run, points):
-    with pytest.raises(InputError, match="four homogeneous coordinates"):
-        run.calibration.project(points)
-
-
-def test_a_run_holds_plan_and_traces_or_says_how_to_make_them(run, tmp_path):
+def test_a_run_says_what_it_lacks_and_how_to_make_it(run, tmp_path):
     assert run.observation.images.shape == (49, 2, 10, 2)
     assert run.traces == {}
     with pytest.raises(InputError, match="projservo plan -o"):
         _ = run.plan
-    results = {
-        name: Result("key", "name: x", {}, {}, {label: fake(kind)})
-        for name, label, kind in [
-            ("calibrate", "calibration", Calibration),
-            ("plan", "", Plan),
-            ("servo/stacked", "", Trace),
-        ]
-    }
-    save(Run(tmp_path / "run.h5", "name: x", results))
-    full = projservo_cli.load(tmp_path / "run.h5")
-    assert full.configuration == "name: x"
-    assert full.plan.profile == "text ä"
-    assert list(full.traces) == ["stacked"]
-    assert isinstance(full.calibration, Calibration)
-    np.testing.assert_array_equal(full.calibration.P, store.load(tmp_path).calibration.P)
+    full = dataclasses.replace(sound_run(tmp_path / "run.h5"), configuration="name: x")
+    save(full)
+    again = projservo_cli.load(tmp_path)
+    assert again.configuration == "name: x"
+    assert (again.plan.profile, list(again.traces)) == (full.plan.profile, ["stacked", "direct_three"])
+    np.testing.assert_array_equal(again.calibration.P, full.calibration.P)
     with pytest.raises(InputError, match="there is no run file"):
         projservo_cli.load(tmp_path / "none")
 

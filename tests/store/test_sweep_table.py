@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, Trace
-from projservo_cli.store import SweepTable, assemble, write_part
+from projservo_cli.store.sweep_table import SweepTable, assemble, write_part
 from tests.fake_records import fake
 
 HEADINGS = [("run", "i8", "1", "number"), ("law", "S7", "1", "text"), ("error", "f8", "px", "of the image")]
@@ -42,16 +42,6 @@ def test_what_was_in_the_parts_is_in_the_table(table):
     np.testing.assert_array_equal(found.trace(30_001).q, fake(Trace, 30_001).q)
     with pytest.raises(InputError, match="trace of run 7 was not kept"):
         found.trace(7)
-
-
-def test_xarray_opens_texts_as_texts(table):
-    xarray = pytest.importorskip("xarray")
-    with xarray.open_dataset(table, engine="h5netcdf") as data:
-        assert data["error"].dims == ("run",)
-        assert data["error"].attrs["units"] == "px"
-        frame = data.to_dataframe()
-    assert frame["law"].iloc[:3].tolist() == ["exact", "stacked", "dé"]
-    assert frame.loc[30_001, "error"] == 15_000.5
 
 
 def test_a_part_that_changed_costs_no_table(table, parts):

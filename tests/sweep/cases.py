@@ -1,11 +1,10 @@
 """Small sweeps of a robot with few trial motions, quick enough to be made many times."""
 
 from projservo_cli.config.sweep import SweepConfig
-from projservo_cli.store import SweepTable
+from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweep.design import read_design
-from projservo_cli.sweep.driver import run
 from projservo_cli.sweep.engine import Engine
-from projservo_cli.sweep.folder import Folder
+from projservo_cli.sweep.folder import Folder, run_sweep
 from tests.conftest import ROOT
 
 QUICK = {"stop.max_steps": 60, "noise.servo_px": 0.3, "calibration.frames_per_joint": 6}
@@ -27,7 +26,7 @@ def design(**given):
 
 def make(found, path, workers=1, progress=lambda *_: None, **options):
     """Run a sweep into a folder; its status."""
-    return run(found, Folder(path), Engine(workers), progress, lambda _: None, **options)
+    return run_sweep(found, Folder(path), Engine(workers), progress, lambda _: None, **options)
 
 
 def columns(path):

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from projservo_cli.store import SweepTable
+from projservo_cli.store.sweep_table import SweepTable
 from tests.conftest import ROOT
 
 # Runs of a law and of a part: seconds of work, on a busy machine long after the first parts are seen.

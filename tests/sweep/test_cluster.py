@@ -9,17 +9,7 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.sweep import engine
-from tests.sweep.processes import (
-    CHUNK,
-    ENVIRONMENT,
-    RUNS,
-    differences,
-    finish,
-    kill_group,
-    parts,
-    start,
-    wait_for_parts,
-)
+from tests.sweep import processes
 
 pytest.importorskip("distributed", reason="distributed is not installed: the extra cluster")
 pytestmark = pytest.mark.volume
@@ -48,7 +38,7 @@ class Dask:
                 [*command, "--no-dashboard", *options],
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                env=ENVIRONMENT,
+                env=processes.ENVIRONMENT,
                 cwd=self.folder,
                 start_new_session=True,
             )
@@ -57,7 +47,7 @@ class Dask:
     def kill(self):
         """End the scheduler, then what is left of the workers."""
         for process in self.processes:
-            kill_group(process)
+            processes.kill_group(process)
 
 
 @pytest.fixture
@@ -77,22 +67,22 @@ def cluster(tmp_path):
 def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(cluster, whole, tmp_path):
     config, reference = whole
     out, first = tmp_path / "out", cluster()
-    process = start(config, out, "--scheduler", first.address)
-    wait_for_parts(process, out, 2)
-    kill_group(first.processes[1])
-    wait_for_parts(process, out, 8)  # more than were under way
-    kill_group(first.processes[0])
-    code, _, err = finish(process)
+    process = processes.start(config, out, "--scheduler", first.address)
+    processes.wait_for_parts(process, out, 2)
+    processes.kill_group(first.processes[1])
+    processes.wait_for_parts(process, out, 8)  # more than were under way
+    processes.kill_group(first.processes[0])
+    code, _, err = processes.finish(process)
     assert code == 1
     assert "2 workers of tcp://127.0.0.1" in err
     assert "the connection to the scheduler is lost; what was stored until then is kept" in err
     assert "Traceback" not in err, err
-    stored = len(parts(out))
-    assert 8 <= stored < 2 * RUNS / CHUNK
-    code, _, err = finish(start(config, out, "--scheduler", cluster().address))
+    stored = len(processes.parts(out))
+    assert 8 <= stored < 2 * processes.RUNS / processes.CHUNK
+    code, _, err = processes.finish(processes.start(config, out, "--scheduler", cluster().address))
     assert code == 0, err
-    assert f"{CHUNK * stored} of {2 * RUNS} runs are stored already" in err
-    assert not differences(out, reference)
+    assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
+    assert not processes.differences(out, reference)
 
 
 def test_no_scheduler_at_the_address(monkeypatch):

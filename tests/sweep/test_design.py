@@ -6,10 +6,10 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.config.sweep import Distribution, load_sweep
+from projservo_cli.config.sweep import SweepConfig, load_sweep
 from projservo_cli.records import InputError
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import from_recipe, read_design, sample
+from projservo_cli.sweep.design import Design, read_design
 from tests.conftest import ROOT
 from tests.sweep.cases import design
 
@@ -58,15 +58,13 @@ def test_a_run_depends_on_its_number_alone_and_cells_share_their_draws():
     assert configs[0].calibration == configs[4].calibration != configs[1].calibration
     assert configs[0].noise == configs[4].noise != configs[1].noise
     assert configs[0].control.gain_t != configs[4].control.gain_t
-    keys = {
-        first.calibration_key(first.numbers(run).cell, first.numbers(run).calibration) for run in range(12)
-    }
+    keys = {first.calibration_key(cell, of) for cell, _, of, _ in map(first.numbers, range(12))}
     assert len(keys) == 4 == len(list(first.calibrations()))
 
 
 def test_a_design_is_made_again_from_its_recipe_and_its_key_tells_what_matters():
     found = design()
-    again = from_recipe(found.recipe)
+    again = Design.made_of(found.recipe)
     assert again.key == found.key
     assert again.config(5) == found.config(5)
     assert design(chunk=2, name="other").key == found.key
@@ -74,19 +72,20 @@ def test_a_design_is_made_again_from_its_recipe_and_its_key_tells_what_matters()
 
 
 def test_distributions_keep_to_their_bounds_and_moments():
-    rng = np.random.default_rng(5)
-    draws = {
-        name: np.array([sample(Distribution(**{name: bounds}), rng) for _ in range(4000)])
-        for name, bounds in {"uniform": (-1, 3), "log_uniform": (0.01, 100), "normal": (2, 0.5)}.items()
-    }
+    given = {"uniform": [-1, 3], "log_uniform": [0.01, 100], "normal": [2, 0.5], "choice": ["a", "b"]}
+    keys = dict(zip(("control.gain_t", "control.gain_r", "control.gain_p", "name"), given, strict=True))
+    values = {"name": "n", "base": ("b",), "seed": 5, "runs": 4000, "grid": {"law": ["exact"]}}
+    values["random"] = {key: {kind: given[kind]} for key, kind in keys.items()}
+    found = Design(SweepConfig.model_validate(values), ())
+    drawn = [found.drawn(run) for run in range(4000)]
+    draws = {kind: np.array([values[key] for values in drawn]) for key, kind in keys.items()}
     # Four standard errors of the mean of 4000 draws.
     assert abs(draws["uniform"].mean() - 1) < 4 * 4 / math.sqrt(12 * 4000)
     assert (draws["uniform"].min(), draws["uniform"].max()) > (-1, 2.9)
     assert abs(np.log(draws["log_uniform"]).mean()) < 4 * math.log(1e4) / math.sqrt(12 * 4000)
     assert abs(draws["normal"].mean() - 2) < 4 * 0.5 / math.sqrt(4000)
     assert abs(draws["normal"].std() / 0.5 - 1) < 4 / math.sqrt(2 * 4000)
-    chosen = [sample(Distribution(choice=("a", "b")), rng) for _ in range(4000)]
-    assert abs(chosen.count("a") - 2000) < 4 * math.sqrt(1000)
+    assert abs((draws["choice"] == "a").sum() - 2000) < 4 * math.sqrt(1000)
 
 
 def test_random_tasks_come_one_of_each_stratum_in_turn():

@@ -11,55 +11,52 @@ import pytest
 
 from projservo_cli.cli import run
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.store import SweepTable, load
-from projservo_cli.sweep import driver, engine
+from projservo_cli.store import load
+from projservo_cli.store.sweep_table import SweepTable
+from projservo_cli.sweep import engine
+from projservo_cli.sweep import folder as driver
 from projservo_cli.sweep.engine import Engine
 from projservo_cli.sweep.folder import Folder
 from projservo_cli.sweep.runs import run_part
 from tests.conftest import ROOT
+from tests.sweep import processes
 from tests.sweep.cases import columns, design, make
-from tests.sweep.processes import (
-    CHUNK,
-    ENVIRONMENT,
-    RUNS,
-    differences,
-    finish,
-    kill_group,
-    parts,
-    start,
-    wait_for_parts,
-)
 
 pytestmark = pytest.mark.volume
 
 
 def test_interrupted_then_killed_it_is_in_the_end_as_if_nothing_had_been(whole, tmp_path):
     config, reference = whole
-    process = start(config, tmp_path, "-j", "2")
-    wait_for_parts(process, tmp_path, 2)
+    process = processes.start(config, tmp_path, "-j", "2")
+    processes.wait_for_parts(process, tmp_path, 2)
     process.send_signal(signal.SIGINT)
-    code, _, err = finish(process)
+    code, _, err = processes.finish(process)
     assert code == 130, err
     assert "Traceback" not in err
     table, full = SweepTable(tmp_path / "sweep.h5"), SweepTable(reference / "sweep.h5")
     rows = table.column("run")
-    assert 2 * CHUNK <= len(rows) < 2 * RUNS
+    assert 2 * processes.CHUNK <= len(rows) < 2 * processes.RUNS
     for name in table.names:
         assert table.column(name).tobytes() == full.column(name)[rows].tobytes()
-    stored = len(parts(tmp_path))
-    assert CHUNK * stored == len(rows)
-    process = start(config, tmp_path)
-    wait_for_parts(process, tmp_path, stored + 2)
-    kill_group(process)
-    stored = len(parts(tmp_path))
-    assert CHUNK * stored < 2 * RUNS
-    code, out, err = finish(start(config, tmp_path, "-j", "2", "--json"))
+    stored = len(processes.parts(tmp_path))
+    assert processes.CHUNK * stored == len(rows)
+    process = processes.start(config, tmp_path)
+    processes.wait_for_parts(process, tmp_path, stored + 2)
+    processes.kill_group(process)
+    stored = len(processes.parts(tmp_path))
+    assert processes.CHUNK * stored < 2 * processes.RUNS
+    code, out, err = processes.finish(processes.start(config, tmp_path, "-j", "2", "--json"))
     assert code == 0, err
-    assert f"{CHUNK * stored} of {2 * RUNS} runs are stored already" in err
+    assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
     told = json.loads(out)
-    assert (told["complete"], told["runs"], told["done"], told["cells"]) == (True, 2 * RUNS, 2 * RUNS, 2)
-    assert not differences(tmp_path, reference)
-    assert not parts(tmp_path)
+    assert (told["complete"], told["runs"], told["done"], told["cells"]) == (
+        True,
+        2 * processes.RUNS,
+        2 * processes.RUNS,
+        2,
+    )
+    assert not processes.differences(tmp_path, reference)
+    assert not processes.parts(tmp_path)
 
 
 def test_the_table_opens_in_xarray_and_pandas(whole):
@@ -68,17 +65,20 @@ def test_the_table_opens_in_xarray_and_pandas(whole):
     _, folder = whole
     ours = columns(folder)
     with xarray.open_dataset(folder / "sweep.h5") as data:
-        assert dict(data.sizes) == {"run": 2 * RUNS}
+        assert dict(data.sizes) == {"run": 2 * processes.RUNS}
         frame = data.to_dataframe()
         assert data["position_error_mm"].attrs["units"] == "mm"
-    assert frame.index.tolist() == list(range(2 * RUNS))
+    assert frame.index.tolist() == list(range(2 * processes.RUNS))
     assert set(frame.columns) == set(ours) - {"run"}
     for name, values in ours.items():
         if name != "run":
             assert frame[name].tolist() == pytest.approx(values.tolist(), nan_ok=True, abs=0)
-    assert frame.groupby("law")["steps"].count().to_dict() == {"direct_two": RUNS, "stacked": RUNS}
-    with xarray.open_dataset(folder / "sweep.h5", group=f"traces/{RUNS}") as trace:
-        assert trace.sizes["instant"] == ours["steps"][RUNS] + 1
+    assert frame.groupby("law")["steps"].count().to_dict() == {
+        "direct_two": processes.RUNS,
+        "stacked": processes.RUNS,
+    }
+    with xarray.open_dataset(folder / "sweep.h5", group=f"traces/{processes.RUNS}") as trace:
+        assert trace.sizes["instant"] == ours["steps"][processes.RUNS] + 1
         assert trace.attrs["law"] == "stacked"
 
 
@@ -104,21 +104,6 @@ def test_what_is_not_of_this_sweep_is_refused(tmp_path):
     folder.manifest.unlink()
     with pytest.raises(InputError, match="is missing; choose another folder"):
         folder.status(second)
-
-
-def test_a_damaged_part_is_named(tmp_path):
-    def interrupt(what, done, total):
-        if what == "runs" and done == 1:
-            raise KeyboardInterrupt
-
-    found, folder = design(runs=1, chunk=1, traces=[0]), Folder(tmp_path)
-    with pytest.raises(KeyboardInterrupt):
-        make(found, tmp_path, progress=interrupt)
-    (part,) = folder.stored()
-    assert folder.status(found).done == SweepTable(folder.table).rows == 1
-    part.write_bytes(part.read_bytes()[:1000])
-    with pytest.raises(InputError, match=f"{part.name}: cut short or changed"):
-        make(found, tmp_path)
 
 
 def test_threads_give_the_same_and_are_left_in_order(tmp_path):
@@ -156,7 +141,7 @@ print(re.search(r"VmHWM:\\s*([0-9]+) kB", open("/proc/self/status").read()).grou
 def test_memory_is_bounded(tmp_path):
     """Machine code that is not there yet is made by a process of its own."""
     command = [sys.executable, "-c", MEMORY, str(ROOT / "configs" / "sweep_speed.yaml"), str(tmp_path)]
-    ended = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=True)
+    ended = subprocess.run(command, env=processes.ENVIRONMENT, capture_output=True, text=True, check=True)
     assert int(ended.stdout.splitlines()[-1]) <= 300_000
 
 
@@ -169,14 +154,14 @@ def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypa
     found, folder = design(runs=2, chunk=2), Folder(tmp_path)
     for name in ("Folder.assemble", "shutil.rmtree"):
         with monkeypatch.context() as patched:
-            patched.setattr(f"projservo_cli.sweep.driver.{name}", killed)
+            patched.setattr(f"projservo_cli.sweep.folder.{name}", killed)
             with pytest.raises(SystemExit):
                 make(found, tmp_path)
         status = folder.status(found)
         assert (status.done, status.total, status.complete) == (4, 4, False)
     assert make(found, tmp_path).complete
     assert folder.status(found).complete
-    assert not parts(tmp_path)
+    assert not processes.parts(tmp_path)
     assert columns(tmp_path)["run"].tolist() == [0, 1, 2, 3]
 
 
@@ -231,7 +216,7 @@ def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, mon
         found, recorded = design(runs=1, chunk=1), Recorded(workers)
         made.clear()
         folder = Folder(tmp_path / f"sweep{len(said)}{workers}")
-        driver.run(found, folder, recorded, lambda *_: None, said.append, force=True)
+        driver.run_sweep(found, folder, recorded, lambda *_: None, said.append, force=True)
         return recorded.given, [(part.first, part.last) for part in made]
 
     every = [(0, 1), (1, 2)]
@@ -245,7 +230,7 @@ def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, mon
 
 def test_a_run_made_anew_has_the_numbers_of_its_row(whole, tmp_path):
     _, folder = whole
-    for number in (3, RUNS + 4):
+    for number in (3, processes.RUNS + 4):
         row = {name: values[number] for name, values in columns(folder).items()}
         assert run(["servo", "--from", f"{folder}:{number}", "-o", str(tmp_path / str(number)), "-q"]) == 0
         (trace,) = load(tmp_path / str(number)).traces.values()

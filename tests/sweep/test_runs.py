@@ -5,13 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.loop.trial import NUMBERS, VERDICT
+from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.plan import rotation_sense as sense_of
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.sweep import runs
-from projservo_cli.sweep.design import changed, name_of_run
-from projservo_cli.sweep.driver import calibrate_one
-from projservo_cli.sweep.runs import Part, is_compiled, numbers_of, run_part
+from projservo_cli.sweep.design import name_of_run
+from projservo_cli.sweep.runs import Part, is_compiled, run_part
+from tests.known import configured
 from tests.sweep.cases import design
 
 # Of each case every run is redone.
@@ -51,8 +52,12 @@ SAME = (
 
 def part_of(found, first=0, last=None):
     """A part with all it needs."""
-    made = [calibrate_one(wanted) for wanted in found.calibrations()]
-    calibrations = {one.key: one.records and one.records[1] for one in made}
+    calibrations = {}
+    for key, config in found.calibrations():
+        try:
+            calibrations[key] = calibrate.run(config)[1]
+        except WorkFailed:
+            calibrations[key] = None
     return Part(found, first, found.total if last is None else last, calibrations)
 
 
@@ -61,14 +66,11 @@ def part_of(found, first=0, last=None):
 def test_every_run_redone_by_the_stages_is_its_row(name):
     found = design(**CASES[name])
     part = part_of(found)
-    made, calibrations = run_part(part), {}
+    made = run_part(part)
     for i in range(found.total):
         config = found.config(i)
-        at = found.numbers(i)
-        key = found.calibration_key(at.cell, at.calibration)
-        if key not in calibrations:
-            calibrations[key] = calibrate.run(config)[1]
-        calibration = calibrations[key]
+        cell, _, number, _ = found.numbers(i)
+        calibration = part.calibrations[found.calibration_key(cell, number)]
         trace = servo.run(config, calibration, plan.run(config, calibration), name_of_run(config))
         row = {column: values[i] for column, values in made.columns.items()}
         assert row["verdict"].decode() == trace.verdict
@@ -111,30 +113,42 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert made.columns["steps"].tolist() == [-1, -1]
 
 
-def prepared(**settings):
-    """What runs of a small sweep share, with a value or two of its configuration changed."""
-    config = changed(design().calibrated(0, 0), settings, "test")
-    _, calibration, _ = calibrate.run(config)
-    return scenario_of(config, calibration), name_of_run(config)
+@pytest.mark.volume
+def test_the_deviation_is_unknown_where_images_alone_show_the_goal():
+    s_star = scenario_of(configured("ur5")).exact.s_star.tolist()
+    goal = {"images": dict(zip(("left", "right"), s_star, strict=True))}
+    made = run_part(part_of(design(runs=1, set={"task.goal": goal}, between_samples=True))).columns
+    assert (made["steps"] > 0).all()
+    assert np.isnan(made["center_deviation_mm"]).all()
+
+
+@pytest.mark.volume
+def test_laws_on_the_same_images_share_the_plan_that_tells_the_sense(monkeypatch):
+    planned = []
+    monkeypatch.setattr(runs, "rotation_sense", lambda given: planned.append(given) or sense_of(given))
+    run_part(part_of(design(**CASES["constrained"] | {"runs": 2, "seed": 7})))
+    assert len(planned) == 2
 
 
 @pytest.mark.volume
 def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
     """A run that outlasts its noise is made anew with more of it."""
-    found = prepared()
-    whole = numbers_of(*found, [1, 2])
-    assert whole[:, NUMBERS.index("steps")].min() > 8
+    part = part_of(design(runs=2))
+    whole = run_part(part).columns
+    assert whole["steps"].min() > 8
     monkeypatch.setattr(runs, "INSTANTS", 2)
-    assert numbers_of(*found, [1, 2]).tobytes() == whole.tobytes()
+    for name, values in run_part(part).columns.items():
+        assert values.tobytes() == whole[name].tobytes(), name
 
 
 @pytest.mark.volume
 def test_a_run_whose_images_show_nothing_has_a_verdict_and_no_numbers():
     """Images so noisy that markers have no place leave nothing to count."""
-    numbers = numbers_of(*prepared(**{"noise.servo_px": 3000.0}), [1, 2, 3])
-    assert (numbers[:, VERDICT] < 0).any()
-    lost = numbers[numbers[:, VERDICT] < 0]
-    assert np.isnan(np.delete(lost, VERDICT, axis=1)).all()
+    made = run_part(part_of(design(runs=3, set={"noise.servo_px": 3000.0}))).columns
+    lost = made["verdict"] == b"not started"
+    assert lost.any()
+    assert (made["steps"][lost] == -1).all()
+    assert np.isnan(made["effort"][lost]).all()
 
 
 @pytest.mark.parametrize(
@@ -142,6 +156,6 @@ def test_a_run_whose_images_show_nothing_has_a_verdict_and_no_numbers():
     [("plant.speed_scale", 0.5), ("trajectory.profile", "constrained"), ("control.mode", "track")],
 )
 def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
-    found = design(grid={"law": ["exact"]})
-    assert is_compiled(found, found.cell(0))
-    assert not is_compiled(found, changed(found.cell(0), {key: value}, "test"))
+    plain, other = (design(grid={"law": ["exact"]}, set=given) for given in ({}, {key: value}))
+    assert is_compiled(plain, plain.cell(0))
+    assert not is_compiled(other, other.cell(0))
