@@ -34,7 +34,7 @@ REGISTER = (
     _entry(
         "2",
         "Projective displacement, conjugate to a rigid motion, of unit determinant",
-        "geometry.displacement.normalize_displacement",
+        "geometry.algebra.normalize_displacement",
         "geometry/test_displacement.py::test_scale_of_a_homography_keeps_points_on_their_side_of_infinity",
         "det = 1 leaves ±H in dimension 4 (the trace is 0 at 180°): choose the sign that keeps the sign "
         "of a_inf·M.",
@@ -48,31 +48,31 @@ REGISTER = (
     _entry(
         "4",
         "Projective rotation: algebra to group and group to algebra",
-        "geometry.displacement.rotation geometry.displacement.log_rotation "
-        "calibration.prediction.displacements",
+        "geometry.algebra.rotation calibration.projective.closed_form_operators "
+        "calibration.forward.displacements",
         "geometry/test_displacement.py::test_rotation_is_the_matrix_exponential "
-        "geometry/test_displacement.py::test_logarithm_inverts_the_rotation",
+        "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0 and ±π: such trial motions are refused.",
     ),
     _entry(
         "5",
         "Projective translation: algebra to group and group to algebra",
-        "geometry.displacement.translation geometry.displacement.log_translation "
-        "calibration.prediction.displacements",
+        "geometry.algebra.translation calibration.projective.closed_form_operators "
+        "calibration.forward.displacements",
         "geometry/test_displacement.py::test_translation_is_the_matrix_exponential "
-        "geometry/test_displacement.py::test_logarithm_inverts_the_translation",
+        "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0: such trial motions are refused.",
     ),
     _entry(
         "6",
         "Forward kinematics as a product of exponentials",
-        "geometry.kinematics.forward calibration.prediction.moved_points",
+        "geometry.kinematics.forward calibration.forward.moved_points",
         "geometry/test_kinematics.py::test_forward_kinematics_is_the_product_of_exponentials",
     ),
     _entry(
         "7",
         "Velocity of a projective point and of its image",
-        "geometry.kinematics.image_velocity calibration.prediction.projection_derivative",
+        "geometry.kinematics.image_velocity calibration.forward.projection_derivative",
         "geometry/test_kinematics.py::test_image_jacobian_is_the_derivative_of_the_pixels",
         "The second row of J_G is printed as 1/m3, 0, …; it is 0, 1/m3, −m2/m3².",
     ),
@@ -126,7 +126,7 @@ REGISTER = (
     _entry(
         "15",
         "The two solutions of the trigonometric equation",
-        "geometry.displacement.incidence_angles",
+        "geometry.algebra.incidence_angles",
         "geometry/test_composition.py::test_solutions_are_all_zeros_of_the_equation "
         "geometry/test_composition.py::test_the_printed_second_solution_holds_only_without_a_cosine",
         "θ⁻ = π − θ⁺ holds only where p_c = 0; θ± = atan2(p_s, p_c) ± arccos(−p_0 / √(p_s² + p_c²)).",
@@ -176,7 +176,7 @@ REGISTER = (
     _entry(
         "22",
         "Translation and rotation at once",
-        "control.direct_two.direct_two control.exact.desired",
+        "control.direct_two.direct_two control.exact.exact",
         "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit "
         "control/test_exact.py::test_the_centre_keeps_to_its_line",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "
@@ -186,7 +186,7 @@ REGISTER = (
     _entry(
         "23",
         "Direct control directTWO",
-        "control.direct_two.direct_two control.law.rotation_about_center",
+        "control.direct_two.direct_two control.law.single_rotation",
         "control/test_direct.py::test_one_rotation_decays_at_the_rate_of_its_gain "
         "control/test_direct.py::test_any_ratio_converges",
         "Sign as in (20): q̇ = λ_t τ q̂_t + λ_s θ_s q̂_s.",
@@ -194,14 +194,14 @@ REGISTER = (
     _entry(
         "24",
         "One rotation for both rotations",
-        "geometry.displacement.composed_angle geometry.displacement.composed_operator",
+        "geometry.algebra.composed_angle geometry.algebra.composed_operator",
         "geometry/test_composition.py::test_one_rotation_equals_two "
         "control/test_direct.py::test_error_of_both_rotations_is_the_true_angle",
     ),
     _entry(
         "25",
         "Coefficients of the composed rotation",
-        "geometry.displacement.composed_angle",
+        "geometry.algebra.composed_angle",
         "geometry/test_composition.py::test_the_printed_factor_two_is_wrong",
         "c = sin(θ_p/2) sin(θ_r/2), without the factor 2, with [Ĥ_r, Ĥ_p] = Ĥ_r Ĥ_p − Ĥ_p Ĥ_r.",
     ),

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.readings import MAD, Readings
+from projservo_cli.calibration.readings import LEAST_SIGMA, MAD, Readings
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Correspondences and readings farther than this many standard deviations do not count.
@@ -32,6 +32,11 @@ class Epipolar:
     inlier: BoolArray  # (N,) which correspondences agree with F
 
     @property
+    def noise_px(self) -> float:
+        """Noise to reckon with, px per coordinate: exact images have round-off."""
+        return max(self.sigma_px, LEAST_SIGMA)
+
+    @property
     def relative_error(self) -> float:
         """Standard error of the noise as a share of it, one residual a correspondence less those F takes."""
         return float(1.0 / np.sqrt(2.0 * (np.count_nonzero(self.inlier) - _PARAMETERS)))
@@ -41,15 +46,16 @@ class Epipolar:
         return np.abs(_sampson(self.F, _homogeneous(left), _homogeneous(right))) <= deviations * self.sigma_px
 
 
-def epipolar_geometry(left: FloatArray, right: FloatArray, rng: np.random.Generator) -> Epipolar:
-    """Fundamental matrix and noise of corresponding pixels (N, 2), px, some of them wrong.
+def epipolar_geometry(readings: Readings, rng: np.random.Generator) -> Epipolar:
+    """Fundamental matrix and noise of what both views saw, some of it wrong.
 
     The least median of Sampson distances over random eights, then reweighted eight-point solutions, then
     a Cauchy loss over minimal parameters.
 
     Raises WorkFailed with fewer than eight correspondences, or where they do not determine the geometry.
     """
-    count = left.shape[0]
+    left, right = readings.pixels[0][readings.both], readings.pixels[1][readings.both]
+    count = len(left)
     if count < 8:
         raise WorkFailed(
             f"{count} sightings of a marker by both cameras at once: at least 8 are needed; check that rows "
@@ -245,6 +251,19 @@ class ImageFrame:
     size: FloatArray
     known: bool
 
+    @classmethod
+    def of(cls, readings: Readings, image_size: tuple[int, int] | None) -> "ImageFrame":
+        """Of a width and height, px, or of the extent of the data in each view."""
+        if image_size is not None:
+            center = np.tile(0.5 * np.asarray(image_size, dtype=np.float64), (2, 1))
+            return cls(center, np.full(2, float(max(image_size))), True)
+        # The outermost percent is left out: it may be outliers.
+        low, high = np.stack(
+            [np.percentile(readings.pixels[v][readings.seen[v]], [1, 99], axis=0) for v in (0, 1)], axis=1
+        )
+        size = (high - low).max(axis=1)
+        return cls(0.5 * (low + high), np.where(size > 0.0, size, 1.0), False)
+
 
 @dataclass(frozen=True, eq=False)
 class Guess:
@@ -254,19 +273,6 @@ class Guess:
     points: FloatArray  # (N, 3) reconstructed points, in units of their median distance from the left camera
     spread: float  # how much marker distances vary over the poses, median of |log ratio|
     focal: float  # guessed focal length over image size
-
-
-def image_frame(readings: Readings, image_size: tuple[int, int] | None) -> ImageFrame:
-    """Centre and size of the images of a width and height, px, or of the extent of the data in each view."""
-    if image_size is not None:
-        center = np.tile(0.5 * np.asarray(image_size, dtype=np.float64), (2, 1))
-        return ImageFrame(center, np.full(2, float(max(image_size))), True)
-    # The outermost percent is left out: it may be outliers.
-    low, high = np.stack(
-        [np.percentile(readings.pixels[v][readings.seen[v]], [1, 99], axis=0) for v in (0, 1)], axis=1
-    )
-    size = (high - low).max(axis=1)
-    return ImageFrame(0.5 * (low + high), np.where(size > 0.0, size, 1.0), False)
 
 
 def metric_guesses(F: FloatArray, readings: Readings, frame: ImageFrame, keep: int) -> list[Guess]:

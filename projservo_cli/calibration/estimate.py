@@ -6,37 +6,40 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.calibration import distortion, outliers
-from projservo_cli.calibration.adjustment import Scene, prepare
-from projservo_cli.calibration.closed_form import closed_form_operators
-from projservo_cli.calibration.covariance import (
-    ProjectiveScene,
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.diagnosis import (
+    Outliers,
+    blamed_joint,
+    explain,
+    listed,
+    share_explained,
+    with_lens,
+)
+from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, epipolar_geometry
+from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, determined, solve
+from projservo_cli.calibration.projective import (
+    Projective,
+    closed_form_operators,
     covariance_factor,
     projective,
-    require_off_line,
+    spread_factor,
 )
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, epipolar_geometry, image_frame
-from projservo_cli.calibration.fit import (
-    REFUSE_RATIO,
-    Expected,
-    Misfit,
-    Solution,
-    determined,
-    expected_noise,
-    solve,
-)
-from projservo_cli.calibration.outliers import Outliers
 from projservo_cli.calibration.quality import WEAK_NOISE, judged_joints, verdict
-from projservo_cli.calibration.readings import Readings, gather, require_images, require_motion
+from projservo_cli.calibration.readings import Readings, require_images, require_motion
 from projservo_cli.calibration.start import Nominal, Search, Tell
-from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation
+from projservo_cli.geometry.lens import FIRST
+from projservo_cli.records import Calibration, FloatArray, InputError, Observation
 
 _METHODS = ("refined", "closed_form")
 # Fitted noise over the expected one from which on, though the fit passes, one joint may be to blame: it is
 # where its change leaves no more than this share.
 _DOUBTFUL_RATIO, _DOUBTFUL_SHARE = 2.0, 0.5
+# Share of the residuals that makes a lens the likely reason of a refusal, and the probability with which
+# noise alone exceeds coefficients that show no lens.
+_DECISIVE_SHARE, _NO_LENS_TAIL = 0.5, 0.01
 # Share of readings that may lie outside the images: they are outliers.
 _STRAYS = 0.01
 
@@ -96,21 +99,21 @@ def calibrate(
     solution = None
     # The matrices are small: a second thread costs more than it gives.
     with threadpool_limits(limits=1):
-        readings = gather(observation, joint_types)
+        readings = Readings.of(observation, joint_types)
         require_motion(readings)
         if lens and image_size is not None:
             _require_size(readings, image_size)
         require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
-        epipolar = _rig(readings, rng)
-        expect = partial(expected_noise, sigma_px=sigma_px, source=source)
+        epipolar = epipolar_geometry(readings, rng)
+        expect = partial(Expected.of, sigma_px=sigma_px, source=source)
         expected = expect(epipolar)
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
             result = _closed_form(readings, epipolar, expected)
         else:
-            problem = prepare(readings, readings.reference())
-            search = Search(problem, epipolar, image_frame(readings, image_size), rng, tell)
+            problem = LeastSquares.of(readings, readings.reference())
+            search = Search(problem, epipolar, ImageFrame.of(readings, image_size), rng, tell)
             solution, expected, result = _most_likely(search, expect, lens, init)
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
@@ -129,62 +132,54 @@ def _require_size(readings: Readings, size: tuple[int, int]) -> None:
         )
 
 
-def _rig(readings: Readings, rng: np.random.Generator) -> Epipolar:
-    """Epipolar geometry of what both views saw."""
-    return epipolar_geometry(readings.pixels[0][readings.both], readings.pixels[1][readings.both], rng)
-
-
 def _most_likely(
     search: Search, expect: Callable[[Epipolar], Expected], lens: bool, init: Nominal | None
 ) -> tuple[Solution, Expected, Calibration]:
     """Maximum likelihood, the noise it is measured by, and its record; a misfit names the joint if it can."""
-    expected = expect(search.epipolar)
+    epipolar = search.epipolar
+    expected = expect(epipolar)
     try:
         solution, note = solve(search, expected, init)
-        straight = search.epipolar
         if lens:
             search.tell("calibration, lens", 0, 1)
-            solution = distortion.with_lens(solution, search.frame, search.epipolar)
-            bent = search.problem.readings
-            straight = _rig(distortion.straight_readings(bent, solution.scene.lens), search.rng)
-            expected = expect(straight)
-        result = _refined(solution, straight, expected, search.frame)
+            solution, epipolar = with_lens(solution, search)
+            expected = expect(epipolar)
+        result = _refined(solution, epipolar, expected, search.frame)
     except Misfit as refused:
         # The joints of a simulation are as configured: their types and readings are not to blame.
-        cause = "" if expected.known else outliers.blamed_joint(search, REFUSE_RATIO * expected.sigma_px)
+        cause = "" if expected.known else blamed_joint(search, REFUSE_RATIO * expected.sigma_px)
         if not cause:
             raise
         raise Misfit(f"{cause}; as given, {refused}") from None
     cause = ""
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
-        cause = outliers.blamed_joint(search, _DOUBTFUL_SHARE * solution.sigma_px)
-    advice = (*filter(None, (cause,)), *result.advice, *filter(None, (note,)))
+        cause = blamed_joint(search, _DOUBTFUL_SHARE * solution.sigma_px)
+    advice = tuple(filter(None, (cause, *result.advice, note)))
     return solution, expected, dataclasses.replace(result, advice=advice)
 
 
 def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: ImageFrame) -> Calibration:
     """Record of the maximum likelihood in its projective frame, with its covariance."""
-    share = distortion.share_explained(whole, frame)
+    share = share_explained(whole, frame)
     solution, kept = determined(whole)
-    problem, scene = solution.problem, solution.scene
     try:
         refusal = expected.refusal(solution)
         if refusal is not None:
             raise Misfit(refusal)
-        straight = distortion.straight_readings(problem.readings, scene.lens)
-        found = outliers.explain(solution, straight, epipolar)
+        found = explain(solution, epipolar)
     except Misfit as refused:
-        raise Misfit(f"{refused}{distortion.hint(share)}") from None
-    result = projective(problem, scene)
-    factor = covariance_factor(problem, scene, solution.used, result)
-    require_off_line(result, solution.sigma_px * factor)
+        if share < _DECISIVE_SHARE:
+            raise
+        hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
+        raise Misfit(f"{refused}; {hint}") from None
+    spread = spread_factor(solution)
     suspicion = "lens" if share else "joint readings"
-    record = _record("refined", result, solution, expected, factor=factor, found=found, suspicion=suspicion)
-    advice = (*record.advice, *distortion.lens_advice(record, share, frame.known))
+    record = _record(projective(solution), solution, expected, spread, found, suspicion)
+    advice = (*record.advice, *_lens_advice(record, share, frame.known))
     if kept.all():
         return dataclasses.replace(record, advice=advice)
     readings = whole.problem.readings
-    lost = outliers.listed(readings, readings.seen & ~kept[readings.marker_of])
+    lost = listed(readings, readings.seen & ~kept[readings.marker_of])
     names = ", ".join(str(number) for number in readings.marker[~kept])
     seldom = f"hardly any reading of marker {names} fits: it is not part of the model; see it more often"
     outlier = np.concatenate([record.outlier, lost])
@@ -192,52 +187,63 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     return dataclasses.replace(record, outlier=outlier, advice=(*advice, seldom))
 
 
+def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tuple[str, ...]:
+    """What to do about the lens: where none was sought by the share it explains, else by its uncertainty."""
+    if calibration.lens is None:
+        if share == 0.0:
+            return ()
+        return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
+    k = calibration.lens[:, FIRST:].ravel()
+    statistic = k @ np.linalg.solve(calibration.covariance[-k.size :, -k.size :], k)
+    if statistic < chdtri(k.size, _NO_LENS_TAIL):
+        return ("the images show no lens distortion: leave out --lens",)
+    if not centered:
+        return (
+            "the lens distortion is centred on the region where markers were seen: give --image-size, and "
+            "it is centred on the image",
+        )
+    return ()
+
+
 def _closed_form(readings: Readings, epipolar: Epipolar, expected: Expected) -> Calibration:
     """Record of the closed forms [RH00] eqs. (4), (5): all readings count, and there is no covariance."""
     result, q_reference, known = closed_form_operators(readings, epipolar.F, epipolar.sigma_px)
-    problem = prepare(readings.of_markers(known), q_reference)
-    scene = Scene(result.P, result.H_hat_0, result.M)
+    problem = LeastSquares.of(readings.of_markers(known), q_reference)
     seen = problem.readings.seen
     dof = 2 * int(np.count_nonzero(seen)) - problem.size
-    return _record(
-        "closed_form",
-        result,
-        Solution(problem, scene, problem.residual(scene), seen, dof),
-        expected,
-        factor=None,
-        found=Outliers.nothing(problem.readings),
-        suspicion="lens or joint readings",
-    )
+    solution = Solution(problem, result.scene, problem.residual(result.scene), seen, dof)
+    found = Outliers.nothing(problem.readings)
+    return _record(result, solution, expected, None, found, "lens or joint readings")
 
 
 def _record(
-    method: str,
-    result: ProjectiveScene,
+    result: Projective,
     solution: Solution,
     expected: Expected,
-    *,
-    factor: FloatArray | None,
+    spread: FloatArray | None,
     found: Outliers,
     suspicion: str,
 ) -> Calibration:
     """Record of a fit in its projective frame; WorkFailed if a joint is not determined.
 
-    ``factor`` is that of ``covariance_factor``, None for a method that has none; ``found`` explains readings
+    ``spread`` is its ``spread_factor``, None for a method without covariance; ``found`` explains readings
     left out, and ``suspicion`` is what may be to blame for more than pixel noise.
     """
-    problem, readings = solution.problem, solution.problem.readings
-    # Residuals of a method without covariance are its own doing, not noise of the images.
-    sigma = expected.sigma_px if factor is None else expected.noise_px(solution)
-    joints = judged_joints(solution, result, factor, sigma)
-    if factor is None:
-        size = result.P.size + result.H_hat_0.size + result.M.size
-        covariance = np.full((size, size), np.nan)
+    method = "closed_form" if spread is None else "refined"
+    problem, readings, scene = solution.problem, solution.problem.readings, result.scene
+    if spread is None:
+        # Residuals of a method without covariance are its own doing, not noise of the images.
+        sigma = expected.sigma_px
+        covariance = np.full((scene.P.size + scene.H_hat.size + scene.M.size,) * 2, np.nan)
     else:
+        sigma = expected.noise_px(solution)
+        factor = covariance_factor(solution, result, spread)
         covariance = sigma**2 * (factor @ factor.T)
-    outlier = outliers.listed(readings, readings.seen & ~solution.used & ~found.explained)
+    joints = judged_joints(solution, spread, sigma)
+    outlier = listed(readings, readings.seen & ~solution.used & ~found.explained)
     counts = (len(outlier), len(found.suspect), len(found.swapped))
     usable, reason, advice = verdict(method, solution, expected, joints, counts, suspicion)
-    operator_defect, trace_defect, plane_defect = _defects(result, readings.prismatic)
+    operator_defect, trace_defect, plane_defect = _defects(result)
     used_rows = solution.used.any(axis=0)
     return Calibration(
         method=method,
@@ -252,12 +258,12 @@ def _record(
         chi2_per_dof=expected.ratio(solution) ** 2,
         dof=solution.dof,
         seconds=0.0,
-        P=result.P,
-        H_hat_0=result.H_hat_0,
+        P=scene.P,
+        H_hat_0=scene.H_hat,
         q_reference=problem.q_reference,
         a_inf=result.a_inf,
         marker=readings.marker,
-        M=result.M,
+        M=scene.M,
         covariance=covariance,
         excitation=joints.span,
         weak=joints.noise > WEAK_NOISE,
@@ -274,17 +280,17 @@ def _record(
         ),
         predicted_rms_px=None if joints.error is None else joints.error[0],
         predicted_p99_px=None if joints.error is None else joints.error[1],
-        lens=solution.scene.lens,
+        lens=scene.lens,
     )
 
 
-def _defects(scene: ProjectiveScene, prismatic: BoolArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _defects(result: Projective) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of no trace, of one plane at infinity."""
-    H_hat = scene.H_hat_0
+    H_hat, prismatic = result.scene.H_hat, result.scene.prismatic
     square = H_hat @ H_hat
     law = np.where(prismatic[:, None, None], square, square @ H_hat + H_hat)
     return (
         np.linalg.norm(law, axis=(1, 2)) / np.linalg.norm(H_hat, axis=(1, 2)),
         np.abs(np.trace(H_hat, axis1=1, axis2=2)),
-        np.linalg.norm(scene.a_inf @ H_hat, axis=1) / np.linalg.norm(scene.a_inf),
+        np.linalg.norm(result.a_inf @ H_hat, axis=1) / np.linalg.norm(result.a_inf),
     )

@@ -1,14 +1,16 @@
 """Fits: a robust search from each start, then least squares of the readings that count, and their noise."""
 
+import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import Problem, Scene, Stalled, Weighting, minimize, prepare
+from projservo_cli.calibration.adjustment import LeastSquares, Stalled, Weighting, minimize
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
-from projservo_cli.calibration.readings import LEAST_SIGMA
+from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.start import Nominal, Search, starts
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
@@ -29,7 +31,7 @@ class Misfit(WorkFailed):
 class Solution:
     """The problem solved, the scene found and what it leaves of the images."""
 
-    problem: Problem
+    problem: LeastSquares
     scene: Scene
     residual: FloatArray  # (2, N, 2) predicted minus seen, px
     used: BoolArray  # (2, N) readings that count; the rest of those seen are outliers
@@ -53,7 +55,7 @@ class Solution:
     @property
     def typical_px(self) -> float:
         """Median residual over all readings seen, outliers included, px."""
-        return median_px(self.residual, self.problem.readings.seen)
+        return _median_px(self.residual, self.problem.readings.seen)
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,13 @@ class Expected:
     known: bool  # whether it is the true noise of a simulation, so that χ² decides
     origin: str  # where it comes from, in words
     error: float  # its own standard error as a share of it, zero where it was given
+
+    @classmethod
+    def of(cls, epipolar: Epipolar, sigma_px: float | None, source: str) -> "Expected":
+        """What was given, px, known for a ``simulated`` source, else the noise of the rig itself."""
+        if sigma_px is None:
+            return cls(epipolar.noise_px, False, "that the epipolar geometry shows", epipolar.relative_error)
+        return cls(sigma_px, source == "simulated", "that were given", 0.0)
 
     def ratio(self, solution: Solution) -> float:
         """Fitted over expected noise."""
@@ -108,14 +117,6 @@ def chi2_band(dof: int) -> tuple[float, float]:
     return float(chdtri(dof, 1.0 - _CHI2_TAIL)) / dof, float(chdtri(dof, _CHI2_TAIL)) / dof
 
 
-def expected_noise(epipolar: Epipolar, sigma_px: float | None, source: str) -> Expected:
-    """Noise to measure a fit by: what was given, px, known for a ``simulated`` source, else the rig's own."""
-    if sigma_px is None:
-        noise = max(epipolar.sigma_px, LEAST_SIGMA)
-        return Expected(noise, False, "that the epipolar geometry shows", epipolar.relative_error)
-    return Expected(sigma_px, source == "simulated", "that were given", 0.0)
-
-
 # Width of the Cauchy loss in robust standard deviations: 95 % efficient on normal residuals.
 _CAUCHY = 2.385
 _MASK_ROUNDS = 4
@@ -130,7 +131,7 @@ _CRAWL, _PATIENCE = 0.01, 10
 _ROUGHLY = 1e-2
 
 
-def median_px(residual: FloatArray, mask: BoolArray) -> float:
+def _median_px(residual: FloatArray, mask: BoolArray) -> float:
     """Median length of the residuals (2, N, 2) in a mask (2, N), px."""
     return float(np.median(np.linalg.norm(residual[mask], axis=1)))
 
@@ -146,9 +147,9 @@ def _cauchy(seen: BoolArray) -> Weighting:
     return weighting
 
 
-def _fixed(weight: FloatArray) -> Weighting:
+def _constant(weight: FloatArray, residual: FloatArray) -> FloatArray:
     """Weights (2, N) that do not depend on the residuals."""
-    return lambda residual: weight
+    return weight
 
 
 def _crawling(seen: BoolArray, far: float) -> Stalled:
@@ -156,7 +157,7 @@ def _crawling(seen: BoolArray, far: float) -> Stalled:
     levels: list[float] = []
 
     def stalled(residual: FloatArray) -> bool:
-        levels.append(median_px(residual, seen))
+        levels.append(_median_px(residual, seen))
         if len(levels) <= _PATIENCE or levels[-1] <= RAYLEIGH * far:
             return False
         return levels[-1] > (1.0 - _CRAWL) * levels[-1 - _PATIENCE]
@@ -164,61 +165,63 @@ def _crawling(seen: BoolArray, far: float) -> Stalled:
     return stalled
 
 
-def follow(problem: Problem, scene: Scene, epipolar: Epipolar) -> Solution | None:
-    """The fit that a scene leads to: a robust search, then ``least_squares``."""
+def fit_from(problem: LeastSquares, scene: Scene, epipolar: Epipolar) -> Solution | None:
+    """The fit that a scene leads to: a robust search, then ``fit_inliers``."""
     searched, level = _robust_search(problem, scene, problem.readings.seen, epipolar)
-    return least_squares(problem, searched, level / RAYLEIGH, epipolar)
+    return fit_inliers(problem, searched, level / RAYLEIGH, epipolar)
 
 
 def _robust_search(
-    problem: Problem, scene: Scene, rows: BoolArray, epipolar: Epipolar
+    problem: LeastSquares, scene: Scene, rows: BoolArray, epipolar: Epipolar
 ) -> tuple[Scene, float]:
     """Screws alone, then everything, under a Cauchy loss over some readings (2, N): scene, median px.
 
     Given up where the fit would be refused and hardly proceeds.
     """
     scene = search_screws(problem, scene, rows, 20)
-    far = REFUSE_RATIO * max(epipolar.sigma_px, LEAST_SIGMA)
+    far = REFUSE_RATIO * epipolar.noise_px
     fit = minimize(problem, scene, _cauchy(rows), most=100, stalled=_crawling(rows, far))
-    return fit.scene, median_px(fit.residual, rows)
+    return fit.scene, _median_px(fit.residual, rows)
 
 
-def search_screws(problem: Problem, scene: Scene, rows: BoolArray, most: int) -> Scene:
+def search_screws(problem: LeastSquares, scene: Scene, rows: BoolArray, most: int) -> Scene:
     """The scene after so many steps of screws and markers alone, under a Cauchy loss over readings (2, N)."""
-    return minimize(problem, scene, _cauchy(rows), cameras=False, most=most, settled_at=_ROUGHLY).scene
+    return minimize(problem, scene, _cauchy(rows), cameras=False, most=most).scene
 
 
-def least_squares(
-    problem: Problem, scene: Scene, sigma: float, epipolar: Epipolar | None = None
+def fit_inliers(
+    problem: LeastSquares, scene: Scene, sigma: float, epipolar: Epipolar | None = None
 ) -> Solution | None:
     """Least squares of the readings within 5σ, in rounds until they no longer change.
 
     Where the robust noise σ at the start, px, is many times that of an epipolar geometry it is not worth the
     time. None where the fit does not put the points in front of both cameras.
     """
-    residual = problem.residual(scene)
-    if epipolar is not None and sigma > _HOPELESS * max(epipolar.sigma_px, LEAST_SIGMA):
-        seen = problem.readings.seen
+    residual, seen = problem.residual(scene), problem.readings.seen
+    if epipolar is not None and sigma > _HOPELESS * epipolar.noise_px:
         dof = _degrees_of_freedom(problem, scene, seen)
         return Solution(problem, scene, residual, seen, dof) if dof > 0 else None
-    used = _within(problem, residual, OUTLIER * max(sigma, 1e-9))
+    within = _within(problem, residual, OUTLIER * max(sigma, 1e-9))
     for _ in range(_MASK_ROUNDS):
-        fit = minimize(problem, scene, _fixed(used.astype(np.float64)))
+        used = within
+        fit = minimize(problem, scene, partial(_constant, used.astype(np.float64)))
         scene = fit.scene
         dof = _degrees_of_freedom(problem, scene, used)
         if dof <= 0:
             return None
-        sigma = max(float(np.sqrt(fit.cost / dof)), 1e-9)
-        before, used = used, _within(problem, fit.residual, OUTLIER * sigma)
-        if np.array_equal(before, used):
+        within = _within(problem, fit.residual, OUTLIER * max(float(np.sqrt(fit.cost / dof)), 1e-9))
+        if np.array_equal(used, within):
             break
     _, depth = problem.pixels(scene)
-    if not (np.sign(depth) == np.sign(depth.sum(axis=1))[:, None])[before].all():
+    # A camera is known up to its sign.
+    sign = np.sign(depth.sum(axis=1))
+    if not (np.sign(depth) == sign[:, None])[used].all():
         return None
-    return Solution(problem, scene, fit.residual, before, dof)
+    scene = dataclasses.replace(scene, P=scene.P * sign[:, None, None])
+    return Solution(problem, scene, fit.residual, used, dof)
 
 
-def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:
+def _within(problem: LeastSquares, residual: FloatArray, limit: float) -> BoolArray:
     """Readings (2, N) within a limit, px, at poses where at least half of those seen are."""
     readings = problem.readings
     good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
@@ -227,7 +230,7 @@ def _within(problem: Problem, residual: FloatArray, limit: float) -> BoolArray:
     return result
 
 
-def _degrees_of_freedom(problem: Problem, scene: Scene, used: BoolArray) -> int:
+def _degrees_of_freedom(problem: LeastSquares, scene: Scene, used: BoolArray) -> int:
     """Coordinates used minus the rank of their derivative."""
     return 2 * int(np.count_nonzero(used)) - problem.size + len(problem.gauge(scene).T)
 
@@ -245,8 +248,8 @@ def determined(solution: Solution) -> tuple[Solution, BoolArray]:
     if keep.all():
         return solution, keep
     rows = keep[readings.marker_of]
-    smaller = prepare(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
-    scene = Scene(scene.P, scene.H_hat, scene.M[keep], scene.lens)
+    smaller = LeastSquares.of(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
+    scene = dataclasses.replace(scene, M=scene.M[keep])
     used = solution.used[:, rows]
     dof = _degrees_of_freedom(smaller, scene, used)
     return Solution(smaller, scene, solution.residual[:, rows], used, dof), keep
@@ -278,9 +281,9 @@ def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[
     pixels, depth = problem.pixels(scene)
     # A camera is given up to scale and sign: most points are to lie in front of it.
     sign = np.where(np.median(depth, axis=1) < 0.0, -1.0, 1.0)
-    scene = Scene(scene.P * sign[:, None, None], scene.H_hat, scene.M)
+    scene = dataclasses.replace(scene, P=scene.P * sign[:, None, None])
     if np.isfinite(pixels).all() and ((depth * sign[:, None])[problem.readings.seen] > 0.0).all():
-        found = follow(problem, scene, search.epipolar)
+        found = fit_from(problem, scene, search.epipolar)
     if found is not None and expected.agrees(found):
         return found, ""
     try:
@@ -327,7 +330,7 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
                     return best
                 continue
             levels.append(level)
-            found = least_squares(problem, scene, level / RAYLEIGH, epipolar)
+            found = fit_inliers(problem, scene, level / RAYLEIGH, epipolar)
             if found is None:
                 continue
             if expected.agrees(found):

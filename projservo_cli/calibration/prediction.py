@@ -1,8 +1,4 @@
-"""Images at many poses at once: the vectorised forward model, what it predicts, and how certainly.
-
-The twin of the kernels in ``geometry``: the same equations for all poses and points together, which the
-adjustment, predictions and random tasks share.
-"""
+"""What a calibration predicts, how certainly, what contradicts it, and which further poses would help."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,85 +6,22 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from projservo_cli.calibration.forward import CAMERA, LENS, Scene, sine_and_versine
 from projservo_cli.calibration.readings import LEAST_SIGMA
-from projservo_cli.geometry.lens import FIRST, bent, bent_derivative, through
-from projservo_cli.records import (
-    PRISMATIC,
-    BoolArray,
-    Calibration,
-    FloatArray,
-    InputError,
-    Model,
-    Observation,
-)
-
-CAMERA = 12
-LENS = 2
+from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation, WorkFailed
 
 
-def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
-    """Displacements exp(q Ĥ) (n, K, 4, 4) of operators (n, 4, 4) at joints (K, n), [RH00] eqs. (4), (5).
-
-    Joint values are from the reference, rad or m.
-    """
-    squared = H_hat @ H_hat
-    sine, versine = (part.T[..., None, None] for part in _sine_and_versine(prismatic, q))
-    result: FloatArray = np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
-    return result
-
-
-def _sine_and_versine(prismatic: BoolArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Coefficients (K, n) of Ĥ and Ĥ² in [RH00] eqs. (4), (5)."""
-    return np.where(prismatic, q, np.sin(q)), np.where(prismatic, 0.0, 2.0 * np.sin(0.5 * q) ** 2)
-
-
-def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
-    """Points (m, 4) or (K, m, 4) after the last joints alone, (n + 1, K, m, 4): [RH00] eq. (6) from its end.
-
-    By displacements (n, K, 4, 4). Entry n holds points at the reference, entry 0 those moved by all joints.
-    """
-    n, K = E.shape[:2]
-    Y = np.empty((n + 1, K, *M.shape[-2:]))
-    Y[n] = M
-    for i in range(n - 1, -1, -1):
-        Y[i] = Y[i + 1] @ np.swapaxes(E[i], 1, 2)
-    return Y
-
-
-def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
-    """Homogeneous image points (…, 2, m, 3) of points (…, m, 4) in both cameras (2, 3, 4), [RH00] eq. (1)."""
-    return np.asarray(points[..., None, :, :] @ np.swapaxes(P, 1, 2))
-
-
-def projection_derivative(
-    P: FloatArray, lens: FloatArray | None, points: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Pixels (…, 2, m, 2) of points (…, m, 4), and derivatives by image points (…, 2, m, 2, 3) and a lens.
-
-    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lenses (2, 5), if
-    any, with a derivative (…, 2, m, 2, 2) by k1 and k2.
-    """
-    m = image_points(P, points)
-    pixels = m[..., :2] / m[..., 2:]
-    G = np.zeros((*pixels.shape, 3))
-    G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
-    G[..., 2] = -pixels / m[..., 2:]
-    if lens is None:
-        return pixels, G, None
-    by_pixel, by_lens = bent_derivative(lens[:, None], pixels)
-    return bent(lens[:, None], pixels), by_pixel @ G, by_lens
-
-
-def _from_reference(model: Model, q: FloatArray) -> FloatArray:
-    """Joint values (K, n) from the reference, after a check of the readings (K, n), rad or m."""
+def _scene(calibration: Calibration, q: FloatArray) -> tuple[Scene, FloatArray]:
+    """The scene of a record, and joint values (K, n) from its reference after a check of the readings."""
     q = np.asarray(q, dtype=np.float64)
-    n = len(model.H_hat_0)
+    n = len(calibration.H_hat_0)
     if q.ndim != 2 or q.shape[1] != n:
         raise InputError(f"joint readings of shape {q.shape}: expected one row of {n} a pose")
     if not np.isfinite(q).all():
         raise InputError("joint readings must be finite numbers")
-    result: FloatArray = q - model.q_reference
-    return result
+    prismatic = np.array([letter == "P" for letter in calibration.joint_types])
+    scene = Scene(calibration.P, calibration.H_hat_0, prismatic, calibration.M, calibration.lens)
+    return scene, q - calibration.q_reference
 
 
 def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
@@ -109,14 +42,8 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
     InputError
         If the readings have another number of joints or are not finite.
     """
-    return marker_pixels(calibration.model(), calibration.M, q)
-
-
-def marker_pixels(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
-    """Pixels (K, 2, m, 2) of markers (m, 4) at joint readings (K, n); NaN and raising as of ``predict``."""
-    E = displacements(model.H_hat_0, model.joint_types == PRISMATIC, _from_reference(model, q))
-    m = image_points(model.P, moved_points(E, M)[0])
-    return through(model.lens[:, None], m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan))
+    scene, q = _scene(calibration, q)
+    return scene.seen(q)
 
 
 def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:
@@ -161,49 +88,46 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     Returns (K, 2, m, 2) variances of u and v, px². Raises InputError if the readings have another number of
     joints or are not finite.
     """
-    J = prediction_derivative(calibration.model(), calibration.M, q)
+    J = prediction_derivative(calibration, q)
     variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
     result: FloatArray = np.maximum(variance, 0.0)
     return result
 
 
-def prediction_derivative(model: Model, M: FloatArray, q: FloatArray) -> FloatArray:
+def prediction_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
     """Derivative of predicted pixels by P, H_hat_0, M (ravelled): (K, 2, m, 2, 24 + 16 n + 4 m).
 
-    With a lens, by k1 and k2 of both views in four more columns.
-
-    An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ).
-
-    model : robot and rig in one frame.
-    M : (m, 4) markers at the reference.
-    q : (K, n) joint readings, rad or m.
+    With a lens, by k1 and k2 of both views in four more columns. An operator enters by E = I + s Ĥ + c Ĥ²,
+    [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). ``q``: (K, n) joint readings, rad or m.
     """
-    H_hat, prismatic = model.H_hat_0, model.joint_types == PRISMATIC
-    dq = _from_reference(model, q)
-    K, n, m = len(dq), len(H_hat), len(M)
-    E = displacements(H_hat, prismatic, dq)
-    Y = moved_points(E, M)
-    _, G, by_lens = projection_derivative(model.P, model.lens if model.lens[:, FIRST:].any() else None, Y[0])
+    scene, q = _scene(calibration, q)
+    (K, n), m = q.shape, len(scene.M)
+    pose_of, marker_of = np.divmod(np.arange(K * m), m)
+    images = scene.images(q, pose_of, marker_of)
     joints, markers = 2 * CAMERA, 2 * CAMERA + 16 * n
-    J = np.zeros((K, 2, m, 2, markers + 4 * m + (0 if by_lens is None else 2 * LENS)))
+    lenses = markers + 4 * m
+    J = np.zeros((2, K * m, 2, lenses + (0 if images.by_lens is None else 2 * LENS)))
     for v in (0, 1):
-        camera = G[:, v, :, :, :, None] * Y[0][:, :, None, None, :]
-        J[:, v, ..., v * CAMERA : (v + 1) * CAMERA] = camera.reshape(K, m, 2, CAMERA)
-        if by_lens is not None:
-            first = markers + 4 * m + v * LENS
-            J[:, v, ..., first : first + LENS] = by_lens[:, v]
-    D = G @ model.P[None, :, None]
-    coefficients = (part.T[..., None, None, None, None] for part in _sine_and_versine(prismatic, dq))
-    for i, (sine, versine) in enumerate(zip(*coefficients, strict=True)):
-        point = Y[i + 1][:, None, :, None]
-        inner = sine * point + versine * (Y[i + 1] @ H_hat[i].T)[:, None, :, None]
-        block = D[..., :, None] * inner[..., None, :]
-        block = block + (versine * (D @ H_hat[i]))[..., :, None] * point[..., None, :]
-        J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(K, 2, m, 2, 16)
-        D = D @ E[i][:, None, None]
-    for j in range(m):
-        J[:, :, j, :, markers + 4 * j : markers + 4 * (j + 1)] = D[:, :, j]
-    return J
+        J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
+        if images.by_lens is not None:
+            J[v, ..., lenses + v * LENS : lenses + (v + 1) * LENS] = images.by_lens[v]
+    sine, versine = (part[pose_of].T[..., None, None, None] for part in sine_and_versine(scene.prismatic, q))
+    for i, (s, c, H) in enumerate(zip(sine, versine, scene.H_hat, strict=True)):
+        D, Y = images.by_point[i], images.points[i + 1]
+        Y, HY = Y[:, None, None], (Y @ H.T)[:, None, None]
+        block = D[..., None] * (s * Y + c * HY) + (c * (D @ H)[..., None]) * Y
+        J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(2, K * m, 2, 16)
+    columns = markers + 4 * marker_of[None, :, None, None] + np.arange(4)
+    np.put_along_axis(J, columns, images.by_point[n], axis=3)
+    return J.reshape(2, K, m, *J.shape[2:]).swapaxes(0, 1)
+
+
+def _root(covariance: FloatArray) -> FloatArray:
+    """Λ (d, r) with Λ Λᵀ the covariance (d, d); the gauge, and what no robot can do, have no spread."""
+    spread, basis = np.linalg.eigh(covariance)
+    known = spread > len(spread) * np.finfo(np.float64).eps * spread[-1]
+    result: FloatArray = basis[:, known] * np.sqrt(spread[known])
+    return result
 
 
 # Observations in a row that must agree on a disturbance: one may be blurred, or a marker taken for another.
@@ -213,8 +137,6 @@ _FALSE_ALARM = 1e-3
 # What the first order leaves out of a prediction's error, at most, as a share of the calibration's own noise:
 # nearer than that no image need come to what is predicted, however good the detector.
 _BEYOND_FIRST_ORDER = 0.02
-# Smallest over largest variance that is no rounding.
-_RANK = 1e-12
 
 
 @dataclass(eq=False)
@@ -238,10 +160,9 @@ class Innovation:
     _beyond: list[BoolArray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        spread, axes = np.linalg.eigh(self.calibration.covariance)
-        known = spread > _RANK * spread[-1]  # the gauge, and what a rigid robot cannot do, have no spread
-        self._factor: FloatArray = np.sqrt(spread[known]) * axes[:, known]
-        self._mean, self._C = np.zeros(known.sum()), np.eye(known.sum())
+        self._factor = _root(self.calibration.covariance)
+        r = self._factor.shape[1]
+        self._mean, self._C = np.zeros(r), np.eye(r)
         self._sigma = max(self.sigma_px, _BEYOND_FIRST_ORDER * self.calibration.sigma_px, LEAST_SIGMA)
         m = len(self.calibration.marker)
         tail = _FALSE_ALARM / (self.observations * (2 + m))
@@ -253,7 +174,7 @@ class Innovation:
         q : (n,) joint readings, rad or m.
         images : (2, m, 2) pixels of the markers of the calibration, NaN where unseen.
         """
-        J = prediction_derivative(self.calibration.model(), self.calibration.M, q[None])[0] @ self._factor
+        J = prediction_derivative(self.calibration, q[None])[0] @ self._factor
         r = images - predict(self.calibration, q[None])[0] - J @ self._mean
         m = len(self.calibration.marker)
         views, numbers = np.arange(2)[:, None], np.arange(m)
@@ -307,3 +228,121 @@ class Innovation:
             f"{fit}, in both cameras alike: the joint readings are wrong, or the tool or the rig was moved; "
             "check them and recalibrate"
         )
+
+
+# Poses drawn to choose from, and to judge by; draws before giving up, in batches.
+_CANDIDATES, _TARGETS = 300, 150
+_BATCH, _BATCHES = 1500, 20
+# Markers that both views must see at a pose for it to tell the joints.
+_LEAST_SEEN = 3
+# A prediction that errs by more than this share of the image does not say what will be seen.
+_VAGUE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Where poses may lie and markers be seen."""
+
+    low: FloatArray
+    high: FloatArray  # low, high: (n,) joint readings between which candidates are drawn, rad or m
+    image: FloatArray  # (2, 2, 2) lower and upper corner of each image, px
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestion:
+    """A pose to record, in the order of choice."""
+
+    q: FloatArray  # (n,) joint readings, rad or m
+    from_pose: int  # number of the nearest pose recorded
+    delta: FloatArray  # (n,) the way from it, rad or m
+    # variance_before, variance_after: of predicted coordinates over the region of the data, px²
+    variance_before: float
+    variance_after: float
+
+
+def suggest(
+    calibration: Calibration,
+    observation: Observation,
+    candidates: Region,
+    targets: Region,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Suggestion, ...]:
+    """Poses that reduce the mean variance of predictions most, one after the other.
+
+    V-optimality, the mean variance over a region, taken greedily over random candidates: A. C.
+    Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS", 2007, chapter 10.
+    With Λ Λᵀ the covariance, C the derivative of what a pose would show and T that of the targets,
+    both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen where they are
+    predicted within the image.
+
+    calibration : with its covariance.
+    observation : what it was made from.
+    candidates : region of the poses to choose from.
+    targets : region of the poses that are to be predicted well.
+    count : poses to suggest.
+    rng : draws both.
+    Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose of a region
+    shows the markers to both views.
+    """
+    if not np.isfinite(calibration.covariance).all():
+        raise InputError(
+            f"suggestions need a covariance, which the method {calibration.method} has not: "
+            "use --set calibration.method=refined"
+        )
+    factor = _root(calibration.covariance)
+    sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
+    _, T = _shown(calibration, targets, _TARGETS, factor, rng)
+    q, C = _shown(calibration, candidates, _CANDIDATES, factor, rng)
+    coordinates = np.count_nonzero(T.any(axis=2))
+    rows = T.reshape(-1, T.shape[2])
+    gram = rows.T @ rows
+    C /= sigma
+    left = np.ones(len(q), dtype=np.bool_)
+    found: list[Suggestion] = []
+    for _ in range(min(count, len(q))):
+        before = float(np.trace(gram)) / coordinates
+        inner = np.eye(C.shape[1]) + C @ np.swapaxes(C, 1, 2)
+        gain = np.trace(np.linalg.solve(inner, C @ gram @ np.swapaxes(C, 1, 2)), axis1=1, axis2=2)
+        best = int(np.argmax(np.where(left, gain, -np.inf)))
+        left[best] = False
+        # What is left of Λ after the pose: its product with the root of (I + Cᵀ C)⁻¹.
+        root = np.linalg.inv(np.linalg.cholesky(np.eye(C.shape[2]) + C[best].T @ C[best])).T
+        C, gram = C @ root, root.T @ gram @ root
+        after = float(np.trace(gram)) / coordinates
+        nearest = int(np.argmin(np.linalg.norm(observation.q - q[best], axis=1)))
+        number = int(observation.pose[nearest])
+        found.append(Suggestion(q[best], number, q[best] - observation.q[nearest], before, after))
+    return tuple(found)
+
+
+def _shown(
+    calibration: Calibration, region: Region, count: int, factor: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Random poses (k, n) that show enough markers, and the derivative (k, 4 m, r) of what they show.
+
+    Rows of what is not seen are zero.
+    """
+    poses: list[FloatArray] = []
+    rows: list[FloatArray] = []
+    for _ in range(_BATCHES):
+        q = rng.uniform(region.low, region.high, (_BATCH, len(region.low)))
+        pixels, (low, high) = predict(calibration, q), region.image.swapaxes(0, 1)[:, :, None]
+        seen = ((pixels >= low) & (pixels <= high)).all(axis=-1)  # none that is NaN, behind the camera
+        enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
+        if enough.size:
+            J = prediction_derivative(calibration, q[enough]) @ factor
+            sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= _VAGUE * np.ptp(region.image, axis=1).max()
+            seen = seen[enough] & sharp
+            J[~seen] = 0.0
+            useful = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)
+            poses += list(q[enough[useful]])
+            rows += list(J.reshape(len(J), -1, J.shape[-1])[useful])
+        if len(poses) >= count:
+            break
+    if not poses:
+        raise WorkFailed(
+            f"no further pose to suggest: none within the joint ranges shows {_LEAST_SEEN} markers to both "
+            "cameras as far as the calibration can tell; make it better with single-joint trials first"
+        )
+    return np.array(poses), np.array(rows)

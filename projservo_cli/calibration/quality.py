@@ -8,10 +8,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import Problem, Scene, prepare
-from projservo_cli.calibration.covariance import ProjectiveScene, spread_factor
-from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, least_squares
-from projservo_cli.calibration.prediction import distance_statistics, marker_pixels, prediction_derivative
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
+from projservo_cli.calibration.prediction import distance_statistics
+from projservo_cli.calibration.projective import spread_factor
 from projservo_cli.calibration.readings import (
     MOST_REACHES,
     REACH_M,
@@ -22,15 +22,11 @@ from projservo_cli.calibration.readings import (
     require_moved,
 )
 from projservo_cli.records import (
-    NO_LENS,
-    PRISMATIC,
-    REVOLUTE,
     BoolArray,
     CrossValidation,
     FloatArray,
     InputError,
     IntArray,
-    Model,
     WorkFailed,
 )
 
@@ -51,38 +47,40 @@ _FRAMES, _LEAST_REACHES, _BISECTIONS = 8, 0.01, 7
 
 @dataclass(frozen=True, eq=False)
 class _Uncertainty:
-    """A calibration whose predictions err, judged in twice the image region in which markers were seen."""
+    """A fit whose predictions err, judged in twice the image region in which markers were seen."""
 
-    model: Model  # projective robot and rig
-    M: FloatArray  # (m, 4) markers at the reference
-    factor: FloatArray  # (24 + 16 n + 4 m, r) factor of the covariance at a noise of one pixel
-    readings: Readings  # what the calibration was made from
+    solution: Solution
+    factor: FloatArray  # (size, r) ``spread_factor``, at a noise of one pixel
 
     def shown(self, q: FloatArray) -> BoolArray:
-        """Which images (K, 2, m) at poses (K, n) lie in the region that counts."""
-        pixels = marker_pixels(self.model, self.M, q)
-        inside = np.empty(pixels.shape[:-1], dtype=np.bool_)
-        for v in (0, 1):
-            seen = self.readings.pixels[v][self.readings.seen[v]]
-            low, high = seen.min(axis=0), seen.max(axis=0)
-            wide = 0.5 * (high - low)
-            inside[:, v] = ((pixels[:, v] >= low - wide) & (pixels[:, v] <= high + wide)).all(axis=-1)
+        """Which images (2, K, m) at poses (K, n) lie in the region that counts."""
+        readings = self.solution.problem.readings
+        pixels = self.solution.scene.seen(q - self.solution.problem.q_reference).swapaxes(0, 1)
+        low, high = (
+            np.stack([extreme(readings.pixels[v][readings.seen[v]], axis=0) for v in (0, 1)])
+            for extreme in (np.min, np.max)
+        )
+        wide = 0.5 * (high - low)
+        low, high = (low - wide)[:, None, None], (high + wide)[:, None, None]
+        inside: BoolArray = ((pixels >= low) & (pixels <= high)).all(axis=-1)
         return inside
 
     def spread(self, q: FloatArray, shown: BoolArray) -> FloatArray:
         """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one."""
-        J = prediction_derivative(self.model, self.M, q)[shown]
-        return np.asarray(J.reshape(-1, len(self.factor)) @ self.factor)
+        problem, scene = self.solution.problem, self.solution.scene
+        there = LeastSquares.of(problem.readings.everywhere(q), problem.q_reference, scene.lens is not None)
+        shown = shown.swapaxes(1, 2).reshape(2, -1)  # sightings are in the order of markers
+        J = there.dense(there.derivative(scene)[1], shown)
+        return np.asarray(J[np.repeat(shown.ravel(), 2)] @ self.factor)
 
     def at(self, i: int, offsets: FloatArray) -> FloatArray:
         """Poses (K, n) with joint i at offsets (K,) from the reference, rad or m."""
-        q = np.tile(self.model.q_reference, (len(offsets), 1))
-        q[:, i] += offsets
-        return q
+        q_reference = self.solution.problem.q_reference
+        return np.asarray(q_reference + offsets[:, None] * np.eye(len(q_reference))[i])
 
     def reach(self, i: int) -> float:
         """Reach of joint i at which predictions are judged, rad or m."""
-        return REACH_M if self.model.joint_types[i] == PRISMATIC else REACH_RAD
+        return REACH_M if self.solution.scene.prismatic[i] else REACH_RAD
 
     def reach_spread(self, i: int) -> FloatArray:
         """``spread`` with joint i at its reach, to either side; halved where no image would count."""
@@ -98,7 +96,7 @@ class _Uncertainty:
 
 def _reach_noise(sure: _Uncertainty) -> FloatArray:
     """Noise of predicted images (n,) with each joint at its reach, in units of the pixel noise."""
-    rows = (sure.reach_spread(i) for i in range(len(sure.model.joint_types)))
+    rows = (sure.reach_spread(i) for i in range(len(sure.solution.scene.prismatic)))
     return np.array([np.sqrt((T**2).sum() / max(len(T), 1)) for T in rows])
 
 
@@ -141,13 +139,13 @@ def _predicted_error(sure: _Uncertainty) -> tuple[float, float]:
     are halved about the reference. No residual shows on which side of the expectation a calibration came
     to lie: to first order the error of a maximum of the likelihood does not depend on what it leaves.
     """
-    q = sure.readings.q
+    q, q_reference = sure.solution.problem.readings.q, sure.solution.problem.q_reference
     poses = np.random.default_rng(0).uniform(q.min(axis=0), q.max(axis=0), (_POSES, q.shape[1]))
     for _ in range(_HALVINGS):
         shown = sure.shown(poses)
         if shown.any():
             break
-        poses = 0.5 * (poses + sure.model.q_reference)
+        poses = 0.5 * (poses + q_reference)
     spread = sure.spread(poses, shown)
     variances = np.linalg.eigvalsh(spread.T @ spread) / max(int(shown.sum()), 1)
     return float(np.sqrt(variances.sum())), float(np.sqrt(_quantile(variances, _SURE)))
@@ -183,28 +181,21 @@ class _Joints:
         return describe_joint(i, float(self.span[i]), bool(self.prismatic[i]), float(self.needed[i]))
 
 
-def judged_joints(
-    solution: Solution, result: ProjectiveScene, factor: FloatArray | None, sigma_px: float
-) -> _Joints:
-    """What the data say of each joint, by a factor of ``covariance_factor`` (None without) and a noise, px.
+def judged_joints(solution: Solution, factor: FloatArray | None, sigma_px: float) -> _Joints:
+    """What the data say of each joint, by a ``spread_factor`` (None for no covariance) and a noise, px.
 
     Raises WorkFailed naming a joint that moves no image, or whose operator is not determined.
     """
-    problem, readings = solution.problem, solution.problem.readings
-    span = _require_joints_seen(problem, solution.scene, sigma_px)
+    prismatic = solution.scene.prismatic
+    span = _require_joints_seen(solution, sigma_px)
     if factor is None:
         # NaN, not zero: a method without covariance does not claim certainty.
         unknown = np.full(len(span), np.nan)
-        return _Joints(readings.prismatic, span, unknown, unknown, None)
-    types = np.where(readings.prismatic, PRISMATIC, REVOLUTE).astype(np.int64)
-    lens = NO_LENS if solution.scene.lens is None else solution.scene.lens
-    model = Model(result.P, result.H_hat_0, types, problem.q_reference, result.a_inf, lens)
-    sure = _Uncertainty(model, result.M, factor, readings)
+        return _Joints(prismatic, span, unknown, unknown, None)
+    sure = _Uncertainty(solution, factor)
     noise = _reach_noise(sure)
     error, bound = _predicted_error(sure)
-    joints = _Joints(
-        readings.prismatic, span, noise, _needed_spans(sure, noise), (sigma_px * error, sigma_px * bound)
-    )
+    joints = _Joints(prismatic, span, noise, _needed_spans(sure, noise), (sigma_px * error, sigma_px * bound))
     i = int(np.argmax(noise))
     if noise[i] > _UNDETERMINED_NOISE:
         raise WorkFailed(
@@ -214,20 +205,12 @@ def judged_joints(
     return joints
 
 
-def _require_joints_seen(problem: Problem, scene: Scene, sigma_px: float) -> FloatArray:
+def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     """Ranges (n,) of the joints; refuse one that moves no image over it, by velocities at the reference."""
-    readings = problem.readings
+    readings, q_reference = solution.problem.readings, solution.problem.q_reference
     span = require_motion(readings)
-    m = len(scene.M)
-    once = dataclasses.replace(
-        readings,
-        q=problem.q_reference[None],
-        pose_of=np.zeros(m, dtype=np.int64),
-        marker_of=np.arange(m),
-        pixels=np.zeros((2, m, 2)),
-        seen=np.ones((2, m), dtype=np.bool_),
-    )
-    rate = prepare(once, problem.q_reference).joint_derivative(scene)[1]
+    there = LeastSquares.of(readings.everywhere(q_reference[None]), q_reference)
+    rate = there.joint_derivative(solution.scene)[1]
     motion = np.linalg.norm(rate, axis=2).mean(axis=(0, 1)) * span
     i = int(np.argmin(motion))
     require_moved(i, float(span[i]), bool(readings.prismatic[i]), float(motion[i]), sigma_px)
@@ -387,16 +370,16 @@ def _predicted(
     whole, q_reference = solution.problem.readings, solution.problem.q_reference
     training = whole.of_poses(~held_out)
     known = training.count_of(training.seen) > 0
-    lens = solution.scene.lens
-    problem = prepare(training.of_markers(known), q_reference, lens is not None)
+    lens = solution.scene.lens is not None
+    problem = LeastSquares.of(training.of_markers(known), q_reference, lens)
     require_motion(problem.readings)
-    scene = Scene(solution.scene.P, solution.scene.H_hat, solution.scene.M[known], lens)
-    found = least_squares(problem, scene, solution.sigma_px)
+    scene = dataclasses.replace(solution.scene, M=solution.scene.M[known])
+    found = fit_inliers(problem, scene, solution.sigma_px)
     if found is None:
         raise WorkFailed(_OPEN)
-    factor = spread_factor(problem, found.scene, found.used)
+    factor = spread_factor(found)
     place = held_out[whole.pose_of] & known[whole.marker_of]
-    test = prepare(whole.of_poses(held_out).of_markers(known), q_reference, lens is not None)
+    test = LeastSquares.of(whole.of_poses(held_out).of_markers(known), q_reference, lens)
     pixels, J = test.derivative(found.scene)
     spread = test.dense(J, np.ones_like(test.readings.seen)) @ factor
     variance = (spread**2).sum(axis=1).reshape(pixels.shape)

@@ -32,6 +32,50 @@ class Readings:
     pixels: FloatArray  # (2, N, 2) px, zero where not seen
     seen: BoolArray  # (2, N) whether the view saw the marker
 
+    @classmethod
+    def of(cls, observation: Observation, joint_types: str) -> "Readings":
+        """What was seen, flattened; one letter a joint, R or P.
+
+        Raises InputError if the arrays or the letters do not fit each other, or values are not finite.
+        """
+        _require_shapes(observation)
+        letters = joint_types.upper()
+        n = observation.q.shape[1]
+        if len(letters) != n or set(letters) - {"R", "P"}:
+            raise InputError(f"joint types {joint_types!r}: expected {n} letters R or P, one a joint")
+        if not np.isfinite(observation.q).all():
+            raise InputError("joint readings must be finite numbers")
+        if np.isinf(observation.images).any():
+            raise InputError("pixels must be finite numbers, or missing where a marker was not seen")
+        finite = np.asarray(np.isfinite(observation.images).all(axis=3))
+        marker_of, pose_of = np.nonzero(finite.any(axis=1).T)
+        seen = finite[pose_of, :, marker_of].T
+        present, marker_of_present = np.unique(marker_of, return_inverse=True)
+        return cls(
+            q=np.array(observation.q, dtype=np.float64),
+            prismatic=np.array([letter == "P" for letter in letters]),
+            pose=observation.pose,
+            marker=observation.marker[present],
+            pose_of=pose_of,
+            marker_of=marker_of_present,
+            pixels=np.where(seen[..., None], observation.images[pose_of, :, marker_of].swapaxes(0, 1), 0.0),
+            seen=seen,
+        )
+
+    def everywhere(self, q: FloatArray) -> "Readings":
+        """All markers at other joint readings (K, n), rad or m, as if both views had seen them at zero."""
+        marker_of, pose_of = np.divmod(np.arange(self.marker.size * len(q)), len(q))
+        pixels, seen = np.zeros((2, marker_of.size, 2)), np.ones((2, marker_of.size), dtype=np.bool_)
+        return dataclasses.replace(
+            self, q=q, pose=np.arange(len(q)), pose_of=pose_of, marker_of=marker_of, pixels=pixels, seen=seen
+        )
+
+    def grid(self) -> FloatArray:
+        """Pixels (2, K, m, 2), NaN where not seen."""
+        result = np.full((2, len(self.q), self.marker.size, 2), np.nan)
+        result[:, self.pose_of, self.marker_of] = np.where(self.seen[..., None], self.pixels, np.nan)
+        return result
+
     @property
     def both(self) -> BoolArray:
         """(N,) whether both views saw the marker."""
@@ -91,37 +135,6 @@ class Readings:
             row = int(np.argmin((deviation**2).sum(axis=1)))
         result: FloatArray = self.q[row].copy()
         return result
-
-
-def gather(observation: Observation, joint_types: str) -> Readings:
-    """Flatten an observation into the list of what was seen; one letter a joint, R or P.
-
-    Raises InputError if the arrays or the letters do not fit each other, or values are not finite.
-    """
-    _require_shapes(observation)
-    letters = joint_types.upper()
-    n = observation.q.shape[1]
-    if len(letters) != n or set(letters) - {"R", "P"}:
-        raise InputError(f"joint types {joint_types!r}: expected {n} letters R or P, one a joint")
-    if not np.isfinite(observation.q).all():
-        raise InputError("joint readings must be finite numbers")
-    finite: BoolArray = np.isfinite(observation.images[..., 0]) & np.isfinite(observation.images[..., 1])
-    if np.isinf(observation.images).any():
-        raise InputError("pixels must be finite numbers, or missing where a marker was not seen")
-    marker_of, pose_of = np.nonzero(finite.any(axis=1).T)
-    seen = finite[pose_of, :, marker_of].T
-    pixels = np.where(seen[..., None], observation.images[pose_of, :, marker_of].transpose(1, 0, 2), 0.0)
-    present = np.unique(marker_of)
-    return Readings(
-        q=np.array(observation.q, dtype=np.float64),
-        prismatic=np.array([letter == "P" for letter in letters]),
-        pose=observation.pose,
-        marker=observation.marker[present],
-        pose_of=pose_of,
-        marker_of=np.searchsorted(present, marker_of),
-        pixels=pixels,
-        seen=seen,
-    )
 
 
 def _require_shapes(observation: Observation) -> None:
@@ -294,50 +307,34 @@ def _require_moving(readings: Readings, sigma: float) -> None:
     for i, rows in enumerate(readings.trials(home)):
         poses = np.zeros(len(readings.q), dtype=bool)
         poses[np.append(rows, home)] = True
-        square = _squared_path(readings.of_poses(poses))
-        # Noise alone has the variance of both coordinates.
+        # A point that moves evenly along a path of length L has the variance L² / 12; noise alone has that
+        # of both coordinates.
+        square = 12.0 * np.nanvar(_tracks(readings.of_poses(poses)), axis=1, ddof=1).sum(axis=1)
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
         span = float(np.ptp(readings.q[poses, i]))
         require_moved(i, span, bool(readings.prismatic[i]), path, sigma)
 
 
-def _squared_path(readings: Readings) -> FloatArray:
-    """Squared length of the path of the images of each marker and view that shows two or more, px².
-
-    Twelve times the variance: a point that moves evenly along a path of length L has L² / 12.
-    """
-    m = readings.marker.size
-    found = []
-    for v in (0, 1):
-        marker_of = readings.marker_of[readings.seen[v]]
-        count = np.bincount(marker_of, minlength=m)
-        square = np.zeros(m)
-        for coordinate in readings.pixels[v, readings.seen[v]].T:
-            mean = np.bincount(marker_of, coordinate, m) / np.maximum(count, 1)
-            square += np.bincount(marker_of, (coordinate - mean[marker_of]) ** 2, m)
-        found.append(12.0 * square[count > 1] / (count[count > 1] - 1))
-    return np.concatenate(found)
+def _tracks(readings: Readings) -> FloatArray:
+    """Images (L, K, 2) of each marker in each view that shows it twice or more, NaN where not seen."""
+    images = readings.grid().swapaxes(1, 2)
+    return np.asarray(images[np.isfinite(images[..., 0]).sum(axis=2) > 1])
 
 
 def _farthest(readings: Readings) -> float:
     """How far sightings are from the median place of their marker in their view, but for the farthest, px."""
-    distances = []
-    for v in (0, 1):
-        for j in range(readings.marker.size):
-            pixels = readings.pixels[v][readings.seen[v] & (readings.marker_of == j)]
-            if len(pixels) > 1:
-                distances.append(np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1))
-    return float(np.quantile(np.concatenate(distances), 1.0 - _MOST_WRONG)) if distances else np.inf
+    tracks = _tracks(readings)
+    distance = np.linalg.norm(tracks - np.nanmedian(tracks, axis=1, keepdims=True), axis=2)
+    return float(np.nanquantile(distance, 1.0 - _MOST_WRONG)) if distance.size else np.inf
 
 
 def _require_no_line(readings: Readings, sigma: float) -> None:
     """Refuse a body whose markers lie on a line in most images, up to the noise: some are wrong."""
     off = []
-    for v in (0, 1):
-        for k in np.unique(readings.pose_of[readings.seen[v]]):
-            pixels = readings.pixels[v][readings.seen[v] & (readings.pose_of == k)]
-            if len(pixels) > 2:
-                across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
-                off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
+    for image in readings.grid().reshape(-1, readings.marker.size, 2):
+        pixels = image[np.isfinite(image[:, 0])]
+        if len(pixels) > 2:
+            across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
+            off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
     if off and np.mean(off) < 0.5:
         raise WorkFailed(ON_A_LINE)

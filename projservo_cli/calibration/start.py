@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.adjustment import Problem, Scene, cross_matrix
+from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix
 from projservo_cli.calibration.epipolar import Epipolar, Guess, ImageFrame, guess_at, metric_guesses
+from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.readings import MAD, SAME_READING, Readings
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
@@ -31,7 +32,7 @@ Tell = Callable[[str, int, int], None]
 class Search:
     """What a search for the maximum likelihood works on."""
 
-    problem: Problem
+    problem: LeastSquares
     epipolar: Epipolar
     frame: ImageFrame
     rng: np.random.Generator
@@ -321,7 +322,7 @@ def _place(w: FloatArray, guess: Guess, readings: Readings, q: FloatArray) -> Sc
     length = np.linalg.norm(x[:n], axis=1)[prismatic]
     if prismatic.any():
         H_hat[prismatic, :3, 3] = x[:n][prismatic] / length[:, None] * np.median(length)
-    return Scene(guess.P, H_hat, np.hstack([x[n:], np.ones((m, 1))]))
+    return Scene(guess.P, H_hat, prismatic, np.hstack([x[n:], np.ones((m, 1))]))
 
 
 def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> FloatArray:
@@ -360,7 +361,7 @@ def starts(search: Search, readings: Readings, factors: tuple[float, ...]) -> It
             yield from filter(_finite, (_place(w, guess, readings, q) for w in axes))
 
 
-def starts_of_changed(search: Search, changes: Iterable[Problem], steps: int) -> Iterator[Scene | None]:
+def starts_of_changed(search: Search, changes: Iterable[LeastSquares], steps: int) -> Iterator[Scene | None]:
     """A start for each of some problems that differ from the one searched in their joints; None without one.
 
     All in one guessed metric frame, which owes nothing to the joints, after some steps of the axes.
@@ -418,4 +419,4 @@ class Nominal:
         column = {int(number): j for j, number in enumerate(self.marker)}
         M = self.M[[column[int(number)] for number in readings.marker]]
         M = M @ forward_kinematics(model, q_reference).T
-        return Scene(self.P, joint_operators(model, q_reference), M)
+        return Scene(self.P, joint_operators(model, q_reference), readings.prismatic, M)

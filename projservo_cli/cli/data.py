@@ -158,15 +158,14 @@ def detect(
     """
     import numpy as np
 
-    from projservo_cli.detection import observe, pair_images
-    from projservo_cli.detection.tags import TagFinder
+    from projservo_cli.detection import TagFinder, observe_tags, pair_images
     from projservo_cli.tables import read_joints, write_table
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
     joints = read_joints(joints_csv, joint_unit="as is")
     pairs = pair_images(left, right, joints, joints_csv)
-    observation, found = observe(pairs, joints.q, finder, points, console.progress)
+    observation, found = observe_tags(pairs, joints.q, finder, points, console.progress)
     write_table(observation, output)
     in_left, in_right = np.moveaxis(np.isfinite(observation.images[..., 0]), 1, 0)
     value = {

@@ -226,7 +226,6 @@ def _require_named(chain: _Chain) -> None:
     from projservo_cli.control import CODES
     from projservo_cli.records import InputError, law_and_mode
     from projservo_cli.robots import plugins
-    from projservo_cli.robots.yours import METHODS
 
     plant = chain.config.plant.use
     servo = [step for step in chain.steps if step.stage == "servo" and step.why]
@@ -247,7 +246,7 @@ def _require_named(chain: _Chain) -> None:
                 f"configuration again with -c, or {flag}"
             )
     for kind, target in wanted:
-        plugins.find(kind, target, METHODS if kind == "plant" else ("__call__",))
+        plugins.find(kind, target)
 
 
 def _named_by(options: Mapping[str, Any]) -> set[tuple[str, str | None]]:

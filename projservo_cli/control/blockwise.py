@@ -17,14 +17,13 @@ def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArr
     if not measure(model, task, s, q, state):
         return LOST
     n = q.shape[0]
-    for i in range(n):
-        state.q_dot[i] = 0.0
+    state.q_dot[:] = 0.0
     for view in range(2):
         # Not a constant, for which the compiler would make the function anew.
         put_view(model, task, s, state, view, 0 * view)
         rows = 2 * state.A.shape[0]
-        if not pseudo_inverse(state, rows, state.newton):
+        if not pseudo_inverse(state, rows, state.work.newton):
             return SINGULAR
         for i in range(n):
-            state.q_dot[i] -= gains.gain * state.newton[i]
+            state.q_dot[i] -= gains.gain * state.work.newton[i]
     return OK

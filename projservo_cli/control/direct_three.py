@@ -1,6 +1,14 @@
 """Direct control of translation and two rotations: the paper's directTHREE."""
 
-from projservo_cli.control.law import OK, SINGULAR, Gains, State, follow, partitioned, translation_rate
+from projservo_cli.control.law import (
+    OK,
+    SINGULAR,
+    Gains,
+    State,
+    partitioned,
+    put_joint_velocity,
+    translation_rate,
+)
 from projservo_cli.geometry.jit import merged
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
@@ -19,7 +27,7 @@ def direct_three(model: Model, task: Task, gains: Gains, s: FloatArray, q: Float
     p = gains.gain_p * parts.theta_p
     for i in range(state.xi_dot.shape[0]):
         state.xi_dot[i] = t * state.q_hat[0, i] + r * state.q_hat[1, i] + p * state.q_hat[2, i]
-    if not follow(state):
+    if not put_joint_velocity(state):
         return SINGULAR
     for i in range(q.shape[0]):
         state.q_dot[i] += state.q_ahead[i] / gains.period

@@ -5,8 +5,8 @@ from projservo_cli.control.law import (
     SINGULAR,
     Gains,
     State,
-    follow,
     partitioned,
+    put_joint_velocity,
     single_rotation,
     translation_rate,
 )
@@ -30,7 +30,7 @@ def direct_two(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatAr
     t = translation_rate(task, gains, parts, state)
     for i in range(state.xi_dot.shape[0]):
         state.xi_dot[i] = t * state.q_hat[0, i] + rate * state.q_hat[3, i]
-    if not follow(state):
+    if not put_joint_velocity(state):
         return SINGULAR
     for i in range(q.shape[0]):
         state.q_dot[i] += state.q_ahead[i] / gains.period

@@ -21,18 +21,17 @@ def euclidean_points(
         return LOST
     n = q.shape[0]
     m = state.A.shape[0]
-    work = state.work
-    operators = work.columns
+    system, operators = state.work.system, state.work.columns
     for i in range(operators.shape[0]):
         operator = mat(operators[i])
         for k in range(m):
             velocity = apply(operator, vec(state.A[k]))
-            work.B[i, 3 * k] = velocity[0]
-            work.B[i, 3 * k + 1] = velocity[1]
-            work.B[i, 3 * k + 2] = velocity[2]
+            system.B[i, 3 * k] = velocity[0]
+            system.B[i, 3 * k + 1] = velocity[1]
+            system.B[i, 3 * k + 2] = velocity[2]
     for k in range(m):
         for j in range(3):
-            work.rhs[3 * k + j] = state.A[k, j] - task.A_star[k, j]
+            system.rhs[3 * k + j] = state.A[k, j] - task.A_star[k, j]
     if not pseudo_inverse(state, 3 * m, state.q_dot):
         return SINGULAR
     for i in range(n):

@@ -14,17 +14,16 @@ from projservo_cli.control.law import (
     SINGULAR,
     Gains,
     State,
-    follow,
     partitioned,
+    put_joint_velocity,
     single_rotation,
     speed_share,
     translation_rate,
 )
-from projservo_cli.geometry.algebra import Mat4, mul
-from projservo_cli.geometry.displacement import rotation, translation
+from projservo_cli.geometry.algebra import Mat4, mul, rotation, translation
 from projservo_cli.geometry.jit import internal, merged
-from projservo_cli.geometry.kinematics import backward, blocked_joint
-from projservo_cli.geometry.mechanisms import SETTLED, reach
+from projservo_cli.geometry.kinematics import backward
+from projservo_cli.geometry.mechanisms import SETTLED, Seen, reach
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
@@ -61,10 +60,9 @@ def _scaled(step: _Step, share: float, count: int) -> _Step:
 
 
 @merged
-def desired(step: _Step, share: float) -> Mat4:
+def _desired(step: _Step, share: float) -> Mat4:
     """Share of the displacement of one period, exp(share τ Ĥ_t) exp(share θ Ĥ_s), [RH00] eq. (22)."""
-    turn = rotation(step.H_s, mul(step.H_s, step.H_s), share * step.theta)
-    return mul(translation(step.parts.H_t, share * step.tau), turn)
+    return mul(translation(step.parts.H_t, share * step.tau), rotation(step.H_s, share * step.theta))
 
 
 @internal
@@ -76,7 +74,7 @@ def _first_order(step: _Step, state: State) -> float:
     """
     for i in range(state.xi_dot.shape[0]):
         state.xi_dot[i] = step.tau * state.q_hat[0, i] + step.theta * step.sense * state.q_hat[3, i]
-    if not follow(state):
+    if not put_joint_velocity(state):
         return math.nan
     most = 0.0
     for i in range(state.q_dot.shape[0]):
@@ -95,7 +93,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
     Returns false where a part does not settle or leaves the branch.
     """
     n, count = q.shape[0], step.pieces
-    H_back = backward(model, q)
+    face = Seen(state.A, backward(model, q))
     for i in range(n):
         state.path[0, i] = q[i]
     for j in range(1, count + 1):
@@ -104,10 +102,10 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
             part = state.q_dot[i] / count if j == 1 else state.path[j - 1, i] - state.path[j - 2, i]
             state.path[j, i] = state.path[j - 1, i] + part
             predicted += part * part
-        goal = desired(step, j / count)
+        goal = _desired(step, j / count)
         if following(task.reference):
             goal = mul(planned_step(task.reference, float(state.clock[0]), step.ahead * j / count), goal)
-        if not reach(model, H_back, goal, state.A, state.path[j], state.work, state.newton, SETTLED):
+        if not reach(model, face, goal, state.path[j], state.work, SETTLED):
             return False
         taken = 0.0
         for i in range(n):
@@ -116,6 +114,15 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
         if taken > BRANCH_FACTOR * BRANCH_FACTOR * predicted + ROUND_OFF * ROUND_OFF:
             return False
     return True
+
+
+@merged
+def _blocked_joint(q: FloatArray, q_next: FloatArray, gains: Gains) -> int:
+    """First joint that a motion from q to q_next takes beyond a limit, or farther beyond it; else −1."""
+    for i in range(q.shape[0]):
+        if q_next[i] > max(q[i], gains.upper[i]) or q_next[i] < min(q[i], gains.lower[i]):
+            return i
+    return -1
 
 
 @merged
@@ -130,7 +137,7 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
         trial = _scaled(step, share + width, step.pieces)
         _first_order(trial, state)
         if _continued(model, task, q, trial, state):
-            joint = blocked_joint(q, state.path[step.pieces], gains.lower, gains.upper)
+            joint = _blocked_joint(q, state.path[step.pieces], gains)
             if joint < 0:
                 share += width
             else:
@@ -186,7 +193,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
             return OK
         count = min(MOST_PARTS, 2 * count)
         step = _scaled(step, 1.0, count)
-    state.blocked[0] = blocked_joint(q, state.path[count], gains.lower, gains.upper)
+    state.blocked[0] = _blocked_joint(q, state.path[count], gains)
     if state.blocked[0] >= 0:
         share *= _up_to_limit(model, task, gains, q, step, state)
     for i in range(q.shape[0]):

@@ -16,6 +16,8 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     axpy,
+    composed_angle,
+    composed_operator,
     dot,
     inner,
     mat,
@@ -25,7 +27,6 @@ from projservo_cli.geometry.algebra import (
     unit,
     vec,
 )
-from projservo_cli.geometry.displacement import composed_angle, composed_operator
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, least_squares
 from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
@@ -36,7 +37,7 @@ from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.body import MOST_STEPS, SETTLED_PX, Fit, Until, carry, fit_body, new_normal
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import Memory, Parts, no_parts, partition
-from projservo_cli.task.trajectory import Reference, between, following, place, planned
+from projservo_cli.task.trajectory import following
 from projservo_cli.task.visibility import limited_translation
 
 # Whether to fit only the views that the goal showed, and in how many steps; written as values of a loop,
@@ -87,6 +88,15 @@ class Gains(NamedTuple):
     upper: FloatArray = UNLIMITED
 
 
+class Law(NamedTuple):
+    """A built-in law, and all it knows."""
+
+    code: int  # of the law
+    model: Model  # what it believes
+    task: Task  # in the frame of the model
+    gains: Gains
+
+
 class State(NamedTuple):
     """Workspace of a law and what it returns."""
 
@@ -107,7 +117,6 @@ class State(NamedTuple):
     # face was seen or not; NaN where it is measured point by point
     face_px: FloatArray
     normal: FloatArray  # (6, 7) workspace of the fit of the body
-    newton: FloatArray  # (n,) one Newton step
     path: FloatArray  # (129, n) joints at the ends of the parts of a step, the current ones first
     # (1,) share of the amplitude left by the joint-speed limit, −1 where the law leaves the limit to the loop
     share: FloatArray
@@ -142,7 +151,6 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
         np.full(3, np.nan),
         np.full(1, np.nan),
         new_normal(),
-        np.zeros(n),
         np.zeros((MOST_PARTS + 1, n)),
         np.full(1, -1.0),
         np.zeros(1, dtype=np.int64),
@@ -158,16 +166,11 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
 @njit
 def reset(state: State) -> None:
     """Make a state as fresh as a new one, for another run."""
-    for part in range(2):
-        for i in range(state.memory.rotation.shape[1]):
-            state.memory.rotation[part, i] = 0.0
-    for i in range(state.q_dot.shape[0]):
-        state.q_dot[i] = 0.0
-        state.q_ahead[i] = 0.0
-    for i in range(state.errors.shape[0]):
-        state.errors[i] = math.nan
-    for i in range(state.fit.shape[0]):
-        state.fit[i] = math.nan
+    state.memory.rotation[:] = 0.0
+    state.q_dot[:] = 0.0
+    state.q_ahead[:] = 0.0
+    state.errors[:] = math.nan
+    state.fit[:] = math.nan
     state.face_px[0] = math.nan
     state.limited[0] = 0.0
     state.share[0] = -1.0
@@ -248,17 +251,7 @@ def _aimed(task: Task, state: State) -> Task:
     """The task whose target is where the plan is now; the task itself where none is followed."""
     if not following(task.reference):
         return task
-    return Task(
-        task.s_star,
-        state.A_aim,
-        task.order,
-        task.center,
-        task.F,
-        task.O,
-        task.visible,
-        task.body,
-        task.reference,
-    )
+    return Task(task.s_star, state.A_aim, *task[2:])
 
 
 @internal
@@ -267,10 +260,8 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
 
     The errors are written to the state.
     """
-    for i in range(state.q_dot.shape[0]):
-        state.q_dot[i] = 0.0
-    for i in range(state.errors.shape[0]):
-        state.errors[i] = math.nan
+    state.q_dot[:] = 0.0
+    state.errors[:] = math.nan
     if not measure(model, task, s, q, state):
         return LOST, no_parts()
     aim = _aimed(task, state)
@@ -288,7 +279,7 @@ def partitioned(model: Model, task: Task, s: FloatArray, q: FloatArray, state: S
 
 
 @merged
-def follow(state: State) -> bool:
+def put_joint_velocity(state: State) -> bool:
     """Joint velocity ``q_dot`` of the velocity ``xi_dot``; False where the joints cannot make it."""
     if state.work.span.H_hat.shape[0] == 0:
         return True
@@ -326,27 +317,13 @@ def _axis_direction(H_s: Mat4, a_inf: FloatArray, A_c: Vec4) -> Vec4:
     return unit(best)
 
 
-@merged
-def rotation_about_center(
-    work: Work, H_s: Mat4, a_inf: FloatArray, A_c: Vec4, q_hat: FloatArray
-) -> tuple[bool, float]:
-    """Joint motion q̂_s with Σ q̂_si Ĥ_i = Ĥ_s, [RH00] eq. (23), by the axis of Ĥ_s in eq. (9).
-
-    Returns the factor that scales the unit-rate motion in ``q_hat`` to the sense of Ĥ_s.
-    """
-    found, H = rotation_mechanism(work, unit(A_c), _axis_direction(H_s, a_inf, A_c), q_hat)
-    size = inner(H, H)
-    if not found or size == 0.0:
-        return False, 0.0
-    return True, inner(H, H_s) / size
-
-
 @internal
 def single_rotation(
     model: Model, parts: Parts, ratio: float, state: State
 ) -> tuple[bool, float, float, Mat4]:
     """Both rotations of a partition as one about the centre, [RH00] eqs. (23)–(25) as corrected.
 
+    The joint motion q̂_s with Σ q̂_si Ĥ_i = Ĥ_s is that of eq. (9) about the axis of Ĥ_s, at unit rate.
     For λ_r/λ_p = ρ ≠ 1 the rotations composed in (24) are θ_r and θ_p weighted by ρ/max(1, ρ) and
     1/max(1, ρ): each then decays at its own rate, and the axis of the single rotation changes.
 
@@ -359,30 +336,33 @@ def single_rotation(
     turns, H_s = composed_operator(parts.H_r, parts.H_p, a, b, c)
     if not turns:
         return True, 0.0, 0.0, H_s
-    found, sense = rotation_about_center(state.work, H_s, model.a_inf, parts.A_c, state.q_hat[3])
-    return found, theta_s, sense, H_s
+    axis = _axis_direction(H_s, model.a_inf, parts.A_c)
+    found, H = rotation_mechanism(state.work, unit(parts.A_c), axis, state.q_hat[3])
+    size = inner(H, H)
+    if not found or size == 0.0:
+        return False, theta_s, 0.0, H_s
+    return True, theta_s, inner(H, H_s) / size, H_s
 
 
 @internal
 def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, first: int) -> None:
     """Interaction matrix and image error of one view, [RH00] eq. (7), into rows from ``first`` on."""
-    work = state.work
-    operators = work.columns
+    system, operators = state.work.system, state.work.columns
     for i in range(operators.shape[0]):
         operator = mat(operators[i])
         for k in range(state.A.shape[0]):
             put_vec(state.A_t[k], apply(operator, vec(state.A[k])))
             _, _, u_dot, v_dot = image_velocity(model.P[view], state.A[k], state.A_t[k])
-            work.B[i, first + 2 * k] = u_dot
-            work.B[i, first + 2 * k + 1] = v_dot
+            system.B[i, first + 2 * k] = u_dot
+            system.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):
         if following(task.reference):
             u, v = float(state.s_aim[view, k, 0]), float(state.s_aim[view, k, 1])
         else:
             target = task.s_star[view, k]
             u, v = straighten(model.lens[view], float(target[0]), float(target[1]))
-        work.rhs[first + 2 * k] = s[view, k, 0] - u
-        work.rhs[first + 2 * k + 1] = s[view, k, 1] - v
+        system.rhs[first + 2 * k] = s[view, k, 0] - u
+        system.rhs[first + 2 * k + 1] = s[view, k, 1] - v
 
 
 @internal
@@ -395,34 +375,10 @@ def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
     """
     work = state.work
     if work.columns.shape[0] == q_hat.shape[0]:
-        return least_squares(work.B, rows, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
-    if not least_squares(work.B, rows, work.xi.shape[0], work.xi, work.pivot, work.z, work.rhs):
+        return least_squares(work.system, rows, q_hat)
+    if not least_squares(work.system, rows, work.xi):
         return False
     return joint_motion(work, work.xi, q_hat)
-
-
-@merged
-def aim(reference: Reference, gains: Gains, state: State) -> None:
-    """Write where the face should be now, where its images should go, and how the joints lead there.
-
-    For the image-based law, whose command is −λ J⁺ (s − s_aim), the planned velocity ṡ is fed forward by
-    aiming ahead: s_aim = s + ṡ/λ.
-    """
-    i, x = place(reference, float(state.clock[0]))
-    j, y = place(reference, float(state.clock[0]) + 1.0)
-    lead = 1.0 / (gains.gain * gains.period)
-    H = planned(reference, float(state.clock[0]))
-    for k in range(state.A_aim.shape[0]):
-        for c in range(4):
-            state.A_aim[k, c] = between(reference.A[:, k, c], i, x)
-        put_vec(state.A_aim[k], apply(H, vec(state.A_aim[k])))
-        for view in range(2):
-            for c in range(2):
-                here = between(reference.s[:, view, k, c], i, x)
-                ahead = between(reference.s_ahead[:, view, k, c], i, x)
-                state.s_aim[view, k, c] = here + lead * ahead
-    for l in range(state.q_ahead.shape[0]):
-        state.q_ahead[l] = between(reference.q[:, l], j, y) - between(reference.q[:, l], i, x)
 
 
 @merged
@@ -434,19 +390,3 @@ def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
         if size * share > speed[i] * period:
             share = speed[i] * period / size
     return share
-
-
-@merged
-def go_on(reference: Reference, gains: Gains, status: int, limited: bool, state: State) -> None:
-    """Advance the plan by as much of a period as the joint-speed limit leaves of the step.
-
-    limited : whether the law kept the limit itself; it is else applied here.
-    """
-    if status != OK:
-        return
-    if not limited:
-        share = speed_share(state.q_dot, gains.speed, 1.0)
-        for i in range(state.q_dot.shape[0]):
-            state.q_dot[i] *= share
-        state.share[0] = share
-    state.clock[0] += reference.rate * state.share[0]

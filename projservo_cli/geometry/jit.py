@@ -24,17 +24,13 @@ _Result = TypeVar("_Result")
 COMPILED_PARTS = ("records.py", "geometry", "task", "control", "loop", "robots")
 
 
-def _sources(part: Path) -> list[Path]:
-    """Files of a package, or the one that is a module."""
-    return [part] if part.is_file() else sorted(part.glob("*.py"))
-
-
-def source_hash(root: Path) -> str:
+def _source_hash(root: Path) -> str:
     """Hash of the sources that machine code depends on, and of the compiler's version."""
     digest = hashlib.sha256(f"{sys.version}|{numba.__version__}|{np.__version__}".encode())
-    for file in (file for part in COMPILED_PARTS for file in _sources(root / part)):
-        digest.update(file.relative_to(root).as_posix().encode())
-        digest.update(file.read_bytes())
+    for part in COMPILED_PARTS:
+        for file in sorted((root / part).glob("*.py")) or [root / part]:
+            digest.update(file.relative_to(root).as_posix().encode())
+            digest.update(file.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -46,7 +42,7 @@ def cache_folder(root: Path) -> Path | None:
             base = str(Path.home() / ".cache")
         except RuntimeError:
             return None
-    folder = Path(base) / "projservo" / f"kernels-{source_hash(root)}"
+    folder = Path(base) / "projservo" / f"kernels-{_source_hash(root)}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -78,6 +74,7 @@ _OPTIONS: dict[str, Any] = {
     "_nrt": False,
     "no_cfunc_wrapper": True,  # for callbacks of C code, of which there are none
 }
+_UNCACHED = {name: value for name, value in _OPTIONS.items() if name != "cache"}
 
 
 def njit(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
@@ -100,24 +97,19 @@ class _Internal(CPUDispatcher):
             return self.py_func(*arguments)
         if self._caller is None:
             # Kept in no cache: another process would not find it, for it is known by the function it holds.
-            self._caller = numba.njit(**{**_OPTIONS, "cache": False})(lambda *values: self(*values))
+            self._caller = numba.njit(**_UNCACHED)(lambda *values: self(*values))
         return self._caller(*arguments)
 
 
-def internal(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
+def internal(function: Callable[_Params, _Result], **given: Any) -> Callable[_Params, _Result]:
     """Compile a function like ``njit`` that only compiled ones call, but for tests.
 
-    To take a record of a hundred arrays from Python would be a fifth of its compilation.
+    To take a record of a hundred arrays from Python would be a fifth of its compilation. Further options of
+    the compiler may be ``given``.
     """
-    return _part(function)
-
-
-def _part(function: Callable[_Params, _Result], **given: Any) -> Callable[_Params, _Result]:
-    """An ``_Internal`` with further options of the compiler."""
     if not COMPILED:
         return function
-    options = {name: value for name, value in _OPTIONS.items() if name != "cache"}
-    options |= {"nopython": True, "no_cpython_wrapper": True, **given}
+    options = {**_UNCACHED, "nopython": True, "no_cpython_wrapper": True, **given}
     dispatcher = _Internal(function, targetoptions=options)
     if _OPTIONS["cache"]:
         dispatcher.enable_caching()
@@ -135,13 +127,12 @@ def composed(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]
     Called from Python it is interpreted and calls compiled functions, so that a single run needs no machine
     code but theirs.
     """
-    options = {name: value for name, value in _OPTIONS.items() if name != "cache"}
-    return register_jitable(**options)(function)
+    return register_jitable(**_UNCACHED)(function)
 
 
 def inline(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:
     """Compile a small helper that the optimiser merges into its callers; Python interprets it."""
-    return _part(function, forceinline=True)
+    return internal(function, forceinline=True)
 
 
 def merged(function: Callable[_Params, _Result]) -> Callable[_Params, _Result]:

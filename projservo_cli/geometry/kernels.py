@@ -6,10 +6,14 @@ the compiler turns into vector instructions without changing the order of any su
 """
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from projservo_cli.geometry.jit import inline, internal, merged
 from projservo_cli.records import FloatArray, IntArray
 
+COORDINATES = 6  # of a displacement
 # A kernel is one-dimensional when the next pivot stands above round-off by this factor of the first.
 RANK_TOLERANCE = 1e-9
 # A last pivot above this share of the first is no kernel at all: noise leaves a few per cent.
@@ -18,62 +22,58 @@ _KERNEL_TOLERANCE = 0.1
 _EXACT_TOLERANCE = 1e-14
 _GAIN_TOLERANCE = 1e-12
 _MOST_ITERATIONS = 100
+# A solution by normal equations, and once more with what rounding left of it.
+_PASSES = 2
+
+
+class System(NamedTuple):
+    """A small dense system of n unknowns, and workspaces of its factorisation."""
+
+    B: FloatArray  # (≥ n, rows) columns of the matrix; rows a multiple of four, n or more
+    rhs: FloatArray  # (rows,) right-hand side
+    z: FloatArray
+    norms: FloatArray
+    pivot: IntArray  # z, norms, pivot: (≥ n,)
+
+
+def new_system(n: int, rows: int) -> System:
+    """Arrays for n unknowns and at most so many rows."""
+    width = (max(n, rows) + 3) // 4 * 4
+    return System(
+        np.zeros((n, width)), np.zeros(width), np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
+    )
 
 
 @inline
-def _projected(B: FloatArray, k: int, v: FloatArray, rows: int) -> float:
-    """Product of column k with a vector."""
-    s0 = s1 = s2 = s3 = 0.0
-    for i in range(0, rows, 4):
-        s0 += B[k, i] * v[i]
-        s1 += B[k, i + 1] * v[i + 1]
-        s2 += B[k, i + 2] * v[i + 2]
-        s3 += B[k, i + 3] * v[i + 3]
-    return (s0 + s2) + (s1 + s3)
-
-
-@inline
-def _paired(B: FloatArray, j: int, k: int, rows: int) -> float:
+def _product(x: FloatArray, y: FloatArray, rows: int) -> float:
     """Product of two columns."""
     s0 = s1 = s2 = s3 = 0.0
     for i in range(0, rows, 4):
-        s0 += B[j, i] * B[k, i]
-        s1 += B[j, i + 1] * B[k, i + 1]
-        s2 += B[j, i + 2] * B[k, i + 2]
-        s3 += B[j, i + 3] * B[k, i + 3]
+        s0 += x[i] * y[i]
+        s1 += x[i + 1] * y[i + 1]
+        s2 += x[i + 2] * y[i + 2]
+        s3 += x[i + 3] * y[i + 3]
     return (s0 + s2) + (s1 + s3)
 
 
 @inline
-def orthogonalize(
-    B: FloatArray,
-    m: int,
-    n: int,
-    norms: FloatArray,
-    z: FloatArray,
-    pivot: IntArray,
-    rhs: FloatArray,
-    solve: bool,
-) -> tuple[float, float, float]:
+def orthogonalize(system: System, m: int, n: int, solve: bool) -> tuple[float, float, float]:
     """Column-pivoted modified Gram–Schmidt in place; returns the first, last but one and last pivot.
 
-    B : (≥n, ≥max(n, m rounded up to four)) columns of the matrix; on return R above the diagonal by rows, and
-        the inverse of the diagonal.
-    m, n : rows and columns, m ≥ n − 1.
-    norms : (n,) workspace.
-    z : (n,) on return Qᵀ rhs where ``solve`` is set.
-    pivot : (n,) on return the column of the matrix in each position.
-    rhs : (≥m rounded up to four) right-hand side, overwritten where ``solve`` is set.
+    m, n : rows and columns of the matrix, m ≥ n − 1. On return ``B`` holds R above the diagonal by rows, and
+        the inverse of the diagonal; ``pivot`` the column of the matrix in each position.
+    solve : whether to leave Qᵀ rhs in ``z``; ``rhs`` is then overwritten.
     Source: Å. Björck, "Solving linear least squares problems by Gram–Schmidt orthogonalization", BIT
     7 (1967): R is as accurate as Householder's, and so is the solution with the right-hand side
     carried as a further column. Norms are computed anew in each step instead of guarding a down-date.
     """
+    B, rhs, z, norms, pivot = system
     rows = (m + 3) // 4 * 4
     for j in range(n):
         pivot[j] = j
         for i in range(m, rows):
             B[j, i] = 0.0
-        norms[j] = _paired(B, j, j, rows)
+        norms[j] = _product(B[j], B[j], rows)
     if solve:
         for i in range(m, rows):
             rhs[i] = 0.0
@@ -107,13 +107,13 @@ def orthogonalize(
         for i in range(rows):
             B[k, i] *= inverse
         for j in range(k + 1, n):
-            r = _paired(B, k, j, rows)
+            r = _product(B[k], B[j], rows)
             z[j] = r
             for i in range(rows):
                 B[j, i] -= r * B[k, i]
-            norms[j] = _paired(B, j, j, rows)
+            norms[j] = _product(B[j], B[j], rows)
         if solve:
-            r = _projected(B, k, rhs, rows)
+            r = _product(B[k], rhs, rows)
             z[k] = r
             for i in range(rows):
                 rhs[i] -= r * B[k, i]
@@ -124,28 +124,25 @@ def orthogonalize(
 
 
 @inline
-def kernel_vector(
-    B: FloatArray, m: int, n: int, x: FloatArray, pivot: IntArray, z: FloatArray, rhs: FloatArray
-) -> bool:
+def kernel_vector(system: System, m: int, x: FloatArray) -> bool:
     """Right singular vector of the smallest singular value: "ker" in [RH00] eqs. (8)–(10).
 
     Inverse iteration on RᵀR stops when its gain, the inverse of the squared singular value, changes
     by less than a relative 1e-12; a matrix that is singular to working precision needs none.
 
-    B : (≥n, ≥max(n, m rounded up to four)) columns of the matrix, overwritten.
-    m, n : rows and columns.
+    m : rows of the matrix, which is overwritten.
     x : (n,) on return the unit kernel vector; its sign is arbitrary.
-    pivot, z, rhs : workspaces of at least n, n and m entries.
     Returns false where there is no kernel or more than one dimension of it; x is then zero.
     """
-    first, before_last, last = orthogonalize(B, m, n, x, z, pivot, rhs, False)
+    n = x.shape[0]
+    B, _, z, _, pivot = system
+    first, before_last, last = orthogonalize(system, m, n, False)
     if not before_last >= RANK_TOLERANCE * first or not first > 0.0 or not last <= _KERNEL_TOLERANCE * first:
-        for j in range(n):
-            x[j] = 0.0
+        x[:] = 0.0
         return False
     for j in range(n - 1):
         z[j] = -B[j, n - 1]
-    back_substitute(B, n - 1, z)
+    _back_substitute(B, n - 1, z)
     z[n - 1] = 1.0
     _normalize(z, n)
     if last > _EXACT_TOLERANCE * first:
@@ -156,7 +153,7 @@ def kernel_vector(
                 for i in range(j):
                     total -= B[i, j] * z[i]
                 z[j] = total * B[j, j]
-            back_substitute(B, n, z)
+            _back_substitute(B, n, z)
             previous = gain
             gain = _normalize(z, n)
             if abs(gain - previous) <= _GAIN_TOLERANCE * gain:
@@ -167,7 +164,7 @@ def kernel_vector(
 
 
 @inline
-def back_substitute(B: FloatArray, n: int, z: FloatArray) -> None:
+def _back_substitute(B: FloatArray, n: int, z: FloatArray) -> None:
     """Solve R x = z in place for the leading n×n triangle."""
     for j in range(n - 1, -1, -1):
         x = z[j] * B[j, j]
@@ -190,103 +187,53 @@ def _normalize(z: FloatArray, n: int) -> float:
 
 
 @internal
-def least_squares(
-    B: FloatArray, m: int, n: int, x: FloatArray, pivot: IntArray, z: FloatArray, rhs: FloatArray
-) -> bool:
-    """Least-squares solution x of B x = rhs for a matrix of full column rank.
-
-    Parameters are those of ``kernel_vector``, with the right-hand side in ``rhs``, overwritten.
+def least_squares(system: System, m: int, x: FloatArray) -> bool:
+    """Least-squares solution x (n,) of B x = rhs, m rows of full column rank, both overwritten.
 
     Returns false where the columns are dependent (or fewer rows than columns); x is then zero.
     """
+    n = x.shape[0]
+    B, _, z, _, pivot = system
     full = m >= n
     if full:
-        first, _, last = orthogonalize(B, m, n, x, z, pivot, rhs, True)
+        first, _, last = orthogonalize(system, m, n, True)
         full = last > RANK_TOLERANCE * first
     if not full:
-        for j in range(n):
-            x[j] = 0.0
+        x[:] = 0.0
         return False
-    back_substitute(B, n, z)
+    _back_substitute(B, n, z)
     for j in range(n):
         x[pivot[j]] = z[j]
     return True
 
 
-COORDINATES = 6
-Row = tuple[float, float, float, float, float, float, float]
-# Products of the columns of (J, e) with those of J, upper triangle by rows.
-Sums = tuple[
-    float, float, float, float, float, float, float, float, float, float, float, float, float, float,
-    float, float, float, float, float, float, float, float, float, float, float, float, float,
-]  # fmt: skip
-NOTHING: Sums = (
-    0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-    0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
-)  # fmt: skip
-
-
-@inline
-def accumulate(N: Sums, a: Row, b: Row) -> Sums:
-    """Sums after two more rows (J, e) of Jacobian and residual."""
-    return (
-        N[0] + (a[0] * a[0] + b[0] * b[0]), N[1] + (a[0] * a[1] + b[0] * b[1]),
-        N[2] + (a[0] * a[2] + b[0] * b[2]), N[3] + (a[0] * a[3] + b[0] * b[3]),
-        N[4] + (a[0] * a[4] + b[0] * b[4]), N[5] + (a[0] * a[5] + b[0] * b[5]),
-        N[6] + (a[0] * a[6] + b[0] * b[6]), N[7] + (a[1] * a[1] + b[1] * b[1]),
-        N[8] + (a[1] * a[2] + b[1] * b[2]), N[9] + (a[1] * a[3] + b[1] * b[3]),
-        N[10] + (a[1] * a[4] + b[1] * b[4]), N[11] + (a[1] * a[5] + b[1] * b[5]),
-        N[12] + (a[1] * a[6] + b[1] * b[6]), N[13] + (a[2] * a[2] + b[2] * b[2]),
-        N[14] + (a[2] * a[3] + b[2] * b[3]), N[15] + (a[2] * a[4] + b[2] * b[4]),
-        N[16] + (a[2] * a[5] + b[2] * b[5]), N[17] + (a[2] * a[6] + b[2] * b[6]),
-        N[18] + (a[3] * a[3] + b[3] * b[3]), N[19] + (a[3] * a[4] + b[3] * b[4]),
-        N[20] + (a[3] * a[5] + b[3] * b[5]), N[21] + (a[3] * a[6] + b[3] * b[6]),
-        N[22] + (a[4] * a[4] + b[4] * b[4]), N[23] + (a[4] * a[5] + b[4] * b[5]),
-        N[24] + (a[4] * a[6] + b[4] * b[6]), N[25] + (a[5] * a[5] + b[5] * b[5]),
-        N[26] + (a[5] * a[6] + b[5] * b[6]),
-    )  # fmt: skip
-
-
 @merged
-def put_sums(N: FloatArray, sums: Sums) -> None:
-    """Write the sums into the upper triangle and the last column of an array (6, 7)."""
-    n = 0
-    for i in range(COORDINATES):
-        for j in range(i, COORDINATES + 1):
-            N[i, j] = sums[n]
-            n += 1
+def least_norm(system: System, J: FloatArray, b: FloatArray, x: FloatArray) -> bool:
+    """Solution x (n,) of least norm of J x = b, for J (k, n) of full row rank; false where it has less.
 
-
-@merged
-def solve_normal(N: FloatArray, tolerance: float) -> bool:
-    """Solution of symmetric positive definite equations by the root-free Cholesky factorisation, in place.
-
-    N : (6, 7) upper triangle of the matrix, and the right-hand side in the last column, which the solution
-        replaces; the rest is overwritten.
-    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is what of a column
-        of the least-squares problem the columns before do not explain, squared.
-    Returns false where the matrix is singular; source: G. Golub, C. Van Loan, Matrix Computations, section
-    4.1.2.
+    With Jᵀ = Q R it is Jᵀ (J Jᵀ)⁻¹ b, J Jᵀ = Rᵀ R.
     """
-    n = COORDINATES
-    for j in range(n):
-        pivot = N[j, j]
-        for k in range(j):
-            pivot -= N[j, k] * N[k, j]
-        if not pivot > tolerance * N[j, j]:
-            return False
-        N[j, j] = pivot
-        for i in range(j + 1, n + 1):
-            total = N[j, i]
-            for k in range(j):
-                total -= N[j, k] * N[k, i]
-            N[j, i] = total
-        inverse = 1.0 / pivot
-        for i in range(j + 1, n):
-            N[i, j] = inverse * N[j, i]
-    for j in range(n - 1, -1, -1):
-        total = N[j, n] / N[j, j]
-        for i in range(j + 1, n):
-            total -= N[i, j] * N[i, n]
-        N[j, n] = total
+    B, _, z, _, pivot = system
+    rows, n = J.shape
+    for i in range(n):
+        for a in range(rows):
+            B[a, i] = J[a, i]
+    first, _, last = orthogonalize(system, n, rows, False)
+    if not last > RANK_TOLERANCE * first:
+        return False
+    x[:] = 0.0
+    for _ in range(_PASSES):
+        for k in range(rows):
+            a = pivot[k]
+            total = b[a]
+            for i in range(n):
+                total -= J[a, i] * x[i]
+            for i in range(k):
+                total -= B[i, k] * z[i]
+            z[k] = total * B[k, k]
+        _back_substitute(B, rows, z)
+        for k in range(rows):
+            a = pivot[k]
+            for i in range(n):
+                x[i] += J[a, i] * z[k]
     return True

@@ -2,26 +2,31 @@
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, mat, mul, put_mat, vec
-from projservo_cli.geometry.displacement import (
+from projservo_cli.geometry.algebra import (
     IDENTITY,
+    Mat4,
     as_array,
+    mat,
+    mul,
+    put_mat,
     rotation,
-    sine_and_versine,
+    rotation_and_inverse,
     translation,
-    turned,
+    vec,
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import through
-from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model, WorkFailed
+from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
 
 
 @internal
 def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
-    """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
+    """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5); none of a free-flying rig's twists."""
+    if joint_type == FREE:
+        return IDENTITY
     if joint_type == PRISMATIC:
         return translation(H_hat, q)
-    return rotation(H_hat, mul(H_hat, H_hat), q)
+    return rotation(H_hat, q)
 
 
 @njit
@@ -42,14 +47,6 @@ def backward(model: Model, q: FloatArray) -> Mat4:
         amount = float(q[i]) - float(model.q_reference[i])
         H = mul(_joint_displacement(mat(model.H_hat_0[i]), model.joint_types[i], -amount), H)
     return H
-
-
-@merged
-def start_pose(model: Model, q: FloatArray) -> Mat4:
-    """Displacement at the first joints; a free-flying rig starts at its reference."""
-    if model.joint_types[0] == FREE:
-        return IDENTITY
-    return forward(model, q)
 
 
 @njit
@@ -74,10 +71,9 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
             H = mul(H, translation(operator, amount))
             H_inverse = mul(translation(operator, -amount), H_inverse)
         else:
-            squared = mul(operator, operator)
-            sine, versine = sine_and_versine(amount)
-            H = mul(H, turned(operator, squared, sine, versine))
-            H_inverse = mul(turned(operator, squared, -sine, versine), H_inverse)
+            turn, turn_back = rotation_and_inverse(operator, amount)
+            H = mul(H, turn)
+            H_inverse = mul(turn_back, H_inverse)
     return H
 
 
@@ -86,15 +82,6 @@ def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
     """First joint outside its limits, or −1."""
     for i in range(q.shape[0]):
         if not lower[i] <= q[i] <= upper[i]:
-            return i
-    return -1
-
-
-@merged
-def blocked_joint(q: FloatArray, q_next: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
-    """First joint that a motion from q to q_next takes beyond a limit, or farther beyond it; else −1."""
-    for i in range(q.shape[0]):
-        if q_next[i] > max(q[i], upper[i]) or q_next[i] < min(q[i], lower[i]):
             return i
     return -1
 
@@ -150,37 +137,3 @@ def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArra
             for i in range(H_hat.shape[0]):
                 _, _, J[view, k, 0, i], J[view, k, 1, i] = image_velocity(P[view], M[k], H_hat[i] @ M[k])
     return J
-
-
-# Forms that the joints keep up to this share of the largest change are kept.
-_INVARIANT = 1e-6
-
-
-def invariant_rotations(actions: FloatArray) -> FloatArray:
-    """Three rotations (3, 3, 3) of the plane at infinity, per rad, in the metric that all joints keep.
-
-    The metric is the symmetric Q with LᵀQ + QL = 0 for every action L (n, 3, 3) of a joint on that plane;
-    where few joints leave it open, the one nearest to the identity, which does as well for these joints.
-
-    Raises WorkFailed if no metric is kept.
-    """
-    basis = np.array([_symmetric(i, j) for i in range(3) for j in range(i, 3)])
-    changes = np.einsum("nba,sbc->nsac", actions, basis) + np.einsum("sab,nbc->nsac", basis, actions)
-    _, sizes, rows = np.linalg.svd(np.swapaxes(changes, 0, 1).reshape(6, -1).T, full_matrices=True)
-    sizes = np.r_[sizes, np.zeros(6 - len(sizes))]
-    kept = rows[sizes <= _INVARIANT * max(sizes[0], 1.0)]
-    Q = np.einsum("s,sab->ab", kept.T @ (kept @ np.einsum("saa->s", basis)), basis)
-    if len(kept) == 0 or np.linalg.eigvalsh(Q)[0] <= 1e-6 * np.abs(Q).max():
-        raise WorkFailed(
-            "the joints keep no metric of the calibrated frame: calibrate anew, or measure point by point "
-            "with control.observation: points"
-        )
-    C = np.linalg.cholesky(Q).T
-    return np.array([np.linalg.solve(C, np.cross(np.eye(3), e) @ C) for e in np.eye(3)])
-
-
-def _symmetric(i: int, j: int) -> FloatArray:
-    """Symmetric 3×3 matrix of unit norm with entries at i, j and j, i."""
-    S = np.zeros((3, 3))
-    S[i, j] = S[j, i] = 1.0
-    return S / np.linalg.norm(S)

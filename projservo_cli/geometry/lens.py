@@ -34,7 +34,7 @@ def _swelling_rate(k1: Number, k2: Number, square: Number) -> Number:
     return k1 + 2.0 * (square * k2)
 
 
-def turning(k1: float, k2: float) -> float:
+def _turning(k1: float, k2: float) -> float:
     """Square of the radius at which the bent radius ρ (1 + k1 ρ² + k2 ρ⁴) turns back, infinite for never."""
     inner = 9.0 * (k1 * k1) - 20.0 * k2
     if not inner >= 0.0:
@@ -44,7 +44,7 @@ def turning(k1: float, k2: float) -> float:
 
 
 # The same three for the kernels, which call nothing that is not compiled.
-_compiled_factor, _compiled_rate, _compiled_limit = njit(_swelling), njit(_swelling_rate), njit(turning)
+_compiled_factor, _compiled_rate, _compiled_limit = njit(_swelling), njit(_swelling_rate), njit(_turning)
 
 
 @merged
@@ -160,7 +160,7 @@ def straight_views(lens: FloatArray, s: FloatArray) -> FloatArray:
 def within(lens: FloatArray, pixels: FloatArray) -> BoolArray:
     """Which straight pixels (..., 2) lie on this side of the turning point of a lens (..., 5)."""
     _, square = _offsets(lens, pixels)
-    limit = np.vectorize(turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
+    limit = np.vectorize(_turning, otypes=[np.float64])(lens[..., 3], lens[..., 4])
     return np.asarray(square < limit)
 
 

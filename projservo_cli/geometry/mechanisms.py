@@ -14,25 +14,28 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     apply_transposed,
+    combine,
     dual_pencil,
     inner,
+    invariant_rotations,
     mat,
     mul,
     multiple,
+    put_vec,
     sub,
     vec,
 )
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.kernels import (
     COORDINATES,
-    RANK_TOLERANCE,
-    back_substitute,
+    System,
     kernel_vector,
+    least_norm,
     least_squares,
-    orthogonalize,
+    new_system,
 )
-from projservo_cli.geometry.kinematics import invariant_rotations, joint_operators, operators_at
-from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.geometry.kinematics import joint_operators, operators_at
+from projservo_cli.records import FloatArray, Model
 
 # A kernel vector whose operator is smaller than this share of its terms moves nothing.
 _NULL_MOTION = 1e-9
@@ -54,70 +57,36 @@ class Work(NamedTuple):
     """Arrays the compiled functions write to, so that nothing is allocated in a loop."""
 
     H_hat: FloatArray  # (n, 4, 4) operators at the current joints
-    B: FloatArray  # (≥ n, rows) columns of the matrix being factorised
-    rhs: FloatArray  # (rows,) right-hand side
-    z: FloatArray
-    pivot: IntArray  # z, pivot: (≥ n,) of the factorisation
+    system: System  # of n unknowns, or of six
     span: Span  # of an arm of n ≠ 6
     basis: FloatArray  # operators whose sums the mechanisms are: of the span, else ``H_hat`` itself
     # independent operators for least squares: of the span of n > 6 joints, else ``H_hat`` itself
     columns: FloatArray
     J: FloatArray  # (6, n) coordinates of the operators in the span
-    norms: FloatArray
-    xi: FloatArray  # norms, xi: (6,) of a factorisation, and coordinates of a displacement
+    xi: FloatArray  # (6,) coordinates of a displacement
+    newton: FloatArray  # (n,) one Newton step
 
 
 def workspace(n: int, rows: int, span: Span = OWN) -> Work:
     """Arrays for n joints and matrices of at most ``rows`` rows, with the span of an arm of n ≠ 6."""
-    columns = max(n, COORDINATES)
-    width = max((n + 3) // 4 * 4, 8, (rows + 3) // 4 * 4)
     H_hat = np.zeros((n, 4, 4))
     own = len(span.H_hat) == 0
     return Work(
         H_hat,
-        np.zeros((columns, width)),
-        np.zeros(width),
-        np.zeros(columns),
-        np.zeros(columns, dtype=np.int64),
+        new_system(max(n, COORDINATES), max(n, 8, rows)),
         span,
         H_hat if own else span.H_hat,
         H_hat if own or n < COORDINATES else span.H_hat,
         np.zeros((COORDINATES, n)),
         np.zeros(COORDINATES),
-        np.zeros(COORDINATES),
+        np.zeros(n),
     )
 
 
 @merged
 def _put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
     """Write a velocity into four rows of column i."""
-    work.B[i, first] = A[0]
-    work.B[i, first + 1] = A[1]
-    work.B[i, first + 2] = A[2]
-    work.B[i, first + 3] = A[3]
-
-
-@internal
-def _kernel_of_eight(work: Work, q_hat: FloatArray) -> bool:
-    """Kernel of the eight rows in ``work.B``, compiled once for that number."""
-    return kernel_vector(work.B, 8, q_hat.shape[0], q_hat, work.pivot, work.z, work.rhs)
-
-
-@merged
-def _operator_of(work: Work, q_hat: FloatArray) -> Mat4:
-    """Operator Σ q̂_i Ĥ_i of a joint motion."""
-    operators = work.basis
-    H = multiple(float(q_hat[0]), mat(operators[0]))
-    for i in range(1, q_hat.shape[0]):
-        K = mat(operators[i])
-        k = float(q_hat[i])
-        H = (
-            H[0] + k * K[0], H[1] + k * K[1], H[2] + k * K[2], H[3] + k * K[3],
-            H[4] + k * K[4], H[5] + k * K[5], H[6] + k * K[6], H[7] + k * K[7],
-            H[8] + k * K[8], H[9] + k * K[9], H[10] + k * K[10], H[11] + k * K[11],
-            H[12] + k * K[12], H[13] + k * K[13], H[14] + k * K[14], H[15] + k * K[15],
-        )  # fmt: skip
-    return H
+    put_vec(work.system.B[i, first : first + 4], A)
 
 
 @merged
@@ -133,8 +102,6 @@ def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tu
         operator = mat(operators[i])
         _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
         _put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
-    if not _kernel_of_eight(work, q_hat):
-        return False, NO_OPERATOR
     return _moving(work, q_hat)
 
 
@@ -147,8 +114,6 @@ def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> t
         operator = mat(operators[i])
         _put_rows(work, i, 0, apply(operator, A_1))
         _put_rows(work, i, 4, apply(operator, A_2))
-    if not _kernel_of_eight(work, q_hat):
-        return False, NO_OPERATOR
     return _to_radians(work, q_hat)
 
 
@@ -161,20 +126,22 @@ def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[b
         operator = mat(operators[i])
         _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
         _put_rows(work, i, 4, apply(operator, A))
-    if not _kernel_of_eight(work, q_hat):
-        return False, NO_OPERATOR
     return _to_radians(work, q_hat)
 
 
 @internal
 def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
-    """Operator of a kernel vector, refused where it moves nothing.
+    """Kernel vector of the eight rows of the system and its operator, refused where that moves nothing.
 
     At a kinematic singularity the kernel is the null motion of the robot: joints move, the face does
     not. Then Σ q̂_i Ĥ_i vanishes against its terms.
     """
-    H = _operator_of(work, q_hat)
+    if not kernel_vector(work.system, 8, q_hat):
+        return False, NO_OPERATOR
     operators = work.basis
+    H = multiple(float(q_hat[0]), mat(operators[0]))
+    for i in range(1, q_hat.shape[0]):
+        H = combine(1.0, H, float(q_hat[i]), mat(operators[i]))
     terms = 0.0
     for i in range(q_hat.shape[0]):
         operator = mat(operators[i])
@@ -186,7 +153,7 @@ def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
 
 @internal
 def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
-    """Scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
+    """The same with the scale ν of [RH00] eqs. (9), (10): eigenvalues ±i, which is trace(Ĥ²) = −2."""
     found, H = _moving(work, q_hat)
     if not found:
         return False, NO_OPERATOR
@@ -201,10 +168,6 @@ def _to_radians(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     for i in range(q_hat.shape[0]):
         q_hat[i] *= nu
     return True, multiple(nu, H)
-
-
-# Once more with what rounding left of a solution by normal equations.
-_PASSES = 2
 
 
 def span_of(model: Model, A: FloatArray) -> Span:
@@ -253,40 +216,11 @@ def joint_motion(work: Work, xi: FloatArray, q_hat: FloatArray) -> bool:
             work.J[a, i] = total
     if n < COORDINATES:
         for a in range(COORDINATES):
-            work.rhs[a] = xi[a]
+            work.system.rhs[a] = xi[a]
             for i in range(n):
-                work.B[i, a] = work.J[a, i]
-        return least_squares(work.B, rows, n, q_hat, work.pivot, work.z, work.rhs)
-    for i in range(n):
-        q_hat[i] = 0.0
-        for a in range(COORDINATES):
-            work.B[a, i] = work.J[a, i]
-    first, _, last = orthogonalize(work.B, n, rows, work.norms, work.z, work.pivot, work.rhs, False)
-    if not last > RANK_TOLERANCE * first:
-        return False
-    for _ in range(_PASSES):
-        _add_least_norm(work, xi, q_hat)
-    return True
-
-
-@merged
-def _add_least_norm(work: Work, xi: FloatArray, q_hat: FloatArray) -> None:
-    """Add Jᵀ(J Jᵀ)⁻¹ of what q̂ lacks of ξ, with Jᵀ factorised in ``work.B``."""
-    n = q_hat.shape[0]
-    z = work.z
-    for k in range(COORDINATES):
-        a = work.pivot[k]
-        total = xi[a]
-        for i in range(n):
-            total -= work.J[a, i] * q_hat[i]
-        for i in range(k):
-            total -= work.B[i, k] * z[i]
-        z[k] = total * work.B[k, k]
-    back_substitute(work.B, work.J.shape[0], z)
-    for k in range(COORDINATES):
-        a = work.pivot[k]
-        for i in range(n):
-            q_hat[i] += work.J[a, i] * z[k]
+                work.system.B[i, a] = work.J[a, i]
+        return least_squares(work.system, rows, q_hat)
+    return least_norm(work.system, work.J, xi, q_hat)
 
 
 _MOST_NEWTON_STEPS = 6
@@ -294,45 +228,36 @@ _MOST_NEWTON_STEPS = 6
 SETTLED = 1e-8
 
 
+class Seen(NamedTuple):
+    """A face, and where the joints were when it was seen."""
+
+    A: FloatArray  # (m, 4) its points
+    H_back: Mat4  # inverse of the forward kinematics
+
+
 @internal
-def reach(
-    model: Model,
-    H_back: Mat4,
-    goal: Mat4,
-    A: FloatArray,
-    q: FloatArray,
-    work: Work,
-    newton: FloatArray,
-    settled: float = SETTLED,
-) -> bool:
-    """Newton steps on the joints ``q``, in place, until they displace the face A by ``goal``.
+def reach(model: Model, face: Seen, goal: Mat4, q: FloatArray, work: Work, settled: float) -> bool:
+    """Newton steps on the joints ``q``, in place, until they displace a face by ``goal`` from where it was.
 
-    Each is of least norm with more than six joints; with fewer the face comes as near as they bring it.
+    Each is of least norm with more than six joints; with fewer the face comes as near as they bring it. The
+    step that is the last has no joint motion above ``settled``, rad or m.
 
-    H_back : inverse forward kinematics at the joints where A was seen.
-    goal : displacement from there.
-    A : (m, 4) points of the face.
-    work, newton : workspaces of n joints and 4m rows; ``newton`` (n,) is left with the last step.
-    settled : Newton step that is the last, rad or m.
+    work : for n joints and 4m rows.
     Returns false where the steps did not settle or the operators are singular.
     """
     n = q.shape[0]
-    m = A.shape[0]
-    redundant = work.columns.shape[0] < n
+    m = face.A.shape[0]
+    B, rhs, newton, columns = work.system.B, work.system.rhs, work.newton, work.columns
+    redundant = columns.shape[0] < n
     x = work.xi if redundant else newton
     for _ in range(_MOST_NEWTON_STEPS):
-        H = mul(operators_at(model, q, work.H_hat), H_back)
+        H = mul(operators_at(model, q, work.H_hat), face.H_back)
         for k in range(m):
-            reached = apply(H, vec(A[k]))
-            miss = sub(apply(goal, vec(A[k])), reached)
-            for j in range(4):
-                work.rhs[4 * k + j] = miss[j]
-            columns = work.columns
+            reached = apply(H, vec(face.A[k]))
+            put_vec(rhs[4 * k : 4 * k + 4], sub(apply(goal, vec(face.A[k])), reached))
             for i in range(columns.shape[0]):
-                velocity = apply(mat(columns[i]), reached)
-                for j in range(4):
-                    work.B[i, 4 * k + j] = velocity[j]
-        if not least_squares(work.B, 4 * m, min(n, x.shape[0]), x, work.pivot, work.z, work.rhs):
+                put_vec(B[i, 4 * k : 4 * k + 4], apply(mat(columns[i]), reached))
+        if not least_squares(work.system, 4 * m, x):
             return False
         if redundant and not joint_motion(work, x, newton):
             return False

@@ -1,7 +1,6 @@
 """Two views of a point: epipolar geometry, optical centres and optimal triangulation."""
 
 import math
-from functools import lru_cache
 
 import numpy as np
 
@@ -92,13 +91,6 @@ def fundamental_matrix(P: FloatArray) -> FloatArray:
 
     Raises WorkFailed if both cameras share one centre.
     """
-    return _fundamental(P.tobytes()).copy()
-
-
-@lru_cache(maxsize=64)
-def _fundamental(cameras: bytes) -> FloatArray:
-    """Fundamental matrix of cameras by their bytes: the laws ask for it anew with every task of a rig."""
-    P = np.frombuffer(cameras).reshape(2, 3, 4)
     rows = np.empty((3, 3, 4, 4))
     rows[:, :, :2] = P[0][_OTHERS]
     rows[:, :, 2:] = P[1][_OTHERS][:, None]
@@ -111,13 +103,6 @@ def _fundamental(cameras: bytes) -> FloatArray:
 
 def optical_centers(P: FloatArray, a_inf: FloatArray) -> FloatArray:
     """Optical centres (2, 4) of both cameras, scaled to a_inf·O = 1."""
-    return _centers(P.tobytes(), a_inf.tobytes()).copy()
-
-
-@lru_cache(maxsize=64)
-def _centers(cameras: bytes, plane: bytes) -> FloatArray:
-    """Optical centres by the bytes of cameras and plane at infinity."""
-    P, a_inf = np.frombuffer(cameras).reshape(2, 3, 4), np.frombuffer(plane)
     centers = np.array([np.linalg.svd(camera)[2][3] for camera in P])
     result: FloatArray = centers / (centers @ a_inf)[:, None]
     return result

@@ -4,10 +4,10 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.control import command
-from projservo_cli.control.law import LOST, SINGULAR, Gains, State
+from projservo_cli.control.law import LOST, SINGULAR, Gains, Law, State
 from projservo_cli.geometry.algebra import mat, put_mat
-from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kinematics import beyond_limits, start_pose
+from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.kinematics import beyond_limits, forward
 from projservo_cli.loop.step import (
     JOINT_LIMIT,
     MARKERS_LOST,
@@ -28,7 +28,7 @@ from projservo_cli.loop.step import (
     verdict_at,
 )
 from projservo_cli.records import FloatArray, Model
-from projservo_cli.robots.simulated import Plant, knock, observe, pose_after, read_joints, rig_distance
+from projservo_cli.robots.simulated import Plant, move, observe, rig_distance
 from projservo_cli.task.face import Task
 
 
@@ -63,7 +63,7 @@ def run(
     for i in range(n):
         log.q[0, i] = q_start[i]
         log.read[0, i] = q_start[i]
-    put_mat(log.H[0], start_pose(plant.model, q_start))
+    put_mat(log.H[0], forward(plant.model, q_start))
     first_distance = 0.0
     first_error = math.nan
     waited = 0
@@ -95,7 +95,7 @@ def run(
         singular = False
         sound = True
         if in_front:
-            status = command(code, model, task, gains, s, log.read[k], state)
+            status = command(Law(code, model, task, gains), s, log.read[k], state)
             seen = status != LOST
             singular = status == SINGULAR
             sound = finite(state.q_dot)
@@ -117,7 +117,7 @@ def run(
             waited += 1
             for i in range(n):
                 dq[i] = 0.0
-            _advance(plant, log, k, dq)
+            move(plant, k + 1, dq, log.H[k : k + 2], log.q[k : k + 2], log.read[k : k + 2])
             continue
         if verdict != RUNNING:
             return verdict, k
@@ -146,7 +146,7 @@ def run(
                     log.path[k, j, i] = state.path[j, i]
         for i in range(n):
             log.q_dot[k, i] = state.q_dot[i]
-        _advance(plant, log, k, dq)
+        move(plant, k + 1, dq, log.H[k : k + 2], log.q[k : k + 2], log.read[k : k + 2])
     last = limits.max_steps
     return PLATEAU if on_plateau(log.judged, last, limits.plateau_steps) else MAX_STEPS, last
 
@@ -162,14 +162,6 @@ def _begin_row(log: Log, k: int) -> None:
         log.q_dot[k, i] = 0.0
     log.factor[k] = 1.0
     log.parts[k] = 0
-
-
-@internal
-def _advance(plant: Plant, log: Log, k: int, dq: FloatArray) -> None:
-    """Move the robot by a joint step, rad or m, overwritten, and whatever befalls it; read its joints."""
-    knock(plant.disturbance, k + 1, dq)
-    put_mat(log.H[k + 1], pose_after(plant, mat(log.H[k]), log.q[k], dq, log.q[k + 1]))
-    read_joints(plant.disturbance, k + 1, log.q[k + 1], log.read[k], log.read[k + 1])
 
 
 class Job(NamedTuple):
@@ -191,7 +183,8 @@ class Job(NamedTuple):
 def many_steps(job: Job) -> float:
     """Measure, partition, command and limit, once in each state of a log: the cost of steps."""
     total = 0.0
+    law = Law(job.code, job.model, job.task, job.gains)
     for k in range(job.log.s.shape[0]):
-        command(job.code, job.model, job.task, job.gains, job.log.s[k], job.log.q[k], job.state)
+        command(law, job.log.s[k], job.log.q[k], job.state)
         total += limit_speed(job.state.q_dot, job.limits.speed)
     return total

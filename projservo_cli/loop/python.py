@@ -8,7 +8,7 @@ from numba import types
 from numba.experimental import structref
 
 from projservo_cli.control import command
-from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, State, new_state
+from projservo_cli.control.law import ERRORS, LOST, SINGULAR, Gains, Law, State, new_state
 from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.geometry.mechanisms import span_of
@@ -75,7 +75,7 @@ def bind(code: int, model: Model, task: Task, gains: Gains, state: State) -> Any
 @allocating
 def bound_command(bound: Any, s: FloatArray, q: FloatArray) -> int:
     """One command of the bound law, as of ``command``: the status, the rest is written to the state."""
-    return command(bound.code, bound.model, bound.task, bound.gains, s, q, bound.state)
+    return command(Law(bound.code, bound.model, bound.task, bound.gains), s, q, bound.state)
 
 
 # What a law may have beside, and what holds where it has not: the share of the amplitude that its own

@@ -8,7 +8,7 @@ from numba import literal_unroll
 
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, MOST_PARTS, Gains, State, measure, new_state, reset
-from projservo_cli.geometry.displacement import as_array
+from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.jit import composed, njit
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.lens import straight

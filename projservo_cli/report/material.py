@@ -28,8 +28,7 @@ from projservo_cli.records import (
     Trace,
     law_and_mode,
 )
-from projservo_cli.robots.simulated import Plant
-from projservo_cli.robots.truth import Robot
+from projservo_cli.robots.simulated import Arm, Plant
 from projservo_cli.store import Run
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ class Material(Fit):
     """All that the figures of a run may show."""
 
     calibrated: Model  # model the laws use
-    robot: Robot
+    robot: Arm
     plant: Plant  # robot, plant: the truth
     plan: Plan  # the plan
     numbers: tuple[int, ...]  # numbers of the face markers

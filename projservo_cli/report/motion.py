@@ -18,8 +18,7 @@ from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.scene import pyramids, skeleton
 from projservo_cli.report.material import CLASSICAL, PAGE_FILE, VIEWS, title
 from projservo_cli.report.page import template
-from projservo_cli.robots.simulated import Plant
-from projservo_cli.robots.truth import Robot
+from projservo_cli.robots.simulated import Arm, Plant
 from projservo_cli.task.face import center_of
 
 MOST_INSTANTS = 60
@@ -77,7 +76,7 @@ class _Motion(NamedTuple):
 
 
 def motion_of(
-    robot: Robot, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
+    robot: Arm, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
 ) -> _Motion:
     """What the view shows of runs with a step at least; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
@@ -103,7 +102,7 @@ def _instants(q: FloatArray) -> IntArray:
     return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
 
 
-def _driven(robot: Robot, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
+def _driven(robot: Arm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
     shown, places = _instants(trace.q), []
     for q in trace.q[shown]:
         H = forward_kinematics(plant.model, q)
@@ -243,7 +242,7 @@ def _still(go: Any, motion: _Motion) -> Iterator[Any]:
 
 
 def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
-    """Robot, face and markers at one of the instants."""
+    """Arm, face and markers at one of the instants."""
     robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
     robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})
     fan = np.arange(1, run.face.shape[1] - 1)

@@ -20,6 +20,7 @@ from typing import Any
 from projservo_cli.records import InputError, WorkFailed
 
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
+_METHODS = {"plant": ("joints", "observe", "command", "stop"), "law": ("__call__",)}
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
 _ALIKE = 0.8
@@ -36,32 +37,29 @@ def target_of(kind: str, name: str) -> str | None:
     return name if re.match(TARGET, name) else registered(kind).get(name)
 
 
-def find(kind: str, target: str, methods: Sequence[str]) -> Any:
+def find(kind: str, target: str) -> Any:
     """Import a class, or a function that makes objects.
 
     kind : ``plant`` or ``law``, for messages.
     target : ``module:Class``; modules are sought on the Python path, then in the working directory.
-    methods : names of the methods its objects must have.
-    Raises InputError if there is no such class or it lacks a method.
+    Raises InputError if there is no such class or it lacks a method that its objects must have.
     """
     where = f"{kind} {target}"
     found = _found(where, *target.split(":"))
     if isinstance(found, type):
-        _require_methods(where, found, methods)
+        _require_methods(where, found, _METHODS[kind])
     return found
 
 
-def make(
-    kind: str, target: str, methods: Sequence[str], arguments: Sequence[Any], options: Mapping[str, Any]
-) -> Any:
+def make(kind: str, target: str, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
     """Import a class and make an object of it.
 
-    kind, target, methods : as for ``find``; arguments, options : what the class is called with.
+    kind, target : as for ``find``; arguments, options : what the class is called with.
     Raises InputError if there is no such class, it lacks a method or does not take the arguments; WorkFailed
     if the class fails when called.
     """
     where = f"{kind} {target}"
-    found = find(kind, target, methods)
+    found = find(kind, target)
     try:
         inspect.signature(found).bind(*arguments, **options)
     except TypeError as error:
@@ -73,7 +71,7 @@ def make(
         result = found(*arguments, **options)
     except Exception as error:
         raise WorkFailed(f"{where}: cannot be made: {what_failed(error)}") from error
-    _require_methods(where, result, methods)
+    _require_methods(where, result, _METHODS[kind])
     return result
 
 

@@ -1,14 +1,28 @@
-"""The true robot and rig as the compiled loop sees them."""
+"""The simulated robot and its rig: from published dimensions, and as the compiled loop sees them."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, combine, dot, mat, mul, put_vec, vec
-from projservo_cli.geometry.displacement import as_array, as_mat, twist_exponential
-from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.geometry.kinematics import forward, row, start_pose
+from projservo_cli.geometry.algebra import (
+    Mat4,
+    Vec4,
+    apply,
+    as_array,
+    as_mat,
+    axpy,
+    combine,
+    dot,
+    mat,
+    mul,
+    put_mat,
+    put_vec,
+    twist_exponential,
+    vec,
+)
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kinematics import forward, forward_kinematics, row
 from projservo_cli.geometry.lens import bend
 from projservo_cli.records import FREE, FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
@@ -52,7 +66,7 @@ class Plant(NamedTuple):
     disturbance: Disturbance = UNDISTURBED  # what befalls the robot
 
 
-@njit
+@internal
 def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: FloatArray) -> Mat4:
     """Displacement of the face after the joint step dq, rad or m; the joints are written to q_next.
 
@@ -69,26 +83,27 @@ def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: Flo
     return mul(twist_exponential(X), H)
 
 
-@merged
-def knock(disturbance: Disturbance, instant: int, dq: FloatArray) -> None:
-    """Add to a joint step, rad or m, what knocks the joints until the instant it ends at."""
+@njit
+def move(plant: Plant, instant: int, dq: FloatArray, H: FloatArray, q: FloatArray, read: FloatArray) -> None:
+    """Move the robot by a joint step, rad or m, and by whatever befalls it, and read its joints.
+
+    instant : that the step ends at.
+    dq : (n,) the step, to which a knock is added.
+    H, q, read : (2, 4, 4), (2, n), (2, n) displacement of the face, joints and their readings, rad or m,
+        before the step and, on return, after it.
+    """
+    disturbance, reading = plant.disturbance, read[1]
     if instant == disturbance.bump_at:
         for i in range(dq.shape[0]):
             dq[i] += disturbance.bump[i]
-
-
-@merged
-def read_joints(
-    disturbance: Disturbance, instant: int, q: FloatArray, before: FloatArray, reading: FloatArray
-) -> None:
-    """Readings (n,) of the joints q (n,), rad or m; ``before`` are those of the instant before."""
-    for i in range(q.shape[0]):
-        reading[i] = q[i]
+    put_mat(H[1], pose_after(plant, mat(H[0]), q[0], dq, q[1]))
+    for i in range(dq.shape[0]):
+        reading[i] = q[1, i]
     if not disturbance.bump_read and 0 <= disturbance.bump_at <= instant:
-        for i in range(q.shape[0]):
+        for i in range(dq.shape[0]):
             reading[i] -= disturbance.bump[i]
     if disturbance.frozen >= 0 and disturbance.frozen_at < instant < disturbance.frozen_until:
-        reading[disturbance.frozen] = before[disturbance.frozen]
+        reading[disturbance.frozen] = read[0, disturbance.frozen]
 
 
 @njit
@@ -114,12 +129,12 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
             if not _put_pixel(camera, lens, A, s[view, k]):
                 in_front = False
             elif plant.opaque and not seen:
-                _put_unseen(s[view, k])
+                s[view, k, :] = math.nan
         for k in range(plant.pins.shape[0]):
             pixel = s[view, m + k]
             A = apply(H, vec(plant.pins[k]))
             if _put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
-                _put_unseen(pixel)
+                pixel[:] = math.nan
     return in_front
 
 
@@ -128,17 +143,10 @@ def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray)
     """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
     depth = row(camera, 2, A)
     if not depth > 0.0:
-        _put_unseen(pixel)
+        pixel[:] = math.nan
         return False
     pixel[0], pixel[1] = bend(lens, row(camera, 0, A) / depth, row(camera, 1, A) / depth)
     return True
-
-
-@merged
-def _put_unseen(pixel: FloatArray) -> None:
-    """Write what stands for an unseen marker, NaN."""
-    pixel[0] = math.nan
-    pixel[1] = math.nan
 
 
 @merged
@@ -178,7 +186,7 @@ class AnalyticPlant:
         self.plant = plant
         self.noise = noise
         self.q = np.array(q_start, dtype=np.float64)
-        self.H = as_array(start_pose(plant.model, self.q))
+        self.H = as_array(forward(plant.model, self.q))
         self.reading = self.q.copy()
         self.shown: list[FloatArray] = []
         self.observations = 0
@@ -209,11 +217,59 @@ class AnalyticPlant:
 
     def command(self, step: FloatArray, period: float) -> None:
         """Move by the joint step (n,), rad or m; the simulated robot always arrives."""
-        step, q_next, before = step.copy(), np.zeros_like(self.q), self.reading.copy()
-        knock(self.plant.disturbance, self.observations, step)
-        self.H = as_array(pose_after(self.plant, as_mat(self.H), self.q, step, q_next))
-        self.q = q_next
-        read_joints(self.plant.disturbance, self.observations, self.q, before, self.reading)
+        H, q, read = (np.stack([rows, rows]) for rows in (self.H, self.q, self.reading))
+        move(self.plant, self.observations, step.copy(), H, q, read)
+        self.H, self.q, self.reading = H[1], q[1], read[1]
 
     def stop(self) -> None:
         """Nothing moves between commands."""
+
+
+METRIC_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+class Arm(NamedTuple):
+    """True kinematics of a serial robot in its base frame."""
+
+    H_hat_0: FloatArray  # (n, 4, 4) twists at the reference, per rad or m
+    joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
+    q_reference: FloatArray  # (n,) rad or m
+    base_tool: FloatArray  # (4, 4) pose of the tool at the reference, m
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+
+    def model(self, P: FloatArray) -> Model:
+        """Metric model of the robot seen by the cameras P (2, 3, 4)."""
+        return Model(
+            np.ascontiguousarray(P, dtype=np.float64),
+            self.H_hat_0,
+            self.joint_types,
+            self.q_reference,
+            METRIC_A_INF.copy(),
+        )
+
+    def pose(self, q: FloatArray) -> FloatArray:
+        """Pose (4, 4) of the tool at the joints q (n,), m."""
+        result: FloatArray = forward_kinematics(self.model(np.zeros((2, 3, 4))), q) @ self.base_tool
+        return result
+
+
+def camera_center(camera: FloatArray) -> FloatArray:
+    """Optical centre (3,) of a metric camera (3, 4), m."""
+    return np.asarray(-np.linalg.solve(camera[:, :3], camera[:, 3]))
+
+
+def _optical_axis(camera: FloatArray) -> FloatArray:
+    """Unit viewing direction (3,) of a metric camera (3, 4)."""
+    forward_direction = np.linalg.det(camera[:, :3]) * camera[2, :3]
+    return np.asarray(forward_direction / np.linalg.norm(forward_direction))
+
+
+def roll_axis(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Roll axis of a rig: the point midway between the optical centres, m, and the mean direction.
+
+    P : (2, 3, 4) metric cameras.
+    """
+    point = 0.5 * (camera_center(P[0]) + camera_center(P[1]))
+    direction = _optical_axis(P[0]) + _optical_axis(P[1])
+    return point, direction / np.linalg.norm(direction)

@@ -11,15 +11,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation
-from projservo_cli.geometry.displacement import as_array
-from projservo_cli.geometry.kinematics import start_pose
+from projservo_cli.geometry.algebra import as_array
+from projservo_cli.geometry.kinematics import forward
 from projservo_cli.records import FloatArray, IntArray, WorkFailed
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import Plant, observe
 
 # Time a robot has to come to rest, s; until then not even Ctrl-C ends the waiting.
 STOP_S = 10.0
-METHODS = ("joints", "observe", "command", "stop")
 
 
 class Robot(Protocol):
@@ -225,7 +224,7 @@ class DrivenRobot:
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
         self.q = self.robot.joints()
-        H = start_pose(self.plant.model, self.q)
+        H = forward(self.plant.model, self.q)
         self.H = as_array(H)
         M = np.zeros_like(self.plant.M)
         observe(self.plant, H, M, np.zeros((2, len(M), 2)), self.hidden)

@@ -9,7 +9,7 @@ from projservo_cli.config import Config
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.simulated import Plant
-from projservo_cli.robots.yours import METHODS, DrivenRobot, ForeignRobot, Robot
+from projservo_cli.robots.yours import DrivenRobot, ForeignRobot, Robot
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.world import Joints
 
@@ -30,7 +30,7 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
             raise InputError(
                 f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot: Robot = plugins.make("plant", target, METHODS, (), config.plant.options.values())
+    robot: Robot = plugins.make("plant", target, (), config.plant.options.values())
     return ForeignRobot(robot, f"plant {target}", len(joints.types), markers, config.plant.timeout_s)
 
 

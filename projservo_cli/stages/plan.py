@@ -10,8 +10,7 @@ from scipy.optimize import least_squares
 from projservo_cli.config import Config
 from projservo_cli.config.models import Trajectory
 from projservo_cli.control.law import State, new_state
-from projservo_cli.geometry.algebra import vec
-from projservo_cli.geometry.displacement import as_array, composed_angle
+from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views

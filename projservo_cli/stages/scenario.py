@@ -27,8 +27,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.robots.simulated import NEVER, NO_PINS, Disturbance, Plant
-from projservo_cli.robots.truth import METRIC_A_INF
+from projservo_cli.robots.simulated import METRIC_A_INF, NEVER, NO_PINS, Disturbance, Plant
 from projservo_cli.stages.world import (
     Joints,
     Truth,

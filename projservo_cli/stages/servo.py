@@ -352,7 +352,7 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
         model = image_model(scenario.calibration)
         # Its own: what a law writes to must not be what other laws are given.
         setup = copy.deepcopy(LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period))
-        return ForeignLaw(plugins.make("law", law, ("__call__",), (setup,), {}), f"law {law}")
+        return ForeignLaw(plugins.make("law", law, (setup,), {}), f"law {law}")
     believed = scenario.believed_by(law)
     built_in = BuiltInLaw(CODES[law], believed, _task_for(scenario, plan, law, replans, believed), gains)
     sense = in_span(built_in.state.work.span, believed, ends.q_start, plan.rotation_sense())

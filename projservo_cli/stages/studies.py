@@ -10,15 +10,15 @@ import numpy as np
 
 from projservo_cli.config import Config
 from projservo_cli.control.law import Gains
-from projservo_cli.geometry.displacement import (
+from projservo_cli.geometry.algebra import (
     as_array,
     as_mat,
-    compose_rotations,
+    composed_angle,
+    composed_operator,
     exp_rotation,
-    exp_translation,
     twist_exponential,
 )
-from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace
+from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import plan_task
@@ -138,12 +138,18 @@ def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> tuple[F
     """How far both sides of [RH00] eq. (22) differ when a metric plan is taken in shares λ of τ and θ_s.
 
     Returns distance: (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m; norm:
-    (k,) Frobenius norm of the difference of both displacements, m and rad mixed.
+    (k,) Frobenius norm of the difference of both displacements, m and rad mixed. Raises WorkFailed if the
+    task has no rotation.
     """
-    theta_s, H_hat_s = compose_rotations(plan.H_hat[1], plan.H_hat[2], plan.theta_r, plan.theta_p)
+    theta_s, a, b, c = composed_angle(plan.theta_r, plan.theta_p)
+    turns, H_s = composed_operator(as_mat(plan.H_hat[1]), as_mat(plan.H_hat[2]), a, b, c)
+    if not turns:
+        raise WorkFailed("two rotations by 0° compose to the identity, which has no axis")
+    H_hat_s = as_array(H_s)
     distance, norm = [], []
     for share in lambdas:
-        product = exp_translation(plan.H_hat[0], share * plan.tau) @ exp_rotation(H_hat_s, share * theta_s)
+        shift = np.eye(4) + share * plan.tau * plan.H_hat[0]
+        product = shift @ exp_rotation(H_hat_s, share * theta_s)
         summed = share * (plan.tau * plan.H_hat[0] + theta_s * H_hat_s)
         difference = product - as_array(twist_exponential(as_mat(summed)))
         distance.append(float(np.linalg.norm(difference @ plan.A_c)))

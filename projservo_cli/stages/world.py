@@ -7,24 +7,15 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.config import Config
 from projservo_cli.config.models import Goal
-from projservo_cli.config.robot import Camera, JointVector, Markers, Rig
-from projservo_cli.config.robot import Robot as DescribedRobot
-from projservo_cli.geometry.kinematics import project
+from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, Robot
+from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.loop.summary import Ends
-from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model
-from projservo_cli.robots.truth import (
-    Robot,
-    dh_robot,
-    inverse_kinematics,
-    look_at_camera,
-    rigid,
-    roll_axis,
-    rotation_about_axis,
-    twist,
-)
+from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.robots.simulated import Arm, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
 
 
@@ -80,7 +71,7 @@ def image_size_of(config: Config) -> tuple[int, int] | None:
 class Truth:
     """Robot, rig and markers as they are."""
 
-    robot: Robot  # true kinematics
+    robot: Arm  # true kinematics
     P: FloatArray  # (2, 3, 4) true cameras, px
     M: FloatArray  # (m, 4) all markers at the robot's reference, m
     number: tuple[int, ...]  # (m,) their numbers
@@ -125,14 +116,14 @@ class Truth:
         """Joints (n,) after a turn about the roll axis of the rig and a small displacement of the tool."""
         assert goal.turn_deg is not None
         point, direction = roll_axis(self.P)
-        pose = rotation_about_axis(point, direction, math.radians(goal.turn_deg)) @ self.robot.pose(q_start)
+        pose = _about_axis(point, direction, math.radians(goal.turn_deg)) @ self.robot.pose(q_start)
         if goal.perturbation is not None:
             v = np.array(goal.perturbation.rotation_rad)
             t = np.array(goal.perturbation.translation_m)
             angle = float(np.linalg.norm(v))
-            turn = rotation_about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
-            pose = pose @ rigid(np.eye(3), t) @ turn
-        return inverse_kinematics(self.robot, pose, q_start)
+            turn = _about_axis(np.zeros(3), v, angle) if angle > 0.0 else np.eye(4)
+            pose = pose @ _rigid(Rotation.identity(), t) @ turn
+        return _inverse_kinematics(self.robot, pose, q_start)
 
     @cached_property
     def _from_tool(self) -> FloatArray:
@@ -170,7 +161,7 @@ def truth_of(config: Config) -> Truth:
 
 
 @lru_cache(maxsize=16)
-def _built(described: DescribedRobot, rig: Rig, markers: Markers) -> Truth:
+def _built(described: Robot, rig: Rig, markers: Markers) -> Truth:
     robot = _robot_of(described)
     numbers = markers.known
     assert numbers is not None
@@ -187,28 +178,49 @@ def _built(described: DescribedRobot, rig: Rig, markers: Markers) -> Truth:
     )
 
 
-def _robot_of(described: DescribedRobot) -> Robot:
-    """Robot of a DH table or of screws."""
-    limits = described.limits
-    if described.dh is not None:
-        table = described.dh
-        rows = [
-            (j.type == "P", math.radians(j.theta_deg), j.d_m, j.a_m, math.radians(j.alpha_deg))
-            for j in table.joints
-        ]
-        return dh_robot(rows, table.convention == "modified", np.array(table.tool), limits)
-    screws = described.screws
-    assert screws is not None
-    types = described.joint_types
-    bounds = np.array(limits)
-    return Robot(
-        np.array([twist(j.w, j.v) for j in screws.joints]),
-        np.array([PRISMATIC if t == "P" else REVOLUTE for t in types], dtype=np.int64),
-        np.array(screws.reference.values(types)),
-        np.array(screws.base_tool),
-        np.ascontiguousarray(bounds[:, 0]),
-        np.ascontiguousarray(bounds[:, 1]),
-    )
+def _twist(w: Sequence[float], v: Sequence[float]) -> FloatArray:
+    """4×4 twist of an angular velocity w (rad) and a velocity v of the origin (m)."""
+    return np.array([[0.0, -w[2], w[1], v[0]], [w[2], 0.0, -w[0], v[1]], [-w[1], w[0], 0.0, v[2]], [0.0] * 4])
+
+
+def _rigid(R: Rotation, t: Sequence[float] | FloatArray) -> FloatArray:
+    """4×4 displacement of a rotation and a translation (3,), m."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R.as_matrix(), t
+    return T
+
+
+def _about_axis(point: FloatArray, direction: FloatArray, theta: float) -> FloatArray:
+    """4×4 rotation by θ, rad, about the axis through a point (3,), m, along a direction (3,)."""
+    R = Rotation.from_rotvec(theta * direction / np.linalg.norm(direction))
+    return _rigid(R, point - R.as_matrix() @ point)
+
+
+def _robot_of(described: Robot) -> Arm:
+    """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero.
+
+    In Craig's modified convention a and α come before θ and d; the joint variable is added to θ or d.
+    Source: P. Corke, Robotics, Vision and Control, 2nd ed., section 7.1.
+    """
+    kinds = described.joint_types
+    types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
+    lower, upper = np.array(described.limits, dtype=np.float64).T.copy()
+    if described.screws is not None:
+        screws = described.screws
+        twists = np.array([_twist(joint.w, joint.v) for joint in screws.joints])
+        q_reference = np.array(screws.reference.values(kinds))
+        return Arm(twists, types, q_reference, np.array(screws.base_tool), lower, upper)
+    assert described.dh is not None
+    table, T, moved = described.dh, np.eye(4), []
+    for joint in table.joints:
+        turn = _rigid(Rotation.from_rotvec([0.0, 0.0, math.radians(joint.theta_deg)]), [0.0, 0.0, joint.d_m])
+        tilt = _rigid(Rotation.from_rotvec([math.radians(joint.alpha_deg), 0.0, 0.0]), [joint.a_m, 0.0, 0.0])
+        if table.convention == "modified":
+            T, tilt = T @ tilt, np.eye(4)
+        axis = _twist([0, 0, 0], [0, 0, 1]) if joint.type == "P" else _twist([0, 0, 1], [0, 0, 0])
+        moved.append(T @ axis @ np.linalg.inv(T))
+        T = T @ turn @ tilt
+    return Arm(np.array(moved), types, np.zeros(len(kinds)), T @ np.array(table.tool), lower, upper)
 
 
 def _camera_of(camera: Camera) -> FloatArray:
@@ -217,13 +229,78 @@ def _camera_of(camera: Camera) -> FloatArray:
         P = np.array(camera.matrix)
         # A camera is given up to scale; the loop needs the scale that makes depths positive metres.
         scale = float(np.sign(np.linalg.det(P[:, :3])) * np.linalg.norm(P[2, :3]))
-        if scale == 0.0:
-            raise InputError("rig: a camera matrix needs an invertible left 3×3 block: a finite camera")
         return P / scale if abs(scale - 1.0) > 1e-12 else P
     assert camera.focal_px is not None
     assert camera.principal_point_px is not None
     assert camera.position_m is not None
     assert camera.target_m is not None
-    return look_at_camera(
-        camera.focal_px, camera.principal_point_px, camera.position_m, camera.target_m, camera.up
-    )
+    z = np.subtract(camera.target_m, camera.position_m)
+    x = np.cross(z, camera.up)
+    z = z / np.linalg.norm(z)
+    x = x / np.linalg.norm(x)
+    R = np.stack([x, np.cross(z, x), z])
+    (f_u, f_v), (u, v) = camera.focal_px, camera.principal_point_px
+    K = np.array([[f_u, 0.0, u], [0.0, f_v, v], [0.0, 0.0, 1.0]])
+    return np.asarray(K @ np.c_[R, -R @ np.asarray(camera.position_m)])
+
+
+def _inverse_kinematics(robot: Arm, goal: FloatArray, q_start: FloatArray) -> FloatArray:
+    """Joints within the limits that put the tool at a pose, as near to the start as found.
+
+    Damped Newton steps on the pose from the start and from 30 seeded places within the limits; the
+    solution with the least joint motion wins.
+
+    goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
+    Raises WorkFailed if none of the starts reaches the goal within the limits.
+    """
+    rng = np.random.default_rng(0)
+    span_lower = np.maximum(robot.lower, q_start - 2 * math.pi)
+    span_upper = np.minimum(robot.upper, q_start + 2 * math.pi)
+    found = []
+    for trial in range(31):
+        q = _newton(robot, goal, q_start if trial == 0 else rng.uniform(span_lower, span_upper))
+        if q is not None:
+            q = _unwind(robot, q, q_start)
+            if np.all(q >= robot.lower) and np.all(q <= robot.upper):
+                found.append(q)
+    if not found:
+        x, y, z = goal[:3, 3]
+        raise WorkFailed(
+            f"task.goal: the robot cannot put its tool at ({x:.3f}, {y:.3f}, {z:.3f}) m with this rotation "
+            "within its joint limits: choose a nearer goal, another start or wider limits"
+        )
+    return min(found, key=lambda q: float(np.linalg.norm(q - q_start)))
+
+
+def _newton(robot: Arm, goal: FloatArray, q: FloatArray) -> FloatArray | None:
+    """Damped Newton steps to a pose; None where they do not arrive."""
+    model = robot.model(np.zeros((2, 3, 4)))
+    for _ in range(40):
+        pose = forward_kinematics(model, q) @ robot.base_tool
+        gap = goal @ np.linalg.inv(pose)
+        error = np.r_[Rotation.from_matrix(gap[:3, :3]).as_rotvec(), goal[:3, 3] - pose[:3, 3]]
+        if np.abs(error).max() < 1e-13:
+            return q
+        H_hat = joint_operators(model, q)
+        tip = H_hat @ pose[:, 3]
+        J = np.stack([H_hat[:, 2, 1], H_hat[:, 0, 2], H_hat[:, 1, 0], *tip.T[:3]])
+        damping = 1e-9 * float(error @ error)
+        if len(q) > len(error):  # of least norm
+            step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(len(error)), error)
+        else:
+            step = np.linalg.solve(J.T @ J + damping * np.eye(len(q)), J.T @ error)
+        q = q + step / max(1.0, float(np.abs(step).max()) / 0.5)
+    return q if np.abs(error).max() < 1e-10 else None
+
+
+def _unwind(robot: Arm, q: FloatArray, near: FloatArray) -> FloatArray:
+    """Shift revolute joints by whole turns to within half a turn of ``near`` where limits allow."""
+    turned = q.copy()
+    for i, kind in enumerate(robot.joint_types):
+        if kind == PRISMATIC:
+            continue
+        candidates = q[i] + 2 * math.pi * np.arange(-4, 5)
+        inside = candidates[(candidates >= robot.lower[i]) & (candidates <= robot.upper[i])]
+        if len(inside):
+            turned[i] = inside[np.argmin(np.abs(inside - near[i]))]
+    return turned

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import displacements, image_points, moved_points
+from projservo_cli.calibration.forward import displacements, image_points, moved_points
 from projservo_cli.config import Config, Override, digest, load_config, to_yaml
 from projservo_cli.config.models import Goal, Task
 from projservo_cli.config.robot import JointVector
@@ -27,7 +27,7 @@ from projservo_cli.records import (
     law_and_mode,
     names_of,
 )
-from projservo_cli.robots.truth import METRIC_A_INF
+from projservo_cli.robots.simulated import METRIC_A_INF
 from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
 from projservo_cli.stages.world import Truth, truth_of
 

@@ -11,25 +11,35 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import (
     Mat4,
+    Vec4,
     add,
     apply,
     apply_transposed,
     combine,
     dot,
+    invariant_rotations,
     mat,
     mul,
-    outer,
     put_vec,
     scale,
+    twist_exponential,
     vec,
 )
-from projservo_cli.geometry.displacement import twist_exponential
 from projservo_cli.geometry.jit import inline, internal, merged, njit
-from projservo_cli.geometry.kernels import COORDINATES, NOTHING, Row, accumulate, put_sums, solve_normal
-from projservo_cli.geometry.kinematics import invariant_rotations
+from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.records import BoolArray, FloatArray, Model
 
 Vec3 = tuple[float, float, float]
+Row = tuple[float, float, float, float, float, float, float]
+# Products of the columns of (J, e) with those of J, upper triangle by rows.
+Sums = tuple[
+    float, float, float, float, float, float, float, float, float, float, float, float, float, float,
+    float, float, float, float, float, float, float, float, float, float, float, float, float,
+]  # fmt: skip
+NOTHING: Sums = (
+    0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+    0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0,
+)  # fmt: skip
 # A step that moves the images by less than this, px rms a coordinate, is the last: what it leaves is
 # its square over the size of the body in the image, a few thousandths of a pixel.
 SETTLED_PX = 0.5
@@ -123,6 +133,72 @@ def new_normal() -> FloatArray:
 
 
 @inline
+def _accumulate(N: Sums, a: Row, b: Row) -> Sums:
+    """Sums after two more rows (J, e) of Jacobian and residual."""
+    return (
+        N[0] + (a[0] * a[0] + b[0] * b[0]), N[1] + (a[0] * a[1] + b[0] * b[1]),
+        N[2] + (a[0] * a[2] + b[0] * b[2]), N[3] + (a[0] * a[3] + b[0] * b[3]),
+        N[4] + (a[0] * a[4] + b[0] * b[4]), N[5] + (a[0] * a[5] + b[0] * b[5]),
+        N[6] + (a[0] * a[6] + b[0] * b[6]), N[7] + (a[1] * a[1] + b[1] * b[1]),
+        N[8] + (a[1] * a[2] + b[1] * b[2]), N[9] + (a[1] * a[3] + b[1] * b[3]),
+        N[10] + (a[1] * a[4] + b[1] * b[4]), N[11] + (a[1] * a[5] + b[1] * b[5]),
+        N[12] + (a[1] * a[6] + b[1] * b[6]), N[13] + (a[2] * a[2] + b[2] * b[2]),
+        N[14] + (a[2] * a[3] + b[2] * b[3]), N[15] + (a[2] * a[4] + b[2] * b[4]),
+        N[16] + (a[2] * a[5] + b[2] * b[5]), N[17] + (a[2] * a[6] + b[2] * b[6]),
+        N[18] + (a[3] * a[3] + b[3] * b[3]), N[19] + (a[3] * a[4] + b[3] * b[4]),
+        N[20] + (a[3] * a[5] + b[3] * b[5]), N[21] + (a[3] * a[6] + b[3] * b[6]),
+        N[22] + (a[4] * a[4] + b[4] * b[4]), N[23] + (a[4] * a[5] + b[4] * b[5]),
+        N[24] + (a[4] * a[6] + b[4] * b[6]), N[25] + (a[5] * a[5] + b[5] * b[5]),
+        N[26] + (a[5] * a[6] + b[5] * b[6]),
+    )  # fmt: skip
+
+
+@merged
+def _put_sums(N: FloatArray, sums: Sums) -> None:
+    """Write the sums into the upper triangle and the last column of an array (6, 7)."""
+    n = 0
+    for i in range(COORDINATES):
+        for j in range(i, COORDINATES + 1):
+            N[i, j] = sums[n]
+            n += 1
+
+
+@merged
+def solve_normal(N: FloatArray, tolerance: float) -> bool:
+    """Solution of symmetric positive definite equations by the root-free Cholesky factorisation, in place.
+
+    N : (6, 7) upper triangle of the matrix, and the right-hand side in the last column, which the solution
+        replaces; the rest is overwritten.
+    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is what of a column
+        of the least-squares problem the columns before do not explain, squared.
+    Returns false where the matrix is singular; source: G. Golub, C. Van Loan, Matrix Computations, section
+    4.1.2.
+    """
+    n = COORDINATES
+    for j in range(n):
+        pivot = N[j, j]
+        for k in range(j):
+            pivot -= N[j, k] * N[k, j]
+        if not pivot > tolerance * N[j, j]:
+            return False
+        N[j, j] = pivot
+        for i in range(j + 1, n + 1):
+            total = N[j, i]
+            for k in range(j):
+                total -= N[j, k] * N[k, i]
+            N[j, i] = total
+        inverse = 1.0 / pivot
+        for i in range(j + 1, n):
+            N[i, j] = inverse * N[j, i]
+    for j in range(n - 1, -1, -1):
+        total = N[j, n] / N[j, j]
+        for i in range(j + 1, n):
+            total -= N[i, j] * N[i, n]
+        N[j, n] = total
+    return True
+
+
+@inline
 def _image_row(t: Vec3, t_depth: Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float) -> Row:
     """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
 
@@ -183,11 +259,17 @@ def normal_equations(
             e_v = float(s[view, k, 1]) - v
             row_u = _image_row(t_u, t_w, u, inverse, body.turn[k], e_u)
             row_v = _image_row(t_v, t_w, v, inverse, body.turn[k], e_v)
-            N = accumulate(N, row_u, row_v)
+            N = _accumulate(N, row_u, row_v)
             squares += e_u * e_u + e_v * e_v
             views += 1
-    put_sums(normal, N)
+    _put_sums(normal, N)
     return squares, views
+
+
+@inline
+def _outer(A: Vec4, a: Vec4) -> Mat4:
+    """Product A aᵀ of a point and a plane."""
+    return scale(A[0], a) + scale(A[1], a) + scale(A[2], a) + scale(A[3], a)
 
 
 @internal
@@ -198,7 +280,7 @@ def _displaced(body: Body, H: Mat4, normal: FloatArray) -> Mat4:
         scale(float(xi[0]), vec(body.D[0])),
         add(scale(float(xi[1]), vec(body.D[1])), scale(float(xi[2]), vec(body.D[2]))),
     )
-    X = outer(direction, vec(body.a_inf))
+    X = _outer(direction, vec(body.a_inf))
     for i in range(3):
         X = combine(1.0, X, float(xi[3 + i]), mat(body.H_hat[i]))
     return mul(H, twist_exponential(X))

@@ -23,7 +23,7 @@ from projservo_cli.geometry.algebra import Mat4, apply, axpy, dot, mat, put_mat,
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize
 from projservo_cli.geometry.kinematics import backward, image_velocity, operators_at, project
-from projservo_cli.geometry.mechanisms import SETTLED, Work, reach, span_of, workspace
+from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, reach, span_of, workspace
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
@@ -149,16 +149,15 @@ class _Carrier(NamedTuple):
 
     reaching: Reaching  # the task
     work: Work  # workspace of n joints and 4m rows
-    newton: FloatArray
     before: FloatArray
-    M: FloatArray  # newton, before, M: (n,), (n,) and (2, 4) workspaces
+    M: FloatArray  # before, M: (n,) and (2, 4) workspaces
 
 
 def carrier_of(reaching: Reaching) -> _Carrier:
     """Workspace in which the joints of a task are carried."""
     n = len(reaching.q_start)
     work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
-    return _Carrier(reaching, work, np.empty(n), np.empty(n), np.empty((2, 4)))
+    return _Carrier(reaching, work, np.empty(n), np.empty((2, 4)))
 
 
 @njit
@@ -176,7 +175,7 @@ def carry_joints(
     """
     reaching, work, before = carrier.reaching, carrier.work, carrier.before
     model = reaching.model
-    H_back = backward(model, reaching.q_start)
+    face = Seen(reaching.A, backward(model, reaching.q_start))
     operators_at(model, q, work.H_hat)
     goal = displaced(reaching.H_hat, reaching.amplitudes, ends[0, 0], ends[0, 1], ends[0, 2])
     for part in range(1, parts + 1):
@@ -187,7 +186,7 @@ def carry_joints(
         mu_r = (1.0 - x) * ends[0, 1] + x * ends[1, 1]
         mu_p = (1.0 - x) * ends[0, 2] + x * ends[1, 2]
         goal = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
-        if not reach(model, H_back, goal, reaching.A, q, work, carrier.newton, settled):
+        if not reach(model, face, goal, q, work, settled):
             return -1.0
         for i in range(q.shape[0]):
             if not abs(q[i] - before[i]) <= stride:
@@ -211,11 +210,11 @@ def _reciprocal_condition(carrier: _Carrier, H: Mat4) -> float:
             put_vec(M[1], apply(mat(work.H_hat[i]), vec(M[0])))
             for view in range(2):
                 _, _, du, dv = image_velocity(P[view], M[0], M[1])
-                work.B[i, 4 * k + 2 * view] = du
-                work.B[i, 4 * k + 2 * view + 1] = dv
-    first, _, last = orthogonalize(work.B, 4 * m, n, carrier.newton, work.z, work.pivot, work.rhs, False)
+                work.system.B[i, 4 * k + 2 * view] = du
+                work.system.B[i, 4 * k + 2 * view + 1] = dv
+    first, _, last = orthogonalize(work.system, 4 * m, n, False)
     if n > COORDINATES:  # further joints add no motion of the face
-        sixth = work.B[COORDINATES - 1, COORDINATES - 1]
+        sixth = work.system.B[COORDINATES - 1, COORDINATES - 1]
         last = 1.0 / sixth if sixth > 0.0 else 0.0
     return last / first if first > 0.0 else 0.0
 

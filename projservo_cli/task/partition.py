@@ -12,16 +12,17 @@ from projservo_cli.geometry.algebra import (
     axpy,
     dot,
     dual_pencil,
+    incidence_angles,
     meet,
     mul,
     multiple,
     put_vec,
+    rotation,
     scale,
     sub,
     unit,
     vec,
 )
-from projservo_cli.geometry.displacement import incidence_angles, rotation
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.mechanisms import (
     NO_OPERATOR,
@@ -186,7 +187,7 @@ def _oriented_angle(A: FloatArray, a: Vec4, a_t: Vec4, H_r: Mat4) -> tuple[bool,
     found, plus, minus = incidence_angles(p_0, p_s, p_c)
     if not found:
         return False, 0.0
-    turned = apply_transposed(rotation(H_r, mul(H_r, H_r), -plus), a)
+    turned = apply_transposed(rotation(H_r, -plus), a)
     return True, plus if dot(turned, a_t) > 0.0 else minus
 
 
@@ -272,7 +273,7 @@ def partition(
     if found:
         found, theta_r, H_r = onto_plane_part(work, task, face, a_t, q_hat[1], memory)
     if found:
-        back = rotation(H_r, mul(H_r, H_r), -theta_r)
+        back = rotation(H_r, -theta_r)
         for k in range(A.shape[0]):
             put_vec(A_r[k], apply(back, vec(A_t[k])))
         found, theta_p, H_p = _within_plane_part(work, face, A_r, q_hat[2], memory)

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from projservo_cli.geometry.algebra import mat, vec
-from projservo_cli.geometry.displacement import wrap
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 from projservo_cli.task.margins import (
     CONDITIONING,
@@ -121,7 +120,7 @@ def turning_sense(reaching: Reaching) -> float:
         for center in (O, O - tau * (reaching.H_hat[0] @ O)):
             _, c_s, c_c = margin_coefficients(a, H_r, vec(center))
             middle.append(math.atan2(sign * c_s, sign * c_c))
-        end = middle[0] + wrap(middle[1] - middle[0])
+        end = middle[0] + math.remainder(middle[1] - middle[0], 2.0 * math.pi)
         for i, sense in enumerate(senses):
             inside[i] += abs(sense - end) < 0.5 * math.pi
     return senses[1] if inside[1] > inside[0] else senses[0]

@@ -5,8 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, mul
-from projservo_cli.geometry.displacement import translation
+from projservo_cli.geometry.algebra import Mat4, mul, translation
 from projservo_cli.geometry.jit import composed
 from projservo_cli.geometry.kinematics import forward, operators_at
 from projservo_cli.geometry.lens import straight_views

@@ -4,8 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, mat, mul
-from projservo_cli.geometry.displacement import as_array, rotation, translation
+from projservo_cli.geometry.algebra import Mat4, as_array, mat, mul, rotation, translation
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.records import FloatArray
 
@@ -47,7 +46,7 @@ def profile_shares(profile: str, sigma: FloatArray, pure_translation: float = 1.
 @njit
 def turned(H_r: Mat4, H_p: Mat4, theta_r: float, theta_p: float) -> Mat4:
     """Rotations of the planned displacement, exp(θ_r Ĥ_r) exp(θ_p Ĥ_p) of [RH00] eq. (17)."""
-    return mul(rotation(H_r, mul(H_r, H_r), theta_r), rotation(H_p, mul(H_p, H_p), theta_p))
+    return mul(rotation(H_r, theta_r), rotation(H_p, theta_p))
 
 
 @njit
@@ -140,7 +139,7 @@ def planned_step(reference: Reference, clock: float, share: float) -> Mat4:
     theta_r = between(mu[:, 1], i, x) * float(reference.amplitudes[1])
     theta_p = between(mu[:, 2], i, x) * float(reference.amplitudes[2])
     tau = between(mu[:, 0], i, x) * float(reference.amplitudes[0])
-    turned_back = mul(rotation(H_p, mul(H_p, H_p), -theta_p), rotation(H_r, mul(H_r, H_r), -theta_r))
+    turned_back = mul(rotation(H_p, -theta_p), rotation(H_r, -theta_r))
     return mul(
         planned(reference, clock + share), mul(turned_back, translation(mat(reference.H_hat[0]), -tau))
     )

@@ -8,8 +8,7 @@ import math
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, vec
-from projservo_cli.geometry.displacement import incidence_angles
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, incidence_angles, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.records import FloatArray
 from projservo_cli.task.face import Task

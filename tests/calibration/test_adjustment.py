@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from projservo_cli.calibration.adjustment import Scene, minimize, prepare
-from projservo_cli.calibration.prediction import displacements
-from projservo_cli.calibration.readings import gather
+from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.forward import Scene, displacements
+from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.records import Model
 from tests.calibration.simulated_robot import Robot, around, random_robot
@@ -22,9 +22,9 @@ def problem_of(robot: Robot, count: int = 5, unseen: float = 0.0, lens=None):
     observation = robot.observe(around(robot, count, rng), 0.0, rng)
     if unseen:
         observation.images[rng.random(observation.images.shape[:3]) < unseen] = np.nan
-    readings = gather(observation, robot.joint_types)
-    problem = prepare(readings, robot.q_reference, lens is not None)
-    return problem, Scene(robot.cameras, robot.twists, robot.markers, lens)
+    readings = Readings.of(observation, robot.joint_types)
+    problem = LeastSquares.of(readings, robot.q_reference, lens is not None)
+    return problem, Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers, lens)
 
 
 def full_jacobian(problem, J):
@@ -100,7 +100,7 @@ def test_twin_of_the_kernels():
         H = np.linalg.multi_dot(list(E[:, k]))
         assert np.abs(H - forward_kinematics(model, q)).max() < 1e-12
     _, J = problem.joint_derivative(scene)
-    moved = problem.carried(scene)[1][0]
+    moved = problem.images(scene).points[0]
     for row in range(0, len(moved), 7):
         q = problem.readings.q[problem.readings.pose_of[row]]
         kernel = image_jacobian(robot.cameras, moved[row : row + 1], joint_operators(model, q))
@@ -140,7 +140,7 @@ def test_search_returns_to_the_truth_from_a_disturbed_start():
 def test_cameras_stay_where_they_are_held():
     robot = random_robot("RRR", np.random.default_rng(9))
     problem, scene = problem_of(robot, count=10)
-    start = Scene(scene.P, scene.H_hat, scene.M + np.array([0.01, 0.0, 0.0, 0.0]))
+    start = dataclasses.replace(scene, M=scene.M + np.array([0.01, 0.0, 0.0, 0.0]))
     fit = minimize(problem, start, lambda residual: problem.readings.seen.astype(float), cameras=False)
     assert np.array_equal(fit.scene.P, scene.P)
     assert fit.cost < 1e-9

@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict, residual_statistics
-from projservo_cli.calibration.adjustment import Scene, prepare
-from projservo_cli.calibration.covariance import (
-    covariance_factor,
-    isotropic,
-    projective,
-    spread_factor,
-)
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.fit import Solution
+from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.prediction import prediction_derivative
-from projservo_cli.calibration.readings import gather
+from projservo_cli.calibration.projective import covariance_factor, isotropic, projective, spread_factor
+from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics
-from projservo_cli.records import InputError, Model, Observation
+from projservo_cli.records import Calibration, InputError, Observation
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
+from tests.fake_records import fake
 
 
 def noisy(types="RRPRRR", seed=5, sigma=0.5, poses=trials):
@@ -91,13 +89,13 @@ def test_frame_does_not_depend_on_the_frame_it_comes_from():
     a_inf = np.array([0.0, 0.0, 0.0, 1.0])
     rng = np.random.default_rng(3)
     points = np.hstack([rng.uniform(-0.2, 0.2, (50, 3)), np.ones((50, 1))])
-    first = isotropic(robot.cameras, robot.twists, robot.markers, a_inf, points)
+    scene = Scene(robot.cameras, robot.twists, np.array([False, True, False]), robot.markers)
+    first = isotropic(scene, a_inf, points).scene
     Z = np.eye(4) + 0.3 * rng.standard_normal((4, 4))
     back = np.linalg.inv(Z)
-    second = isotropic(
-        -3.0 * robot.cameras @ back, Z @ robot.twists @ back, robot.markers @ Z.T, a_inf @ back, points @ Z.T
-    )
-    for one, other in ((first.P, second.P), (first.H_hat_0, second.H_hat_0), (first.M, second.M)):
+    moved = dataclasses.replace(scene, P=-3.0 * scene.P @ back, H_hat=Z @ scene.H_hat @ back, M=scene.M @ Z.T)
+    second = isotropic(moved, a_inf @ back, points @ Z.T).scene
+    for one, other in ((first.P, second.P), (first.H_hat, second.H_hat), (first.M, second.M)):
         assert np.allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(one).max())
 
 
@@ -105,15 +103,23 @@ def test_covariance_is_that_of_the_parameters():
     """Variances of predictions from the record equal those of the adjustment, and its gauge is free."""
     robot = random_robot("RPR", np.random.default_rng(2), markers=5)
     q = trials(robot, frames=4)
-    readings = gather(robot.observe(q, 0.0, np.random.default_rng(0)), "RPR")
-    problem = prepare(readings, robot.q_reference)
-    scene = Scene(robot.cameras, robot.twists, robot.markers)
-    result = projective(problem, scene)
-    model = Model(result.P, result.H_hat_0, np.array([0, 1, 0]), robot.q_reference, result.a_inf)
-    predicted = prediction_derivative(model, result.M, q)
-    J = problem.dense(problem.derivative(scene)[1], readings.seen)
-    direct = J @ spread_factor(problem, scene, readings.seen)
-    chained = predicted @ covariance_factor(problem, scene, readings.seen, result)
+    readings = readings_at(robot, q)
+    problem = LeastSquares.of(readings, robot.q_reference)
+    scene = Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers)
+    solution = Solution(problem, scene, problem.residual(scene), readings.seen, 1)
+    spread = spread_factor(solution)
+    direct = problem.dense(problem.derivative(scene)[1], readings.seen) @ spread
+    result = projective(solution)
+    record = fake(
+        Calibration,
+        P=result.scene.P,
+        H_hat_0=result.scene.H_hat,
+        M=result.scene.M,
+        joint_types="RPR",
+        q_reference=robot.q_reference,
+        lens=None,
+    )
+    chained = prediction_derivative(record, q) @ covariance_factor(solution, result, spread)
     chained = chained[readings.pose_of, :, readings.marker_of].transpose(1, 0, 2, 3).reshape(direct.shape)
     # Both are factors of one covariance, each with a gauge of its own.
     covariance, other = direct @ direct.T, chained @ chained.T
@@ -148,7 +154,7 @@ def test_residual_statistics_count_what_they_skip():
 
 
 def readings_at(robot, q):
-    return gather(robot.observe(q, 0.0, np.random.default_rng(0)), robot.joint_types)
+    return Readings.of(robot.observe(q, 0.0, np.random.default_rng(0)), robot.joint_types)
 
 
 def test_reference_is_the_pose_all_trials_share():

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration.epipolar import epipolar_geometry, reconstruct
+from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.stereo import fundamental_matrix
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import Observation, WorkFailed
 from tests.calibration.simulated_robot import rig
 
 
@@ -16,13 +17,20 @@ def sightings(count, sigma, rng):
     return pixels + sigma * rng.standard_normal(pixels.shape)
 
 
+def geometry(left, right, seed):
+    """Of a marker seen at as many poses."""
+    images = np.stack([left, right], axis=1)[:, :, None]
+    seen = Observation(np.arange(len(left)), np.array([0]), np.zeros((len(left), 1)), images)
+    return epipolar_geometry(Readings.of(seen, "R"), np.random.default_rng(seed))
+
+
 def same_up_to_sign(F, G):
     return min(np.abs(F - G).max(), np.abs(F + G).max())
 
 
 def test_exact_correspondences_give_the_rig():
     left, right = sightings(40, 0.0, np.random.default_rng(0))
-    found = epipolar_geometry(left, right, np.random.default_rng(1))
+    found = geometry(left, right, 1)
     # The relative accuracy of a double times the conditioning of normalised points.
     assert same_up_to_sign(found.F, fundamental_matrix(rig())) < 1e-9
     assert found.sigma_px < 1e-8
@@ -36,7 +44,7 @@ def test_noise_is_estimated_in_spite_of_gross_errors(share):
     right[wrong] += rng.uniform(20.0, 50.0, (int(wrong.sum()), 2)) * rng.choice(
         [-1.0, 1.0], (int(wrong.sum()), 2)
     )
-    found = epipolar_geometry(left, right, np.random.default_rng(3))
+    found = geometry(left, right, 3)
     # 593 degrees of freedom leave 3 % of spread; errors along the epipolar line go unnoticed and add.
     assert found.sigma_px == pytest.approx(0.5, rel=0.12)
     # What lies 20 px off in a direction of no account may pass; what is far from its epipolar line does not.
@@ -49,11 +57,11 @@ def test_noise_is_estimated_in_spite_of_gross_errors(share):
 def test_too_few_and_flat_sightings_are_refused():
     left, right = sightings(7, 0.0, np.random.default_rng(4))
     with pytest.raises(WorkFailed, match="7 sightings of a marker by both"):
-        epipolar_geometry(left, right, np.random.default_rng(0))
+        geometry(left, right, 0)
     left, _ = sightings(50, 0.3, np.random.default_rng(5))
     again = left + 0.3 * np.random.default_rng(6).standard_normal(left.shape)
     with pytest.raises(WorkFailed, match="without a baseline"):
-        epipolar_geometry(left, again, np.random.default_rng(0))
+        geometry(left, again, 0)
 
 
 def test_reconstruction_is_isotropic_and_projects_back():

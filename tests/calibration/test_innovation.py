@@ -49,7 +49,7 @@ def test_each_innovation_has_the_distribution_it_is_tested_by(arm, monkeypatch):
         test = Innovation(calibration, SIGMA, 100)
         error = rng.standard_normal(len(test._mean))
         for row in q:
-            J = prediction.prediction_derivative(calibration.model(), calibration.M, row[None])[0]
+            J = prediction.prediction_derivative(calibration, row[None])[0]
             J = J @ test._factor
             r = J @ error + SIGMA * rng.standard_normal((2, m, 2))
             values, _, S = test._seen(r - J @ test._mean, J, left)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.readings import Readings
 from projservo_cli.config.nominal import read_nominal
 from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
@@ -78,16 +80,13 @@ def test_the_same_optimum_as_from_the_images_alone(robot, observation, alone, wr
 
 def test_the_reference_of_the_file_may_be_any_pose(robot, observation, written):
     """The truth about another reference predicts the images of all poses without any fit."""
-    from projservo_cli.calibration.adjustment import prepare
-    from projservo_cli.calibration.readings import gather
-
     values = described(robot, observation)
-    readings = gather(observation, "RPRR")
+    readings = Readings.of(observation, "RPRR")
     nominal = read_nominal(written(values))
     home = readings.reference()
     for q_reference in (home, home + np.array([0.3, 0.1, -0.5, 0.8])):
         scene = nominal.scene(readings, q_reference)
-        pixels, depth = prepare(readings, q_reference).pixels(scene)
+        pixels, depth = LeastSquares.of(readings, q_reference).pixels(scene)
         truth = robot.images(observation.q).transpose(1, 0, 2, 3)[:, readings.pose_of, readings.marker_of]
         np.testing.assert_allclose(pixels, truth, atol=1e-9)
         assert (depth > 0.0).all()

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.calibration.adjustment import prepare
-from projservo_cli.calibration.epipolar import epipolar_geometry, image_frame
-from projservo_cli.calibration.readings import gather
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.epipolar import ImageFrame, epipolar_geometry
+from projservo_cli.calibration.readings import Readings
 from projservo_cli.calibration.start import Search, starts
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
 
@@ -18,11 +18,11 @@ def around_all(robot):
 
 def first_starts(robot, observation):
     """Problem and scenes of the focal length that fits best, given the size of the images."""
-    readings = gather(observation, robot.joint_types)
-    problem = prepare(readings, robot.q_reference)
+    readings = Readings.of(observation, robot.joint_types)
+    problem = LeastSquares.of(readings, robot.q_reference)
     rng = np.random.default_rng(1)
-    epipolar = epipolar_geometry(*(readings.pixels[v][readings.both] for v in (0, 1)), rng)
-    frame = image_frame(readings, IMAGE_SIZE)
+    epipolar = epipolar_geometry(readings, rng)
+    frame = ImageFrame.of(readings, IMAGE_SIZE)
     search = Search(problem, epipolar, frame, rng, lambda what, done, total: None)
     return problem, starts(search, readings, (1.0,))
 

@@ -59,12 +59,9 @@ def case(name="paper", steps=SHORT, whole=False):
 def known(config, true, model, q):
     """The record of a model known in the frame of ``projective_twin``, as if it had been fitted freely."""
     M = np.linalg.solve(studies.H_PE, true.M.T).T
-    J = prediction_derivative(model, M, q)
-    s, Vt = np.linalg.svd(J.reshape(-1, J.shape[-1]), full_matrices=False)[1:]
-    factor = (Vt / s[:, None])[s > 1e-8 * s[0]]
     none = np.zeros((0, 3), dtype=np.int64)
     sigma = config.noise.calibration_px or 0.5
-    return fake(
+    found = fake(
         Calibration,
         sizes={"joint": len(q[0])},
         joint_types=config.robot.joint_types,
@@ -73,10 +70,13 @@ def known(config, true, model, q):
         **{name: getattr(model, name) for name in ("P", "H_hat_0", "q_reference", "a_inf")},
         marker=np.array(true.number),
         M=M,
-        covariance=sigma**2 * factor.T @ factor,
         excitation=np.ptp(q, axis=0),
         weak=np.arange(len(q[0])) == 1,
         outlier=none,
         suspect=none[:, :2],
         swapped=none,
     )
+    J = prediction_derivative(found, q)
+    s, Vt = np.linalg.svd(J.reshape(-1, J.shape[-1]), full_matrices=False)[1:]
+    factor = (Vt / s[:, None])[s > 1e-8 * s[0]]
+    return replace(found, covariance=sigma**2 * factor.T @ factor)

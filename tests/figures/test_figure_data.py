@@ -3,14 +3,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.displacement import exp_rotation
+from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import PRISMATIC, REVOLUTE
 from projservo_cli.report import style
 from projservo_cli.report.figures import planned, scene
 from projservo_cli.report.figures.drift import study_numbers
 from projservo_cli.report.material import along_line, title
-from projservo_cli.robots.truth import camera_center, look_at_camera
+from projservo_cli.robots.simulated import camera_center
 from projservo_cli.task.trajectory import trajectory_displacement
 from tests.figures.cases import GAINS, SPECS, case
 from tests.samples import prismatic, revolute
@@ -58,7 +58,7 @@ def test_margins_begin_at_one_and_vanish_where_visibility_changes(material):
 
 
 def test_middle_camera_of_two_equal_cameras_is_the_camera():
-    P = look_at_camera([1100, 1100], [639.5, 511.5], [1.0, -2.0, 0.5], [0.2, 0.1, 0.4], [0, 0, 1])
+    P = case("paper")[2].plant.model.P[0]
     np.testing.assert_allclose(planned.middle_camera(np.stack([P, P]), np.array([1280, 1024])), P, atol=1e-9)
 
 

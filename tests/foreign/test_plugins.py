@@ -9,7 +9,6 @@ import pytest
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots import plugins
-from projservo_cli.robots.yours import METHODS
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
 HERE = "tests.foreign.robots"
@@ -54,7 +53,7 @@ def test_what_cannot_be_used_is_said_in_one_line(target, message):
     written("mine_lacks", "import no_such_thing\n")
     written("mine_exits", "raise SystemExit(3)\n")
     with pytest.raises(InputError, match=message) as caught:
-        plugins.make("plant", target, METHODS, (), {})
+        plugins.make("plant", target, (), {})
     assert "\n" not in str(caught.value)
 
 
@@ -62,21 +61,21 @@ def test_a_class_that_cannot_be_made_is_a_failure_of_the_work():
     with pytest.raises(
         WorkFailed, match=r"Unmakeable: cannot be made: ConnectionError: no route .* \(robots.py:"
     ):
-        plugins.make("plant", f"{HERE}:Unmakeable", METHODS, (), {})
+        plugins.make("plant", f"{HERE}:Unmakeable", (), {})
 
 
 def test_a_function_may_make_the_robot():
     written(
         "mine_made", "from tests.foreign.robots import Sound\n\ndef robot(path):\n    return Sound(path)\n"
     )
-    made = plugins.make("plant", "mine_made:robot", METHODS, (), {"path": str(UR5)})
+    made = plugins.make("plant", "mine_made:robot", (), {"path": str(UR5)})
     assert made.joints().shape == (6,)
 
 
 def test_the_working_directory_comes_last():
     written("colorsys", "raise AssertionError('a file here must not stand in for an installed module')\n")
     sys.modules.pop("colorsys", None)
-    assert plugins.find("law", "colorsys:rgb_to_hsv", ())(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0)
+    assert plugins.find("law", "colorsys:rgb_to_hsv")(0.0, 0.0, 0.0) == (0.0, 0.0, 0.0)
 
 
 def test_registered_names_stand_for_their_class(monkeypatch):
@@ -101,7 +100,7 @@ def test_reading_a_configuration_imports_nothing():
     assert load_config("stored", text=to_yaml(config)) == config
     assert not Path("imported").exists()
     with pytest.raises(InputError, match="has no A"):
-        plugins.find("plant", "mine_touches:A", ())
+        plugins.find("plant", "mine_touches:A")
     assert Path("imported").exists()
 
 

@@ -3,29 +3,26 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.kernels import kernel_vector, least_squares
+from projservo_cli.geometry.kernels import kernel_vector, least_squares, new_system
 
 
-def workspaces(A, b=None):
-    """Columns of A as the kernels want them, with room to spare, and their workspaces."""
+def system_of(A, b=0.0):
+    """The columns of A as the kernels want them, with rubbish beside them."""
     m, n = A.shape
-    B = np.full((n, max(m, n) + 3), 7.0)
-    B[:, :m] = A.T
-    rhs = np.zeros(max(m, n) + 3)
-    rhs[:m] = 0.0 if b is None else b
-    return B, m, n, np.zeros(n), np.zeros(n, dtype=np.int64), np.zeros(n), rhs
+    system = new_system(n, m)
+    system.B[:] = system.rhs[:] = 7.0
+    system.B[:, :m], system.rhs[:m] = A.T, b
+    return system
 
 
 def kernel(A):
-    B, m, n, x, pivot, z, rhs = workspaces(A)
-    found = kernel_vector(B, m, n, x, pivot, z, rhs)
-    return found, x
+    x = np.zeros(A.shape[1])
+    return kernel_vector(system_of(A), len(A), x), x
 
 
 def solve(A, b):
-    B, m, n, x, pivot, z, rhs = workspaces(A, b)
-    found = least_squares(B, m, n, x, pivot, z, rhs)
-    return found, x
+    x = np.zeros(A.shape[1])
+    return least_squares(system_of(A, b), len(A), x), x
 
 
 def singular(rng, m, n, sizes):
@@ -49,17 +46,6 @@ def test_kernel_of_an_exactly_singular_matrix(rng, m, n):
         # Round-off of the factorisation over the least non-zero singular value, 0.1.
         assert np.abs(A @ x).max() < 1e-13
         assert abs(x @ least_right_vector(A)) == pytest.approx(1.0, abs=1e-13)
-
-
-def test_kernel_of_integers_that_vanish_exactly():
-    """Dependent columns without round-off, and a column that is zero: pivots of exactly 0."""
-    A = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]])
-    assert kernel(A)[1] == pytest.approx([0, 0, 1], abs=0)
-    A = np.array([[1.0, 0, 1], [0, 2, 2], [0, 0, 0]])
-    found, x = kernel(A)
-    assert found
-    assert np.abs(x) == pytest.approx(np.full(3, 1 / np.sqrt(3)), abs=1e-15)
-    assert A @ x == pytest.approx(np.zeros(3), abs=1e-15)
 
 
 @pytest.mark.parametrize("n", [5, 6, 7])
@@ -89,14 +75,10 @@ def test_a_kernel_of_two_dimensions_is_refused(rng, n):
     A[:, 1] = A[:, 3] = 0.0
     assert not kernel(A)[0]
     assert not kernel(np.zeros((8, n)))[0]
-
-
-def test_no_kernel_is_refused(rng):
-    """Least singular value of the size of the others: nothing is left still."""
-    for n in (5, 6, 7):
-        found, x = kernel(singular(rng, 8, n, rng.uniform(1.0, 2.0, n)))
-        assert not found
-        assert not x.any()
+    # Nor is one where the least singular value has the size of the others: nothing is left still.
+    found, x = kernel(singular(rng, 8, n, rng.uniform(1.0, 2.0, n)))
+    assert not found
+    assert not x.any()
 
 
 def test_kernel_scales_with_its_matrix(rng):

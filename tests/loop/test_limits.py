@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from projservo_cli.control import CODES
-from projservo_cli.geometry.kinematics import blocked_joint
 from projservo_cli.loop.python import BuiltInLaw, run
 from projservo_cli.loop.step import VERDICTS, shorten, stands_still
 from projservo_cli.robots.simulated import AnalyticPlant
@@ -79,6 +78,11 @@ def test_limits_beside_the_path_change_nothing():
     beside = Run(sc, "exact", gains, limits(**STOP))
     assert (beside.verdict, beside.steps) == ("converged", free.steps)
     np.testing.assert_array_equal(beside.log.q, free.log.q)
+    # Nor does the limit that a joint begins beyond and returns from.
+    lower = sc.plant.lower.copy()
+    lower[2] = sc.q_start[2] + 0.1 * STEP[2]
+    returning = Run(sc, "exact", gains._replace(lower=lower), limits(**STOP))
+    np.testing.assert_array_equal(returning.log.q, free.log.q)
 
 
 def test_a_step_is_shortened_to_the_first_limit():
@@ -94,11 +98,3 @@ def test_a_step_is_shortened_to_the_first_limit():
     assert shorten(beyond, out, lower, upper) == 0
     assert stands_still(out)
     assert not stands_still(back)
-
-
-def test_which_joint_is_in_the_way():
-    lower, upper = np.full(2, -1.0), np.full(2, 1.0)
-    assert blocked_joint(np.zeros(2), np.array([1.0, -1.0]), lower, upper) == -1
-    assert blocked_joint(np.zeros(2), np.array([1.0, -1.1]), lower, upper) == 1
-    assert blocked_joint(np.array([1.2, 0.0]), np.array([1.1, 0.0]), lower, upper) == -1  # on its way back
-    assert blocked_joint(np.array([1.2, 0.0]), np.array([1.3, 0.0]), lower, upper) == 0

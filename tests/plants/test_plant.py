@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.displacement import as_mat
-from projservo_cli.robots.simulated import AnalyticPlant, observe, rig_distance
+from projservo_cli.geometry.algebra import as_mat
+from projservo_cli.robots.simulated import AnalyticPlant, observe
 from tests.samples import displacement, poe
 from tests.scene import STEP, scene
 
@@ -56,11 +56,6 @@ def test_a_marker_behind_a_camera_has_no_pixel():
     assert np.isnan(s).any()
 
 
-def test_distance_is_from_the_middle_of_the_rig():
-    plant = scene().plant
-    assert rig_distance(plant, plant.M) == pytest.approx(np.linalg.norm(plant.M.mean(axis=0)[:3]))
-
-
 def test_the_plant_as_an_object():
     sc = scene()
     noise = np.arange(2 * 16, dtype=float).reshape(2, 2, 4, 2)
@@ -70,5 +65,6 @@ def test_the_plant_as_an_object():
     assert plant.joints() == pytest.approx(sc.q_start + 0.5 * STEP, abs=1e-15)
     plant.joints()[:] = 7.0  # a reading is a copy
     assert plant.observe() == pytest.approx(sc.images(sc.q_start + 0.5 * STEP) + noise[1], abs=1e-9)
-    assert plant.distance() == pytest.approx(rig_distance(sc.plant, plant.M), abs=0)
+    # From the middle between the cameras, which is the origin.
+    assert plant.distance() == pytest.approx(np.linalg.norm(plant.M.mean(axis=0)[:3]))
     assert sc.q_start.tolist() == sc.model.q_reference.tolist()

@@ -4,15 +4,16 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from projservo_cli.config import load_config
 from projservo_cli.geometry.kinematics import joint_operators, project
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.truth import rotation_about_axis
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
+from tests.samples import revolute
 
 LAWS = ("exact", "direct_two", "direct_three", "stacked")
 # Four joints: two vertical axes, a lift and a vertical axis again; it turns the face about one direction.
@@ -103,7 +104,7 @@ def test_a_task_beyond_the_joints_is_refused_with_what_is_left(name, axis):
     truth = truth_of(planned(name)[0])
     q = scenario_of(planned(name)[0]).exact.q_start
     M = truth.M_face @ (truth.robot.pose(q) @ np.linalg.inv(truth.robot.base_tool)).T
-    M = M @ rotation_about_axis(M[:, :3].mean(axis=0), np.array(axis, dtype=float), np.radians(20.0)).T
+    M = M @ expm(np.radians(20.0) * revolute(M[:, :3].mean(axis=0), axis)).T
     images = {side: s.tolist() for side, s in zip(("left", "right"), project(truth.P, M), strict=True)}
     with pytest.raises(WorkFailed, match=r"does not lie in what \d joints can do: .* px rms") as refusal:
         planned(name, f"task.goal={{images: {images}}}")

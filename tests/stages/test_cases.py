@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.truth import rotation_about_axis
 from projservo_cli.stages import calibrate, plan, servo
 from tests.conftest import ROOT
+from tests.samples import revolute
 
 pytestmark = pytest.mark.volume
 PAPER = ROOT / "configs" / "paper.yaml"
@@ -26,7 +27,7 @@ def turn(angle_deg, *befalls):
 def moved(angle_deg, axis=NORMAL, point=CENTER, shift=(0.0, 0.0, 0.0)):
     """Goal turned about an axis through a point, then shifted, m, all in the frame of the tool."""
     angle = np.radians(angle_deg)
-    T = rotation_about_axis(np.array(point), np.array(axis), angle)
+    T = expm(angle * revolute(point, axis))
     where = (
         f"{{translation_m: {(T[:3, 3] + shift).tolist()}, rotation_rad: {(angle * np.array(axis)).tolist()}}}"
     )

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.loop.summary import angle_between
 from tests.samples import displacement

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.config.models import Noise
-from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.loop.summary import angle_between
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo

@@ -3,7 +3,7 @@
 import numpy as np
 
 from projservo_cli.control.law import new_state
-from projservo_cli.geometry.displacement import as_array
+from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers
 from projservo_cli.task.face import MIDPOINT, Task, center_of, cyclic_order, face_plane
 from projservo_cli.task.partition import partition_now

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.geometry.displacement import as_array, as_mat
-from projservo_cli.geometry.kernels import COORDINATES, solve_normal
+from projservo_cli.geometry.algebra import as_array, as_mat
+from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import (
     MOST_STEPS,
@@ -18,6 +18,7 @@ from projservo_cli.task.body import (
     fit_body,
     new_normal,
     normal_equations,
+    solve_normal,
 )
 from tests.samples import arm, displacement, frame, in_frame, pixels, poe, revolute
 

@@ -35,6 +35,8 @@ def used(value):
     found = [value.__globals__[name] for name in wanted if name in value.__globals__]
     for module in [each for each in found if isinstance(each, types.ModuleType)]:
         found += [vars(module)[name] for name in wanted if name in vars(module)]
+    for table in [each for each in found if isinstance(each, dict)]:
+        found += table.values()
     yield from found
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import body_of, new_normal
 from projservo_cli.task.face import UNSEEN_GOAL, require_found

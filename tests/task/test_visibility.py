@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from projservo_cli.geometry.displacement import as_mat
+from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from projservo_cli.task.visibility import (
     arc_minimum,

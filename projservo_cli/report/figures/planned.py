@@ -5,14 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.geometry.displacement import exp_rotation
+from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.geometry.lens import through
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Material, registered
-from projservo_cli.robots.truth import METRIC_A_INF, roll_axis
+from projservo_cli.robots.simulated import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
 

@@ -1,4 +1,4 @@
-"""What is wrong with readings that do not fit: joint readings, marker numbers, detections, or a joint."""
+"""What is wrong with readings that do not fit: joint readings, marker numbers, detections, a lens."""
 
 import dataclasses
 import itertools
@@ -6,15 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import fdtri
 
-from projservo_cli.calibration.adjustment import Problem, Scene, prepare
-from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
-from projservo_cli.calibration.fit import RAYLEIGH, Misfit, Solution, follow, median_px, search_screws
-from projservo_cli.calibration.prediction import displacements, image_points, moved_points
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame, epipolar_geometry
+from projservo_cli.calibration.fit import RAYLEIGH, Misfit, Solution, fit_from, search_screws
+from projservo_cli.calibration.forward import LENS, Scene
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.calibration.start import Search, starts_of_changed
-from projservo_cli.geometry.lens import through
-from projservo_cli.records import NO_LENS, BoolArray, Calibration, FloatArray, IntArray, WorkFailed
+from projservo_cli.geometry.lens import straight_views, within
+from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, WorkFailed
 
 # A pose is explained by a corrected joint reading when its median residual falls below so many σ.
 _CORRECTED = 3.0
@@ -41,10 +42,10 @@ class Outliers:
         return cls(rows[:, :2], rows, np.zeros_like(readings.seen))
 
 
-def explain(solution: Solution, straight: Readings, epipolar: Epipolar) -> Outliers:
+def explain(solution: Solution, epipolar: Epipolar) -> Outliers:
     """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings.
 
-    Raises Misfit where too much is left, by the readings as projective cameras would have seen them.
+    Raises Misfit where too much is left, by the geometry of what projective cameras would have seen.
     """
     problem, scene, used = solution.problem, solution.scene, solution.used
     readings, sigma = problem.readings, solution.sigma_px
@@ -59,22 +60,19 @@ def explain(solution: Solution, straight: Readings, epipolar: Epipolar) -> Outli
         pose = dataclasses.replace(
             pose, q=readings.q[k : k + 1], pose_of=np.zeros(int(here.sum()), dtype=np.int64)
         )
-        joints = _wrong_joints(prepare(pose, problem.q_reference, scene.lens is not None), scene, sigma)
+        joints = _wrong_joints(LeastSquares.of(pose, problem.q_reference), scene, sigma)
         suspects += [(int(k), i) for i in joints]
         if joints:
             explained[:, here] |= out[:, here]
     found = Outliers(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
-    _require_explained(straight, used, found, epipolar)
+    _require_explained(_straight(readings, scene.lens), used, found, epipolar)
     return found
 
 
-def _swaps(problem: Problem, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
+def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
     """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N)."""
     readings = problem.readings
-    E = displacements(scene.H_hat, readings.prismatic, problem.q)
-    m = image_points(scene.P, moved_points(E, scene.M)[0])
-    lens = NO_LENS if scene.lens is None else scene.lens
-    predicted = through(lens[:, None], m[..., :2] / m[..., 2:])
+    predicted = scene.seen(problem.q)
     rows = np.flatnonzero(out.any(axis=0))
     distance = np.linalg.norm(
         predicted[readings.pose_of[rows]] - readings.pixels[:, rows].transpose(1, 0, 2)[:, :, None], axis=3
@@ -94,7 +92,7 @@ def _swaps(problem: Problem, scene: Scene, out: BoolArray, limit: float) -> tupl
     return np.array(listed, dtype=np.int64).reshape(-1, 3), explained
 
 
-def _wrong_joints(pose: Problem, scene: Scene, sigma: float) -> tuple[int, ...]:
+def _wrong_joints(pose: LeastSquares, scene: Scene, sigma: float) -> tuple[int, ...]:
     """The joint, or else the pair of joints, whose correction explains the images of a pose; or none."""
     for size in (1, 2):
         pairs = list(itertools.combinations(range(pose.q.shape[1]), size))
@@ -104,14 +102,14 @@ def _wrong_joints(pose: Problem, scene: Scene, sigma: float) -> tuple[int, ...]:
     return ()
 
 
-def _corrected_level(pose: Problem, scene: Scene, joints: list[int]) -> float:
+def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int]) -> float:
     """Median residual after some joints of a pose are fitted to its images under a Cauchy loss, px."""
     seen = pose.readings.seen
     best = np.inf
     for _ in range(_STEPS):
         pixels, J = pose.joint_derivative(scene)
         residual = np.where(seen[..., None], pixels - pose.readings.pixels, 0.0)
-        level = median_px(residual, seen)
+        level = float(np.median(np.linalg.norm(residual[seen], axis=1)))
         if not np.isfinite(level) or level > 0.999 * best:
             break
         best = level
@@ -207,7 +205,7 @@ def blamed_joint(search: Search, most_px: float) -> str:
     return ""
 
 
-def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, Problem, float]]:
+def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
     """Every joint of the other type, and every joint standing still.
 
     In words, with the problem as it then is, and by what share an equal one must leave less.
@@ -219,7 +217,7 @@ def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, 
         given, fits = ("prismatic", "revolute") if slides else ("revolute", "prismatic")
         words = f"by the images joint {i + 1} is {fits}, not {given}: check --joints"
         found.append(
-            (words, prepare(dataclasses.replace(readings, prismatic=flipped), q_reference), _SIMPLER)
+            (words, LeastSquares.of(dataclasses.replace(readings, prismatic=flipped), q_reference), _SIMPLER)
         )
     for i in range(len(q_reference) if len(q_reference) > 1 else 0):
         words = (
@@ -228,19 +226,19 @@ def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, 
         fewer = dataclasses.replace(
             readings, q=np.delete(readings.q, i, axis=1), prismatic=np.delete(readings.prismatic, i)
         )
-        found.append((words, prepare(fewer, np.delete(q_reference, i)), 0.0))
+        found.append((words, LeastSquares.of(fewer, np.delete(q_reference, i)), 0.0))
     return found
 
 
-def _level(problem: Problem, scene: Scene) -> float:
+def _level(problem: LeastSquares, scene: Scene) -> float:
     """Mean logarithm of the residuals: neither a few gross errors nor many small ones outweigh the rest."""
     distance = np.linalg.norm(problem.residual(scene)[problem.readings.seen], axis=1)
     return float(np.mean(np.log(distance + 1e-9)))
 
 
-def _describes(problem: Problem, scene: Scene, epipolar: Epipolar, most_px: float) -> bool:
+def _describes(problem: LeastSquares, scene: Scene, epipolar: Epipolar, most_px: float) -> bool:
     """Whether a scene leads to a fit that leaves little noise and little out."""
-    found = follow(problem, scene, epipolar)
+    found = fit_from(problem, scene, epipolar)
     if found is None or found.sigma_px > most_px:
         return False
     try:
@@ -248,3 +246,82 @@ def _describes(problem: Problem, scene: Scene, epipolar: Epipolar, most_px: floa
     except WorkFailed:
         return False
     return True
+
+
+_COEFFICIENTS = 2 * LENS
+# A lens is suspected where it explains this share of the squared residuals and chance, with its tail
+# probability, would not.
+_LEAST_SHARE, _TAIL = 0.02, 1e-3
+_LEAST_CHI2 = 1e-20
+
+
+def share_explained(solution: Solution, frame: ImageFrame) -> float:
+    """Share of the squared residuals that a lens would explain; zero where there is one, or chance may do.
+
+    Nothing is fitted: the scores of k1 and k2, cleared of what the other parameters explain, add up to
+    the gain; C. R. Rao, "Large sample tests of statistical hypotheses concerning several parameters",
+    1948. Errors of a pose's joint readings move all of its images alike, so that poses, not readings,
+    are the independent draws: H. Hotelling's test of 1931 that the scores of the poses have no mean.
+    """
+    if solution.scene.lens is not None:
+        return 0.0
+    readings = solution.problem.readings
+    poses = np.unique(readings.pose_of[solution.used.any(axis=0)])
+    K, d = poses.size, _COEFFICIENTS
+    if d + 1 >= K:
+        return 0.0
+    columns = _cleared_columns(solution, frame)
+    scores = (columns * solution.residual).sum(axis=(1, 3))
+    by_pose = np.stack([np.bincount(readings.pose_of, score)[poses] for score in scores])
+    total = by_pose.sum(axis=1)
+    flat = columns.reshape(d, -1)
+    share = float(total @ np.linalg.solve(flat @ flat.T, total)) / max(solution.chi2, _LEAST_CHI2)
+    square = float(total @ np.linalg.solve(K * np.cov(by_pose), total))
+    chance = float(fdtri(d, K - d, 1.0 - _TAIL)) * d * (K - 1) / (K - d)
+    return share if square > chance and share >= _LEAST_SHARE else 0.0
+
+
+def _undistorted(frame: ImageFrame) -> FloatArray:
+    """Lenses (2, 5) without distortion about the image centres; the radius is half the image size."""
+    return np.concatenate([frame.center, 0.5 * frame.size[:, None], np.zeros((2, LENS))], axis=1)
+
+
+def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
+    """Change of the images by k1, k2 of both views (4, 2, N, 2), less what other parameters can undo."""
+    problem = LeastSquares.of(solution.problem.readings, solution.problem.q_reference, lens=True)
+    scene = dataclasses.replace(solution.scene, lens=_undistorted(frame))
+    J = problem.dense(problem.derivative(scene)[1], solution.used)
+    J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
+    others, lenses = J[:, : problem.lens], J[:, problem.lens :]
+    left = lenses - others @ np.linalg.lstsq(others, lenses, rcond=None)[0]
+    return np.asarray(left.T.reshape(-1, *solution.residual.shape))
+
+
+def with_lens(solution: Solution, search: Search) -> tuple[Solution, Epipolar]:
+    """The solution with radial distortion freed, and the epipolar geometry of what it straightens.
+
+    Which readings count is found anew. Raises WorkFailed if the data do not determine the distortion.
+    """
+    readings = solution.problem.readings
+    problem = LeastSquares.of(readings, solution.problem.q_reference, lens=True)
+    scene = dataclasses.replace(solution.scene, lens=_undistorted(search.frame))
+    found = fit_from(problem, scene, search.epipolar)
+    if found is not None:
+        assert found.scene.lens is not None
+        unbent, _ = problem.pixels(dataclasses.replace(found.scene, lens=None))
+        if within(found.scene.lens[:, None], unbent)[found.used].all():
+            straight = _straight(readings, found.scene.lens)
+            return found, epipolar_geometry(straight, search.rng)
+    raise WorkFailed(
+        "the images do not determine the distortion of the lenses: record poses with markers all over "
+        "both images, or calibrate without --lens"
+    )
+
+
+def _straight(readings: Readings, lens: FloatArray | None) -> Readings:
+    """Readings as projective cameras would have seen them; unseen where lenses (2, 5) bend no pixel there."""
+    if lens is None:
+        return readings
+    pixels = straight_views(lens, readings.pixels)
+    seen = readings.seen & np.isfinite(pixels).all(axis=2)
+    return dataclasses.replace(readings, pixels=np.where(seen[..., None], pixels, 0.0), seen=seen)

@@ -1,0 +1,117 @@
+"""Images at many poses at once: the vectorised forward model and its derivative.
+
+The twin of the kernels in ``geometry``: the same equations for all poses and points together, which the
+adjustment, predictions and random tasks share.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.lens import bent, bent_derivative, through
+from projservo_cli.records import BoolArray, FloatArray, IntArray
+
+CAMERA = 12
+LENS = 2
+
+
+def sine_and_versine(prismatic: BoolArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (K, n) of Ĥ and Ĥ² in [RH00] eqs. (4), (5) at joints (K, n) from the reference."""
+    return np.where(prismatic, q, np.sin(q)), np.where(prismatic, 0.0, 2.0 * np.sin(0.5 * q) ** 2)
+
+
+def displacements(H_hat: FloatArray, prismatic: BoolArray, q: FloatArray) -> FloatArray:
+    """Displacements exp(q Ĥ) (n, K, 4, 4) of operators (n, 4, 4) at joints (K, n), [RH00] eqs. (4), (5).
+
+    Joint values are from the reference, rad or m.
+    """
+    squared = H_hat @ H_hat
+    sine, versine = (part.T[..., None, None] for part in sine_and_versine(prismatic, q))
+    result: FloatArray = np.eye(4) + sine * H_hat[:, None] + versine * squared[:, None]
+    return result
+
+
+def moved_points(E: FloatArray, M: FloatArray) -> FloatArray:
+    """Points (m, 4) or (K, m, 4) after the last joints alone, (n + 1, K, m, 4): [RH00] eq. (6) from its end.
+
+    By displacements (n, K, 4, 4). Entry n holds points at the reference, entry 0 those moved by all joints.
+    """
+    n, K = E.shape[:2]
+    Y = np.empty((n + 1, K, *M.shape[-2:]))
+    Y[n] = M
+    for i in range(n - 1, -1, -1):
+        Y[i] = Y[i + 1] @ np.swapaxes(E[i], 1, 2)
+    return Y
+
+
+def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
+    """Homogeneous image points (…, 2, m, 3) of points (…, m, 4) in both cameras (2, 3, 4), [RH00] eq. (1)."""
+    return np.asarray(points[..., None, :, :] @ np.swapaxes(P, 1, 2))
+
+
+def projection_derivative(
+    P: FloatArray, lens: FloatArray | None, points: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+    """Pixels (2, N, 2) of points (N, 4), and derivatives by image points (2, N, 2, 3) and k1, k2 of a lens.
+
+    [RH00] eq. (7), second row corrected: rows (1, 0, −u)/m3 and (0, 1, −v)/m3; then the lenses (2, 5).
+    """
+    m = image_points(P, points)
+    pixels = m[..., :2] / m[..., 2:]
+    G = np.zeros((*pixels.shape, 3))
+    G[..., 0, 0] = G[..., 1, 1] = 1.0 / m[..., 2]
+    G[..., 2] = -pixels / m[..., 2:]
+    if lens is None:
+        return pixels, G, None
+    by_pixel, by_lens = bent_derivative(lens[:, None], pixels)
+    return bent(lens[:, None], pixels), by_pixel @ G, by_lens
+
+
+class Images(NamedTuple):
+    """Pixels of N sightings and their derivatives."""
+
+    pixels: FloatArray  # (2, N, 2) px
+    points: FloatArray  # (n + 1, N, 4) the point behind each joint, entry 0 moved by all joints
+    by_camera: FloatArray  # (2, N, 2, 12)
+    by_point: FloatArray  # (n + 1, 2, N, 2, 4) by ``points``, the joints before it held
+    by_lens: FloatArray | None  # (2, N, 2, 2) by k1 and k2, if there is a lens
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Rig, robot and markers, in any one frame; joint values are from the reference, rad or m."""
+
+    P: FloatArray  # (2, 3, 4) cameras to pixels
+    H_hat: FloatArray  # (n, 4, 4) operators at the reference
+    prismatic: BoolArray  # (n,) whether the joint is prismatic
+    M: FloatArray  # (m, 4) markers at the reference
+    lens: FloatArray | None = None  # (2, 5) lenses, None without
+
+    def seen(self, q: FloatArray) -> FloatArray:
+        """Pixels (K, 2, m, 2) of all markers at joints (K, n), [RH00] eqs. (1), (6).
+
+        NaN for a point that does not lie in front of the camera, or beyond where its lens turns back.
+        """
+        m = image_points(self.P, moved_points(displacements(self.H_hat, self.prismatic, q), self.M)[0])
+        pixels: FloatArray = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
+        return pixels if self.lens is None else through(self.lens[:, None], pixels)
+
+    def carried(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Displacements (n, N, 4, 4) at sightings (N,), and points behind each joint (n + 1, N, 4)."""
+        E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]
+        return E, moved_points(E, self.M[marker_of][:, None])[:, :, 0]
+
+    def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> Images:
+        """Sightings (N,) of markers at rows of q (K, n), with their derivatives.
+
+        From images to the point behind each joint by [RH00] eq. (6).
+        """
+        E, Y = self.carried(q, pose_of, marker_of)
+        pixels, G, by_lens = projection_derivative(self.P, self.lens, Y[0])
+        D = np.empty((len(Y), *pixels.shape, 4))
+        D[0] = G @ self.P[:, None]
+        for i, by_joint in enumerate(E):
+            D[i + 1] = D[i] @ by_joint
+        by_camera = (G[..., None] * Y[0][:, None, None, :]).reshape(*pixels.shape, CAMERA)
+        return Images(pixels, Y, by_camera, D, by_lens)

@@ -1,0 +1,253 @@
+"""Projective kinematics, what [RH00] section 2 calls P, Ĥ, M and the plane at infinity.
+
+Of an adjusted scene with its covariance, or by the paper's closed forms: one 4×4 homography a trial motion,
+equations (4), (5).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from projservo_cli.calibration.adjustment import generators
+from projservo_cli.calibration.epipolar import reconstruct
+from projservo_cli.calibration.fit import Solution
+from projservo_cli.calibration.forward import CAMERA, Scene
+from projservo_cli.calibration.readings import ON_A_LINE, Readings
+from projservo_cli.geometry.algebra import normalize_displacement
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
+
+# Least distance of the markers from their best line, in units of its own noise.
+_OFF_LINE = 5.0
+# A direction whose singular value is this share of the largest is open.
+_OPEN_DIRECTION = 1e-10
+_A_INF = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class Projective:
+    """A scene in its isotropic projective frame."""
+
+    # depths of the points seen are positive, of unit mean square a view; a_inf @ M = 1
+    scene: Scene
+    a_inf: FloatArray  # (4,) plane at infinity
+    W: FloatArray  # (4, 4) frame change that led here
+    camera_scale: FloatArray  # (2,) factors the cameras took
+
+
+def isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective:
+    """The one projective frame in which points seen, ``moved`` (N, 4), have the identity as second moment.
+
+    The rotation that leaves free is settled by the left camera: its depth row and then its two image
+    rows are triangular, its centre lies along the fourth axis on the positive side of ``a_inf``. So
+    the frame depends on images alone: whatever frame the scene comes in, the same numbers come out.
+    """
+    P = scene.P
+    points = moved / (moved @ a_inf)[:, None]
+    M = scene.M / (scene.M @ a_inf)[:, None]
+    L = np.linalg.cholesky(points.T @ points / len(points))
+    rows = (P[0] @ L)[[2, 0, 1]]
+    depth = points @ P[0, 2]
+    rows = rows * np.sign(depth.sum())
+    Q, R = np.linalg.qr(rows.T, mode="complete")
+    Q[:, :3] *= np.where(np.diagonal(R) < 0.0, -1.0, 1.0)
+    if (a_inf @ L) @ Q[:, 3] < 0.0:
+        Q[:, 3] *= -1.0
+    W = Q.T @ np.linalg.inv(L)
+    back = L @ Q
+    depths = points @ P[:, 2].T
+    scale = np.sign(depths.sum(axis=0)) / np.sqrt((depths**2).mean(axis=0))
+    P, H_hat = scale[:, None, None] * (P @ back), W @ scene.H_hat @ back
+    return Projective(Scene(P, H_hat, scene.prismatic, M @ W.T, scene.lens), a_inf @ back, W, scale)
+
+
+def projective(solution: Solution) -> Projective:
+    """The adjusted scene in the isotropic projective frame of the points seen."""
+    problem, scene = solution.problem, solution.scene
+    readings = problem.readings
+    moved = scene.carried(problem.q, readings.pose_of, readings.marker_of)[1][0]
+    return isotropic(scene, _A_INF, moved)
+
+
+def spread_factor(solution: Solution) -> FloatArray:
+    """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that the readings determine.
+
+    Singular values of J itself keep the weakest direction, which the normal matrix would lose.
+    At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
+    """
+    problem, scene = solution.problem, solution.scene
+    J = problem.dense(problem.derivative(scene)[1], solution.used)
+    scale = np.linalg.norm(J, axis=0)
+    # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
+    scale = np.where(scale > 0.0, scale, scale.max())
+    G = np.linalg.qr(scale[:, None] * problem.gauge(scene))[0]
+    free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
+    _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
+    # Robots of one or two joints leave more directions open than the gauge, none of which matters
+    # to an image: they must come out as zero after the product with its derivative.
+    result: FloatArray = (free @ (Vt.T / np.maximum(s, _OPEN_DIRECTION * s[0]))) / scale[:, None]
+    return result
+
+
+def covariance_factor(solution: Solution, result: Projective, spread: FloatArray) -> FloatArray:
+    """Factor (24 + 16 n + 4 m, r) of the covariance of P, H_hat_0, M, gauge fixed, by the ``spread_factor``.
+
+    At a noise of one pixel; with four rows more, for k1 and k2 of both views, where lenses are adjusted.
+
+    Raises WorkFailed where the markers cannot be told from a line.
+    """
+    factor = _output_derivative(solution, result) @ spread
+    free = _output_gauge(result.scene)
+    first = len(free)
+    factor[:first] -= free @ (free.T @ factor[:first])
+    _require_off_line(result.scene.M, free, solution.sigma_px * factor[:first])
+    return factor
+
+
+def _output_derivative(solution: Solution, result: Projective) -> FloatArray:
+    """Derivative of P, H_hat_0, M and the lenses (ravelled, in this order) by the adjusted parameters.
+
+    The frame and the camera scales are held: they are part of the gauge.
+    """
+    problem, scene = solution.problem, solution.scene
+    back = np.linalg.inv(result.W)
+    cameras = [scale * np.kron(np.eye(3), back.T) for scale in result.camera_scale]
+    joints = [
+        (result.W @ (B @ H_hat - H_hat @ B) @ back).reshape(-1, 16).T
+        for B, H_hat in zip(generators(scene), scene.H_hat, strict=True)
+    ]
+    markers = [result.W[:, :3]] * len(scene.M)
+    J: FloatArray = block_diag(*cameras, *joints, *markers, np.eye(problem.size - problem.lens))
+    return J
+
+
+def _output_gauge(scene: Scene) -> FloatArray:
+    """Orthonormal directions (24 + 16 n + 4 m, 18) that change no image: of the frame and of both cameras."""
+    Z = np.eye(16).reshape(16, 1, 4, 4)
+    parts = (-(scene.P @ Z), Z @ scene.H_hat - scene.H_hat @ Z, scene.M @ Z.swapaxes(2, 3))
+    frame = np.hstack([part.reshape(16, -1) for part in parts])
+    cameras = np.zeros((2, frame.shape[1]))
+    cameras[:, : 2 * CAMERA] = block_diag(*scene.P.reshape(2, 1, CAMERA))
+    return np.asarray(np.linalg.svd(np.vstack([frame, cameras]).T, full_matrices=False)[0])
+
+
+def _require_off_line(M: FloatArray, gauge: FloatArray, factor: FloatArray) -> None:
+    """Refuse markers (m, 4) that a factor (24 + 16 n + 4 m, r) of the covariance cannot tell from a line.
+
+    A line is the span of two points; the markers must be off it by several times the noise of that distance,
+    whatever frame and scale they are given: beside the ``gauge`` their scales are free.
+    """
+    first, m = len(factor) - M.size, len(M)
+    scales = np.vstack([np.zeros((first, m)), block_diag(*M[:, :, None])])
+    # One of the directions is a sum of others: all markers scaled at once.
+    U, s, _ = np.linalg.svd(np.hstack([gauge, scales]), full_matrices=False)
+    free = U[:, s > _OPEN_DIRECTION * s[0]]
+    markers = (factor - free @ (free.T @ factor))[first:]
+    U, extent, Vt = np.linalg.svd(M, full_matrices=False)
+    across = np.eye(m) - U[:, :2] @ U[:, :2].T
+    noise = across @ (Vt[2:] @ markers.reshape(m, 4, -1)).reshape(m, -1)
+    if extent[2] < _OFF_LINE * float(np.linalg.norm(noise)):
+        raise WorkFailed(ON_A_LINE)
+
+
+_LEAST_MARKERS = 5
+# Parallax off the best plane, in units of the pixel noise, below which a body is coplanar.
+_COPLANAR = 3.0
+# Trials whose angle has a smaller sine are too close to 0 or ±180° for equation (4) under noise.
+_LEAST_LEVER = 1e-3
+
+
+def closed_form_operators(
+    readings: Readings, F: FloatArray, sigma_px: float
+) -> tuple[Projective, FloatArray, BoolArray]:
+    """Projective kinematics from homographies of the trial motions, [RH00] eqs. (2), (4), (5).
+
+    The operator of a joint is the mean over its trials weighted by sin² θ (or τ²), the least-squares
+    weights of the quotients in (4) and (5). With the reference joints (n,), and which markers (m,) there are.
+
+    Raises WorkFailed if the trials do not determine the operators: which joint, and why.
+    """
+    home = readings.home()
+    if home is None:
+        raise WorkFailed(
+            "the closed_form method needs single-joint trials about one reference pose, and these poses move "
+            "several joints at once: use refined"
+        )
+    both = readings.both
+    P, points = reconstruct(F, readings.pixels[0][both], readings.pixels[1][both])
+    M = np.full((len(readings.q), readings.marker.size, 4), np.nan)
+    M[readings.pose_of[both], readings.marker_of[both]] = points
+    known = np.isfinite(M[..., 0])
+    if int(known[home].sum()) < _LEAST_MARKERS:
+        raise WorkFailed(
+            f"closed_form needs {_LEAST_MARKERS} markers in both images of the reference pose, and there are "
+            f"{int(known[home].sum())}: use refined"
+        )
+    _require_space(P, M[home, known[home]], sigma_px)
+    # The depth in the left camera is positive for all points: it orients them as a_inf would.
+    trials = readings.trials(home)
+    H_hat = np.array([_mean_operator(i, rows, M, home, readings, P[0, 2]) for i, rows in enumerate(trials)])
+    a_inf = np.linalg.svd(np.hstack(list(H_hat)))[0][:, 3]
+    sides = points @ a_inf
+    a_inf = a_inf * np.sign(np.median(sides))
+    scene = Scene(P, H_hat, readings.prismatic, M[home, known[home]])
+    return isotropic(scene, a_inf, points[np.abs(sides) > 1e-6]), readings.q[home], known[home]
+
+
+def _mean_operator(
+    i: int, rows: IntArray, M: FloatArray, home: int, readings: Readings, depth: FloatArray
+) -> FloatArray:
+    """Operator (4, 4) of joint i from its trials, the rows of M (K, m, 4) where it alone moved.
+
+    Each says (H − H⁻¹) / (2 sin θ), or / (2 τ): [RH00] eqs. (4), (5) from group to algebra, weighted by the
+    square of what it is divided by. ``depth`` (4,) is a plane that all points lie on one side of.
+    """
+    total, weights = np.zeros((4, 4)), 0.0
+    refused = "record poses in which it alone moves"
+    for k in rows:
+        common = np.isfinite(M[[home, k], :, 0]).all(axis=0)
+        amplitude = float(readings.q[k, i] - readings.q[home, i])
+        lever = amplitude if readings.prismatic[i] else float(np.sin(amplitude))
+        if int(common.sum()) < _LEAST_MARKERS:
+            refused = f"fewer than {_LEAST_MARKERS} markers are common to a trial and the reference"
+            continue
+        if not readings.prismatic[i] and abs(lever) < _LEAST_LEVER:
+            refused = f"a turn by {np.degrees(amplitude):.4g}° leaves equation (4) undefined"
+            continue
+        A, B = M[home, common], M[k, common]
+        try:
+            H = normalize_displacement(_homography(A, B), A, depth)
+        except WorkFailed as error:
+            raise WorkFailed(f"joint {i + 1}, pose {readings.pose[k]}: {error}") from None
+        total += 0.5 * lever * (H - np.linalg.inv(H))
+        weights += lever**2
+    if weights == 0.0:
+        raise WorkFailed(f"joint {i + 1} has no trial that can be used: {refused}")
+    return total / weights
+
+
+def _homography(A: FloatArray, B: FloatArray) -> FloatArray:
+    """4×4 homography B ∼ H A of five or more points (m, 4) of unit norm, least squares of the cross products.
+
+    Source: R. Hartley, A. Zisserman, Multiple View Geometry, 2nd ed., section 4.1, in space.
+    """
+    first, second = np.triu_indices(4, 1)
+    rows = np.zeros((len(A), 6, 4, 4))
+    k = np.arange(6)
+    rows[:, k, first] += B[:, second, None] * A[:, None, :]
+    rows[:, k, second] -= B[:, first, None] * A[:, None, :]
+    return np.asarray(np.linalg.svd(rows.reshape(-1, 16))[2][15].reshape(4, 4))
+
+
+def _require_space(P: FloatArray, points: FloatArray, sigma_px: float) -> None:
+    """Refuse points (m, 4) of one plane up to the noise: the right image then follows from the left one."""
+    plane = np.linalg.svd(points)[2][3]
+    center = np.linalg.svd(P[0])[2][3]
+    on_plane = points - np.outer(points @ plane / (center @ plane), center)
+    seen, flat = points @ P[1].T, on_plane @ P[1].T
+    parallax = np.linalg.norm(seen[:, :2] / seen[:, 2:] - flat[:, :2] / flat[:, 2:], axis=1)
+    if float(np.sqrt((parallax**2).mean())) < _COPLANAR * sigma_px:
+        raise WorkFailed(
+            "the markers lie in one plane: a plane's motion does not determine a 4×4 homography; "
+            "use refined, or move a marker off the plane"
+        )
