@@ -285,7 +285,7 @@ def _work(chain: _Chain) -> int:
         chain.beside["calibrate"] = _suggestions(chain, count)
     if (wanted := _extras(chain.options)) and not chain.lacks("report"):
         chain.beside["report"] = _made_extras(chain, wanted)
-    from projservo_cli.report.values import failed_object, stage_object
+    from projservo_cli.report.material import failed_object, stage_object
 
     values = {}
     for name in chain.names:

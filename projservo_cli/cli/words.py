@@ -7,7 +7,7 @@ from typing import Any
 
 from projservo_cli.cli.output import wrapped
 from projservo_cli.records import name_of
-from projservo_cli.report.values import LISTS, NEAREST
+from projservo_cli.report.material import LISTS, NEAREST
 
 _NOTES = {  # on runs, and their reasons
     "unplanned": "driven without a plan",

@@ -5,31 +5,20 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
-from projservo_cli.report.figures.drift import drift_tables
+from projservo_cli.report.figures.drift import study_numbers
 from projservo_cli.report.material import (
     DIRECT,
-    LEAST_ANGLE,
-    LEAST_DISTANCE,
     TITLES,
     Material,
     Studies,
     along_line,
-    center_distance,
-    center_image,
-    coordinate_rise,
     curve_difference,
-    decay_factors,
-    fitted_rate,
-    off_exponential,
-    path_gap,
     percent,
-    second_order_drift,
-    settled_at,
-    true_rotation,
 )
 
 
@@ -51,15 +40,16 @@ def _listed(values: FloatArray) -> str:
     return ", ".join(f"{value:.0f}" if value >= 100 else f"{value:.3g}" for value in np.atleast_1d(values))
 
 
-# A curve follows an exponential where each step's factor is within this share of 1 - gain·period.
+# A curve follows an exponential where each step's factor is within this share of 1 - gain·period, over enough
+# steps that are this long after the last one at the joint-speed limit, and down to errors that nothing but
+# the calibration explains, m and rad.
 _FACTOR_TOLERANCE = 0.01
-_LEAST_STEPS = 10  # settled steps needed to say so
+_LEAST_STEPS, _SETTLING_STEPS = 10, 20
+_LEAST_DISTANCE, _LEAST_ANGLE = 1e-4, math.radians(0.05)
 _MODEL_TOLERANCE_DEG = 1e-6
 _START_TOLERANCE_DEG = 0.5
-# A coordinate rises, or leaves the exponential, by more than this, px.
-_VISIBLE_PX = 1.0
-# τ agrees with the true distance within this, % of the start.
-_SCALE_TOLERANCE = 2.0
+_VISIBLE_PX = 1.0  # by more than this a coordinate rises, or leaves the exponential
+_SCALE_TOLERANCE = 2.0  # within this τ agrees with the true distance, % of the start
 
 
 def _control_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
@@ -79,76 +69,62 @@ def _control_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     )
     yield from _scale(material, calibrated)
     trace = studies.own[DIRECT[1], "calibrated", False]
-    start, task = math.degrees(trace.theta_s[0]), math.degrees(true_rotation(trace))
+    start, task, known = math.degrees(trace.theta_s[0]), math.nan, np.isfinite(trace.goal_pose).all()
+    if known:
+        R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
+        task = math.degrees(Rotation.from_matrix(R).magnitude())
     yield _Claim(
         "θ_s starts at the overall rotation of the task, 180° in the paper",
         "section 6, Fig. 9",
-        f"{start:.3f}°; true rotation " + ("unknown" if math.isnan(task) else f"{task:.3f}°"),
+        f"{start:.3f}°; true rotation " + (f"{task:.3f}°" if known else "unknown"),
         f"within {_START_TOLERANCE_DEG:g}° of the true rotation",
-        None if math.isnan(task) else abs(start - task) <= _START_TOLERANCE_DEG,
+        abs(start - task) <= _START_TOLERANCE_DEG if known else None,
     )
-    factor = 1.0 - studies.gains_of_laws.gain_t * calibrated.period
-    yield from _image_error(calibrated, factor)
-
-
-def _decay_ranges(material: Material, trace: Trace) -> dict[str, tuple[float, float, int]]:
-    """Least and largest factor a step, and their number, of the centre's distance and of θ_s.
-
-    Counted are the steps 20 after the last speed-limited one, down to 0.1 mm and 0.05°.
-    """
-    first = settled_at(trace)
-    ratios = {
-        "distance": decay_factors(center_distance(material, trace), first, LEAST_DISTANCE),
-        "theta_s": decay_factors(trace.theta_s, first, float(LEAST_ANGLE)),
-    }
-    return {name: (float(r.min()), float(r.max()), len(r)) for name, r in ratios.items() if len(r)}
+    yield from _image_error(calibrated, 1.0 - studies.gains_of_laws.gain_t * calibrated.period)
 
 
 def _exponential(material: Material, studies: Studies, law: str) -> Iterator[_Claim]:
-    trace = studies.own[law, "calibrated", True]
+    """Whether the distance of the centre and the rotation decay at the gains of both, of the slowest turn.
+
+    A loop that takes the share λ T of an error in each period T has the rate λ, 1/s.
+    """
+    trace, gains = studies.own[law, "calibrated", True], studies.gains_of_laws
     if not np.isfinite(trace.goal_pose).all():
         return
-    first = settled_at(trace)
-    rates = [
-        fitted_rate(center_distance(material, trace), first, LEAST_DISTANCE, trace.period),
-        fitted_rate(trace.theta_s, first, float(LEAST_ANGLE), trace.period),
-    ]
-    ranges = _decay_ranges(material, trace)
-    gains = _gains(studies, law)
-    expected = {"distance": 1 - gains[0] * trace.period, "theta_s": 1 - gains[1] * trace.period}
-    off = [
-        max(abs(low / expected[name] - 1), abs(high / expected[name] - 1))
-        for name, (low, high, _) in ranges.items()
-    ]
-    enough = len(ranges) == 2 and min(count for _, _, count in ranges.values()) >= _LEAST_STEPS
-    measured = (
-        "too few settled steps"
-        if not enough
-        else (
-            f"fitted rates {rates[0]:.3f} (centre) and {rates[1]:.3f} (θ_s) per s for gains {gains[0]:g} and "
-            f"{gains[1]:g}; each step's factor within {max(off):.2%} of 1 - gain·period over "
-            f"{ranges['distance'][2]} and {ranges['theta_s'][2]} steps"
-        )
+    first = _SETTLING_STEPS + int(np.flatnonzero(trace.speed_factor < 1.0).max(initial=0))
+    gain = (gains.gain_t, gains.gain_s if law == "direct_two" else min(gains.gain_r, gains.gain_p))
+    curves = (
+        (material.center_distance(trace)[first:], _LEAST_DISTANCE),
+        (trace.theta_s[first:], _LEAST_ANGLE),
     )
+    measured, holds = "too few settled steps", None
+    settled = [late[np.logical_and.accumulate(late > least)] for late, least in curves]
+    if min(len(values) for values in settled) > _LEAST_STEPS:
+        slopes = [np.polyfit(np.arange(len(values)), np.log(values), 1)[0] for values in settled]
+        rates = [(1.0 - math.exp(slope)) / trace.period for slope in slopes]
+        off = max(
+            float(np.abs(values[1:] / values[:-1] / (1.0 - own * trace.period) - 1.0).max())
+            for values, own in zip(settled, gain, strict=True)
+        )
+        measured = (
+            f"fitted rates {rates[0]:.3f} (centre) and {rates[1]:.3f} (θ_s) per s for gains {gain[0]:g} and "
+            f"{gain[1]:g}; each step's factor within {off:.2%} of 1 - gain·period over "
+            f"{len(settled[0]) - 1} and {len(settled[1]) - 1} steps"
+        )
+        holds = off <= _FACTOR_TOLERANCE
     yield _Claim(
         f"{TITLES[law]}: the control errors decay exponentially",
         "section 6, Figs. 9 and 10",
         measured,
         f"factor of every settled step within {_FACTOR_TOLERANCE:.0%} of 1 - gain·period",
-        max(off) <= _FACTOR_TOLERANCE if enough else None,
+        holds,
     )
-
-
-def _gains(studies: Studies, law: str) -> tuple[float, float]:
-    """Gains, 1/s, of the translation and of the slowest rotation."""
-    gains = studies.gains_of_laws
-    return gains.gain_t, gains.gain_s if law == "direct_two" else min(gains.gain_r, gains.gain_p)
 
 
 def _model_difference(trace: Trace, metric: Trace) -> float:
     """Largest difference of θ_r and θ_p between two runs, deg."""
     return max(
-        math.degrees(curve_difference(getattr(trace, name), getattr(metric, name))[0].max())
+        math.degrees(curve_difference(getattr(trace, name), getattr(metric, name)).max())
         for name in ("theta_r", "theta_p")
     )
 
@@ -156,7 +132,7 @@ def _model_difference(trace: Trace, metric: Trace) -> float:
 def _scale(material: Material, trace: Trace) -> Iterator[_Claim]:
     if not np.isfinite(trace.goal_pose).all() or trace.tau[0] == 0:
         return
-    distance = percent(center_distance(material, trace))
+    distance = percent(material.center_distance(trace))
     off = float(np.abs(percent(trace.tau) - distance).max())
     affine = float(np.abs(percent(trace.tau_affine) - distance).max())
     yield _Claim(
@@ -170,15 +146,19 @@ def _scale(material: Material, trace: Trace) -> Iterator[_Claim]:
 
 
 def _image_error(trace: Trace, factor: float) -> Iterator[_Claim]:
+    """Whether image errors decay by a factor a step, and whether they rise above the least before."""
     e = trace.s - trace.s_star
-    rise, off = coordinate_rise(e), off_exponential(e, factor)
+    decay = factor ** np.arange(len(e))
+    off = float(np.abs(e - e[0] * decay[:, None, None, None]).max())
     yield _Claim(
         "The image error does not decay exponentially",
         "section 6, Fig. 11",
-        f"a marker coordinate is up to {off.max():.0f} px away from an exponential decay",
+        f"a marker coordinate is up to {off:.0f} px away from an exponential decay",
         f"more than {_VISIBLE_PX:g} px (directTHREE, no limit)",
-        bool(off.max() > _VISIBLE_PX),
+        off > _VISIBLE_PX,
     )
+    size = np.abs(e)
+    rise = (size - np.minimum.accumulate(size, axis=0)).max(axis=0)
     rising = int((rise > _VISIBLE_PX).sum())
     yield _Claim(
         "The image error does not even decay monotonically",
@@ -189,15 +169,14 @@ def _image_error(trace: Trace, factor: float) -> Iterator[_Claim]:
     )
 
 
-# Both sides of (22) agree where the centre is moved to within this of the same place, m.
-_EQUAL_M = 1e-9
+_EQUAL_M = 1e-9  # both sides of (22) agree where the centre is moved to within this of the same place
 # A limit that bends the first step alone moves the phase at which the largest deviation is sampled.
 _SAMPLING = 1e-3
 
 
 def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     """Claims of sections 5.2, 6 and 7 about drift; none where the goal pose is unknown."""
-    drift = drift_tables(studies)[0]
+    drift = study_numbers(studies)["drift_mm"]
     if not np.isfinite(drift).all():
         return
     gains = ", ".join(f"{gain:g}" for gain in studies.gains)
@@ -233,10 +212,7 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
 def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
     """Drift over the period; the longest turn in a step says how far apart the samples can be."""
     periods = np.array(studies.periods)
-    for law in DIRECT:
-        values = np.array(
-            [studies.rate[law, period].center_deviation_mm for period in studies.periods], float
-        )
+    for law, values in zip(DIRECT, study_numbers(studies)["period_drift_mm"], strict=True):
         if len(periods) < 2 or not (values > 0).all():
             continue
         order = np.polyfit(np.log(periods), np.log(values), 1)[0]
@@ -255,11 +231,11 @@ def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
 
 def _joints(material: Material, trace: Trace) -> _Claim:
     """Second-order share of each joint in the deviation of the first step."""
-    line = material.goal_center(trace) - trace.center[0]
-    line = line / max(float(np.linalg.norm(line)), np.finfo(float).tiny)
+    way = material.goal_center(trace) - trace.center[0]
+    line = way / max(float(np.linalg.norm(way)), np.finfo(float).tiny)
     H_hat = joint_operators(material.plant.model, trace.q[0])
     joint_step = trace.q[1] - trace.q[0]
-    parts = second_order_drift(H_hat, joint_step, np.append(trace.center[0], 1.0), line)
+    parts = _second_order_drift(H_hat, joint_step, np.append(trace.center[0], 1.0), line)
     first = 1e3 * along_line(trace.center[1:2], trace.center[0], trace.center[0] + line)[1][0]
     ranking = np.argsort(-np.abs(parts))
     shares = ", ".join(f"q{i + 1} {1e3 * parts[i]:+.2f}" for i in ranking)
@@ -274,11 +250,28 @@ def _joints(material: Material, trace: Trace) -> _Claim:
     )
 
 
-def composition_claim(lambdas: FloatArray, distance: FloatArray) -> _Claim:
-    """Whether both sides of [RH00] eq. (22) agree, and to which order they do.
+def _second_order_drift(
+    H_hat: FloatArray, joint_step: FloatArray, center: FloatArray, line: FloatArray
+) -> FloatArray:
+    """Contribution of each joint to the centre's second-order deviation from its line in one step, m.
 
-    lambdas : (k,) shares of the task; distance : (k,) of the centre between both sides, m.
+    Under the product of exponentials of [RH00] eq. (6) a point M has the second derivatives
+    Ĥ_i Ĥ_j M, i ≤ j. Joint i is given its own term and half of each term it shares with another
+    joint; contributions (n,) are counted along the direction of their sum, so that they add up to its
+    length. With metric operators (n, 4, 4) at the current joints, a step (n,), rad or m, the centre (4,), m,
+    and the unit direction (3,) of the line.
     """
+    acceleration = np.einsum("iab,jbc,c->ija", H_hat, H_hat, center)[..., :3]
+    ordered = np.tri(len(H_hat), dtype=np.bool_).T[..., None]
+    acceleration = np.where(ordered, acceleration, acceleration.swapaxes(0, 1))
+    parts = 0.5 * np.einsum("i,j,ija->ia", joint_step, joint_step, acceleration)
+    parts -= np.outer(parts @ line, line)
+    total = parts.sum(axis=0)
+    return np.asarray(parts @ total / max(float(np.linalg.norm(total)), np.finfo(float).tiny))
+
+
+def _composition(lambdas: FloatArray, distance: FloatArray) -> _Claim:
+    """Whether both sides of [RH00] eq. (22) agree at shares of the task, and to which order they do."""
     small = np.argsort(lambdas)[:3]
     order = ""
     if (distance[small] > 0).all():
@@ -294,10 +287,8 @@ def composition_claim(lambdas: FloatArray, distance: FloatArray) -> _Claim:
     )
 
 
-# What counts as "very small" in an image, as a share of its diagonal.
-_SMALL_SHARE = 0.01
-# The centre moves horizontally where its ordinate varies by less than this share of its abscissa.
-_LEVEL_SHARE = 0.02
+_SMALL_SHARE = 0.01  # of the diagonal of an image, that counts as very little
+_LEVEL_SHARE = 0.02  # of the variation of its abscissa, within which the ordinate of a level motion varies
 
 
 def _classical(material: Material) -> Iterator[_Claim]:
@@ -311,12 +302,9 @@ def _classical(material: Material) -> Iterator[_Claim]:
             "verdict other than converged",
             trace.verdict != "converged",
         )
-        way = center_distance(material, trace) if np.isfinite(trace.goal_pose).all() else None
-        grown = (
-            ""
-            if way is None
-            else f"; centre {1e3 * way[-1]:.0f} mm from the goal, {1e3 * way[0]:.0f} at the start"
-        )
+        way, grown = 1e3 * material.center_distance(trace), ""
+        if np.isfinite(way).all():
+            grown = f"; centre {way[-1]:.0f} mm from the goal, {way[0]:.0f} at the start"
         yield _Claim(
             "The block-wise law diverges towards infinity",
             "section 6",
@@ -352,11 +340,11 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
     )
 
 
-def _planned(material: Material) -> Iterator[_Claim]:
-    """Claims of sections 4.3 and 6 about the planned motion."""
+def _planned(material: Material) -> _Claim:
+    """The claim of sections 4.3 and 6 about the planned motion."""
     plan = material.plan
     miss = float(np.linalg.norm(plan.s[-1] - plan.s_star, axis=-1).max())
-    yield _Claim(
+    return _Claim(
         "The planned trajectory avoids self-occlusion",
         "sections 4.3 and 6, Figs. 5 and 6",
         f"least margin {plan.margin.min():.3f} of the start's; ends {miss:.2g} px from the goal images",
@@ -382,7 +370,7 @@ def _direct(material: Material) -> Iterator[_Claim]:
             total == 0,
         )
     if len(traces) == len(DIRECT):
-        gap = float(path_gap(*(trace.s for trace in traces.values())).max())
+        gap = _path_gap(*(trace.s.reshape(len(trace.s), -1, 2) for trace in traces.values()))
         diagonal = float(np.linalg.norm(material.plant.image_size))
         yield _Claim(
             "The image paths of directTHREE and directTWO differ very little",
@@ -392,32 +380,42 @@ def _direct(material: Material) -> Iterator[_Claim]:
             gap <= _SMALL_SHARE * diagonal,
         )
     if DIRECT[0] in traces:
-        yield _level(material, traces[DIRECT[0]])
+        travel, variation = np.ptp(material.center_image(traces[DIRECT[0]]), axis=0).T
+        yield _Claim(
+            "The centre moves horizontally in the images: its ordinate stays constant",
+            "section 6, Fig. 11",
+            f"ordinate varies by {variation[0]:.1f} and {variation[1]:.1f} px while the abscissa travels "
+            f"{travel[0]:.0f} and {travel[1]:.0f} px (left, right)",
+            f"variation at most {_LEVEL_SHARE:.0%} of the travel",
+            bool((variation <= _LEVEL_SHARE * travel).all()),
+        )
 
 
-def _level(material: Material, trace: Trace) -> _Claim:
-    image = center_image(material, trace)
-    travel, variation = np.ptp(image, axis=0).T
-    return _Claim(
-        "The centre moves horizontally in the images: its ordinate stays constant",
-        "section 6, Fig. 11",
-        f"ordinate varies by {variation[0]:.1f} and {variation[1]:.1f} px while the abscissa travels "
-        f"{travel[0]:.0f} and {travel[1]:.0f} px (left, right)",
-        f"variation at most {_LEVEL_SHARE:.0%} of the travel",
-        bool((variation <= _LEVEL_SHARE * travel).all()),
-    )
+def _path_gap(first: FloatArray, second: FloatArray) -> float:
+    """Largest distance of a vertex of either path from the other, px, of paths (k, p, 2) and (l, p, 2)."""
+    both = ((first, second), (second, first))
+    return max(float(_to_polyline(a[:, i], b[:, i]).max()) for a, b in both for i in range(a.shape[1]))
 
 
-def claims_of(material: Material, eq22: tuple[FloatArray, FloatArray] | None) -> list[_Claim]:
+def _to_polyline(points: FloatArray, path: FloatArray) -> FloatArray:
+    """Distance (k,) of points (k, 2) from a polyline (l, 2)."""
+    start, way = path[:-1], np.diff(path, axis=0)
+    if not len(way):
+        return np.asarray(np.linalg.norm(points - path[0], axis=1))
+    square = np.maximum((way**2).sum(axis=1), np.finfo(float).tiny)
+    offset = points[:, None] - start
+    share = np.clip((offset * way).sum(axis=2) / square, 0.0, 1.0)
+    return np.asarray(np.linalg.norm(offset - share[..., None] * way, axis=2).min(axis=1))
+
+
+def claims_of(material: Material, share: FloatArray, distance: FloatArray) -> list[_Claim]:
     """All claims that this run can speak about, in the order of the paper.
 
     material : records, truth and extra runs.
-    eq22 : shares λ, and the distances of the centre between both sides of (22), m; None where they could not
-        be computed.
+    share, distance : (k,) shares λ, and how far apart both sides of (22) put the centre, m; empty where that
+        could not be computed.
     """
-    found = [*_classical(material), *_planned(material), *_direct(material)]
+    found = [*_classical(material), _planned(material), *_direct(material)]
     if material.studies is not None:
         found += [*_drift_claims(material, material.studies), *_control_claims(material, material.studies)]
-    if eq22 is not None:
-        found.append(composition_claim(*eq22))
-    return found
+    return [*found, _composition(share, distance)] if len(share) else found

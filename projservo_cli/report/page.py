@@ -4,10 +4,11 @@ import base64
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,76 +21,72 @@ from projservo_cli.files import inside, replacing
 from projservo_cli.records import Plan, Report, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.drift import drift_rows
-from projservo_cli.report.material import VIEWS, FigureSpec, title
-from projservo_cli.report.style import FORMATS
-from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, stage_object
+from projservo_cli.report.material import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, VIEWS, stage_object, title
+from projservo_cli.report.style import FORMATS, power_of_ten
 from projservo_cli.store import Run
 
 if TYPE_CHECKING:
     from jinja2 import Template
 
-_MINUS = "\N{MINUS SIGN}"
 _NONE = "\N{EN DASH}"
-_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def short(value: float | None, digits: int = 3) -> str:
+def _short(value: float | None, digits: int = 3) -> str:
     """A number with few digits, powers of ten set as such; a dash where there is none."""
     if value is None or not math.isfinite(value):
         return _NONE
-    if value == 0 or isinstance(value, (int, np.integer)):
-        return f"{value:.0f}".replace("-", _MINUS)
-    power = math.floor(math.log10(abs(value)))
-    if digits <= power + 1 <= 6:
-        return f"{value:.0f}".replace("-", _MINUS)
-    text = f"{value:.{digits}g}"
-    mantissa, sign, exponent = text.partition("e")
-    if sign:
-        text = f"{mantissa} × 10{str(int(exponent)).translate(_SUPERSCRIPT)}"
-    return text.replace("-", _MINUS)
+    power = math.floor(math.log10(abs(value))) if value else 0
+    whole = value == 0 or isinstance(value, (int, np.integer)) or digits <= power + 1 <= 6
+    mantissa, sign, exponent = (f"{value:.0f}" if whole else f"{value:.{digits}g}").partition("e")
+    text = f"{mantissa} × {power_of_ten(int(exponent))}" if sign else mantissa
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
-def number(value: Any, digits: int = 3) -> Markup:
+def _number(value: Any, digits: int = 3) -> Markup:
     """A number for the eye that carries all of its digits for programs."""
     plain = value.item() if isinstance(value, np.generic) else value
     if plain is None or not math.isfinite(plain):
         return Markup(_NONE)
-    return Markup('<data value="{}">{}</data>').format(repr(plain), short(plain, digits))
+    return Markup('<data value="{}">{}</data>').format(repr(plain), _short(plain, digits))
 
 
-def calibration_words(found: Mapping[str, Any], *, estimated: bool) -> list[str]:
+def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator[str]:
     """Whether a calibration is good, why, and which joint is known worst, a sentence each.
 
-    found : its plain values, as of ``stage_object``.
-    estimated : whether the noise was estimated from the same images, so that χ² alone decides nothing.
+    ``estimated`` says that the noise was estimated from the same images, so that χ² alone decides nothing.
     """
-    words = [f"{'Usable' if found['usable'] else 'Not usable'}: {found['reason']}."]
+    yield f"{'Usable' if found['usable'] else 'Not usable'}: {found['reason']}."
     if math.isfinite(found["chi2_per_dof"]) and found["dof"] > 0:
-        low, high = chi2_band(found["dof"])
-        words.append(
-            f"χ² per degree of freedom is {short(found['chi2_per_dof'])} at {short(found['sigma_px'])} px of "
-            f"noise per coordinate, with {found['dof']} degrees of freedom; where model and noise are true "
-            f"it stays within {short(low)} and {short(high)}."
+        low, high = (_short(bound) for bound in chi2_band(found["dof"]))
+        chi2, sigma = _short(found["chi2_per_dof"]), _short(found["sigma_px"])
+        yield (
+            f"χ² per degree of freedom is {chi2} at {sigma} px of noise per coordinate, with {found['dof']} "
+            f"degrees of freedom; where model and noise are true it stays within {low} and {high}."
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
-    words.append(_worst_joint(found))
+    yield _worst_joint(found)
     if found["predicted_rms_px"] is not None and found["predicted_p99_px"] is not None:
-        rms, bound = short(found["predicted_rms_px"]), short(found["predicted_p99_px"])
-        words.append(
+        rms, bound = _short(found["predicted_rms_px"]), _short(found["predicted_p99_px"])
+        yield (
             f"Within the ranges of the joints images are expected to err by {rms} px rms, and in 99 of 100 "
             f"calibrations by less than {bound} px."
         )
-    left_out = (
+    for name, what, one, many in (
         ("outliers", "reading", "left out as an outlier", "left out as outliers"),
         ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
         ("swapped", "marker", "was renumbered", "were renumbered"),
-    )
-    for name, what, one, many in left_out:
+    ):
         if count := len(found[name]):
-            words.append(f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}.")
+            yield f"{count} {what}{'s' * (count > 1)} {many if count > 1 else one}."
     if "cross_validation" in found:
-        words.append(_held_out_words(found["cross_validation"]))
-    return words
+        value = found["cross_validation"]
+        names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")
+        rms, predicted, median, p95 = (_short(value[name]) for name in names)
+        yield (
+            f"Held out, in {value['folds']} parts of {value['unit']}: rms {rms} px where noise and "
+            f"covariance predict {predicted} px, median {median} px, 95th percentile {p95} px. "
+            f"{value['reason'][:1].upper()}{value['reason'][1:].rstrip('.')}."
+        )
 
 
 def _worst_joint(found: Mapping[str, Any]) -> str:
@@ -99,36 +96,23 @@ def _worst_joint(found: Mapping[str, Any]) -> str:
     noise, worst = max(known)
     reach = f"{REACH_M:g} m" if found["joints"][worst]["type"] == "P" else f"{REACH_RAD:g} rad"
     return (
-        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {short(noise)} times the "
+        f"Joint {worst + 1} is known worst: {reach} from the reference it adds {_short(noise)} times the "
         f"pixel noise to predicted images; a joint is weak above {WEAK_NOISE:g}, so this one is "
         f"{'weak' if noise > WEAK_NOISE else 'well determined'}."
     )
 
 
-def _held_out_words(value: Mapping[str, Any]) -> str:
-    """How well poses were predicted that the fit had not seen, in a sentence or two."""
-    names = ("rms_px", "predicted_rms_px", "median_px", "p95_px")
-    rms, predicted, median, p95 = (short(value[name]) for name in names)
-    reason = value["reason"]
-    text = (
-        f"Held out, in {value['folds']} parts of {value['unit']}: rms {rms} px where noise and covariance "
-        f"predict {predicted} px, median {median} px, 95th percentile {p95} px. "
-        f"{reason[:1].upper()}{reason[1:]}."
-    )
-    return text.replace("..", ".")
-
-
 def _law_words(trace: Mapping[str, Any]) -> str:
     """Verdict of a law, its reason, and where it ended, in one sentence."""
     steps, reason = trace["steps"], trace["reason"]
-    took = f"{steps} step{'s' * (steps != 1)} ({short(steps * trace['period'])} s)"
+    took = f"{steps} step{'s' * (steps != 1)} ({_short(steps * trace['period'])} s)"
     text = f"{title(name_of(trace['law'], trace['mode']))}: {trace['verdict']} after {took}"
     if reason:
         text += f", because the {reason}" if reason.startswith("image error") else f": {reason}"
     if trace["position_error_mm"] is not None and trace["rotation_error_deg"] is not None:
         text += (
-            f"; the face is then {short(trace['position_error_mm'])} mm and "
-            f"{short(trace['rotation_error_deg'])}° from its goal"
+            f"; the face is then {_short(trace['position_error_mm'])} mm and "
+            f"{_short(trace['rotation_error_deg'])}° from its goal"
         )
     return f"{text}."
 
@@ -153,34 +137,21 @@ def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -
     """Figures by section, of the files that the report wrote; ``prefix`` is of all names within the page."""
     found: dict[str, list[_Picture]] = {section: [] for section in SECTIONS}
     for spec in FIGURES:
-        kinds = [kind for kind in FORMATS if _file(spec, kind) in files]
-        if kinds:
-            found[_section(spec)].append(_picture(spec, directory, kinds, folder, prefix))
+        own = {kind: f"figures/{spec.name}.{kind}" for kind in ("csv", *FORMATS)}
+        kinds = [kind for kind in FORMATS if own[kind] in files]
+        if not kinds:
+            continue
+        alt = spec.alt or spec.title
+        images = (_drawing(directory / own[kind], kind, alt) for kind in _TYPES if kind in kinds)
+        drawing = next((image for image in images if image is not None), None)
+        links = [(kind.upper(), folder + own[kind]) for kind in kinds]
+        if (directory / own["csv"]).is_file():
+            links.insert(0, ("numbers (CSV)", folder + own["csv"]))
+        number = str(int(spec.name[3:5]))
+        section = "control" if spec.laws or spec.studies or spec.modes else "plan"
+        picture = _Picture(prefix + spec.name, number, spec.title, spec.paper, drawing, tuple(links))
+        found[section if spec.task else "calibration"].append(picture)
     return found
-
-
-def _file(spec: FigureSpec, kind: str) -> str:
-    return f"figures/{spec.name}.{kind}"
-
-
-def _section(spec: FigureSpec) -> str:
-    if not spec.task:
-        return "calibration"
-    return "control" if spec.laws or spec.studies or spec.modes else "plan"
-
-
-def _picture(spec: FigureSpec, directory: Path, kinds: list[str], folder: str, prefix: str) -> _Picture:
-    images = (
-        _drawing(directory / _file(spec, kind), kind, spec.alt or spec.title)
-        for kind in _TYPES
-        if kind in kinds
-    )
-    drawing = next((image for image in images if image is not None), None)
-    links = [(kind.upper(), folder + _file(spec, kind)) for kind in kinds]
-    if (directory / _file(spec, "csv")).is_file():
-        links.insert(0, ("numbers (CSV)", folder + _file(spec, "csv")))
-    number = str(int(spec.name.partition("_")[0].removeprefix("fig")))
-    return _Picture(f"{prefix}{spec.name}", number, spec.title, spec.paper, drawing, tuple(links))
 
 
 def _drawing(path: Path, kind: str, alt: str) -> Markup | None:
@@ -202,74 +173,54 @@ def _drawing(path: Path, kind: str, alt: str) -> Markup | None:
 # What may lie beside the page, and what the page calls it.
 _EXTRAS = {VIEW_FILE: "3D view with a time slider", ANIMATION_FILE: "animation of both camera images (GIF)"}
 # What made a run: key in the provenance, and what the page calls it.
-_MADE = {
-    "date": "date",
-    "argv": "command",
-    "projservo": "projservo",
-    "git_commit": "commit",
-    "host": "host",
-    "system": "system",
-    "cpu": "processor",
-}
+_MADE = {"date": "date", "argv": "command", "projservo": "projservo", "git_commit": "commit"}
+_MADE |= {"host": "host", "system": "system", "cpu": "processor"}
 _VERSIONS = ("python", "numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 
 
-@dataclass(frozen=True)
-class _View:
-    """One run as the page shows it; what it lacks is empty or None.
-
-    Stages are told by their plain values and what only the page tells; ``folder`` is that of the run,
-    relative to the page, ``made`` (property, value) of what made it, ``extras`` (label, path) of what lies
-    beside the page.
-    """
+class _View(NamedTuple):
+    """One run as the page shows it; what it lacks is empty or None."""
 
     name: str
-    folder: str
+    folder: str  # that of the run, relative to the page
     config: Config
     configuration: str
-    made: list[tuple[str, str]]
-    calibration: dict[str, Any] | None = None
-    plan: dict[str, Any] | None = None
-    laws: list[dict[str, Any]] = field(default_factory=list)
-    claims: Sequence[dict[str, Any]] = ()
-    drift: dict[str, Any] | None = None
-    left_out: dict[str, list[str]] = field(default_factory=dict)
-    reported: bool = False
-    pictures: dict[str, list[_Picture]] = field(default_factory=lambda: {name: [] for name in SECTIONS})
-    extras: tuple[tuple[str, str], ...] = ()
+    made: list[tuple[str, str]]  # property and value of what made it
+    extras: list[tuple[str, str]]  # label and path of what lies beside the page
+    calibration: dict[str, Any] | None  # the stages by their plain values, and what only the page tells
+    plan: dict[str, Any] | None
+    laws: list[dict[str, Any]]
+    reported: bool
+    claims: Sequence[dict[str, Any]]
+    drift: dict[str, Any] | None
+    left_out: dict[str, list[str]]  # by reason
+    pictures: dict[str, list[_Picture]]
 
 
 def _view(run: Run, *, folder: str = "", prefix: str = "") -> _View:
     """What the page shows of a run in a ``folder``; ``prefix`` sets its names off from those of others."""
-    config = load_config(run.path, text=run.configuration)
+    config, beside = load_config(run.path, text=run.configuration), run.path.parent
     stages = {name.split("/")[0] for name in run.results}
     found = {stage: stage_object(stage, run, config, list(run.traces)) for stage in stages}
-    shown = _View(
+    report: Report | None = run.results["report"].records[""] if "report" in stages else None
+    left_out: dict[str, list[str]] = {}
+    for entry in report.left_out if report else ():
+        left_out.setdefault(entry["reason"], []).append(entry["what"])
+    return _View(
         config.name,
         folder,
         config,
         run.configuration,
         list(_made(run, config)),
+        [(label, folder + name) for name, label in _EXTRAS.items() if (beside / name).is_file()],
         calibration=_calibration(found["calibrate"], config) if "calibrate" in found else None,
         plan=found["plan"] | _visibility(run.plan) if "plan" in found else None,
         laws=[_law(trace, config) for trace in found["servo"]["laws"]] if "servo" in found else [],
-        extras=tuple(
-            (label, folder + name) for name, label in _EXTRAS.items() if (run.path.parent / name).is_file()
-        ),
-    )
-    if "report" not in found:
-        return shown
-    report: Report = run.results["report"].records[""]
-    left_out: dict[str, list[str]] = {}
-    for entry in report.left_out:
-        left_out.setdefault(entry["reason"], []).append(entry["what"])
-    return replace(
-        shown,
-        claims=report.claims,
-        drift=_drift(report),
+        reported=report is not None,
+        claims=report.claims if report else (),
+        drift=_drift(report) if report else None,
         left_out=left_out,
-        reported=True,
-        pictures=_pictures(run.path.parent, report.figures, folder, prefix),
+        pictures=_pictures(beside, report.figures if report else (), folder, prefix),
     )
 
 
@@ -280,37 +231,28 @@ def _made(run: Run, config: Config) -> Iterator[tuple[str, str]]:
     inputs = {key: text for result in run.results.values() for key, text in result.inputs.items()}
     for key, text in inputs.items():
         yield key.replace("_", " "), text
-    stages = {name: result.provenance for name, result in run.results.items()}
-    for key, label in _MADE.items():
-        yield from _values(label, {name: _told(key, made) for name, made in stages.items()})
-    versions = {
-        name: ", ".join(f"{package} {made[package]}" for package in _VERSIONS if made.get(package))
-        for name, made in stages.items()
-    }
-    yield from _values("versions", versions)
+    for key, label in (*_MADE.items(), ("", "versions")):
+        by_value: dict[str, list[str]] = {}
+        for name, result in run.results.items():
+            if value := _told(key, result.provenance):
+                by_value.setdefault(value, []).append(name.split("/")[0])
+        for value, names in by_value.items():
+            yield label, value if len(by_value) == 1 else f"{value} ({', '.join(dict.fromkeys(names))})"
 
 
-def _told(key: str, made: Any) -> str:
+def _told(key: str, made: Mapping[str, Any]) -> str:
+    """One of the things that made a result, in words; the versions where there is no key."""
+    if not key:
+        return ", ".join(f"{package} {made[package]}" for package in _VERSIONS if made.get(package))
     value = made.get(key)
-    if value is None:
-        return ""
-    if key == "argv":
+    if key == "argv" and value:
         return " ".join(["projservo", *value[1:]])
-    if key == "date":
+    if key == "date" and value:
         moment = datetime.fromisoformat(value)
         return f"{moment.astimezone(UTC):%Y-%m-%d %H:%M} UTC" if moment.tzinfo else str(value)
-    if key == "git_commit":
+    if key == "git_commit" and value:
         return f"{value}{', with changes' if made.get('git_dirty') else ''}"
-    return str(value)
-
-
-def _values(label: str, told: dict[str, str]) -> Iterator[tuple[str, str]]:
-    by_value: dict[str, list[str]] = {}
-    for name, value in told.items():
-        if value:
-            by_value.setdefault(value, []).append(name.split("/")[0])
-    for value, names in by_value.items():
-        yield label, value if len(by_value) == 1 else f"{value} ({', '.join(dict.fromkeys(names))})"
+    return "" if value is None else str(value)
 
 
 def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
@@ -334,7 +276,7 @@ def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
         *lens,
         ("time", found["seconds"], "s"),
     ]
-    return found | {"words": calibration_words(found, estimated=estimated), "numbers": numbers}
+    return found | {"words": list(_calibration_words(found, estimated=estimated)), "numbers": numbers}
 
 
 def _visibility(plan: Plan) -> dict[str, Any]:
@@ -342,26 +284,17 @@ def _visibility(plan: Plan) -> dict[str, Any]:
     views = []
     for v, name in enumerate(VIEWS):
         least = int(np.argmin(plan.margin[:, v]))
-        views.append(
-            {
-                "name": name,
-                "margin": float(plan.margin[least, v]),
-                "sigma": float(plan.sigma[least]),
-                "tau_0": float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None,
-                "theta_0": np.degrees(plan.theta_0[v]).tolist(),
-                "sense_margins": plan.sense_margin[:, v].tolist(),
-            }
-        )
+        seen = {"name": name, "margin": float(plan.margin[least, v]), "sigma": float(plan.sigma[least])}
+        seen["tau_0"] = float(plan.tau_0[v] / plan.tau) if plan.tau > 0 else None
+        seen["theta_0"] = np.degrees(plan.theta_0[v]).tolist()
+        views.append(seen | {"sense_margins": plan.sense_margin[:, v].tolist()})
     return {"views": views, "senses": np.degrees(plan.sense).tolist()}
 
 
 def _law(trace: dict[str, Any], config: Config) -> dict[str, Any]:
-    return trace | {
-        "title": title(name_of(trace["law"], trace["mode"])),
-        "words": _law_words(trace),
-        "converged": trace["verdict"] == "converged",
-        "must": trace["law"] in config.control.must_converge,
-    }
+    told = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
+    must = trace["law"] in config.control.must_converge
+    return trace | told | {"converged": trace["verdict"] == "converged", "must": must}
 
 
 def _drift(report: Report) -> dict[str, Any] | None:
@@ -370,14 +303,8 @@ def _drift(report: Report) -> dict[str, Any] | None:
         return None
     rows: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
     for row in drift_rows(report):
-        rows.setdefault((row["law"], row["operators"], row["limit_deg_per_step"]), []).append(row)
-    return {
-        "gains": [float(gain) for gain in report.gain_per_step],
-        "rows": [
-            {"law": title(law), "operators": operators, "limit": limit, "cells": cells}
-            for (law, operators, limit), cells in rows.items()
-        ],
-    }
+        rows.setdefault((title(row["law"]), row["operators"], row["limit_deg_per_step"]), []).append(row)
+    return {"gains": report.gain_per_step.tolist(), "rows": rows}
 
 
 def _differences(views: list[_View]) -> list[tuple[str, list[str]]]:
@@ -399,25 +326,14 @@ def _leaves(path: str, value: Any) -> Iterator[tuple[str, str]]:
         yield path, value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
 
 
-def _picture_rows(views: list[_View]) -> dict[str, list[list[_Picture | None]]]:
-    """Figures by section, a row for each, an entry for each run; None where a run lacks it."""
-    rows: dict[str, list[list[_Picture | None]]] = {}
-    for section in SECTIONS:
-        numbered = [{picture.number: picture for picture in view.pictures[section]} for view in views]
-        names = sorted({number for own in numbered for number in own}, key=int)
-        rows[section] = [[own.get(number) for own in numbered] for number in names]
+def _side_by_side(columns: Iterable[Iterable[Any]], key: Callable[[Any], Any]) -> dict[Any, list[Any]]:
+    """What several runs have, by a key: an entry for each run, None where it has none."""
+    columns = list(columns)
+    rows: dict[Any, list[Any]] = {}
+    for k, column in enumerate(columns):
+        for item in column:
+            rows.setdefault(key(item), [None] * len(columns))[k] = item
     return rows
-
-
-def _claim_rows(views: list[_View]) -> list[dict[str, Any]]:
-    """Claims of all runs: what is claimed, where, when it holds, and what each run measured."""
-    rows: dict[tuple[str, str, str], dict[str, Any]] = {}
-    for v, view in enumerate(views):
-        for claim in view.claims:
-            key = (claim["claim"], claim["source"], claim["criterion"])
-            row = rows.setdefault(key, {**claim, "runs": [None] * len(views)})
-            row["runs"][v] = claim
-    return list(rows.values())
 
 
 @cache
@@ -433,7 +349,7 @@ def template(name: str) -> "Template":
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"number": number, "degrees": math.degrees}
+    environment.filters |= {"number": _number, "degrees": math.degrees}
     return environment.get_template(name)
 
 
@@ -452,22 +368,26 @@ def write_comparison(runs: Sequence[Run], path: Path) -> None:
 
     Raises InputError if a configuration cannot be read or the page cannot be written.
     """
-    base = path.parent.resolve()
-    views = []
+    base, views = path.parent.resolve(), []
     for k, run in enumerate(runs, 1):
-        folder = os.path.relpath(run.path.parent.resolve(), base)
-        views.append(_view(run, folder=Path(folder).as_posix() + "/", prefix=f"run{k}-"))
-    shared = {view.name for view in views if sum(view.name == other.name for other in views) > 1}
+        folder = Path(os.path.relpath(run.path.parent.resolve(), base)).as_posix()
+        views.append(_view(run, folder=f"{folder}/", prefix=f"run{k}-"))
+    shared = Counter(view.name for view in views)
     named = [
-        replace(view, name=f"{view.name} ({view.folder.rstrip('/')})") if view.name in shared else view
+        view._replace(name=f"{view.name} ({view.folder[:-1]})") if shared[view.name] > 1 else view
         for view in views
     ]
     _write(path, named)
 
 
 def _write(path: Path, views: list[_View]) -> None:
+    claims = _side_by_side((v.claims for v in views), itemgetter("claim", "source", "criterion"))
+    pictures = {}
+    for section in SECTIONS:
+        numbered = _side_by_side((v.pictures[section] for v in views), attrgetter("number"))
+        pictures[section] = [numbered[number] for number in sorted(numbered, key=int)]
     text = template("page.html").render(
-        views=views, claims=_claim_rows(views), differences=_differences(views), pictures=_picture_rows(views)
+        views=views, claims=claims, differences=_differences(views), pictures=pictures
     )
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")

@@ -4,23 +4,19 @@ matplotlib is imported where it is used and always draws without a display; the 
 same bytes in SVG, PDF and PNG.
 """
 
-import hashlib
 import io
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from projservo_cli.records import FloatArray
-from projservo_cli.report.material import Data, FigureSpec
+from projservo_cli.records import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
 
 FORMATS = ("svg", "pdf", "png")
 WIDTH = 6.9  # inches across both columns of a page
@@ -30,19 +26,11 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 IMAGE = "image"  # label of axes that show pixels
 
 # M. Okabe, K. Ito, "Color Universal Design", 2008; ordered so that neighbours differ in lightness.
-BLACK, ORANGE, BLUE, SKY, VERMILION, GREEN, PURPLE = (
-    "#000000",
-    "#E69F00",
-    "#0072B2",
-    "#56B4E9",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-)
-GREY = "#999999"
-PALE = "#DDDDDD"
+BLACK, ORANGE, BLUE, SKY = "#000000", "#E69F00", "#0072B2", "#56B4E9"
+VERMILION, GREEN, PURPLE = "#D55E00", "#009E73", "#CC79A7"
+GREY, PALE = "#999999", "#DDDDDD"
 # Colour, line style and marker change together, so that a curve is known without its colour.
-CURVES: tuple[tuple[str, Any, str], ...] = (
+_CURVES: tuple[tuple[str, Any, str], ...] = (
     (BLACK, "-", "o"),
     (VERMILION, (0, (5, 1.5)), "s"),
     (BLUE, (0, (1, 1)), "^"),
@@ -54,11 +42,6 @@ CURVES: tuple[tuple[str, Any, str], ...] = (
 # How the face at the start and at the goal look in every figure.
 START: Look = {"color": BLACK, "linewidth": 1.4}
 GOAL: Look = {"color": BLUE, "linestyle": (0, (5, 1.5))}
-SHARES: dict[str, Look] = {  # equal shares lie on one another: the wider shows beneath
-    r"$\mu_t$": {"color": SKY, "linewidth": 3.0},
-    r"$\mu_r$": {"color": BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
-    r"$\mu_p$": {"color": VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
-}
 
 _RC: Any = {
     "font.family": "DejaVu Sans",
@@ -104,21 +87,24 @@ def styled() -> Iterator[None]:
         yield
 
 
-def new_figure(height: float, width: float = WIDTH) -> "Figure":
-    """Empty figure of a size in inches whose parts arrange themselves."""
+def drawn(draw: Callable[[Any, "Figure"], None], data: Any, height: float, width: float = WIDTH) -> "Figure":
+    """A figure of a size in inches, drawn from data and arranged, so that every format shows the same."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import TightLayoutEngine
 
     # Without a rectangle it measures each part once; with one, or "constrained", twice, which takes 0.6 s.
     layout: Any = TightLayoutEngine(pad=0.5, rect=None)  # type: ignore[arg-type]
-    figure = Figure(figsize=(width, height), layout=layout)
-    FigureCanvasAgg(figure)
+    with styled():
+        figure = Figure(figsize=(width, height), layout=layout)
+        FigureCanvasAgg(figure)
+        draw(data, figure)
+        _arrange(figure)
     return figure
 
 
-def arrange(figure: "Figure") -> None:
-    """Arrange the parts of a figure once, so that every format shows the same."""
+def _arrange(figure: "Figure") -> None:
+    """Arrange the parts of a figure once and for all."""
     engine: Any = figure.get_layout_engine()
     if engine is None:
         return
@@ -152,39 +138,15 @@ def _equal_scales(
     axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
 
 
-def drawn(spec: FigureSpec, data: Data, formats: Sequence[str]) -> dict[str, bytes]:
-    """A figure of some data as files, by format: ``svg``, ``pdf`` or ``png``."""
-    figure = new_figure(spec.height)
-    spec.draw(data, figure)
-    arrange(figure)
-    return contents(figure, formats)
-
-
 def contents(figure: "Figure", formats: Sequence[str]) -> dict[str, bytes]:
-    """An arranged figure as files, by format: ``svg``, ``pdf`` or ``png``."""
+    """A figure as files, by format: ``svg``, ``pdf`` or ``png``."""
     made = {}
     for kind in formats:
         file = io.BytesIO()
-        figure.savefig(file, format=kind, dpi=_PNG_DPI, metadata=_METADATA[kind])
-        made[kind] = clips_by_content(file.getvalue()) if kind == "svg" else file.getvalue()
+        with styled():
+            figure.savefig(file, format=kind, dpi=_PNG_DPI, metadata=_METADATA[kind])
+        made[kind] = file.getvalue()
     return made
-
-
-def clips_by_content(svg: bytes) -> bytes:
-    """The same picture with outlines that clip named by what they are.
-
-    matplotlib names those that are no rectangles by where they are in memory.
-    """
-    outlines = re.findall(rb'<clipPath id="(\w+)">(.*?)</clipPath>', svg, re.DOTALL)
-    names = {name: b"p" + hashlib.sha256(outline).hexdigest()[:10].encode() for name, outline in outlines}
-    return re.sub(rb"p[0-9a-f]{10}", lambda found: names.get(found[0], found[0]), svg)
-
-
-def pixels(figure: "Figure") -> npt.NDArray[np.uint8]:
-    """Pixels (height, width, 3) of a figure as it is now."""
-    canvas: Any = figure.canvas
-    canvas.draw()
-    return np.array(canvas.buffer_rgba(), dtype=np.uint8)[:, :, :3]
 
 
 def legend_below(figure: "Figure", looks: Mapping[str, Look], columns: int) -> None:
@@ -201,18 +163,14 @@ def legend_below(figure: "Figure", looks: Mapping[str, Look], columns: int) -> N
 
 def curve(index: int, *, marker: bool = False) -> Look:
     """Look of the curve of a number: colour, line style and, if asked for, marker."""
-    color, style, symbol = CURVES[index % len(CURVES)]
+    color, style, symbol = _CURVES[index % len(_CURVES)]
     look = {"color": color, "linestyle": style}
     return look | {"marker": symbol} if marker else look
 
 
-def image_axes(axes: "Axes", title: str) -> None:
-    """Axes in pixels of an image with equal scales; the view widens to fill its panel."""
+def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.06) -> None:
+    """Axes of an image that show all pixels (…, 2) with a margin, v down, and widen to fill their panel."""
     axes.set(title=title, xlabel="u (px)", ylabel="v (px)", label=IMAGE)
-
-
-def frame_pixels(axes: "Axes", pixels: FloatArray, margin: float = 0.06) -> None:
-    """Show all pixels (…, 2) with a margin; v points down."""
     points = pixels.reshape(-1, 2)
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
@@ -233,21 +191,16 @@ def log_scale(axes: "Axes") -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_yscale("log", nonpositive="clip")
-    axis = axes.yaxis
-    axis.set_major_locator(LogLocator(numticks=5))
-    axis.set_major_formatter(FuncFormatter(_power))
-    axis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_major_locator(LogLocator(numticks=5))
+    axes.yaxis.set_major_formatter(
+        FuncFormatter(lambda value, _: power_of_ten(round(float(np.log10(value)))))
+    )
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
-def _power(value: float, position: int | None = None) -> str:
-    del position
-    exponent = round(float(np.log10(value))) if value > 0 else 0
+def power_of_ten(exponent: int) -> str:
+    """A power of ten as it is written by hand."""
     return "10" + str(exponent).translate(_SUPERSCRIPTS)
-
-
-def signed(value: float, decimals: int = 1) -> str:
-    """Number with a typographic minus."""
-    return f"{value:.{decimals}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def closed(polygon: FloatArray) -> FloatArray:
@@ -262,3 +215,13 @@ def face(axes: "Axes", corners: FloatArray, look: Look, *, fill: bool = False) -
         axes.fill(loop[:, 0], loop[:, 1], color=PALE, alpha=0.35, linewidth=0)
     axes.plot(loop[:, 0], loop[:, 1], **look)
     axes.plot(corners[:1, 0], corners[:1, 1], "o", color=look["color"], markersize=3)
+
+
+def paths(axes: "Axes", points: FloatArray, look: Look) -> None:
+    """Draw the ways (k, m, 2) of m points; NaN is a gap."""
+    axes.plot(points[..., 0], points[..., 1], **look)
+
+
+def hidden_paths(axes: "Axes", points: FloatArray, hidden: BoolArray, look: Look) -> None:
+    """Mark those stretches of the ways (k, m, 2) of m points at whose instants (k,) they are hidden."""
+    paths(axes, np.where(hidden[:, None, None], points, np.nan), {"solid_capstyle": "butt"} | look)

@@ -6,23 +6,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from projservo_cli import provenance
 from projservo_cli.config import load_config
 from projservo_cli.files import replacing, require_inside
-from projservo_cli.records import FloatArray, InputError, Report, Trace, WorkFailed
+from projservo_cli.records import InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
-from projservo_cli.report.animation import write_animation
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.figures.drift import drift_rows, drift_tables
-from projservo_cli.report.material import DIRECT, Fit, Material, Studies
+from projservo_cli.report.figures.drift import drift_rows, study_numbers
+from projservo_cli.report.material import ANIMATION_FILE, CLAIMS_FILE, VIEW_FILE, Fit, Material, Studies
+from projservo_cli.report.motion import motion_of, plotly, write_animation, write_view
 from projservo_cli.report.page import write_page
-from projservo_cli.report.values import ANIMATION_FILE, CLAIMS_FILE, VIEW_FILE
-from projservo_cli.report.view import motion, plotly, write_view
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import plant_of
 from projservo_cli.stages.studies import (
@@ -45,7 +43,6 @@ if TYPE_CHECKING:
 
 FOLDER = "figures"
 _NUMBERS = "csv"  # what is drawn, beside each figure
-_Eq22 = tuple[FloatArray, FloatArray]
 
 
 def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
@@ -59,16 +56,30 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
     material: Fit = Fit(run.calibration, run.observation, held_out=run.cross_validation)
-    studies, eq22, claims = None, None, []
+    studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
     if has_task(config):
         bench = comparison_of(config, run.calibration, run.plan)
-        material = material_of(run, bench, left_out, progress)
-        studies, eq22 = material.studies, composition(bench, left_out)
-        claims = [claim._asdict() for claim in claims_of(material, eq22)]
+        with _unless_it_fails("studies", left_out):
+            studies = run_studies(bench, progress=progress)
+        material = _material(run, bench, studies, left_out)
+        with _unless_it_fails("equation (22)", left_out):
+            distance, _ = composition_error(metric_plan(bench))
+            share = np.array(LAMBDAS)
+        claims = [claim._asdict() for claim in claims_of(material, share, distance)]
     figures = draw_all(material, directory, config.report.formats, left_out, progress)
-    told = {"figures": tuple(figures), "left_out": tuple(left_out), "claims": tuple(claims)}
-    report = record_of(studies, eq22, **told)
-    _write_claims(report, directory / CLAIMS_FILE)
+    report = Report(
+        figures=tuple(figures),
+        left_out=tuple(left_out),
+        claims=tuple(claims),
+        step_limit_deg=STEP_LIMIT_DEG,
+        share=share,
+        composition_mm=1e3 * distance,
+        **study_numbers(studies),
+    )
+    content = {"claims": report.claims, "drift": drift_rows(report), "left_out": report.left_out}
+    text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
+    with replacing(directory / CLAIMS_FILE) as temporary:
+        temporary.write_text(f"{text}\n", encoding="utf-8")
     for name in (VIEW_FILE, ANIMATION_FILE):  # of other runs than those that are reported on now
         (directory / name).unlink(missing_ok=True)
     made = Result("", run.configuration, provenance.collect(seed=config.seed), {}, {"": report})
@@ -76,16 +87,20 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     return report
 
 
-def material_of(
-    run: "Run", bench: Comparison, left_out: list[dict[str, str]], progress: Progress
-) -> Material:
-    """All that the figures may show; extra runs that fail are named in ``left_out``."""
-    truth, studies, reason = bench.truth, None, ""
+@contextmanager
+def _unless_it_fails(what: str, left_out: list[dict[str, str]]) -> Iterator[None]:
+    """Do something that a report can be without; where it fails, say why."""
     try:
-        studies = run_studies(bench, progress=progress)
+        yield
     except WorkFailed as error:
-        reason = " ".join(str(error).split())
-        left_out.append({"what": "studies", "reason": reason})
+        left_out.append({"what": what, "reason": " ".join(str(error).split())})
+
+
+def _material(
+    run: "Run", bench: Comparison, studies: Studies | None, left_out: list[dict[str, str]]
+) -> Material:
+    """All that figures may show and claims be about."""
+    truth = bench.truth
     return Material(
         run.calibration,
         run.observation,
@@ -96,7 +111,7 @@ def material_of(
         tuple(truth.number[i] for i in truth.face),
         run.traces,
         studies,
-        reason,
+        "" if studies else left_out[-1]["reason"],
         bench.scenario.limits.plateau_steps,
         held_out=run.cross_validation,
     )
@@ -118,7 +133,7 @@ def draw_all(
     folder = directory / FOLDER
     require_inside(folder, directory)
     written: list[str] = []
-    with style.styled(), _without_collector():
+    with _without_collector():
         for done, spec in enumerate(FIGURES):
             progress("figures", done, len(FIGURES))
             contents: dict[str, bytes] = {}
@@ -128,7 +143,8 @@ def draw_all(
                 if partial := spec.partly(material):
                     left_out.append({"what": f"{spec.name}, in part", "reason": partial})
                 data = spec.data(material)
-                contents = {_NUMBERS: to_csv(data).encode(), **style.drawn(spec, data, formats)}
+                figure = style.drawn(spec.draw, data, spec.height)
+                contents = {_NUMBERS: to_csv(data).encode(), **style.contents(figure, formats)}
             for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
                 (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
             for kind, content in contents.items():
@@ -147,46 +163,6 @@ def _without_collector() -> Iterator[None]:
         yield
     finally:
         gc.enable()
-
-
-def composition(bench: Comparison, left_out: list[dict[str, str]]) -> _Eq22 | None:
-    """Shares λ, and how far both sides of [RH00] eq. (22) differ at each, m; None, and why, if they fail."""
-    try:
-        distance, _ = composition_error(metric_plan(bench))
-    except WorkFailed as error:
-        left_out.append({"what": "equation (22)", "reason": " ".join(str(error).split())})
-        return None
-    return np.array(LAMBDAS), distance
-
-
-def record_of(studies: Studies | None, eq22: _Eq22 | None, **told: Any) -> Report:
-    """The record of a report, with ``figures``, ``left_out`` and ``claims`` as they are ``told``."""
-    share, distance = eq22 if eq22 is not None else (np.zeros(0), np.zeros(0))
-    periods = studies.periods if studies is not None else ()
-    gains = studies.gains if studies is not None else ()
-    drift, at_samples, converged = drift_tables(studies)
-    rate = {} if studies is None else studies.rate
-    rows = [[rate[law, period].center_deviation_mm for period in periods] for law in DIRECT]
-    return Report(
-        **told,
-        step_limit_deg=STEP_LIMIT_DEG,
-        gain_per_step=np.array(gains),
-        drift_mm=drift,
-        drift_at_samples_mm=at_samples,
-        drift_converged=converged,
-        period=np.array(periods),
-        period_drift_mm=np.array(rows, dtype=np.float64),
-        share=share,
-        composition_mm=1e3 * distance,
-    )
-
-
-def _write_claims(report: Report, path: Path) -> None:
-    """Claims and drift table as strict JSON."""
-    content = {"claims": report.claims, "drift": drift_rows(report), "left_out": report.left_out}
-    text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
-    with replacing(path) as temporary:
-        temporary.write_text(f"{text}\n", encoding="utf-8")
 
 
 def require(config: "Config", wanted: Sequence[str]) -> None:
@@ -217,7 +193,7 @@ def view(run: "Run", progress: Progress = silent) -> Path:
     known = f"Robot, rig and face as the configuration describes them, moved by the {joints}."
     path = run.path.parent / VIEW_FILE
     progress("view", 0, 1)
-    write_view(path, motion(truth.robot, plant, truth.M, run.plan, traces), name=config.name, known=known)
+    write_view(path, motion_of(truth.robot, plant, truth.M, run.plan, traces), name=config.name, known=known)
     progress("view", 1, 1)
     return path
 

@@ -14,7 +14,7 @@ from typing import Any
 from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.records import InputError, names_of
-from projservo_cli.report.values import CLAIMS_FILE, PAGE_FILE
+from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.stages.world import has_task
 from projservo_cli.store import SERVO, Result, Run
 

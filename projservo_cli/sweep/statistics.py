@@ -15,7 +15,6 @@ from projservo_cli.config.sweep import LAW
 from projservo_cli.files import replacing
 from projservo_cli.records import BoolArray
 from projservo_cli.report import style
-from projservo_cli.report.figures.sweeps import draw_basin, draw_final_errors, draw_success
 from projservo_cli.report.material import Data
 from projservo_cli.stages import Progress
 from projservo_cli.store.sweep_table import SweepTable
@@ -204,31 +203,28 @@ def _written(path: Path, content: bytes) -> Path:
 
 
 def _drawn(picture: _Picture, formats: Sequence[str]) -> dict[str, bytes]:
-    with style.styled():
-        figure = style.new_figure(picture.height, 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH)
-        picture.draw(picture.data, figure)
-        style.arrange(figure)
-        return style.contents(figure, formats)
+    width = 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH
+    return style.contents(style.drawn(picture.draw, picture.data, picture.height, width), formats)
 
 
 def _pictures(rows: _Rows) -> Iterator[_Picture]:
     """Every figure that the columns of a sweep allow."""
     axes = {name: values for name, values in rows.axes if len(values) > 1 and _numeric(values)}
     for name in axes:
-        yield _Picture(f"success_over_{name}", _success(rows, name, name, None), draw_success, 2.9)
+        yield _Picture(f"success_over_{name}", _success(rows, name, name, None), _draw_success, 2.9)
     drawn = [name for name in rows.table.names if name in rows.table.attributes["random"]]
     for name in (name for name in drawn if rows[name].dtype.kind == "f"):
         edges = np.linspace(rows[name].min(), np.nextafter(rows[name].max(), math.inf), BINS + 1)
-        yield _Picture(f"success_over_{name}", _success(rows, name, name, edges.tolist()), draw_success, 2.9)
+        yield _Picture(f"success_over_{name}", _success(rows, name, name, edges.tolist()), _draw_success, 2.9)
     if np.nanmax(rows["rotation_deg"], initial=0.0) - np.nanmin(rows["rotation_deg"], initial=180.0) > 1.0:
         data = _success(rows, "rotation_deg", "rotation from start to goal (deg)", [*ANGLES[:-1], 180.1])
-        yield _Picture("success_over_rotation", data, draw_success, 2.9)
+        yield _Picture("success_over_rotation", data, _draw_success, 2.9)
     offsets = [name for name in axes if name.startswith(OFFSET)]
     if len(offsets) >= 2:
-        yield _Picture("basin", _basin(rows, offsets[0], offsets[1]), draw_basin, 4.0)
+        yield _Picture("basin", _basin(rows, offsets[0], offsets[1]), _draw_basin, 4.0)
     errors = _final_errors(rows)
     if errors:
-        yield _Picture("final_error", errors, draw_final_errors, 2.9)
+        yield _Picture("final_error", errors, _draw_final_errors, 2.9)
 
 
 def _numeric(values: Sequence[Any]) -> bool:
@@ -281,3 +277,68 @@ def _final_errors(rows: _Rows) -> Data:
             data[f"{law}.error"] = np.maximum(finite[shown], 1e-6)
             data[f"{law}.share"] = (shown + 1) / len(errors)
     return data
+
+
+def _draw_success(data: Data, figure: "style.Figure") -> None:
+    """Success of each law, ``<law>.rate``, from ``.low`` to ``.high``, over ``.x``, which is a ``label``."""
+    axes = figure.add_subplot()
+    laws = _laws(data, ".rate")
+    looks = {law: style.curve(i, marker=True) for i, law in enumerate(laws)}
+    span = max(float(np.ptp(data[f"{law}.x"])) for law in laws) or 1.0
+    for i, law in enumerate(laws):
+        x, rate = data[f"{law}.x"], data[f"{law}.rate"]
+        beside = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
+        reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
+        axes.errorbar(x + beside, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **looks[law])
+    axes.set(xlabel=str(data["label"]), ylabel="converged (%), bars: 95 %", ylim=(-3, 103))
+    style.legend_below(figure, looks, min(3, len(laws)))
+
+
+def _draw_basin(data: Data, figure: "style.Figure") -> None:
+    """Success of each law over two start offsets, as a map with a panel for each; pale where none begins.
+
+    ``data`` has ``x`` (k,), ``y`` (j,), ``label_x``, ``label_y`` and for each law ``<law>.share`` (j, k).
+    """
+    figure.set_layout_engine("constrained")  # leaves the scale of colours its room
+    laws = _laws(data, ".share")
+    columns = min(3, len(laws))
+    panels = figure.subplots(
+        math.ceil(len(laws) / columns), columns, sharex=True, sharey=True, squeeze=False
+    ).ravel()
+    x, y = _edges(data["x"]), _edges(data["y"])
+    mesh: Any = None
+    for axes, law in zip(panels, laws, strict=False):
+        mesh = axes.pcolormesh(x, y, 100.0 * data[f"{law}.share"], vmin=0, vmax=100)
+        axes.grid(visible=False)
+        axes.set(title=law, facecolor=style.PALE)  # pale where no run can begin
+        axes.set_xticks(data["x"][:: max(1, len(data["x"]) // 5)])
+        axes.set_yticks(data["y"][:: max(1, len(data["y"]) // 5)])
+    for axes in panels[len(laws) :]:
+        axes.set_visible(False)
+    figure.supxlabel(str(data["label_x"]), fontsize=8)
+    figure.supylabel(str(data["label_y"]), fontsize=8)
+    figure.colorbar(mesh, ax=panels.tolist(), label="converged (%)")
+
+
+def _draw_final_errors(data: Data, figure: "style.Figure") -> None:
+    """Share of the runs of each law that end within a distance of the goal.
+
+    ``data`` has for each law ``<law>.error`` (k,), mm, sorted, and ``<law>.share`` (k,) of all its runs.
+    """
+    axes = figure.add_subplot()
+    looks = {law: style.curve(i) for i, law in enumerate(_laws(data, ".error"))}
+    for law, look in looks.items():
+        axes.plot(data[f"{law}.error"], 100.0 * data[f"{law}.share"], drawstyle="steps-post", **look)
+    label = "distance of the centre from the goal at the end (mm)"
+    axes.set(xlabel=label, ylabel="runs within it (%)", xscale="log", ylim=(-3, 103))
+    style.legend_below(figure, looks, min(3, len(looks)))
+
+
+def _laws(data: Data, ending: str) -> list[str]:
+    return [name.removesuffix(ending) for name in data if name.endswith(ending)]
+
+
+def _edges(x: Any) -> Any:
+    """Edges of the cells around sorted places."""
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[1.5 * x[0] - 0.5 * x[1]], middle, [1.5 * x[-1] - 0.5 * x[-2]]])

@@ -80,8 +80,3 @@ def known(config, true, model, q):
         suspect=none[:, :2],
         swapped=none,
     )
-
-
-def geometric(start, factor, count):
-    """Geometric sequence."""
-    return start * factor ** np.arange(count)

@@ -5,13 +5,11 @@ import pytest
 from matplotlib.container import BarContainer
 
 from projservo_cli.calibration import predict, prediction_variance
-from projservo_cli.config import load_config
+from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
-from projservo_cli.report.figures import calibration
 from projservo_cli.report.material import Fit
-from projservo_cli.stages import calibrate
-from projservo_cli.stages.chain import make_result
+from projservo_cli.stages import calibrate, report
 from projservo_cli.stages.steps import steps_for
 from projservo_cli.store import Result, Run
 from tests.fake_records import fake
@@ -28,20 +26,16 @@ def fitted():
     return Fit(*reversed(calibrate.run(configured("paper"))[:2]))
 
 
-def shifted(name="paper", **fields):
+def shifted(name="paper", size=1.0, **fields):
     """A calibration and images that are what it predicts, but for one shift in each view."""
     known = dataclasses.replace(case(name)[2].calibration, **fields)
     q = case(name)[2].observation.q
-    images = predict(known, q) + SHIFT_PX[:, None]
+    images = predict(known, q) + size * SHIFT_PX[:, None]
     return Fit(known, Observation(np.arange(len(q)) + 100, known.marker, q, images))
 
 
 def drawn(fit):
-    with style.styled():
-        figure = style.new_figure(SPEC.height)
-        SPEC.draw(SPEC.data(fit), figure)
-        style.arrange(figure)
-    return figure
+    return style.drawn(SPEC.draw, SPEC.data(fit), SPEC.height)
 
 
 def bars(axes):
@@ -66,7 +60,7 @@ def test_markers_are_matched_by_number_and_unknown_ones_left_out():
     images = np.concatenate([fit.observation.images[:, :, order], np.full((49, 2, 1, 2), 7.0)], axis=2)
     marker = np.append(fit.observation.marker[order], 77)
     other = Fit(fit.calibration, dataclasses.replace(fit.observation, marker=marker, images=images))
-    expected = SPEC.data(fit) | {f"left_out_{view}": np.full((49, 2), 7.0) for view in ("left", "right")}
+    expected = SPEC.data(fit) | dict.fromkeys(("left_out_left", "left_out_right"), np.full((49, 2), 7.0))
     for name, values in SPEC.data(other).items():
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
@@ -108,34 +102,29 @@ def test_held_out_errors_take_the_place_of_those_in_the_fit():
     # All that is drawn lies within the axes.
     assert axes.get_xlim()[0] < 2.0 < axes.get_xlim()[1]
     assert axes.get_ylim()[1] > 3.0
-    assert "not held out" in drawn(fit).axes[3].get_title()
+    axes = drawn(fit).axes[3]
+    assert "not held out" in axes.get_title()
+    predicted, left = axes.lines[0].get_data()  # a residual and the error of its prediction make up the noise
+    np.testing.assert_allclose(predicted**2 + left**2, fit.calibration.sigma_px**2)
 
 
 def test_information_is_the_inverse_of_the_covariance_without_its_null_space():
-    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(9, 9)))[0]
-    spread = np.array([0.0, 0.0, 0.0, 1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0])
-    values = calibration.information(basis * spread @ basis.T)
-    # round-off of the largest eigenvalue over the smallest: 4 · 1e-16 · 9 / 1e-6
-    np.testing.assert_allclose(values, [1e6, 1e3, 2.0, 0.5, 0.5, 0.25], rtol=1e-8)
-    assert calibration.information(np.full((4, 4), np.nan)).size == 0
+    size = len(case()[2].calibration.covariance)
+    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(size, size)))[0]
+    spread = np.zeros(size)
+    spread[:6] = 1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0
+    values = SPEC.data(shifted(covariance=basis * spread @ basis.T))["information"]
+    # round-off of the largest eigenvalue over the smallest: 4 · 1e-16 · 200 / 1e-6
+    np.testing.assert_allclose(values, [1e6, 1e3, 2.0, 0.5, 0.5, 0.25], rtol=1e-6)
 
 
-def test_a_residual_and_the_error_of_its_prediction_make_up_the_noise():
-    np.testing.assert_allclose(
-        calibration.expected_residual(np.array([0.0, 3.0, 5.0, 6.0]), 5.0), [5, 4, 0, 0]
-    )
-    J = np.random.default_rng(2).normal(size=(12, 3))
-    hat = J @ np.linalg.pinv(J)
-    rest = np.diag((np.eye(12) - hat) @ (np.eye(12) - hat).T)  # covariance of residuals at unit noise
-    np.testing.assert_allclose(calibration.expected_residual(np.sqrt(np.diag(hat)), 1.0) ** 2, rest)
-
-
-@pytest.mark.parametrize("extent", [40.0, 640.0, 5472.0])
-@pytest.mark.parametrize("size", [1e-9, 0.03, 0.5, 4.0])
-def test_arrows_are_magnified_by_a_round_factor_to_a_visible_length(extent, size):
-    factor = calibration.magnification(np.array([size, -size]), extent)
-    length = factor * size * np.sqrt(2.0) / (0.04 * extent)
-    assert 0.4 - 1e-9 <= length <= 1.0 + 1e-9  # the steps 1, 2, 5 are at most 2.5 apart
+@pytest.mark.parametrize("size", [1e-6, 0.05, 1.0, 8.0])
+def test_arrows_are_magnified_by_a_round_factor_to_a_visible_length(size):
+    fit = shifted(size=size)
+    extent = np.ptp(fit.observation.images, axis=(0, 2)).max()
+    factor = float(SPEC.data(fit)["factor"])
+    length = factor * size * np.sqrt(0.15) / (0.04 * extent)  # rms of both coordinates
+    assert 0.4 - 1e-6 <= length <= 1.0 + 1e-6  # the steps 1, 2, 5 are at most 2.5 apart
     assert round(factor / 10.0 ** np.floor(np.log10(factor) + 1e-9), 9) in (1.0, 2.0, 5.0)
 
 
@@ -172,11 +161,8 @@ def test_excitation_is_in_degrees_and_metres_on_own_axes_and_weak_joints_are_hat
     np.testing.assert_allclose(heights, np.degrees(np.ptp(fit.observation.q, axis=0)[revolute]))
     assert [bar.get_height() for bar in bars(right)] == [np.ptp(fit.observation.q[:, 2])]
     assert (left.get_ylabel(), right.get_ylabel()) == ("range (deg)", "range (m)")
-    assert [label.get_text() for label in left.get_xticklabels()][1:4] == [
-        "$q_{2}$",
-        "$q_{3}$ (m)",
-        "$q_{4}$",
-    ]
+    labels = [label.get_text() for label in left.get_xticklabels()]
+    assert labels[1:4] == ["$q_{2}$", "$q_{3}$ (m)", "$q_{4}$"]
     assert [bool(bar.get_hatch()) for bar in bars(left)] == [False, True, False, False, False]
     assert [bool(bar.get_hatch()) for bar in bars(right)] == [True]
 
@@ -193,16 +179,12 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
     table.write_text("pose,marker\n")
     config = load_config(None, [f"data.table={table}", "report.formats=[svg]"])
     material = case()[2]
-    run = Run(tmp_path / "run.h5")
-    steps = steps_for(config, run, ["report"])
-    assert [step.stage for step in steps] == ["calibrate", "report"]
-    assert "plan" in [step.stage for step in steps_for(config, run, ["plan", "report"])]
     records = {"calibration": material.calibration, "observation": material.observation}
-    run = dataclasses.replace(run, results={"calibrate": Result(steps[0].key, "", {}, {}, records)})
-    made, _ = make_result(steps[1], config, run, (), lambda *_: None)
-    report = made.results["report"].records[""]
-    assert report.figures == ("figures/fig13_calibration.svg",)
-    assert (tmp_path / report.figures[0]).read_bytes().startswith(b"<?xml")
-    assert [entry["what"] for entry in report.left_out] == [spec.name for spec in SPECS.values() if spec.task]
-    assert all("task" in entry["reason"] for entry in report.left_out)
-    assert report.claims == ()
+    run = Run(tmp_path / "run.h5", to_yaml(config), {"calibrate": Result("", "", {}, {}, records)})
+    for names, with_plan in ((["report"], False), (["plan", "report"], True)):
+        assert ("plan" in [step.stage for step in steps_for(config, run, names)]) == with_plan
+    made = report.run(run, tmp_path)
+    assert (made.figures, made.claims) == (("figures/fig13_calibration.svg",), ())
+    assert (tmp_path / made.figures[0]).read_bytes().startswith(b"<?xml")
+    assert [entry["what"] for entry in made.left_out] == [spec.name for spec in SPECS.values() if spec.task]
+    assert all("task" in entry["reason"] for entry in made.left_out)

@@ -7,9 +7,9 @@ from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import PRISMATIC, REVOLUTE
 from projservo_cli.report import style
-from projservo_cli.report.figures import path, planned, scene
-from projservo_cli.report.figures.drift import drift_tables
-from projservo_cli.report.material import percent, title
+from projservo_cli.report.figures import planned, scene
+from projservo_cli.report.figures.drift import study_numbers
+from projservo_cli.report.material import along_line, title
 from projservo_cli.robots.simulated import camera_center
 from projservo_cli.task.trajectory import trajectory_displacement
 from tests.figures.cases import GAINS, SPECS, case
@@ -30,45 +30,31 @@ def material(request):
 
 
 def test_partition_leads_from_the_face_to_its_goal(material):
-    data = data_of("partition", material)
+    data, plan = data_of("partition", material), material.plan
     np.testing.assert_allclose(data["within_plane"][0], data["A"], atol=PX)
     np.testing.assert_allclose(data["within_plane"][-1], data["A_r"], atol=PX)
     np.testing.assert_allclose(data["onto_plane"][0], data["A_r"], atol=PX)
     np.testing.assert_allclose(data["onto_plane"][-1], data["A_t"], atol=PX)
-    order = material.plant.order
-    np.testing.assert_allclose(
-        np.sort(data["A_star"], axis=0), np.sort(material.plan.s_star[0, order], axis=0), atol=PX
-    )
-
-
-def test_points_on_the_axis_of_the_rotation_stay(material):
-    data = data_of("partition", material)
-    plan = material.plan
+    goal = plan.s_star[0, material.plant.order]
+    np.testing.assert_allclose(np.sort(data["A_star"], axis=0), np.sort(goal, axis=0), atol=PX)
     middle = project(material.calibrated.P[:1], plan.A_c[None])[0, 0]
-    along = data["axis"][1] - data["axis"][0]
-    off = middle - data["axis"][0]
-    assert abs(along[0] * off[1] - along[1] * off[0]) < 1e-6 * np.linalg.norm(along) ** 2
+    along, off = data["axis"][1] - data["axis"][0], middle - data["axis"][0]
+    assert abs(along[0] * off[1] - along[1] * off[0]) < 1e-6 * np.linalg.norm(along) ** 2  # lies on the axis
 
 
 def test_margins_begin_at_one_and_vanish_where_visibility_changes(material):
-    data = data_of("visibility", material)
+    data, plan = data_of("visibility", material), material.plan
     np.testing.assert_allclose(data["theta_margin"][:, 0], 1.0, rtol=1e-12)
-    for view in range(2):
-        at_zero = np.interp(0.0, data["tau_share"], data["tau_margin"][:, view])
-        assert at_zero == pytest.approx(1.0, abs=1e-9)
-        share = data["tau_0_share"][view]
-        if data["tau_share"][0] <= share <= data["tau_share"][-1]:
-            zero = np.interp(share, data["tau_share"], data["tau_margin"][:, view])
-            assert zero == pytest.approx(0.0, abs=1e-9)  # the margin is linear in τ
+    for view, tau_margin in enumerate(data["tau_margin"].T):
+        places = [0.0, data["tau_0_share"][view]]
+        inside = data["tau_share"][0] <= places[1] <= data["tau_share"][-1]
+        found = np.interp(places, data["tau_share"], tau_margin)  # it is linear in τ
+        assert found[0] == pytest.approx(1.0, abs=1e-9)
+        assert not inside or found[1] == pytest.approx(0.0, abs=1e-9)
         for theta in np.radians(data["theta_0_deg"][view]):
-            plan = material.plan
             turned = exp_rotation(plan.H_hat[1], -theta).T @ plan.a @ plan.optical_center[view]
             assert turned / (plan.a @ plan.optical_center[view]) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_both_senses_of_the_rotation_end_at_the_same_face(material):
-    ends = data_of("visibility", material)["images"][:, -1]
-    np.testing.assert_allclose(ends[0], ends[1], atol=PX)
+    np.testing.assert_allclose(*data["images"][:, -1], atol=PX)  # both senses end at the same face
 
 
 def test_middle_camera_of_two_equal_cameras_is_the_camera():
@@ -76,22 +62,13 @@ def test_middle_camera_of_two_equal_cameras_is_the_camera():
     np.testing.assert_allclose(planned.middle_camera(np.stack([P, P]), np.array([1280, 1024])), P, atol=1e-9)
 
 
-def test_middle_camera_sits_between_the_two(material):
-    P = material.plant.model.P
-    camera = planned.middle_camera(P, material.plant.image_size)
-    expected = 0.5 * (camera_center(P[0]) + camera_center(P[1]))
-    np.testing.assert_allclose(camera_center(camera), expected, atol=1e-12)
-
-
 def test_rendered_plan_begins_and_ends_at_the_true_faces(material):
     camera = planned.middle_camera(material.plant.model.P, material.plant.image_size)
-    trace = material.traces["direct_three"]
-    inverse = np.linalg.inv(material.robot.base_tool)
+    trace, face = material.traces["direct_three"], material.plant.M[material.plant.order]
     for data in (data_of("planned", material), data_of("planned_steep", material)):
         for j, pose in ((0, trace.pose[0]), (-1, trace.goal_pose)):
-            m = material.plant.M[material.plant.order] @ (pose @ inverse).T @ camera.T
-            rendered = data["faces"][j]
-            gaps = np.linalg.norm(rendered[:, None] - m[:, :2] / m[:, 2:], axis=2)
+            seen = project(camera[None], face @ (pose @ np.linalg.inv(material.robot.base_tool)).T)[0]
+            gaps = np.linalg.norm(data["faces"][j][:, None] - seen, axis=2)
             assert gaps.min(axis=1).max() < 1e-6
 
 
@@ -111,44 +88,42 @@ def test_skeleton_passes_the_axes_of_revolute_joints():
 
 
 def test_corners_of_a_viewing_pyramid_are_seen_at_the_corners_of_the_image(material):
-    size = material.plant.image_size
-    for P in material.plant.model.P:
-        corners = scene.pyramid(P, size, 0.2)[1:]
+    model, size = material.plant.model, material.plant.image_size
+    pyramids = data_of("scene", material)["pyramids"]
+    for P, (center, *corners) in zip(model.P, pyramids, strict=True):
+        np.testing.assert_allclose(center, camera_center(P), atol=1e-12)
         m = np.c_[corners, np.ones(4)] @ P.T
         expected = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
         np.testing.assert_allclose(m[:, :2] / m[:, 2:], expected, atol=1e-8)
-        depth = m[:, 2] / np.linalg.norm(P[2, :3])
-        np.testing.assert_allclose(depth, 0.2, rtol=1e-12)
+        np.testing.assert_allclose(m[:, 2], m[0, 2], rtol=1e-12)
+        assert m[0, 2] > 0
 
 
-def test_scene_without_a_known_goal_has_none():
-    material = case()[2]
-    unknown = {"exact": dataclasses.replace(material.traces["exact"], goal_pose=np.full((4, 4), np.nan))}
-    assert "face_goal" not in data_of("scene", dataclasses.replace(material, traces=unknown))
-    assert "face_goal" in data_of("scene", material)
-
-
-def test_scene_shows_the_tool_of_the_robot_at_the_face(material):
+def test_scene_shows_the_tool_of_the_robot_at_the_face_and_a_goal_that_is_known(material):
     data = data_of("scene", material)
     trace = material.traces["direct_three"]
     np.testing.assert_allclose(data["robot"][-1], trace.pose[0, :3, 3], atol=1e-12)
-    np.testing.assert_allclose(data["line"][0], trace.center[0], atol=1e-12)
-    np.testing.assert_allclose(data["line"][1], material.goal_center(trace), atol=1e-12)
+    np.testing.assert_allclose(data["line"], [trace.center[0], material.goal_center(trace)], atol=1e-12)
+    unknown = {"exact": dataclasses.replace(material.traces["exact"], goal_pose=np.full((4, 4), np.nan))}
+    assert "face_goal" not in data_of("scene", dataclasses.replace(material, traces=unknown))
 
 
-def test_drift_table_holds_each_run_at_its_place():
-    studies = case()[2].studies
-    drift, at_samples, converged = drift_tables(studies)
+def test_drift_table_holds_each_run_at_its_place_and_paths_run_through_the_instants():
+    material = case()[2]
+    numbers = study_numbers(material.studies)
+    drift, at_samples = numbers["drift_mm"], numbers["drift_at_samples_mm"]
     assert drift.shape == (2, 2, 2, len(GAINS))
-    trace = studies.sweep["direct_two", "calibrated", True, GAINS[0]]
+    trace = material.studies.sweep["direct_two", "calibrated", True, GAINS[0]]
     assert drift[1, 1, 1, 0] == trace.center_deviation_mm
     assert at_samples[1, 1, 1, 0] == trace.center_deviation_at_samples_mm
-    assert not converged.any()  # four steps are too few
-
-
-def test_translation_error_is_normalised_to_100():
-    np.testing.assert_allclose(percent(np.array([4.0, 2.0, 1.0])), [100, 50, 25])
-    assert np.isnan(percent(np.zeros(3))).all()
+    assert not numbers["drift_converged"].any()  # four steps are too few
+    path = data_of("drift", material)["path_mm_direct_two_2"]
+    assert len(path) > 4 * len(trace.center)
+    instants = along_line(trace.center, trace.center[0], material.goal_center(trace))
+    for instant in 1e3 * np.stack(instants, axis=1):
+        assert np.abs(path - instant).max(axis=1).min() < 1e-9
+    # both sample the same curve, at different points
+    assert path[:, 1].max() == pytest.approx(trace.center_deviation_mm, rel=1e-2)
 
 
 def test_metric_scale_is_the_true_distance_and_the_frame_changes_no_angle():
@@ -167,15 +142,6 @@ def test_joint_steps_add_up_to_the_trajectory():
     assert np.abs(data["step_limited"]).max() <= data["step_limit_deg"] * (1 + 1e-12)
 
 
-def test_classical_paths_of_the_laws_that_were_run():
-    material = case()[2]
-    traces = {"stacked": material.traces["stacked"]}
-    data = data_of("classical", dataclasses.replace(material, traces=traces))
-    assert "s_stacked" in data
-    assert "s_blockwise" not in data
-    assert str(data["verdict_stacked"]) == "plateau, 4 steps" or "max steps" in str(data["verdict_stacked"])
-
-
 def test_image_errors_end_at_the_goal_by_definition():
     material = case()[2]
     trace = dataclasses.replace(
@@ -189,36 +155,31 @@ def test_image_errors_end_at_the_goal_by_definition():
 
 def test_the_map_of_sight_is_the_margin_of_the_displaced_face(material):
     data, plan = data_of("path", material), material.plan
+    amplitudes = (plan.tau, plan.theta_r, plan.theta_p)
     for i, j in ((0, 0), (20, 60), (80, 0), (80, 80)):
-        H = trajectory_displacement(
-            plan.H_hat, (plan.tau, plan.theta_r, plan.theta_p), np.array([i / 80, j / 80, 0.4])
-        )
+        H = trajectory_displacement(plan.H_hat, amplitudes, np.array([i / 80, j / 80, 0.4]))
         sight = plan.optical_center @ np.linalg.solve(H.T, plan.a) / (plan.optical_center @ plan.a)
         np.testing.assert_allclose(data["margin"][:, i, j], sight, atol=1e-10)
     # No share μ_p does better for both images than the one shown, of 41.
-    H = trajectory_displacement(
-        plan.H_hat, (plan.tau, plan.theta_r, plan.theta_p), np.array([20 / 80, 60 / 80, 0.4])
-    )
+    H = trajectory_displacement(plan.H_hat, amplitudes, np.array([20 / 80, 60 / 80, 0.4]))
     s = project(material.calibrated.P, plan.A @ H.T)
     border = np.minimum(s + 0.5, material.plant.image_size - 0.5 - s).min(axis=(1, 2))
     assert data["border_px"][:, 20, 60].min() >= border.min() - 1e-9
 
 
 def test_numbers_on_the_map_of_sight_keep_off_the_path(material):
-    figure = style.new_figure(6.0)
     data = data_of("path", material)
-    SPECS["fig14_path"].draw(data, figure)
+    figure = style.drawn(SPECS["fig14_path"].draw, data, 6.0)
     for axes in figure.axes[:2]:
         for text in axes.texts:
-            assert np.linalg.norm(data["mu"][:, :2] - text.get_position(), axis=1).min() > path.LABEL
+            assert np.linalg.norm(data["mu"][:, :2] - text.get_position(), axis=1).min() > planned.LABEL
     assert sum(len(axes.texts) for axes in figure.axes[:2]) > 0
 
 
 def test_margins_that_grow_a_hundredfold_leave_the_others_to_be_read(material):
-    data, figure = data_of("path", material), style.new_figure(6.0)
+    data = data_of("path", material)
     data["along"][-1, 3] = 200.0
-    SPECS["fig14_path"].draw(data, figure)
-    axes = figure.axes[3]
+    axes = style.drawn(SPECS["fig14_path"].draw, data, 6.0).axes[3]
     one, zero, most = (axes.transData.transform((0.0, y))[1] for y in (1.0, 0.0, 200.0))
     assert one - zero > 0.15 * (most - zero)
 

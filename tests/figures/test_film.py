@@ -1,18 +1,15 @@
-"""The animation of both camera images."""
+"""The animation of both camera images, as it is written."""
 
 import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 from projservo_cli.records import Trace
-from projservo_cli.report import animation as film
-from projservo_cli.report import style
+from projservo_cli.report import motion
 from tests.fake_records import fake
 from tests.figures.cases import case
 
-SIZE = np.array([1280.0, 1024.0])
-
-
-ORDER = np.arange(4)
+PALE_ORANGE = "#F0C566"  # of what is hidden, on paper, as all frames show it
 
 
 def run(end=4, hidden=(2,), verdict="converged"):
@@ -24,10 +21,17 @@ def run(end=4, hidden=(2,), verdict="converged"):
     return fake(Trace, steps=end, period=1.0, verdict=verdict, s=s, s_star=s[-1], self_occluded=behind)
 
 
-def frames(runs, at):
-    with style.styled():
-        named = {f"law {k}": one for k, one in enumerate(runs)}
-        return list(film.frames(named, ORDER, SIZE, np.asarray(at, dtype=float)))
+@pytest.fixture
+def frames(tmp_path, monkeypatch):
+    """Pixels of so many frames of an animation of named runs, at equal steps of its time."""
+
+    def written(count, **runs):
+        monkeypatch.setattr(motion, "FRAMES", count)
+        motion.write_animation(tmp_path / "film.gif", runs, np.arange(4), (1280, 1024), lambda *_: None)
+        with Image.open(tmp_path / "film.gif") as film:
+            return [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+
+    return written
 
 
 def count(pixels, color):
@@ -35,50 +39,43 @@ def count(pixels, color):
     return np.count_nonzero((np.abs(pixels.astype(int) - wanted) < 40).all(axis=2))
 
 
-def test_the_direct_law_stands_beside_the_classical_ones():
+def test_the_direct_law_stands_beside_the_classical_ones(frames):
     traces = case()[2].traces
-    assert film.shown(traces) == ["direct_three", "stacked", "blockwise", "euclidean_points"]
-    direct = {name: traces[name] for name in ("direct_two", "exact")}
-    assert film.shown(direct) == ["direct_two", "exact"]
-    assert film.shown({"stacked": traces["stacked"]}) == ["stacked"]
+    beside = ("direct_three", "stacked", "blockwise", "euclidean_points")
+    shown = [frames(1, **{name: traces[name] for name in names})[0] for names in (traces, beside)]
+    np.testing.assert_array_equal(*shown)
+    for names, width in ((("direct_two", "exact"), 510), (("stacked",), 400)):
+        (pixels,) = frames(1, **{name: traces[name] for name in names})
+        assert abs(pixels.shape[1] - width) <= 1
 
 
-def test_the_film_lasts_as_long_as_the_longest_run_that_converged():
-    assert film.times([run(4), run(80, verdict="max steps"), run(9)])[[0, -1]].tolist() == [0.0, 9.0]
-    assert film.times([run(4, verdict="diverged"), run(80, verdict="plateau")])[-1] == 80.0
-    assert len(film.times([run()])) == film.FRAMES
+def test_the_film_lasts_as_long_as_the_longest_run_that_converged(frames):
+    slow, ends = run(80, verdict="plateau"), []
+    for verdict in ("converged", "diverged"):
+        end = frames(2, slow=slow, quick=run(9, verdict=verdict))[-1]
+        ends.append(count(end[:, : end.shape[1] // 2], motion.SEEN))
+    assert ends[0] < 0.6 * ends[1]  # of the way of the first run, 9 s and 80 s
 
 
-def test_the_face_moves_and_hidden_instants_are_marked():
-    first, hidden, last = frames([run()], [0.0, 2.0, 4.0])
-    assert first.shape == hidden.shape == last.shape
+def test_the_face_moves_and_hidden_instants_are_marked(frames):
+    first, hidden, last = frames(3, one=run())
+    assert abs(first.shape[1] - 400) <= 1  # room for the legend
     assert (first != last).any(axis=2).sum() > 500
     # The legend has some of the colour; the filled face and the word beside it are more.
-    orange = [count(pixels, film.HIDDEN) for pixels in (first, hidden, last)]
+    orange = [count(pixels, PALE_ORANGE) for pixels in (first, hidden, last)]
     assert orange[1] > orange[0] + 500
-    green = [count(pixels, film.SEEN) for pixels in (first, hidden, last)]
+    green = [count(pixels, motion.SEEN) for pixels in (first, hidden, last)]
     assert min(green[0], green[2]) > 1.5 * green[1]
+    legend = first[-60:]  # is whole
+    assert (legend[:, [0, 1, 2, -3, -2, -1]] > 250).all()
+    assert (legend < 128).any()
 
 
-@pytest.mark.parametrize("columns", [1, 4])
-def test_as_many_columns_as_runs(columns):
-    (pixels,) = frames([run() for _ in range(columns)], [1.0])
-    assert abs(pixels.shape[1] - {1: 400, 4: 970}[columns]) <= 1
-
-
-def test_markers_that_were_not_seen_are_told_and_leave_the_rest():
+def test_markers_that_were_not_seen_are_told_and_leave_the_rest(frames):
     lost, whole = run(hidden=()), run(hidden=())
     lost.s[3, 1] = np.nan
-    first, last = zip(*(frames([one], [3.0, 4.0]) for one in (lost, whole)), strict=True)
+    first, last = zip(*(frames(5, one=one)[3:] for one in (lost, whole)), strict=True)
     upper, lower = np.array_split(np.abs(first[0].astype(int) - first[1]).max(axis=2) > 60, 2)
     assert lower.sum() > 200  # the word, and the face that is gone, in the image of the right camera alone
     assert not upper.any()
-    assert count(last[0], film.SEEN) > 0.9 * count(last[1], film.SEEN)
-
-
-def test_the_legend_is_whole_where_there_is_one_column():
-    (pixels,) = frames([run()], [0.0])
-    legend = pixels[-60:]
-    assert (legend[:, :3] == 255).all()
-    assert (legend[:, -3:] == 255).all()
-    assert (legend < 128).any()
+    assert count(last[0], motion.SEEN) > 0.9 * count(last[1], motion.SEEN)

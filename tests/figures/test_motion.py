@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.report import view as motion
+from projservo_cli.report.motion import MOST_INSTANTS, motion_of
 from projservo_cli.stages.world import truth_of
 from tests.figures.cases import SHORT, case
 
@@ -14,7 +14,7 @@ from tests.figures.cases import SHORT, case
 def shown():
     config, _, material = case()
     truth = truth_of(config)
-    scene = motion.motion(truth.robot, material.plant, truth.M, material.plan, material.traces)
+    scene = motion_of(truth.robot, material.plant, truth.M, material.plan, material.traces)
     return truth, material, scene
 
 
@@ -51,21 +51,17 @@ def test_the_ends_of_the_task_and_the_planned_path_between_them(shown):
     np.testing.assert_allclose(scene.planned[[0, -1]], [trace.center[0], middle], atol=1e-6)
 
 
-def test_a_goal_of_which_only_images_are_known_is_not_drawn(shown):
+def test_instants_miss_neither_the_quick_beginning_nor_the_end_of_a_long_run(shown):
     truth, material, _ = shown
-    unknown = np.full((4, 4), np.nan)
-    traces = {"stacked": dataclasses.replace(material.traces["stacked"], goal_pose=unknown)}
-    scene = motion.motion(truth.robot, material.plant, truth.M, material.plan, traces)
-    assert scene.goal is None
-
-
-def test_instants_miss_neither_the_quick_beginning_nor_the_end_of_a_long_run():
-    q = np.zeros((2001, 2))
-    q[:, 0] = 1.0 - np.exp(-np.arange(2001) / 20.0)  # as good as still after a tenth
-    chosen = motion.instants(q)
-    assert chosen[0] == 0
-    assert chosen[-1] == 2000
-    assert len(chosen) <= motion.MOST_INSTANTS
+    trace, count = material.traces["stacked"], 2001
+    share = 1.0 - np.exp(-np.arange(count) / 20.0)  # as good as still after a tenth
+    q = trace.q[0] + share[:, None] * (trace.q[-1] - trace.q[0])
+    hidden, unknown = np.zeros((count, 2), dtype=bool), np.full((4, 4), np.nan)
+    long = dataclasses.replace(trace, q=q, self_occluded=hidden, goal_pose=unknown)
+    scene = motion_of(truth.robot, material.plant, truth.M, material.plan, {"stacked": long})
+    assert scene.goal is None  # of which only images are known
+    chosen = np.round(scene.runs["stacked"].seconds / trace.period)
+    assert (chosen[0], chosen[-1]) == (0, 2000)
+    assert len(chosen) <= MOST_INSTANTS
     assert np.all(np.diff(chosen) > 0)
-    assert np.count_nonzero(chosen < 100) > 0.4 * motion.MOST_INSTANTS
-    np.testing.assert_array_equal(motion.instants(np.zeros((3, 2))), [0, 1, 2])
+    assert np.count_nonzero(chosen < 100) > 0.4 * MOST_INSTANTS

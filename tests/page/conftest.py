@@ -1,7 +1,6 @@
 """A run with a report of some figures, and a page read as a browser reads it."""
 
 import dataclasses
-import json
 from html.parser import HTMLParser
 
 import pytest
@@ -30,21 +29,16 @@ def stored(folder, *overrides, material=None):
     return Run(folder / "run.h5", to_yaml(config), results)
 
 
-def reported(folder, *overrides):
-    """A run with its report, which stands in the folder."""
-    run = stored(folder, "report.formats=[svg]", *overrides)
+@pytest.fixture(scope="session")
+def run(tmp_path_factory):
+    """A run with its report, which stands in its folder; tests only read it."""
+    folder = tmp_path_factory.mktemp("run")
+    run = stored(folder, "report.formats=[svg]")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "FIGURES", [SPECS[name] for name in SOME])
         patch.setattr(report, "run_studies", lambda bench, progress: case()[2].studies)
         record = report.run(run, folder)
-    made = Result("k", "", MADE, {}, {"": record})
-    return dataclasses.replace(run, results={**run.results, "report": made})
-
-
-@pytest.fixture(scope="session")
-def run(tmp_path_factory):
-    """A run with its report; tests only read it."""
-    return reported(tmp_path_factory.mktemp("run"))
+    return dataclasses.replace(run, results=run.results | {"report": Result("k", "", MADE, {}, {"": record})})
 
 
 @dataclasses.dataclass
@@ -78,15 +72,11 @@ class Reader(HTMLParser):
         assert self.open == [self.root], [element.tag for element in self.open]
 
     def handle_starttag(self, tag, attrs):
-        names = [name for name, _ in attrs]
-        assert len(set(names)) == len(names), (tag, attrs)
+        assert len(dict(attrs)) == len(attrs), (tag, attrs)
         element = Element(tag, dict(attrs))
         self.open[-1].children.append(element)
         if tag not in VOID:
             self.open.append(element)
-
-    def handle_startendtag(self, tag, attrs):
-        self.open[-1].children.append(Element(tag, dict(attrs)))
 
     def handle_endtag(self, tag):
         assert self.open.pop().tag == tag
@@ -101,16 +91,3 @@ def read(path):
 
 def words(text):
     return " ".join(text.split())
-
-
-def numbers(value):
-    """All numbers in a JSON value, not those within texts."""
-    if isinstance(value, dict):
-        value = list(value.values())
-    if isinstance(value, list):
-        return [number for inner in value for number in numbers(inner)]
-    return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else []
-
-
-def claims_of(folder):
-    return json.loads((folder / "claims.json").read_text(encoding="utf-8"))

@@ -1,24 +1,22 @@
 """The page of a run: whole, self-contained, safe, and in agreement with the run."""
 
 import base64
-import csv
 import dataclasses
-import math
-import re
+import json
 
 import numpy as np
 import pytest
 
-from projservo_cli.records import CrossValidation, Report
-from projservo_cli.report.page import calibration_words, number, short, write_comparison, write_page
-from projservo_cli.report.values import PAGE_FILE, stage_object
+from projservo_cli.config import load_config, to_yaml
+from projservo_cli.records import CrossValidation
+from projservo_cli.report.material import PAGE_FILE
+from projservo_cli.report.page import write_comparison, write_page
 from projservo_cli.stages import steps
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from tests.fake_records import fake
 from tests.figures.cases import SPECS, case
-from tests.known import configured
-from tests.page.conftest import SOME, claims_of, numbers, read, stored, words
+from tests.page.conftest import SOME, read, words
 
 
 @pytest.fixture(scope="session")
@@ -26,9 +24,15 @@ def page(run):
     return read(run.path.parent / PAGE_FILE)
 
 
-def with_report(run, **given):
-    changed = dataclasses.replace(run.results["report"].records[""], **given)
-    return dataclasses.replace(run, results={**run.results, "report": Result("", "", {}, {}, {"": changed})})
+def altered(run, folder, *, report=None, **results):
+    """The run in another folder, with other results, and some fields of its report replaced."""
+    record = dataclasses.replace(run.results["report"].records[""], **(report or {}))
+    made = {"report": Result("", "", {}, {}, {"": record})}
+    return dataclasses.replace(run, path=folder / "run.h5", results=run.results | made | results)
+
+
+def shown(run):
+    return read(write_page(run))
 
 
 def test_the_page_loads_nothing_and_runs_nothing(page, run):
@@ -49,14 +53,13 @@ def test_the_page_loads_nothing_and_runs_nothing(page, run):
 
 
 def test_names_are_unique_and_references_lead_somewhere(page):
-    names = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
+    found = [element.attributes for element in page.all()]
+    names = [attributes["id"] for attributes in found if "id" in attributes]
     assert len(set(names)) == len(names)
-    text = " ".join(str(element.attributes) for element in page.all())
-    wanted = {e.attributes["href"][1:] for e in page.all() if e.attributes.get("href", "").startswith("#")}
-    wanted |= set(re.findall(r"url\(#([^)]*)\)", text))
-    wanted |= {e.attributes["aria-labelledby"] for e in page.all() if "aria-labelledby" in e.attributes}
-    assert wanted <= set(names)
+    wanted = {a["href"][1:] for a in found if a.get("href", "").startswith("#")}
+    wanted |= {a["aria-labelledby"] for a in found if "aria-labelledby" in a}
     assert wanted
+    assert wanted <= set(names)
 
 
 def test_headings_sections_language_and_title(page):
@@ -64,11 +67,9 @@ def test_headings_sections_language_and_title(page):
     assert html.attributes["lang"] == "en"
     assert next(page.all("title")).text == "projservo: paper"
     assert len(list(page.all("h1"))) == len(list(page.all("main"))) == 1
-    assert [h.attributes["id"] for h in page.all("h2")] == [
-        *("run", "calibration", "plan", "control", "claims", "left-out"),
-    ]
-    for table in page.all("table"):
-        assert all("scope" in th.attributes for th in table.all("th"))
+    sections = ["run", "calibration", "plan", "control", "claims", "left-out"]
+    assert [h.attributes["id"] for h in page.all("h2")] == sections
+    assert all("scope" in th.attributes for th in page.all("th"))
 
 
 def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
@@ -78,50 +79,42 @@ def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
         spec = SPECS[figure.attributes["id"]]
         (image,) = figure.all("img")
         assert image.attributes["alt"] == spec.alt
-        kind, content = image.attributes["src"].split(",")
-        assert kind == "data:image/svg+xml;base64"
         drawn = run.path.parent / "figures" / f"{spec.name}.svg"
-        assert base64.b64decode(content, validate=True) == drawn.read_bytes()
+        content = base64.b64encode(drawn.read_bytes()).decode()
+        assert image.attributes["src"] == f"data:image/svg+xml;base64,{content}"
         (caption,) = figure.all("figcaption")
         assert spec.title in words(caption.text)
         assert not spec.paper.startswith("Fig") or spec.paper in words(caption.text)
         links = {a.text: a.attributes["href"] for a in caption.all("a")}
         assert set(links) == {"numbers (CSV)", "SVG"}
         assert (run.path.parent / links["numbers (CSV)"]).stat().st_size > 100
-
-
-def test_all_figures_say_what_can_be_seen():
     texts = [spec.alt for spec in SPECS.values() if spec.alt]
     assert len(set(texts)) == len(texts) >= 14
 
 
 def test_numbers_of_a_figure_are_those_that_are_drawn(run):
-    spec = SPECS["fig08_drift"]
-    data = spec.data(case()[2])
-    with open(run.path.parent / "figures" / "fig08_drift.csv", encoding="utf-8", newline="") as file:
-        header, *rows = csv.reader(file)
-    assert {name.partition("[")[0] for name in header} == {name for name, value in data.items() if value.size}
-    for k, name in enumerate(header):
-        values = [float(row[k]) for row in rows if row[k] != ""]
-        label, _, index = name.rstrip("]").partition("[")
-        place = tuple(slice(None) if i == ":" else int(i) for i in index.split(",") if i)
-        np.testing.assert_array_equal(values, np.atleast_1d(data[label][place]).astype(float))
+    text = (run.path.parent / "figures" / "fig08_drift.csv").read_bytes().decode()
+    assert text == to_csv(SPECS["fig08_drift"].data(case()[2]))
 
 
 def test_columns_keep_every_bit_and_kind():
     arrays = {"x": np.array([0.1, np.nan, -np.inf]), "on": np.array([True, False]), "n": np.array(3)}
-    assert to_csv(arrays) == "x,on,n\n0.1,1,3\nnan,0,\n-inf,,\n"
+    arrays["m"] = np.array([[[1.0, 2.0]], [[3.0, 1 / 3]]])
+    lines = ['x,on,n,"m[:,0,0]","m[:,0,1]"', "0.1,1,3,1.0,2.0", f"nan,0,,3.0,{1 / 3!r}", "-inf,,,,", ""]
+    assert to_csv(arrays) == "\n".join(lines)
 
 
 def test_all_that_the_claims_say_is_on_the_page(page, run):
-    content = claims_of(run.path.parent)
-    text = words(page.text)
+    told = (run.path.parent / "claims.json").read_text(encoding="utf-8")
+    content, text = json.loads(told), words(page.text)
     for claim in content["claims"]:
         for key in ("claim", "source", "measured", "criterion"):
             assert words(claim[key]) in text
     shown = {element.attributes["value"] for element in page.all("data")}
-    assert len(numbers(content)) > 30
-    assert {repr(value) for value in numbers(content)} <= shown
+    numbers = (item for row in content["drift"] for item in row.items())
+    values = {value for key, value in numbers if "_mm" in key or "_per" in key}
+    assert len(values) > 15
+    assert {repr(value) for value in values - {None}} <= shown
     holding = sum(claim["holds"] is True for claim in content["claims"])
     assert f"{holding} of {len(content['claims'])} hold" in text
 
@@ -162,116 +155,84 @@ def test_hostile_texts_are_shown_and_not_run(run, tmp_path):
     claims = ({"claim": HOSTILE, "source": "s", "measured": HOSTILE, "criterion": "c", "holds": None},)
     left_out = ({"what": HOSTILE, "reason": HOSTILE},)
     files = ("figures/../x.svg", "javascript:alert(1)//fig01_partition.svg", "figures/fig01_partition.svg")
-    other = with_report(run, claims=claims, left_out=left_out, figures=files)
     trace = dataclasses.replace(run.traces["stacked"], verdict=HOSTILE, reason=HOSTILE)
     made = {"argv": ["projservo", HOSTILE], "host": HOSTILE}
-    results = {**other.results, "servo/stacked": Result("", "", made, {}, {"": trace})}
+    report = {"claims": claims, "left_out": left_out, "figures": files}
+    other = altered(run, tmp_path, report=report, **{"servo/stacked": Result("", "", made, {}, {"": trace})})
     configuration = run.configuration.replace("PUMA 560", "</pre><script>")
-    other = dataclasses.replace(other, path=tmp_path / "run.h5", results=results, configuration=configuration)
+    other = dataclasses.replace(other, configuration=configuration)
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "fig01_partition.svg").write_text(f'"><svg>{HOSTILE}</svg>')
-    page = read(write_page(other))
+    page = shown(other)
     assert not list(page.all("script", "svg"))  # an image runs nothing and fetches nothing
     assert words(page.text).count(HOSTILE) >= 6
     assert not any("javascript" in a.attributes["href"] for a in page.all("a"))
     assert "</pre><script>" in next(page.all("pre")).text
 
 
-def test_a_figure_without_its_file_says_so(run, tmp_path):
-    gone = dataclasses.replace(run, path=tmp_path / "run.h5")
-    page = read(write_page(gone))
-    assert words(page.text).count("cannot show the figure") == len(SOME)
-
-
 def test_a_picture_stands_in_where_there_is_no_vector_image(run, tmp_path):
     files = ("figures/fig01_partition.png", "figures/fig01_partition.pdf")
-    other = dataclasses.replace(with_report(run, figures=files), path=tmp_path / "run.h5")
+    other = altered(run, tmp_path, report={"figures": files})
+    assert words(shown(other).text).count("cannot show the figure") == 1
     (tmp_path / "figures").mkdir()
     (tmp_path / files[0]).write_bytes(b"\x89PNG")
-    page = read(write_page(other))
+    page = shown(other)
     (image,) = page.all("img")
     assert image.attributes["src"] == "data:image/png;base64,iVBORw=="
     assert image.attributes["alt"].startswith("Three panels")
     assert [a.text for a in next(page.all("figcaption")).all("a")] == ["PDF", "PNG"]
 
 
-def test_a_calibration_alone_is_told_as_far_as_it_goes(tmp_path):
-    whole = stored(tmp_path)
-    run = dataclasses.replace(whole, results={"calibrate": whole.results["calibrate"]})
-    text = words(read(write_page(run)).text)
-    assert "This run holds no plan." in text
-    assert "No law was run." in text
-    assert "No claim was measured." in text
-    assert "projservo report -o" in text
-
-
-def test_a_report_of_a_recording_has_no_drift(run, tmp_path):
+def test_a_run_is_told_as_far_as_it_goes(run, tmp_path):
+    fit = {"calibrate": run.results["calibrate"]}
+    text = words(shown(dataclasses.replace(run, path=tmp_path / "run.h5", results=fit)).text)
+    missing = ("This run holds no plan.", "No law was run.", "No claim was measured.", "projservo report -o")
+    assert all(part in text for part in missing)
     empty = np.zeros((2, 2, 2, 0))
     drift = {"drift_mm": empty, "drift_at_samples_mm": empty, "drift_converged": empty.astype(bool)}
-    record = fake(Report, claims=(), figures=(), left_out=(), **drift)
-    results = {"calibrate": run.results["calibrate"], "report": Result("", "", {}, {}, {"": record})}
-    other = dataclasses.replace(run, path=tmp_path / "run.h5", results=results)
-    assert "No drift was measured." in words(read(write_page(other)).text)
+    recording = altered(run, tmp_path, report={"claims": (), "figures": (), **drift})
+    text = words(shown(recording).text)
+    assert "No drift was measured." in text
+    assert "projservo report -o" not in text
 
 
-def test_a_figure_that_one_run_lacks_leaves_its_place_empty(run, tmp_path):
-    few = with_report(run, figures=tuple(f"figures/{name}.svg" for name in SOME[1:]))
-    write_comparison([run, few], tmp_path / "both.html")
-    page = read(tmp_path / "both.html")
-    assert words(page.text).count("lacks the figure") == 1
-    rows = [
-        div for div in page.all("div") if div.attributes.get("class") == "runs" and list(div.all("figure"))
-    ]
-    named = [[figure.attributes["id"].partition("-")[2] for figure in row.all("figure")] for row in rows]
-    assert {tuple(names) for names in named} == {(SOME[0],), *((name, name) for name in SOME[1:])}
-
-
-def test_runs_stand_side_by_side(run, tmp_path):
-    other = dataclasses.replace(run, configuration=run.configuration.replace("seed: 1", "seed: 22"))
+def test_runs_stand_side_by_side_and_a_figure_that_one_lacks_leaves_its_place_empty(run, tmp_path):
+    other = altered(run, run.path.parent, report={"figures": [f"figures/{name}.svg" for name in SOME[1:]]})
+    other = dataclasses.replace(other, configuration=run.configuration.replace("seed: 1", "seed: 22"))
     path = tmp_path / "both.html"
     write_comparison([run, other], path)
     page = read(path)
     names = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
     assert len(set(names)) == len(names)
-    assert len(list(page.all("figure"))) == 2 * len(SOME)
-    (row,) = [tr for tr in page.all("tr") if tr.children and "seed" in words(tr.text) and "22" in tr.text][
-        -1:
-    ]
+    assert words(page.text).count("lacks the figure") == 1
+    classes = (div for div in page.all("div") if div.attributes.get("class") == "runs")
+    rows = [list(div.all("figure")) for div in classes]
+    named = {tuple(figure.attributes["id"].partition("-")[2] for figure in row) for row in rows if row}
+    assert named == {(SOME[0],), *((name, name) for name in SOME[1:])}
+    *_, row = [tr for tr in page.all("tr") if "seed" in words(tr.text) and "22" in tr.text]
     assert words(row.text) == "seed 1 22"
-    claims = claims_of(run.path.parent)["claims"]
     (table,) = [t for t in page.all("table") if "What the paper claims" in t.text]
-    assert len(list(table.all("tr"))) == 1 + len(claims)
+    assert len(list(table.all("tr"))) == 1 + len(run.results["report"].records[""].claims)
     for link in page.all("a"):
         target = link.attributes["href"]
         assert target.startswith("#") or target.endswith("run.h5") or (tmp_path / target).is_file()
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.0, "0"), (116, "116"), (1461.2, "1461"), (12.345, "12.3"), (-0.5, "−0.5"), (float("nan"), "–"),
-        (None, "–"), (2.34e-12, "2.34 × 10⁻¹²"), (1.5e9, "1.5 × 10⁹"), (999.9, "1000"), (99.99, "100"),
-    ],
-)  # fmt: skip
-def test_numbers_for_the_eye(value, text):
-    assert short(value) == text
+def test_numbers_for_the_eye_carry_all_their_digits(run, tmp_path):
+    told = {0.0: "0", 116.0: "116", 1461.2: "1461", 12.345: "12.3", -0.5: "−0.5", 999.9: "1000", 99.99: "100"}
+    told |= {2.34e-12: "2.34 × 10⁻¹²", 1.5e9: "1.5 × 10⁹", 1 / 3: "0.333"}
+    values = [*told, *6 * [np.nan]]
+    page = shown(altered(run, tmp_path, report={"drift_mm": np.reshape(values, (2, 2, 2, 2))}))
+    (table,) = [table for table in page.all("table") if "in brackets at the sampling" in table.text]
+    cells = [cell for cell in table.all("td") if cell.attributes.get("class") == "count"]
+    for value, cell in zip(values, cells, strict=True):
+        assert words(cell.text).partition(" (")[0] == told.get(value, "–")
+        assert np.isnan(value) or next(cell.all("data")).attributes["value"] == repr(value)
 
 
-def test_numbers_carry_all_their_digits():
-    assert number(np.float64(1 / 3)) == f'<data value="{1 / 3!r}">0.333</data>'
-
-
-def test_a_held_out_error_is_told(run, tmp_path):
-    held_out = fake(CrossValidation, folds=5, unit="poses", rms_px=0.321, reason="as predicted")
-    result = run.results["calibrate"]
-    result = dataclasses.replace(result, records={**result.records, "cross_validation": held_out})
-    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
-    text = words(read(write_page(other)).text)
-    assert "Held out, in 5 parts of poses: rms 0.321 px" in text
-    assert "As predicted." in text
-
-
-def test_a_weak_joint_and_what_was_left_out_are_named(run, tmp_path):
+def test_what_is_known_of_a_calibration_is_told(run, tmp_path):
+    table = tmp_path / "table.csv"
+    table.write_text("pose,marker\n")
     calibration = dataclasses.replace(
         run.calibration,
         usable=False,
@@ -281,19 +242,29 @@ def test_a_weak_joint_and_what_was_left_out_are_named(run, tmp_path):
         advice=("move joint 2",),
         lens=np.array([[640, 512, 800, -0.0625, 0.5], [640, 512, 800, 0.25, 0.0]]),
     )
-    result = run.results["calibrate"]
-    result = dataclasses.replace(result, records={**result.records, "calibration": calibration})
-    other = dataclasses.replace(run, path=tmp_path / "run.h5", results={**run.results, "calibrate": result})
-    found = stage_object("calibrate", other, configured("paper"), [])
-    text = " ".join(calibration_words(found, estimated=True))
-    assert text.startswith("Not usable: ")
-    assert "an estimate from these images" in text
-    assert "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times" in text
-    assert "so this one is weak." in text
-    assert "2 readings left out as outliers. 1 joint reading contradicts the images." in text
-    unknown = found | {"joints": [joint | {"noise": math.nan} for joint in found["joints"]]}
-    assert "states no uncertainty" in " ".join(calibration_words(unknown, estimated=False))
-    shown = words(read(write_page(other)).text)
-    assert "✗ not usable" in shown
-    assert "What to do next: move joint 2" in shown
-    assert "lens of the left camera, k1 −0.0625" in shown
+    held_out = fake(CrossValidation, folds=5, unit="poses", rms_px=0.321, reason="as predicted")
+
+    configuration = to_yaml(load_config(None, [f"data.table={table}"]))
+
+    def told(calibration):
+        records = {"calibration": calibration, "cross_validation": held_out}
+        fit = run.results["calibrate"]
+        other = altered(run, tmp_path, calibrate=dataclasses.replace(fit, records=fit.records | records))
+        return words(shown(dataclasses.replace(other, configuration=configuration)).text)
+
+    text = told(calibration)
+    for part in (
+        "✗ not usable",
+        "Not usable: ",
+        "an estimate from these images",
+        "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times",
+        "so this one is weak.",
+        "2 readings left out as outliers. 1 joint reading contradicts the images.",
+        "Held out, in 5 parts of poses: rms 0.321 px",
+        "As predicted.",
+        "What to do next: move joint 2",
+        "lens of the left camera, k1 −0.0625",
+    ):
+        assert part in text, part
+    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan))
+    assert "states no uncertainty" in told(unknown)

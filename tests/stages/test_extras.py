@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.report import animation as film
+from projservo_cli.report import motion as film
+from projservo_cli.report.material import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.report.page import write_page
-from projservo_cli.report.values import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.stages import report
 from projservo_cli.store import Result
 from tests.figures.cases import case

@@ -5,14 +5,16 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.report.claims import claims_of, composition_claim
-from projservo_cli.report.figures.drift import drift_tables
+from projservo_cli.report.claims import claims_of
+from projservo_cli.report.figures.drift import study_numbers
 from projservo_cli.report.material import DIRECT
 from projservo_cli.stages import report, steps, studies
 from projservo_cli.store import Result, Run, load, save
 from tests.figures.cases import GAINS, PERIODS_S, SPECS, case
 from tests.known import configured
 from tests.page.conftest import stored
+
+NONE = np.zeros(0)
 
 
 def changed(material, **traces):
@@ -93,7 +95,8 @@ def test_a_run_that_ended_after_three_steps_is_drawn(tmp_path, monkeypatch):
     written = report.draw_all(material, tmp_path, ("svg",), left_out)
     assert len(written) == len(of_traces) >= 3
     assert left_out == []
-    assert any(claim.claim.startswith("No self-occlusion") for claim in claims_of(material, None))
+    claims = claims_of(material, NONE, NONE)
+    assert any(claim.claim.startswith("No self-occlusion") for claim in claims)
 
 
 def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, monkeypatch):
@@ -123,34 +126,31 @@ def test_an_unknown_goal_leaves_out_what_needs_it_and_nothing_else(tmp_path, mon
     for spec in SPECS.values():
         assert ("pose of the goal is unknown" in spec.lacking(material)) == spec.goal
     monkeypatch.setattr(report, "FIGURES", (SPECS["fig03_scene"], SPECS["fig12_joints"]))
-    assert len(report.draw_all(material, tmp_path, ("svg",), [])) == 2
-    rows = [claim._asdict() for claim in claims_of(material, None)]
-    json.dumps(rows, allow_nan=False)
-    assert not any("drift" in row["claim"] or "nan" in row["measured"] for row in rows)
-    record = report.record_of(material.studies, None, figures=(), left_out=(), claims=tuple(rows))
-    assert all(row["drift_mm"] is None for row in report.drift_rows(record))
+    monkeypatch.setattr(report, "run_studies", lambda bench, progress: material.studies)
+    record = report.run(stored(tmp_path, "report.formats=[svg]", material=material), tmp_path)
+    assert len(record.figures) == 2
+    assert not any("drift" in claim["claim"] or "nan" in claim["measured"] for claim in record.claims)
+    content = json.loads((tmp_path / "claims.json").read_text(encoding="utf-8"))
+    assert all(row["drift_mm"] is None for row in content["drift"])
 
 
 def test_what_fails_is_named_and_its_figures_left_out(tmp_path, monkeypatch):
     """Studies, and the comparison of both sides of equation (22)."""
-    _, bench, _ = case()
 
     def fail(*_, **__):
         raise WorkFailed("the task\ncannot be partitioned")
 
+    reason = "the task cannot be partitioned"
     monkeypatch.setattr(report, "run_studies", fail)
-    left_out = []
-    run = stored(tmp_path)
-    made = report.material_of(run, bench, left_out, lambda *_: None)
-    assert made.studies is None
-    assert left_out == [{"what": "studies", "reason": "the task cannot be partitioned"}]
-    for spec in SPECS.values():
-        assert ("cannot be partitioned" in spec.lacking(made)) == spec.studies
-    record = report.record_of(None, None, figures=(), left_out=(), claims=())
-    assert report.drift_rows(record) == []
     monkeypatch.setattr(report, "metric_plan", fail)
-    assert report.composition(bench, left_out) is None
-    assert left_out[1] == {"what": "equation (22)", "reason": "the task cannot be partitioned"}
+    monkeypatch.setattr(report, "FIGURES", (SPECS["fig12_joints"],))
+    record = report.run(stored(tmp_path), tmp_path)
+    assert [entry["what"] for entry in record.left_out] == ["studies", "equation (22)", "fig12_joints"]
+    assert all(entry["reason"].endswith(reason) for entry in record.left_out)
+    assert (record.figures, record.drift_mm.size, record.share.size) == ((), 0, 0)
+    made = dataclasses.replace(case()[2], studies=None, no_studies=reason)
+    for spec in SPECS.values():
+        assert (reason in spec.lacking(made)) == spec.studies
 
 
 def test_which_laws_must_converge_outdates_the_page_that_says_so_and_no_run(tmp_path):
@@ -170,7 +170,7 @@ def test_a_report_needs_a_plan(tmp_path):
 
 
 def test_both_sides_of_eq_22_agree_to_first_order_only():
-    _, bench, _ = case()
+    _, bench, material = case()
     plan = studies.metric_plan(bench)
     lambdas = np.array([0.02, 0.01, 0.005])
     distance, norm = studies.composition_error(plan, lambdas)
@@ -180,10 +180,10 @@ def test_both_sides_of_eq_22_agree_to_first_order_only():
     # without a translation both sides are the same
     still = dataclasses.replace(plan, tau=0.0)
     assert studies.composition_error(still, lambdas)[0].max() < 1e-12
-    claim = composition_claim(lambdas, distance)
-    assert claim.holds is False
-    assert "λ^2.0" in claim.measured
-    assert composition_claim(lambdas, np.zeros(3)).holds is True
+    *_, differs = claims_of(material, lambdas, distance)
+    *_, same = claims_of(material, lambdas, np.zeros(3))
+    assert (differs.holds, same.holds) == (False, True)
+    assert "λ^2.0" in differs.measured
 
 
 def test_projective_twin_is_well_conditioned_and_sees_the_same():
@@ -219,10 +219,8 @@ def test_a_claim_follows_its_number():
     material = case()[2]
     trace = material.traces["direct_three"]
     hidden = dataclasses.replace(trace, self_occluded_steps_left=3)
-    verdicts = [
-        next(c for c in claims_of(changed(material, direct_three=t), None) if c.claim.startswith("No self"))
-        for t in (trace, hidden)
-    ]
+    found = [claims_of(changed(material, direct_three=run), NONE, NONE) for run in (trace, hidden)]
+    verdicts = [next(c for c in claims if c.claim.startswith("No self")) for claims in found]
     assert [claim.holds for claim in verdicts] == [True, False]
     assert "3 left" in verdicts[1].measured
 
@@ -237,7 +235,8 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         "stacked Jacobians: runs through self-occlusion, then converges",
         "Euclidean points: runs through self-occlusion, then converges",
     )
-    claims = claims_of(material, report.composition(bench, []))
+    plan = studies.metric_plan(bench)
+    claims = claims_of(material, np.array(studies.LAMBDAS), studies.composition_error(plan)[0])
     assert len({claim.claim for claim in claims}) == len(claims) >= 24
     for claim in claims:
         assert claim.holds is not None
@@ -255,7 +254,7 @@ def test_claims_of_a_whole_run_with_exact_operators(name):
         "The image error does not decay exponentially",
         *(of_paper if name == "paper" else ()),
     } <= {claim.claim for claim in claims if claim.holds}
-    assert drift_tables(material.studies)[2].all()  # converged
+    assert study_numbers(material.studies)["drift_converged"].all()  # converged
 
 
 @pytest.mark.volume

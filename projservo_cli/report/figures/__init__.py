@@ -1,22 +1,10 @@
 """Figures after those of [RH00]: named arrays from a run, and a drawing of them.
 
-A figure is a pair of functions ``data(material) -> arrays`` and ``draw(data, figure)`` in a file of its own,
-which registers it; to add one, write the file and name it here.
+A figure is a pair of functions ``data(material) -> arrays`` and ``draw(data, figure)``, which registers it
+in a file with those of its topic; to add one, write both, and name the file here if it is new.
 """
 
-from projservo_cli.report.figures import (  # noqa: F401
-    calibration,
-    drift,
-    errors,
-    images,
-    joints,
-    overview,
-    partition,
-    path,
-    planned,
-    scene,
-    visibility,
-)
+from projservo_cli.report.figures import calibration, drift, errors, images, parts, planned, scene  # noqa: F401
 from projservo_cli.report.material import REGISTER
 
 FIGURES = tuple(REGISTER[name] for name in sorted(REGISTER))

@@ -1,6 +1,6 @@
 """Diagnostics of a calibration: what the fit leaves of the images, and what the data determine."""
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtri
@@ -10,25 +10,14 @@ from projservo_cli.records import BoolArray, Calibration, FloatArray, Observatio
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 _RIGHT, _BOTH = 1, 2
-# Length of an arrow of the rms residual, as a share of the extent of what was seen.
-_ARROW = 0.04
-# Shares of χ² between which the residuals of a pose are expected.
-_BAND = (0.025, 0.975)
+_ARROW = 0.04  # length of an arrow of the rms residual, as a share of the extent of what was seen
+_BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
 _RESIDUAL: style.Look = {"color": style.BLUE}
 _WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
-_LEFT_OUT: style.Look = {
-    "color": style.VERMILION,
-    "marker": "x",
-    "linestyle": "none",
-    "markersize": 4,
-    "markeredgewidth": 0.9,
-}
+_LEFT_OUT: style.Look = {"color": style.VERMILION, "marker": "x", "linestyle": "none"}
+_LEFT_OUT |= {"markersize": 4, "markeredgewidth": 0.9}
 _MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
 
 
@@ -36,11 +25,10 @@ def _data(fit: Fit) -> Data:
     """Residuals, noise model, predicted error of each pose, excitation and information of a fit."""
     calibration, observation = fit.calibration, fit.observation
     predicted = predict(calibration, observation.q)
-    seen, renamed = _by_marker(calibration, observation)
-    read: BoolArray = np.asarray(np.isfinite(seen).all(axis=-1))
-    lost = renamed | ~np.isfinite(predicted).all(axis=-1)
-    out: BoolArray = np.logical_or(_left_out(calibration, observation), lost)
-    used: BoolArray = np.logical_and(read, ~out)
+    seen, left_out = _readings(calibration, observation)
+    read: BoolArray = np.all(np.isfinite(seen), axis=-1)
+    out = left_out | ~np.isfinite(predicted).all(axis=-1)
+    used = read & ~out
     residual = seen - predicted
     result: Data = {
         "sigma_px": np.array(calibration.sigma_px),
@@ -48,7 +36,7 @@ def _data(fit: Fit) -> Data:
         "excitation": calibration.excitation,
         "prismatic": np.array([letter == "P" for letter in calibration.joint_types]),
         "weak": calibration.weak,
-        "information": information(calibration.covariance),
+        "information": _information(calibration.covariance),
         "parameters": np.array(len(calibration.covariance)),
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
@@ -56,9 +44,8 @@ def _data(fit: Fit) -> Data:
     if fit.held_out is None:
         result |= _by_pose(used, residual, prediction_variance(calibration, observation.q))
     else:  # from fits that have not seen the pose; predicted with the noise of the held-out reading
-        held_out = fit.held_out
-        predictable: BoolArray = np.asarray(np.isfinite(held_out.residual).all(axis=-1))
-        result |= _by_pose(predictable, held_out.residual, held_out.predicted**2)
+        predictable: BoolArray = np.all(np.isfinite(fit.held_out.residual), axis=-1)
+        result |= _by_pose(predictable, fit.held_out.residual, fit.held_out.predicted**2)
     unknown = observation.images[:, :, ~np.isin(observation.marker, calibration.marker)]
     for v, view in enumerate(VIEWS):
         others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
@@ -66,61 +53,45 @@ def _data(fit: Fit) -> Data:
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
         result[f"left_out_{view}"] = np.concatenate([seen[:, v][(read & out)[:, v]], others])
     extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
-    result["factor"] = np.array(magnification(result["residual"], extent))
+    result["factor"] = np.array(_magnification(result["residual"], extent))
     return result
 
 
-def _by_marker(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
-    """Pixels (K, 2, m, 2) of the calibrated markers, and which of them were read under another number."""
+def _readings(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
+    """Pixels (K, 2, m, 2) of the calibrated markers, and which of them (K, 2, m) the fit left out.
+
+    Those are outliers, poses whose joints are in doubt, and markers that were read under another number.
+    """
     column = {int(number): j for j, number in enumerate(observation.marker)}
     seen = observation.images[:, :, [column[int(number)] for number in calibration.marker]]
-    renamed = np.zeros(seen.shape[:3], dtype=np.bool_)
-    for pose, number, _ in calibration.swapped:
-        rows = observation.pose == pose
-        renamed |= rows[:, None, None] & (calibration.marker == number)
-    return seen, renamed
-
-
-def _left_out(calibration: Calibration, observation: Observation) -> BoolArray:
-    """Readings (K, 2, m) that the fit did not use: outliers, and poses whose joints are in doubt."""
-    out = np.zeros((len(observation.pose), 2, len(calibration.marker)), dtype=np.bool_)
-    for pose, number, view in calibration.outlier:
-        views = np.array([view != _RIGHT, view in (_RIGHT, _BOTH)])
-        rows = observation.pose == pose
-        out |= rows[:, None, None] & views[:, None] & (calibration.marker == number)
+    out = np.zeros(seen.shape[:3], dtype=np.bool_)
     out[np.isin(observation.pose, calibration.suspect[:, 0])] = True
-    return out
+    renamed = ((pose, number, _BOTH) for pose, number, _ in calibration.swapped)
+    for pose, number, view in (*calibration.outlier, *renamed):
+        views = np.array([view != _RIGHT, view in (_RIGHT, _BOTH)])
+        out |= (observation.pose == pose)[:, None, None] & views[:, None] & (calibration.marker == number)
+    return seen, out
 
 
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
-    """Predicted and actual error of each pose with a reading, rms per coordinate.
+    """Predicted and actual error (L,) of each pose with a reading, rms per coordinate, and their number.
 
-    used : (K, 2, m) readings that count.
-    residual : (K, 2, m, 2) px.
-    variance : (K, 2, m, 2) variance of the prediction, px².
-    Returns ``pose_predicted_px``, ``pose_residual_px`` (L,) and ``pose_coordinates`` (L,), their number.
+    Of the readings ``used`` (K, 2, m), with residual (K, 2, m, 2), px, and variance of the prediction, px².
     """
     poses = used.any(axis=(1, 2))
     count = 2 * used.sum(axis=(1, 2))[poses]
-
-    def mean(squares: FloatArray) -> FloatArray:
+    found: Data = {}
+    for name, squares in (("pose_predicted_px", variance), ("pose_residual_px", residual**2)):
         total = np.where(used[..., None], squares, 0.0).sum(axis=(1, 2, 3))[poses]
-        return np.asarray(total / count)
-
-    return {
-        "pose_predicted_px": np.sqrt(mean(variance)),
-        "pose_residual_px": np.sqrt(mean(residual**2)),
-        "pose_coordinates": count,
-    }
+        found[name] = np.sqrt(total / count)
+    return found | {"pose_coordinates": count}
 
 
-def information(covariance: FloatArray) -> FloatArray:
+def _information(covariance: FloatArray) -> FloatArray:
     """Eigenvalues of the information matrix, falling: the covariance's that are not zero, inverted.
 
     Zero are the gauge directions, and those across the constraint that all operators are conjugate
-    to rigid motions by one matrix. Empty for a method without covariance.
-
-    covariance : (d, d) of P, H_hat_0 and M.
+    to rigid motions by one matrix. Empty for a method without a covariance (d, d) of P, H_hat_0 and M.
     """
     if not np.isfinite(covariance).all():
         return np.zeros(0)
@@ -129,22 +100,17 @@ def information(covariance: FloatArray) -> FloatArray:
     return np.asarray(1.0 / spread[spread > floor])
 
 
-def expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
+def _expected_residual(predicted: FloatArray, sigma: float) -> FloatArray:
     """Rms residual (L,) that a fit leaves where its own prediction errs by so much, px per coordinate.
 
     A least-squares residual is noise less the error of the fitted prediction, which it follows:
     variance σ² − p²; D. A. Belsley, E. Kuh, R. E. Welsch, "Regression Diagnostics", 1980, section 2.1.
-
-    predicted : (L,) predicted error p, px per coordinate; sigma : noise σ, px per coordinate.
     """
     return np.asarray(np.sqrt(np.maximum(sigma**2 - predicted**2, 0.0)))
 
 
-def magnification(residual: FloatArray, extent: float) -> float:
-    """Factor 1, 2 or 5 times a power of ten that makes the rms residual visible in an image.
-
-    residual : (N,) px per coordinate; extent : width or height of what was seen, px.
-    """
+def _magnification(residual: FloatArray, extent: float) -> float:
+    """Factor 1, 2 or 5 times a power of ten that makes the rms of residuals (N,) visible in an extent, px."""
     rms = float(np.sqrt(2.0 * np.mean(residual**2))) if residual.size else 0.0
     if rms == 0.0:
         return 1.0
@@ -157,14 +123,14 @@ def magnification(residual: FloatArray, extent: float) -> float:
     "fig13_calibration",
     "What the calibration leaves of the images, and what the data determine",
     "beside the paper's",
-    7.8,
     _data,
+    height=7.8,
     task=False,
     alt="Residuals as arrows in both images; their histogram beside the noise model; rms residual "
     "of each pose over its predicted error; range of each joint; eigenvalues of the information "
     "matrix.",
 )
-def _draw(data: Data, figure: "Figure") -> None:
+def _draw(data: Data, figure: "style.Figure") -> None:
     """Residuals over both images; their histogram and error of each pose; excitation and information."""
     panels = figure.subplots(3, 2, height_ratios=(1.15, 1.0, 0.9))
     for axes, view in zip(panels[0], VIEWS, strict=True):
@@ -184,44 +150,30 @@ def _draw(data: Data, figure: "Figure") -> None:
     style.legend_below(figure, looks, 3)
 
 
-def _arrows(axes: "Axes", data: Data, view: str) -> None:
-    seen, residual, out = data[f"seen_{view}"], data[f"residual_{view}"], data[f"left_out_{view}"]
-    tips = seen + float(data["factor"]) * residual
-    axes.quiver(
-        *seen.T,
-        *(tips - seen).T,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        width=0.0022,
-        headwidth=4.0,
-        headlength=5.0,
-        headaxislength=4.0,
-        **_RESIDUAL,
-    )
+def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
+    seen, out = data[f"seen_{view}"], data[f"left_out_{view}"]
+    arrows = float(data["factor"]) * data[f"residual_{view}"]
+    pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
+    heads: Any = {"width": 0.0022, "headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.0}
+    axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
     axes.plot(*out.T, **_LEFT_OUT)
-    style.image_axes(axes, f"{view}: {len(seen)} readings, {len(out)} left out")
-    style.frame_pixels(axes, np.concatenate([seen, tips, out]))
+    title = f"{view}: {len(seen)} readings, {len(out)} left out"
+    style.image_axes(axes, title, np.concatenate([seen, seen + arrows, out]))
 
 
-def _histogram(axes: "Axes", data: Data) -> None:
+def _histogram(axes: "style.Axes", data: Data) -> None:
     """Density of the residuals beside the normal one of the noise model."""
     residual, sigma = data["residual"], float(data["sigma_px"])
     widest = max(4.0 * sigma, float(np.abs(residual).max(initial=0.0)))
-    axes.hist(
-        residual,
-        bins=np.linspace(-widest, widest, _BINS + 1).tolist(),
-        density=bool(residual.size),
-        color=style.SKY,
-        linewidth=0,
-    )
+    bins = np.linspace(-widest, widest, _BINS + 1).tolist()
+    axes.hist(residual, bins, density=bool(residual.size), color=style.SKY, linewidth=0)
     x = np.linspace(-widest, widest, 401)
     axes.plot(x, np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)), **_MODEL)
     title = f"noise model {sigma:.3g} px, χ²/dof {float(data['chi2_per_dof']):.3g}"
     axes.set(title=title, xlabel="residual (px)", ylabel="density (1/px)")
 
 
-def _poses(axes: "Axes", data: Data) -> None:
+def _poses(axes: "style.Axes", data: Data) -> None:
     """Residual of each pose over its predicted error, beside what the noise model leads one to expect."""
     predicted, residual = data["pose_predicted_px"], data["pose_residual_px"]
     sigma = float(data["sigma_px"])
@@ -232,10 +184,11 @@ def _poses(axes: "Axes", data: Data) -> None:
         ylabel="rms residual (px)",
     )
     if not np.isfinite(predicted).all():
-        return _without_covariance(axes)
+        _without_covariance(axes)
+        return
     most = 1.06 * float(predicted.max(initial=0.0))
     x = np.linspace(0.94 * float(predicted.min(initial=most)) if held_out else 0.0, most, 101)
-    expected = x if held_out else expected_residual(x, sigma)
+    expected = x if held_out else _expected_residual(x, sigma)
     coordinates = float(np.median(data["pose_coordinates"])) if predicted.size else 1.0
     low, high = np.sqrt(chdtri(coordinates, 1.0 - np.array(_BAND)) / coordinates)
     axes.fill_between(x, low * expected, high * expected, color=style.PALE, linewidth=0)
@@ -243,10 +196,9 @@ def _poses(axes: "Axes", data: Data) -> None:
     axes.plot(predicted, residual, "o", color=style.BLUE, markersize=2.5)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(0.0, 1.1 * max(float(residual.max(initial=0.0)), high * float(expected.max(initial=sigma))))
-    return None
 
 
-def _excitation(axes: "Axes", data: Data) -> None:
+def _excitation(axes: "style.Axes", data: Data) -> None:
     """Range of each joint, revolute in deg on the left, prismatic in m on the right."""
     prismatic, weak = data["prismatic"], data["weak"]
     mixed = bool(prismatic.any() and not prismatic.all())
@@ -269,19 +221,21 @@ def _excitation(axes: "Axes", data: Data) -> None:
     axes.set_title(f"excitation, {int(weak.sum())} of {len(weak)} joints weak")
 
 
-def _spectrum(axes: "Axes", data: Data) -> None:
+def _spectrum(axes: "style.Axes", data: Data) -> None:
     """Information along each direction that the images determine, falling; the last is the worst."""
     values = data["information"]
     title = f"information, {len(values)} of {int(data['parameters'])} directions free"
     axes.set(title=title, xlabel="direction (best to worst)", ylabel="eigenvalue (1)")
-    if not values.size:
-        return _without_covariance(axes)
-    axes.plot(np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8)
-    style.log_scale(axes)
-    return None
+    if values.size:
+        axes.plot(
+            np.arange(1, len(values) + 1), values, "o-", color=style.BLUE, markersize=2.5, linewidth=0.8
+        )
+        style.log_scale(axes)
+    else:
+        _without_covariance(axes)
 
 
-def _without_covariance(axes: "Axes") -> None:
+def _without_covariance(axes: "style.Axes") -> None:
     """Say why a panel is empty."""
     axes.set(xticks=[], yticks=[])
     axes.text(0.5, 0.5, "the method has no covariance", ha="center", va="center", transform=axes.transAxes)

@@ -1,36 +1,23 @@
-"""Figs. 9 and 10 of [RH00]: the control errors of directTWO and directTHREE."""
-
-from typing import TYPE_CHECKING
+"""Figs. 9, 10 and 12 of [RH00]: control errors and joints under direct control, over time."""
 
 import numpy as np
 
-from projservo_cli.records import FloatArray, Trace
+from projservo_cli.records import PRISMATIC, FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.material import (
-    Data,
-    Material,
-    center_distance,
-    curve_difference,
-    percent,
-    registered,
-)
+from projservo_cli.report.material import Data, Material, curve_difference, percent, registered
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# What is drawn of an error on a logarithmic scale: five decades below its start.
-_DECADES = 1e-5
+_DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
 _FAINT: style.Look = {"linewidth": 0.8, "alpha": 0.55}
 _DOTTED = (0, (1, 1.2))
+_KERNEL = r"$\tau$, unit-norm kernel (8), "
+_WAYS = (("free", False), ("limited", True))  # without and with the limit of the joint speed
 
 
 def _data_two(material: Material) -> Data:
     """Errors of directTWO with calibrated operators, without and with the limit."""
-    studies = material.studies
-    assert studies is not None
-    result: Data = {"step_limit_deg": np.array(studies.step_limit_deg)}
-    for name, limited in (("free", False), ("limited", True)):
-        trace = studies.own["direct_two", "calibrated", limited]
+    result: Data = {"step_limit_deg": np.array(material.extra.step_limit_deg)}
+    for name, limited in _WAYS:
+        trace = material.extra.own["direct_two", "calibrated", limited]
         result |= {
             f"t_s_{name}": _time(trace),
             f"tau_{name}": percent(trace.tau),
@@ -48,31 +35,30 @@ def _time(trace: Trace) -> FloatArray:
     "fig09_errors_two",
     "Control errors of directTWO, without and with the limit",
     "Fig. 9, section 6",
-    4.2,
     _data_two,
+    height=4.2,
     studies=True,
     alt="Translation and rotation error of directTWO over time, on a linear and on a logarithmic "
     "scale, without a limit and with one.",
 )
-def _draw_two(data: Data, figure: "Figure") -> None:
+def _draw_two(data: Data, figure: "style.Figure") -> None:
     """Above τ, below θ_s; left as in the paper, right on a logarithmic scale."""
     axes = figure.subplots(2, 2, sharex=True)
     looks: dict[str, style.Look] = {
         "free": {"color": style.BLACK, "linestyle": "-"},
         "limited": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
     }
-    for name, look in looks.items():
-        t = data[f"t_s_{name}"]
-        for column in range(2):
-            axes[0, column].plot(t, data[f"tau_affine_{name}"], **look)
-            axes[0, column].plot(t, data[f"tau_{name}"], **look, **_FAINT)
-            axes[1, column].plot(t, data[f"theta_s_deg_{name}"], **look)
+    for (above, below), scale in zip(axes.T, ("linear", "logarithmic"), strict=True):
+        for name, look in looks.items():
+            t = data[f"t_s_{name}"]
+            above.plot(t, data[f"tau_affine_{name}"], **look)
+            above.plot(t, data[f"tau_{name}"], **look, **_FAINT)
+            below.plot(t, data[f"theta_s_deg_{name}"], **look)
+        above.set(title=f"directTWO, {scale} scale", ylabel=r"$\tau$ (% of its start)")
+        below.set(xlabel="time (s)", ylabel=r"$\theta_s$ (deg)")
     for panel, start in zip(axes[:, 1], (100.0, float(data["theta_s_deg_free"][0])), strict=True):
         style.log_scale(panel)
         panel.set_ylim(max(start, 1e-3) * _DECADES, max(start, 1e-3) * 3.0)
-    for column, title in enumerate(("linear scale", "logarithmic scale")):
-        axes[0, column].set(title=f"directTWO, {title}", ylabel=r"$\tau$ (% of its start)")
-        axes[1, column].set(xlabel="time (s)", ylabel=r"$\theta_s$ (deg)")
     legend: dict[str, style.Look] = {
         "no limit": looks["free"],
         f"{data['step_limit_deg']:g}° per step": looks["limited"],
@@ -87,26 +73,22 @@ def _data_three(material: Material) -> Data:
     τ is normalised to 100. In the unit-norm kernel of (8) its scale changes with the joints; scaled
     through a_inf it is the true distance of the centre.
     """
-    studies = material.studies
-    assert studies is not None
-    calibrated = studies.own["direct_three", "calibrated", False]
-    metric = studies.own["direct_three", "true", False]
-    twin = studies.own["direct_three", "twin", False]
+    own = material.extra.own
+    calibrated, metric, twin = (own["direct_three", kind, False] for kind in ("calibrated", "true", "twin"))
     result: Data = {
         "t_s": _time(calibrated),
         "t_s_metric": _time(metric),
         "tau": percent(calibrated.tau),
         "tau_affine": percent(calibrated.tau_affine),
-        "distance": percent(center_distance(material, calibrated)),
+        "distance": percent(material.center_distance(calibrated)),
         "tau_metric": percent(metric.tau),
-        "distance_metric": percent(center_distance(material, metric)),
+        "distance_metric": percent(material.center_distance(metric)),
     }
     for name in ("theta_r", "theta_p"):
-        curves = {trace: getattr(trace, name) for trace in (calibrated, metric, twin)}
-        result[f"{name}_deg"] = np.degrees(curves[calibrated])
-        result[f"{name}_deg_metric"] = np.degrees(curves[metric])
+        result[f"{name}_deg"] = np.degrees(getattr(calibrated, name))
+        result[f"{name}_deg_metric"] = np.degrees(getattr(metric, name))
         for kind, trace in (("calibrated", calibrated), ("true", twin)):
-            difference, _ = curve_difference(curves[trace], curves[metric])
+            difference = curve_difference(getattr(trace, name), getattr(metric, name))
             result[f"{name}_difference_deg_{kind}"] = np.degrees(difference)
     return result
 
@@ -115,54 +97,102 @@ def _data_three(material: Material) -> Data:
     "fig10_errors_three",
     "Control errors of directTHREE, projective beside Euclidean model",
     "Fig. 10, section 6",
-    4.8,
     _data_three,
+    height=4.8,
     studies=True,
     goal=True,
     alt="Translation and rotation errors of directTHREE over time with the projective and the "
     "Euclidean model, and the differences between both.",
 )
-def _draw_three(data: Data, figure: "Figure") -> None:
+def _draw_three(data: Data, figure: "style.Figure") -> None:
     """Above τ and what separates it from the truth, below the angles and their differences."""
     axes = figure.subplots(2, 2, sharex=True)
+    (translation, off), (rotation, difference) = axes
     t, t_metric = data["t_s"], data["t_s_metric"]
     t_common = max(t, t_metric, key=len)
-    looks: dict[str, style.Look] = {
-        "distance": {"color": style.SKY, "linewidth": 3.2},
-        "tau_affine": {"color": style.BLACK},
-        "tau": {"color": style.VERMILION, "linestyle": (0, (4, 1.5))},
-        "tau_metric": {"color": style.BLACK, "linestyle": _DOTTED},
+    looks: dict[str, tuple[str, style.Look]] = {
+        "distance": ("true distance", {"color": style.SKY, "linewidth": 3.2}),
+        "tau_affine": (r"$\tau$, scale fixed through $a_\infty$", {"color": style.BLACK}),
+        "tau": (_KERNEL + "projective", {"color": style.VERMILION, "linestyle": (0, (4, 1.5))}),
+        "tau_metric": (_KERNEL + "Euclidean", {"color": style.BLACK, "linestyle": _DOTTED}),
     }
-    for name, look in looks.items():
-        axes[0, 0].plot(t_metric if name == "tau_metric" else t, data[name], **look)
-    for name in ("tau_affine", "tau"):
-        axes[0, 1].plot(t, np.abs(data[name] - data["distance"]), **looks[name])
-    angles = (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s"))
-    for name, color, marker in angles:
-        axes[1, 0].plot(t, data[f"{name}_deg"], color=color)
-        every = max(1, len(t_metric) // 25)
-        axes[1, 0].plot(
-            t_metric, data[f"{name}_deg_metric"], marker, color=color, fillstyle="none", markevery=every
-        )
+    for name, (_, look) in looks.items():
+        translation.plot(t_metric if name == "tau_metric" else t, data[name], **look)
+        if name in ("tau_affine", "tau"):
+            off.plot(t, np.abs(data[name] - data["distance"]), **look)
+    some = {"fillstyle": "none", "markevery": max(1, len(t_metric) // 25)}
+    for name, color, marker in (("theta_r", style.BLACK, "o"), ("theta_p", style.VERMILION, "s")):
+        rotation.plot(t, data[f"{name}_deg"], color=color)
+        rotation.plot(t_metric, data[f"{name}_deg_metric"], marker, color=color, **some)
         for kind, line in (("calibrated", "-"), ("true", _DOTTED)):
-            difference = data[f"{name}_difference_deg_{kind}"]
-            axes[1, 1].plot(t_common[: len(difference)], difference, color=color, linestyle=line)
-    for panel, least in zip(axes[:, 1], (1e-4, 1e-15), strict=True):
+            curve = data[f"{name}_difference_deg_{kind}"]
+            difference.plot(t_common[: len(curve)], curve, color=color, linestyle=line)
+    for panel, least in ((off, 1e-4), (difference, 1e-15)):
         style.log_scale(panel)
         panel.set_ylim(bottom=least)
-    axes[0, 0].set(title="directTHREE: translation error", ylabel=r"$\tau$ (% of its start)")
-    axes[0, 1].set(title="its difference from the true distance", ylabel="difference (% of the start)")
-    axes[1, 0].set(title="rotation errors", xlabel="time (s)", ylabel="angle (deg)")
-    axes[1, 1].set(title="projective less Euclidean model", xlabel="time (s)", ylabel="difference (deg)")
+    translation.set(title="directTHREE: translation error", ylabel=r"$\tau$ (% of its start)")
+    off.set(title="its difference from the true distance", ylabel="difference (% of the start)")
+    rotation.set(title="rotation errors", xlabel="time (s)", ylabel="angle (deg)")
+    difference.set(title="projective less Euclidean model", xlabel="time (s)", ylabel="difference (deg)")
     points: style.Look = {"color": style.BLACK, "marker": "o", "linestyle": "none", "fillstyle": "none"}
-    legend = {
-        "true distance": looks["distance"],
-        r"$\tau$, scale fixed through $a_\infty$": looks["tau_affine"],
-        r"$\tau$, unit-norm kernel (8), projective": looks["tau"],
-        r"$\tau$, unit-norm kernel (8), Euclidean": looks["tau_metric"],
+    legend = dict(looks.values()) | {
         r"$\theta_r$, projective model": {"color": style.BLACK},
         r"$\theta_p$, projective model": {"color": style.VERMILION},
         r"$\theta_r$, $\theta_p$, Euclidean": points,
         "dotted difference: true operators": {"color": style.BLACK, "linestyle": _DOTTED},
     }
     style.legend_below(figure, legend, 2)
+
+
+def _data_joints(material: Material) -> Data:
+    """Joints and their steps under directTHREE with calibrated operators, in deg and in mm."""
+    prismatic = material.robot.joint_types == PRISMATIC
+    scale = np.where(prismatic, 1e3, np.degrees(1.0))
+    result: Data = {"prismatic": prismatic, "step_limit_deg": np.array(material.extra.step_limit_deg)}
+    for name, limited in _WAYS:
+        trace = material.extra.own["direct_three", "calibrated", limited]
+        result |= {
+            f"t_s_{name}": _time(trace),
+            f"q_{name}": trace.q * scale,
+            f"step_{name}": trace.q_dot * trace.period * scale,
+        }
+    return result
+
+
+@registered(
+    "fig12_joints",
+    "Joint trajectories without and with the limit",
+    "Fig. 12, section 6",
+    _data_joints,
+    studies=True,
+    alt="The joints and their steps over time under directTHREE, without a limit and with one.",
+)
+def _draw_joints(data: Data, figure: "style.Figure") -> None:
+    """Left without, right with the limit; joints above, their steps below, per kind of joint."""
+    prismatic = data["prismatic"]
+    both = ((np.flatnonzero(~prismatic), "deg"), (np.flatnonzero(prismatic), "mm"))
+    kinds = [(chosen.tolist(), unit) for chosen, unit in both if len(chosen)]
+    figure.set_figheight(1.2 + 3.6 * len(kinds))
+    axes = figure.subplots(2 * len(kinds), 2, sharex=True, squeeze=False)
+    limit = float(data["step_limit_deg"])
+    line: style.Look = {"color": style.GREY, "linewidth": 0.8}
+    for column, (name, limited) in zip(axes.T, _WAYS, strict=True):
+        t = data[f"t_s_{name}"]
+        for joints, steps, (chosen, unit) in zip(column[::2], column[1::2], kinds, strict=True):
+            for i in chosen:
+                joints.plot(t, data[f"q_{name}"][:, i], **style.curve(i))
+                steps.plot(t[:-1], data[f"step_{name}"][:, i], **style.curve(i))
+            if limited and unit == "deg":
+                for bound in (-limit, limit):
+                    steps.axhline(bound, **line)
+            if not limited:
+                joints.set_ylabel(f"joint ({unit})")
+                steps.set_ylabel(f"step ({unit} per period)")
+        column[0].set_title(f"directTHREE, {f'{limit:g}° per step' if limited else 'no limit'}")
+        column[-1].set_xlabel("time (s)")
+    for row in axes[::2]:  # both sides are to be compared
+        limits = [panel.get_ylim() for panel in row]
+        for panel in row:
+            panel.set_ylim(np.min(limits), np.max(limits))
+    looks = {f"$q_{i + 1}$": style.curve(i) for i in range(len(prismatic))} | {"limit": line}
+    style.legend_below(figure, looks, min(len(looks), 7))

@@ -1,11 +1,10 @@
-"""Figs. 4, 7 and 11 of [RH00]: paths and errors of the markers in both images."""
-
-from typing import TYPE_CHECKING
+"""Figs. 4, 7 and 11 of [RH00], and the overview: paths and errors of the markers in both images."""
 
 import numpy as np
 
+from projservo_cli.geometry.kinematics import project
 from projservo_cli.loop.step import plateau_stretch
-from projservo_cli.records import FloatArray, Trace
+from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.material import (
     CLASSICAL,
@@ -14,54 +13,53 @@ from projservo_cli.report.material import (
     VIEWS,
     Data,
     Material,
-    center_image,
+    percent,
     registered,
 )
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-# How far outside an image, as a share of its size, a path is still drawn.
-_OUTSIDE = 0.15
+_OUTSIDE = 0.15  # how far outside an image, as a share of its size, a path is still drawn
 _BORDER_SHOWN = 0.08  # share of the image next to its border: paths that reach into it show the border
 _PANEL_WIDTH = 2.9  # inches, of one of two panels beside one another
 _BORDER: style.Look = {"color": style.GREY, "linewidth": 0.8}
-_LOOKS: dict[str, style.Look] = {
-    "start": style.START,
-    "goal": style.GOAL,
-    "path of a marker": {"color": style.BLACK, "linewidth": 0.9},
-    "face hidden from this camera": {"color": style.ORANGE, "linewidth": 4.0, "alpha": 0.6},
-    "plateau of the image error": {"color": style.VERMILION, "linewidth": 2.0, "marker": "s"},
+_HIDDEN: style.Look = {"color": style.ORANGE, "linewidth": 4.0, "alpha": 0.6}
+_PATH: style.Look = {"color": style.BLACK, "linewidth": 0.9}
+_PLATEAU: style.Look = {"color": style.VERMILION, "linewidth": 2.0, "marker": "s"}
+_MARKER: style.Look = {"linewidth": 0.9, "markersize": 3.0, "linestyle": "-"}  # how it is broken says u or v
+# The overview.
+_SHOWN: dict[str, style.Look] = {
+    "direct_three": {"color": style.GREEN, "linewidth": 1.2},
+    "stacked": {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.2))},
 }
+_IMAGE_WIDTH, _ERRORS_WIDTH = 3.7, 2.1  # inches, of the panels with images and of those beside them
+_ASPECTS = (0.45, 0.9)  # height over width of an image, within: an error panel has its height
+_PERCENT = (1e-2, 200.0)  # shown of a control error: below, noise of the calibration rules
+_BAND: style.Look = {"color": style.ORANGE, "linewidth": 5.0, "alpha": 0.55, "solid_capstyle": "butt"}
+_CENTER: style.Look = {"color": style.GREEN, "linewidth": 3.2}
+_ERRORS = (("tau_affine", r"$\tau$"), ("theta_r", r"$\theta_r$"), ("theta_p", r"$\theta_p$"))
 
 
 def _data_classical(material: Material) -> Data:
     """Image paths of the classical laws that were run, with their hidden and standing stretches."""
     result: Data = {"image_size": material.plant.image_size}
+    order = material.plant.order
     for law in CLASSICAL:
         if law in material.traces:
             trace = material.traces[law]
-            result |= {f"{name}_{law}": value for name, value in _paths(material, trace).items()}
-            result[f"verdict_{law}"] = np.array(f"{trace.verdict}, {trace.steps} steps")
+            stretch = plateau_stretch(trace.stop_error, material.plateau_steps)
+            result |= {
+                f"s_{law}": trace.s[:, :, order],
+                f"s_star_{law}": trace.s_star[:, order],
+                f"hidden_{law}": trace.self_occluded,
+                f"plateau_{law}": np.array(stretch if stretch is not None else (-1, -1)),
+                f"verdict_{law}": np.array(f"{trace.verdict}, {trace.steps} steps"),
+            }
     return result
-
-
-def _paths(material: Material, trace: Trace) -> Data:
-    stretch = plateau_stretch(trace.stop_error, material.plateau_steps)
-    return {
-        "s": trace.s[:, :, material.plant.order],
-        "s_star": trace.s_star[:, material.plant.order],
-        "hidden": trace.self_occluded,
-        "plateau": np.array(stretch if stretch is not None else (-1, -1)),
-    }
 
 
 @registered(
     "fig04_classical",
     "Image trajectories of the classical laws",
     "Fig. 4, section 6",
-    8.0,
     _data_classical,
     laws=CLASSICAL,
     any_law=True,
@@ -69,98 +67,74 @@ def _paths(material: Material, trace: Trace) -> Data:
     "to goal, with the stretches in which the face is hidden and in which the image error "
     "stands still.",
 )
-def _draw_classical(data: Data, figure: "Figure") -> None:
+def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
-    laws = [law for law in CLASSICAL if f"s_{law}" in data]
-    shown = [
-        np.concatenate([data[f"s_{law}"].reshape(-1, 2), data[f"s_star_{law}"].reshape(-1, 2)])
-        for law in laws
-    ]
-    heights = [_PANEL_WIDTH * style.aspect(near_pixels(pixels, data["image_size"])) for pixels in shown]
+    laws, size = [law for law in CLASSICAL if f"s_{law}" in data], data["image_size"]
+    shown = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
+    heights = [_PANEL_WIDTH * style.aspect(near_pixels(s, size)) for s in shown]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
     axes = figure.subplots(len(laws), 2, squeeze=False, height_ratios=heights)
+    border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
     for row, law in enumerate(laws):
+        first, last = data[f"plateau_{law}"]
         for view, name in enumerate(VIEWS):
-            panel = axes[row, view]
-            s, hidden = data[f"s_{law}"][:, view], data[f"hidden_{law}"][:, view]
-            _draw_paths(panel, s, hidden, data[f"plateau_{law}"])
+            panel, s, goal = axes[row, view], data[f"s_{law}"][:, view], data[f"s_star_{law}"][view]
+            style.hidden_paths(panel, s, data[f"hidden_{law}"][:, view], _HIDDEN)
+            style.paths(panel, s, _PATH)
+            if first >= 0:
+                style.paths(panel, s[first : last + 1], _PLATEAU | {"markevery": [0]})
             panel.plot(*s[-1].T, "x", color=style.BLACK, markersize=4)
             style.face(panel, s[0], style.START, fill=True)
-            goal = data[f"s_star_{law}"][view]
             style.face(panel, goal, style.GOAL)
             title = f"{name} camera" if view else f"{TITLES[law]}: {data[f'verdict_{law}']}"
-            style.image_axes(panel, title)
-            _frame(panel, np.concatenate([s.reshape(-1, 2), goal]), data["image_size"])
-    looks = {**_LOOKS, "end of the run": {"color": style.BLACK, "marker": "x", "linestyle": "none"}}
-    every = near_pixels(np.concatenate(shown), data["image_size"]) / data["image_size"]
+            style.image_axes(panel, title, near_pixels(np.concatenate([s, goal[None]]), size))
+            panel.plot(*style.closed(border).T, **_BORDER)
+    looks: dict[str, style.Look] = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
+    looks |= {"face hidden from this camera": _HIDDEN, "plateau of the image error": _PLATEAU}
+    looks["end of the run"] = {"color": style.BLACK, "marker": "x", "linestyle": "none"}
+    every = np.concatenate([near_pixels(s, size) for s in shown]) / size
     if (np.abs(every - 0.5) > 0.5 - _BORDER_SHOWN).any():
         looks["border of the image"] = _BORDER
     style.legend_below(figure, looks, 4)
 
 
-def _draw_paths(axes: "Axes", s: FloatArray, hidden: FloatArray, plateau: FloatArray) -> None:
-    path, behind, still = [*_LOOKS.values()][2:]
-    for k in range(s.shape[1]):
-        stretch = np.where(hidden[:, None], s[:, k], np.nan)
-        axes.plot(*stretch.T, solid_capstyle="butt", **behind)
-        axes.plot(*s[:, k].T, **path)
-        if plateau[0] >= 0:
-            first, last = plateau
-            axes.plot(*s[first : last + 1, k].T, markevery=[0], **still)
-
-
-def _frame(axes: "Axes", pixels: FloatArray, size: FloatArray) -> None:
-    """Show the paths as far as they stay near the image, and the image border where it is near."""
-    style.frame_pixels(axes, near_pixels(pixels, size))
-    border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size - 0.5
-    limits = axes.get_xlim(), axes.get_ylim()
-    axes.plot(*style.closed(border).T, **_BORDER)
-    axes.set(xlim=limits[0], ylim=limits[1])
-
-
 def near_pixels(pixels: FloatArray, size: FloatArray) -> FloatArray:
-    """Pixels (k, 2) that were measured, none farther outside the image than is drawn."""
-    seen = pixels[np.isfinite(pixels).all(axis=1)]
+    """Of pixels (…, 2) those (k, 2) that were measured, none farther outside the image than is drawn."""
+    seen = pixels[np.isfinite(pixels).all(axis=-1)]
     return np.clip(seen, -_OUTSIDE * size, (1.0 + _OUTSIDE) * size)
 
 
 def _data_direct(material: Material) -> Data:
     """Image paths of both direct laws."""
     order = material.plant.order
-    first = material.traces[DIRECT[0]]
     result: Data = {f"s_{law}": material.traces[law].s[:, :, order] for law in DIRECT}
-    return result | {"s_star": first.s_star[:, order]}
+    return result | {"s_star": material.traces[DIRECT[0]].s_star[:, order]}
 
 
 @registered(
     "fig07_three_two",
     "directTHREE over directTWO in the images",
     "Fig. 7, section 6",
-    3.4,
     _data_direct,
     laws=DIRECT,
     alt="Paths of the markers in both camera images under directTHREE and directTWO.",
 )
-def _draw_direct(data: Data, figure: "Figure") -> None:
+def _draw_direct(data: Data, figure: "style.Figure") -> None:
     """Both laws over one another, one panel a camera."""
-    every = np.concatenate([data[f"s_{law}"].reshape(-1, 2) for law in DIRECT])
-    figure.set_figheight(_PANEL_WIDTH * style.aspect(every) + 1.05)
+    runs = [data[f"s_{law}"] for law in DIRECT]
+    figure.set_figheight(_PANEL_WIDTH * style.aspect(np.concatenate(runs)) + 1.05)
     axes = figure.subplots(1, 2)
     looks: tuple[style.Look, ...] = (
         {"color": style.BLACK, "linewidth": 1.1},
         {"color": style.VERMILION, "linewidth": 1.1, "linestyle": (0, (4, 1.5))},
     )
-    for view, name in enumerate(VIEWS):
-        shown = [data["s_star"][view]]
-        for law, look in zip(DIRECT, looks, strict=True):
-            s = data[f"s_{law}"][:, view]
-            shown.append(s.reshape(-1, 2))
-            for k in range(s.shape[1]):
-                axes[view].plot(*s[:, k].T, **look)
-        style.face(axes[view], data[f"s_{DIRECT[0]}"][0, view], style.START, fill=True)
-        style.face(axes[view], data["s_star"][view], style.GOAL)
-        style.frame_pixels(axes[view], np.concatenate(shown))
-        style.image_axes(axes[view], f"{name} camera")
+    for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
+        goal = data["s_star"][view]
+        for s, look in zip(runs, looks, strict=True):
+            style.paths(panel, s[:, view], look)
+        style.face(panel, runs[0][0, view], style.START, fill=True)
+        style.face(panel, goal, style.GOAL)
+        style.image_axes(panel, f"{name} camera", np.concatenate([goal[None], *(s[:, view] for s in runs)]))
     legend: dict[str, style.Look] = {TITLES[law]: look for law, look in zip(DIRECT, looks, strict=True)}
     style.legend_below(figure, legend | {"start": style.START, "goal": style.GOAL}, 4)
 
@@ -168,13 +142,11 @@ def _draw_direct(data: Data, figure: "Figure") -> None:
 def _data_errors(material: Material) -> Data:
     """Image errors of the markers and of the centre under directTHREE, over time."""
     trace = material.traces[DIRECT[0]]
-    center = center_image(material, trace)
     goal = np.append(material.goal_center(trace), 1.0)
-    m = material.plant.model.P @ goal
     return {
         "t_s": trace.period * np.arange(len(trace.s)),
         "e": trace.s - trace.s_star,
-        "center_e": center - m[:, :2] / m[:, 2:],
+        "center_e": material.center_image(trace) - project(material.plant.model.P, goal[None])[:, 0],
         "law": np.array(TITLES[trace.law]),
         "marker": np.array(material.numbers),
     }
@@ -184,35 +156,111 @@ def _data_errors(material: Material) -> Data:
     "fig11_image_errors",
     "Image errors of the markers and of the centre",
     "Fig. 11, section 6",
-    3.2,
     _data_errors,
+    height=3.2,
     laws=DIRECT[:1],
     goal=True,
     alt="For each camera: the errors of u and v of every marker and of the centre over time.",
 )
-def _draw_errors(data: Data, figure: "Figure") -> None:
+def _draw_errors(data: Data, figure: "style.Figure") -> None:
     """One panel a camera; u solid, v dashed, the centre thick."""
     axes = figure.subplots(1, 2, sharey=True)
     t = data["t_s"]
     thick: style.Look = {"color": style.GREY, "linewidth": 3.0, "alpha": 0.6}
     thin: style.Look = {"color": style.BLACK, "linewidth": 0.9}
-    for view, name in enumerate(VIEWS):
-        e = data["e"][:, view]
-        for k in range(e.shape[1]):
-            look = _marker_look(k) | {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
-            axes[view].plot(t, e[:, k, 0], **look)
-            axes[view].plot(t, e[:, k, 1], linestyle=(0, (3, 1.2)), **look)
-        center = data["center_e"][:, view]
-        axes[view].plot(t, center[:, 0], **thick)
-        axes[view].plot(t, center[:, 1], linestyle=(0, (2, 1)), **thick)
-        axes[view].set(title=f"{name} camera, {data['law']}", xlabel="time (s)")
+    markers = [style.curve(k, marker=True) | _MARKER for k in range(len(data["marker"]))]
+    for view, (panel, name) in enumerate(zip(axes, VIEWS, strict=True)):
+        for k, look in enumerate(markers):
+            u, v = data["e"][:, view, k].T
+            every = {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
+            panel.plot(t, u, **look, **every)
+            panel.plot(t, v, **look | every | {"linestyle": (0, (3, 1.2))})
+        u, v = data["center_e"][:, view].T
+        panel.plot(t, u, **thick)
+        panel.plot(t, v, linestyle=(0, (2, 1)), **thick)
+        panel.set(title=f"{name} camera, {data['law']}", xlabel="time (s)")
     axes[0].set_ylabel("image error $s - s_*$ (px)")
-    looks = {f"marker {number}": _marker_look(k) for k, number in enumerate(data["marker"])}
+    looks = {f"marker {number}": look for number, look in zip(data["marker"], markers, strict=True)}
     looks |= {"centre": thick, "u": thin, "v": thin | {"linestyle": (0, (3, 1.2))}}
     style.legend_below(figure, looks, min(len(looks), 8))
 
 
-def _marker_look(k: int) -> style.Look:
-    """Colour and symbol of a marker; how its curve is broken says u or v."""
-    color, _, symbol = style.CURVES[k % len(style.CURVES)]
-    return {"color": color, "linewidth": 0.9, "marker": symbol, "markersize": 3.0}
+def _data_overview(material: Material) -> Data:
+    """Paths and image errors of the direct and the stacked law, control errors of the direct one."""
+    order = material.plant.order
+    direct = material.traces[DIRECT[0]]
+    result: Data = {
+        "s_star": direct.s_star[:, order],
+        "center": material.center_image(direct),
+        "period_s": np.array(direct.period),
+        **{f"{name}_percent": np.abs(percent(getattr(direct, name))) for name, _ in _ERRORS},
+    }
+    for law in _SHOWN:
+        trace = material.traces[law]
+        hidden = trace.self_occluded
+        end = f"{trace.verdict} in {trace.steps} steps, face hidden in {hidden.any(axis=1).sum()}"
+        result |= {
+            f"s_{law}": trace.s[:, :, order],
+            f"hidden_{law}": hidden,
+            f"image_error_{law}": trace.image_error,
+            f"verdict_{law}": np.array(f"{TITLES[law]}: {end}"),
+        }
+    return result
+
+
+@registered(
+    "fig00_overview",
+    "One run at a look: the classical and the direct law in both images, and their errors",
+    "beside the paper's",
+    _data_overview,
+    laws=tuple(_SHOWN),
+    alt="Left: paths of the markers in both camera images, from the face at the start to the goal, "
+    "for directTHREE and the stacked law, with the stretches in which the face is hidden. "
+    "Right: control errors of directTHREE and image errors of both laws over time.",
+)
+def _draw_overview(data: Data, figure: "style.Figure") -> None:
+    """Left the images of both cameras, right the errors."""
+    shown = [
+        np.concatenate(
+            [
+                data["s_star"][view],
+                data["center"][:, view],
+                *(data[f"s_{law}"][:, view].reshape(-1, 2) for law in _SHOWN),
+            ]
+        )
+        for view in range(2)
+    ]
+    aspect = style.aspect(np.concatenate(shown), *_ASPECTS)
+    figure.set_figheight(2.0 * _IMAGE_WIDTH * aspect + 1.75)
+    axes = figure.subplots(2, 2, width_ratios=(_IMAGE_WIDTH, _ERRORS_WIDTH))
+    control, image = axes[:, 1]
+    for view, (panel, name) in enumerate(zip(axes[:, 0], VIEWS, strict=True)):
+        for law, look in reversed(_SHOWN.items()):
+            s = data[f"s_{law}"][:, view]
+            style.hidden_paths(panel, s, data[f"hidden_{law}"][:, view], _BAND)
+            style.paths(panel, s, look)
+        panel.plot(*data["center"][:, view].T, **_CENTER)
+        style.face(panel, data[f"s_{DIRECT[0]}"][0, view], style.START, fill=True)
+        style.face(panel, data["s_star"][view], style.GOAL)
+        style.image_axes(panel, f"{name} camera", shown[view])
+    for index, (name, label) in enumerate(_ERRORS):
+        values = data[f"{name}_percent"]
+        if np.isfinite(values).all():
+            t = data["period_s"] * np.arange(len(values))
+            control.plot(t, values, label=label, **style.curve(index))
+    style.log_scale(control)
+    control.set(title=f"control errors, {TITLES[DIRECT[0]]}", ylabel="error (% of its start)", ylim=_PERCENT)
+    control.legend(loc="upper right")
+    for law, look in _SHOWN.items():
+        e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
+        t = data["period_s"] * np.arange(len(e))
+        image.plot(t, np.where(hidden, e, np.nan), **_BAND)
+        image.plot(t, e, **look)
+    style.log_scale(image)
+    image.set(title="image errors, both laws", ylabel="rms (px)")
+    for panel in (control, image):
+        panel.set_xlabel("time (s)")
+    looks = {str(data[f"verdict_{law}"]): look for law, look in _SHOWN.items()}
+    looks |= {f"centre under {TITLES[DIRECT[0]]}": _CENTER, "face at the start": style.START}
+    looks |= {"face at the goal": style.GOAL, "face hidden from the camera": _BAND}
+    style.legend_below(figure, looks, 2)

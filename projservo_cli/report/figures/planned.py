@@ -1,10 +1,13 @@
-"""Figs. 5 and 6 of [RH00]: planned motions as seen from between the cameras, with their shares μ."""
+"""Figs. 5 and 6 of [RH00]: planned motions seen from between the cameras; and the path among all motions."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
+from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.kinematics import project
+from projservo_cli.geometry.lens import through
 from projservo_cli.geometry.stereo import triangulate_points
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
@@ -13,12 +16,29 @@ from projservo_cli.robots.simulated import METRIC_A_INF, roll_axis
 from projservo_cli.task.face import cyclic_order
 from projservo_cli.task.trajectory import trajectory_displacement
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# The steep profile has the translation done at this share of the path.
-STEEP = 0.35
+STEEP = 0.35  # share of the path at which the steep profile has done the translation
 _FACES = 9
+_NODES = 81
+_TURNS = 41  # shares μ_p tried at each μ_t, μ_r
+_TICKS = 11  # points at equal steps of σ on the path
+_WIDE = 4.0  # margins beyond are drawn in powers of ten
+LABEL = 0.05  # room that the number on a contour needs, in shares
+_SIGMA, _SHARE = r"path parameter $\sigma$ (1)", r"share $\mu$ (1)"
+_SHARES: dict[str, style.Look] = {  # equal shares lie on one another: the wider shows beneath
+    r"$\mu_t$": {"color": style.SKY, "linewidth": 3.0},
+    r"$\mu_r$": {"color": style.BLACK, "linewidth": 1.8, "linestyle": (0, (4, 2))},
+    r"$\mu_p$": {"color": style.VERMILION, "linewidth": 1.0, "linestyle": (0, (1, 1))},
+}
+_REGIONS: dict[str, style.Look] = {  # hatched, so that they differ in grey too
+    "margin": {"facecolor": style.GREY, "hatch": ""},
+    "border_px": {"facecolor": style.ORANGE, "hatch": "////"},
+}
+_MARGINS: dict[str, style.Look] = {
+    "visibility": {"color": style.BLUE, "linestyle": "-"},
+    "image": {"color": style.ORANGE, "linestyle": (0, (5, 1.5))},
+    "joints": {"color": style.GREEN, "linestyle": (0, (4, 1, 1, 1))},
+    "conditioning (start = 1)": {"color": style.PURPLE, "linestyle": (0, (1, 1))},
+}
 
 
 def _data_linear(material: Material) -> Data:
@@ -29,14 +49,13 @@ def _data_linear(material: Material) -> Data:
 
 def _data_steep(material: Material) -> Data:
     """The same task with linear shares of the rotations and a steep one of the translation."""
-    plan = material.plan
+    plan, model = material.plan, material.calibrated
     mu = np.stack([np.minimum(plan.sigma / STEEP, 1.0), plan.sigma, plan.sigma], axis=1)
     amplitudes = (plan.tau, plan.theta_r, plan.theta_p)
-    H_d = trajectory_displacement(plan.H_hat, amplitudes, mu)
-    s = np.array([project(material.calibrated.P, plan.A @ H.T, material.calibrated.lens) for H in H_d])
-    carried = np.array([np.linalg.solve(H.T, plan.a) for H in H_d])
-    margin = carried @ plan.optical_center.T / (plan.optical_center @ plan.a)
-    return _rendered(material, mu, s, margin, "steep translation")
+    H_d = np.array([trajectory_displacement(plan.H_hat, amplitudes, row) for row in mu])
+    s = project(model.P, plan.A @ H_d.swapaxes(1, 2), model.lens).swapaxes(0, 1)
+    margin = np.linalg.solve(H_d.swapaxes(1, 2), plan.a[:, None])[..., 0] @ plan.optical_center.T
+    return _rendered(material, mu, s, margin / (plan.optical_center @ plan.a), "steep translation")
 
 
 def _rendered(material: Material, mu: FloatArray, s: FloatArray, margin: FloatArray, profile: str) -> Data:
@@ -46,48 +65,41 @@ def _rendered(material: Material, mu: FloatArray, s: FloatArray, margin: FloatAr
     points that a third camera can see.
     """
     plan, P = material.plan, material.plant.model.P
-    order = cyclic_order(plan.A)
-    camera = middle_camera(P, material.plant.image_size)
-    points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s])
-    m = points[:, order] @ camera.T
+    points = np.array([triangulate_points(P, METRIC_A_INF, row) for row in s[:, :, cyclic_order(plan.A)]])
     return {
         "sigma": plan.sigma,
         "mu": mu,
         "margin": margin,
-        "faces": m[..., :2] / m[..., 2:],
+        "faces": project(middle_camera(P, material.plant.image_size)[None], points)[0],
         "profile": np.array(profile.replace("_", " ")),
     }
 
 
 def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
-    """Camera (3, 4) midway between two metric cameras, looking along the roll axis of the rig, px.
+    """Camera (3, 4) midway between metric cameras (2, 3, 4), looking along the roll axis of the rig, px.
 
     Its focal length is the mean of both, its principal point the middle of the image.
-
-    P : (2, 3, 4) metric cameras; image_size : (2,) px.
     """
     center, z = roll_axis(P)
-    across = np.zeros(3)
-    focal = 0.0
-    for camera in P:
-        Q = camera[:, :3] / np.linalg.norm(camera[2, :3]) * np.sign(np.linalg.det(camera[:, :3]))
-        right = Q[0] - (Q[0] @ Q[2]) * Q[2]
-        across += right / np.linalg.norm(right)
-        focal += float(np.linalg.norm(right)) / len(P)
+    Q = (
+        P[:, :, :3]
+        * (np.sign(np.linalg.det(P[:, :, :3])) / np.linalg.norm(P[:, 2, :3], axis=1))[:, None, None]
+    )
+    right = Q[:, 0] - (Q[:, :1] @ Q[:, 2, :, None])[:, 0] * Q[:, 2]
+    focal = np.linalg.norm(right, axis=1, keepdims=True)
+    across = (right / focal).sum(axis=0)
     x = across - (across @ z) * z
     x /= np.linalg.norm(x)
-    R = np.stack([x, np.cross(z, x), z])
     u, v = (image_size - 1.0) / 2.0
-    K = np.array([[focal, 0.0, u], [0.0, focal, v], [0.0, 0.0, 1.0]])
-    result: FloatArray = K @ np.c_[R, -R @ center]
-    return result
+    K = np.array([[focal.mean(), 0.0, u], [0.0, focal.mean(), v], [0.0, 0.0, 1.0]])
+    R = np.stack([x, np.cross(z, x), z])
+    return np.asarray(K @ np.c_[R, -R @ center])
 
 
 @registered(
     "fig05_planned",
     "The planned motion from between the cameras",
     "Fig. 5, section 6",
-    3.6,
     _data_linear,
     alt="The face at several moments of the planned motion, seen from between the cameras; beside "
     "it the shares of translation and rotations that are done and the visibility margin of both "
@@ -97,12 +109,11 @@ def middle_camera(P: FloatArray, image_size: FloatArray) -> FloatArray:
     "fig06_planned_steep",
     "The planned motion with a steep translation",
     "Fig. 6, section 6",
-    3.6,
     _data_steep,
     alt="As the figure before, with a translation that is driven first: the face at several "
     "moments, the shares of the motions and the visibility margins.",
 )
-def _draw(data: Data, figure: "Figure") -> None:
+def _draw_planned(data: Data, figure: "style.Figure") -> None:
     """Left the faces from dark to light along the path, right the shares and the margins."""
     from matplotlib import colormaps
 
@@ -111,34 +122,141 @@ def _draw(data: Data, figure: "Figure") -> None:
     image, shares = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
     margins = figure.add_subplot(grid[1, 1], sharex=shares)
     faces, sigma = data["faces"], data["sigma"]
-    for k in range(faces.shape[1]):
-        image.plot(*faces[:, k].T, color=style.GREY, linewidth=0.6)
+    style.paths(image, faces, {"color": style.GREY, "linewidth": 0.6})
     shown = np.unique(np.linspace(0, len(sigma) - 1, _FACES).round().astype(int))
     for j in shown:
         color = colormaps["cividis"](0.82 * sigma[j])
         ends = j in (shown[0], shown[-1])
         style.face(image, faces[j], {"color": color, "linewidth": 1.8 if ends else 1.0})
-    style.frame_pixels(image, faces)
-    style.image_axes(image, f"from the rig's centre, {data['profile']}")
+    style.image_axes(image, f"from the rig's centre, {data['profile']}", faces)
+    place: Any = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "va": "bottom"}
+    paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8}
     for j, label in ((0, "start"), (-1, "goal")):
-        corner = faces[j][np.argmin(faces[j][:, 1])]
-        image.annotate(
-            label,
-            corner,
-            xytext=(0, 5),
-            textcoords="offset points",
-            ha="center",
-            va="bottom",
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8},
-        )
-    for column, look in zip(data["mu"].T, style.SHARES.values(), strict=True):
-        shares.plot(sigma, column, **look)
-    shares.set_ylabel(r"share $\mu$ (1)")
-    shares.tick_params(labelbottom=False)
+        image.annotate(label, faces[j][np.argmin(faces[j][:, 1])], bbox=paper, **place)
     cameras = {f"{name} camera": style.curve(3 - view) for view, name in enumerate(VIEWS)}
-    for column, look in zip(data["margin"].T, cameras.values(), strict=True):
-        margins.plot(sigma, column, **look)
+    _columns(shares, sigma, data["mu"], _SHARES.values())
+    _columns(margins, sigma, data["margin"], cameras.values())
+    shares.set_ylabel(_SHARE)
+    shares.tick_params(labelbottom=False)
     margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
-    margins.set(xlabel=r"path parameter $\sigma$ (1)", ylabel="margin $a\\cdot O$\n(start = 1)")
+    margins.set(xlabel=_SIGMA, ylabel="margin $a\\cdot O$\n(start = 1)")
     first: style.Look = {"color": style.BLACK, "marker": "o", "linestyle": "none"}
-    style.legend_below(figure, {**style.SHARES, **cameras, "first marker of the face": first}, 6)
+    style.legend_below(figure, {**_SHARES, **cameras, "first marker of the face": first}, 6)
+
+
+def _columns(axes: "style.Axes", x: FloatArray, values: FloatArray, looks: Iterable[style.Look]) -> None:
+    """Each column of values (k, c) over x (k,), in a look of its own."""
+    for column, look in zip(values.T, looks, strict=True):
+        axes.plot(x, column, **look)
+
+
+def _data_path(material: Material) -> Data:
+    """Margins of both cameras over the unit square, the border distance at the best μ_p, and the path."""
+    plan = material.plan
+    mu = np.linspace(0.0, 1.0, _NODES)
+    O = plan.optical_center
+    moved = O[:, None] - mu[:, None] * plan.tau * (O @ plan.H_hat[0].T)[:, None]
+    planes = np.array([exp_rotation(plan.H_hat[1], -share * plan.theta_r).T @ plan.a for share in mu])
+    half = 0.5 * float(material.plant.image_size.min())
+    along = (plan.margin.min(axis=1), plan.border_distance.min(axis=1) / half, plan.joint_margin)
+    return {
+        "share": mu,
+        "margin": np.einsum("vtc,rc->vtr", moved, planes) / (O @ plan.a)[:, None, None],
+        "border_px": _border_distance(material, mu),
+        "sigma": plan.sigma,
+        "mu": plan.mu,
+        "along": np.stack([*along, plan.condition / plan.condition[0]], axis=1),
+        "profile": np.array(plan.profile.replace("_", " ")),
+    }
+
+
+def _border_distance(material: Material, mu: FloatArray) -> FloatArray:
+    """Least distance of a marker from the border of each image, px, where μ_p is best for both.
+
+    It is (2, k, k) over the shares mu (k,) of t and of r, negative outside.
+    """
+    plan, P, lens = material.plan, material.calibrated.P, material.calibrated.lens
+    turns = np.linspace(0.0, 1.0, _TURNS)
+    within = np.array([exp_rotation(plan.H_hat[2], share * plan.theta_p) for share in turns])
+    onto = np.array([exp_rotation(plan.H_hat[1], share * plan.theta_r) for share in mu])
+    M = np.einsum("rij,pmj->rpmi", onto, plan.A @ np.swapaxes(within, 1, 2))
+    depth = np.sign(np.einsum("vc,mc->vm", P[:, 2], plan.A))
+    result = np.empty((2, len(mu), len(mu)))
+    for i, share in enumerate(mu):
+        there = M + share * plan.tau * (M @ plan.H_hat[0].T)
+        m = there @ P.swapaxes(1, 2)[:, None, None]
+        uv = through(lens[:, None, None, None], m[..., :2] / m[..., 2:])
+        least = np.minimum(uv + 0.5, material.plant.image_size - 0.5 - uv).min(axis=(-1, -2))
+        front = (m[..., 2] * depth[:, None, None] > 0.0).all(axis=-1)
+        least = np.where(front & np.isfinite(least), least, -np.inf)
+        best = least.min(axis=0).argmax(axis=1)
+        result[:, i] = least[:, np.arange(len(mu)), best]
+    return result
+
+
+@registered(
+    "fig14_path",
+    "Where each camera sees the face, and the planned path among it",
+    "beside the paper's, after section 4.3",
+    _data_path,
+    height=6.0,
+)
+def _draw_path(data: Data, figure: "style.Figure") -> None:
+    """Above the map of each camera with the path, below the shares and the margins along it."""
+    axes = figure.subplots(2, 2, height_ratios=[1.5, 1.0])
+    for view, name in enumerate(VIEWS):
+        _map(axes[0, view], data, view)
+        axes[0, view].set_title(f"{name} camera, {data['profile']} profile")
+    shares, margins = axes[1]
+    _columns(shares, data["sigma"], data["mu"], _SHARES.values())
+    _columns(margins, data["sigma"], data["along"], _MARGINS.values())
+    shares.set(xlabel=_SIGMA, ylabel=_SHARE)
+    margins.set(xlabel=_SIGMA, ylabel="margin (1)")
+    margins.axhline(0.0, color=style.BLACK, linewidth=0.6)
+    if np.nanmax(data["along"]) > _WIDE:  # conditioning may grow a hundredfold
+        margins.set_yscale("symlog", linthresh=1.0)
+        margins.yaxis.set_major_formatter("{x:g}")
+    margins.set_ylim(bottom=min(-0.1, 1.1 * float(np.nanmin(data["along"]))))
+    region: style.Look = {"alpha": 0.6, "edgecolor": style.BLACK, "linewidth": 0.0}
+    looks: dict[str, style.Look] = {
+        "hidden from this camera": region | _REGIONS["margin"],
+        r"outside this image at every $\mu_p$": region | _REGIONS["border_px"],
+        r"path, at tenths of $\sigma$": {"color": style.VERMILION, "marker": "o"},
+    }
+    style.legend_below(figure, {**looks, **_SHARES, **_MARGINS}, 4)
+
+
+def _map(axes: "style.Axes", data: Data, view: int) -> None:
+    share = data["share"]
+    for name, look in _REGIONS.items():
+        finite = np.maximum(data[name][view], -1e6)
+        region: Any = {"colors": [look["facecolor"]], "hatches": [look["hatch"]], "alpha": 0.6}
+        if finite.min() < 0.0:
+            axes.contourf(share, share, finite.T, levels=[-1e9, 0.0], **region)
+        if finite.min() < 0.0 < finite.max():
+            axes.contour(share, share, finite.T, levels=[0.0], colors=[style.BLACK], linewidths=0.6)
+    faint: Any = {"colors": [style.BLACK], "linewidths": 0.4, "linestyles": "dotted"}
+    seen = axes.contour(
+        share, share, data["margin"][view].T, levels=[0.25, 0.5, 0.75, 1.0, 1.5, 2.0], **faint
+    )
+    lines = np.concatenate([data["mu"][:, :2], np.repeat(share[:, None], 2, axis=1)])
+    axes.clabel(seen, fmt="%g", fontsize=6.5, manual=_clear(seen.allsegs, lines))
+    axes.plot([0.0, 1.0], [0.0, 1.0], color=style.BLACK, linewidth=0.5)
+    t, r = data["mu"][:, :2].T
+    axes.plot(t, r, color=style.VERMILION, linewidth=1.6)
+    tenths, sigma = np.linspace(0.0, 1.0, _TICKS), data["sigma"]
+    axes.plot(np.interp(tenths, sigma, t), np.interp(tenths, sigma, r), "o", color=style.VERMILION)
+    labels = {"xlabel": r"translation $\mu_t$ (1)", "ylabel": r"turn onto the plane $\mu_r$ (1)"}
+    axes.set(xlim=(-0.02, 1.02), ylim=(-0.02, 1.02), **labels)
+
+
+def _clear(contours: Any, lines: FloatArray) -> list[FloatArray]:
+    """A place (2,) on each piece of each contour, away from the points (k, 2), the border and one another."""
+    places: list[FloatArray] = []
+    for piece in (piece for pieces in contours for piece in pieces if len(piece) > 1):
+        taken = np.concatenate([lines, np.reshape(places, (-1, 2))])
+        room = np.linalg.norm(piece[:, None] - taken, axis=2).min(axis=1)
+        room = np.minimum(room, np.minimum(piece, 1.0 - piece).min(axis=1))
+        if room.max() > LABEL:
+            places.append(piece[room.argmax()])
+    return places

@@ -1,6 +1,6 @@
 """Fig. 3 of [RH00]: robot, stereo rig and face at the start and at the goal."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,11 +11,7 @@ from projservo_cli.report.material import Data, Material, registered
 from projservo_cli.robots.simulated import Plant, camera_center
 from projservo_cli.task.face import center_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-# Length of the drawn viewing pyramids, as a share of the distance to the face.
-_PYRAMID = 0.16
+_PYRAMID = 0.16  # length of the drawn viewing pyramids, as a share of the distance to the face
 _CAMERAS: dict[str, style.Look] = {
     "left camera": {"color": style.BLUE, "linewidth": 1.0},
     "right camera": {"color": style.ORANGE, "linewidth": 1.0},
@@ -24,42 +20,30 @@ _CAMERAS: dict[str, style.Look] = {
 
 def _data(material: Material) -> Data:
     """Joints, faces and cameras in metres; the robot at the start as a polyline through its axes."""
-    plant, robot, plan = material.plant, material.robot, material.plan
-    start = forward_kinematics(plant.model, plan.q_start)
+    plant, robot, q = material.plant, material.robot, material.plan.q_start
+    start = forward_kinematics(plant.model, q)
     face = plant.M[plant.order]
+    tool = (start @ robot.base_tool)[:3, 3]
     result: Data = {
-        "robot": skeleton(
-            joint_operators(plant.model, plan.q_start), robot.joint_types, (start @ robot.base_tool)[:3, 3]
-        ),
+        "robot": skeleton(joint_operators(plant.model, q), robot.joint_types, tool),
         "face_start": (face @ start.T)[:, :3],
-        "cameras": np.stack([camera_center(P) for P in plant.model.P]),
     }
-    result["pyramids"] = pyramids(plant, result["face_start"])
-    goal = _goal(material)
-    if goal is not None:
+    shown = pyramids(plant, result["face_start"])
+    result |= {"cameras": shown[:, 0], "pyramids": shown}
+    goals = (trace.goal_pose for trace in material.traces.values() if np.isfinite(trace.goal_pose).all())
+    if (pose := next(goals, None)) is not None:
+        goal = pose @ np.linalg.inv(robot.base_tool)
         result["face_goal"] = (face @ goal.T)[:, :3]
-        centers = [np.array(center_of(plant.M @ H.T, plant.center))[:3] for H in (start, goal)]
-        result["line"] = np.stack(centers)
+        centers = [center_of(plant.M @ H.T, plant.center)[:3] for H in (start, goal)]
+        result["line"] = np.array(centers)
     return result
-
-
-def _goal(material: Material) -> FloatArray | None:
-    """True displacement of the face at the goal, where a run knows it."""
-    for trace in material.traces.values():
-        if np.isfinite(trace.goal_pose).all():
-            return trace.goal_pose @ np.linalg.inv(material.robot.base_tool)
-    return None
 
 
 def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArray:
     """Points (k, 3) of a polyline from the base over all revolute axes to the tool, m.
 
-    From each point the perpendicular is dropped onto the next axis; a prismatic joint has a
-    direction but no place.
-
-    H_hat : (n, 4, 4) metric operators at the current joints.
-    joint_types : (n,) ``REVOLUTE`` or ``PRISMATIC``.
-    tool : (3,) place of the tool, m.
+    From each point the perpendicular is dropped onto the next axis, known by the metric operators
+    (n, 4, 4) at the current joints; a prismatic joint has a direction but no place.
     """
     points = [np.zeros(3)]
     for operator, kind in zip(H_hat, joint_types, strict=True):
@@ -72,44 +56,42 @@ def skeleton(H_hat: FloatArray, joint_types: Any, tool: FloatArray) -> FloatArra
 
 
 def pyramids(plant: Plant, face: FloatArray) -> FloatArray:
-    """Viewing pyramids (2, 5, 3) of both cameras, m; their length goes by the distance of a face (m, 3)."""
-    centers = np.stack([camera_center(P) for P in plant.model.P])
+    """Optical centre and image corners (2, 5, 3) of both metric cameras, m.
+
+    The corners are drawn at a depth in front of the camera that goes by the distance of a face (m, 3).
+    """
+    P = plant.model.P
+    centers = np.stack([camera_center(camera) for camera in P])[:, None]
     depth = _PYRAMID * float(np.linalg.norm(face.mean(axis=0) - centers.mean(axis=0)))
-    return np.stack([pyramid(P, plant.image_size, depth) for P in plant.model.P])
-
-
-def pyramid(P: FloatArray, image_size: FloatArray, depth: float) -> FloatArray:
-    """Centre and four image corners (5, 3) of a metric camera (3, 4), m, at a depth in front of it."""
-    center = camera_center(P)
-    width, height = image_size - 0.5
+    width, height = plant.image_size - 0.5
     corners = np.array([[-0.5, -0.5, 1], [width, -0.5, 1], [width, height, 1], [-0.5, height, 1]])
-    scale = np.linalg.norm(P[2, :3])
-    sign = np.sign(np.linalg.det(P[:, :3]))
-    rays = np.linalg.solve(P[:, :3], corners.T).T * scale * sign
-    return np.concatenate([center[None], center + depth * rays])
+    scale = np.linalg.norm(P[:, 2, :3], axis=1) * np.sign(np.linalg.det(P[:, :, :3]))
+    rays = np.linalg.solve(P[:, :, :3], corners.T).swapaxes(1, 2) * scale[:, None, None]
+    return np.concatenate([centers, centers + depth * rays], axis=1)
 
 
 @registered(
     "fig03_scene",
     "Robot, stereo rig, and the face at the start and at the goal",
     "Fig. 3, section 6",
-    4.4,
     _data,
+    height=4.4,
     alt="The robot's arm at the start in three dimensions, both cameras, the face at the start and "
     "at the goal, and the straight line of its centre between them.",
 )
-def _draw(data: Data, figure: "Figure") -> None:
+def _draw(data: Data, figure: "style.Figure") -> None:
     """One view in perspective with equal scales."""
+    from matplotlib.ticker import MultipleLocator
+
     axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d", proj_type="persp", focal_length=0.9)
     axes.patch.set_visible(False)
     axes.computed_zorder = False
     robot: style.Look = {"color": style.BLACK, "linewidth": 2.0, "marker": "o", "markersize": 4}
     axes.plot(*data["robot"].T, **robot)
-    for pyramid, look in zip(data["pyramids"], _CAMERAS.values(), strict=True):
-        corners = style.closed(pyramid[1:])
-        axes.plot(*corners.T, **look)
-        for corner in corners[:-1]:
-            axes.plot(*np.stack([pyramid[0], corner]).T, **look)
+    for (center, *corners), look in zip(data["pyramids"], _CAMERAS.values(), strict=True):
+        axes.plot(*style.closed(np.stack(corners)).T, **look)
+        for corner in corners:
+            axes.plot(*np.stack([center, corner]).T, **look)
     axes.plot(*style.closed(data["face_start"]).T, **style.START)
     looks = {"robot at the start": robot, "face at the start": style.START}
     shown = [data["robot"], data["pyramids"].reshape(-1, 3), data["face_start"]]
@@ -120,16 +102,7 @@ def _draw(data: Data, figure: "Figure") -> None:
         axes.plot(*data["line"].T, **line)
         looks |= {"face at the goal": goal, "straight line of the centre": line}
         shown.append(data["face_goal"])
-    extent = _frame(axes, np.concatenate(shown), data["cameras"].mean(axis=0))
-    figure.set_layout_engine()
-    style.legend_below(figure, looks | _CAMERAS, 3)
-    _fit(axes, figure, extent)
-
-
-def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
-    """Equal scales on all axes, seen from the side of the rig; returns the extent (3, 2) shown, m."""
-    from matplotlib.ticker import MultipleLocator
-
+    points = np.concatenate(shown)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = 0.05 * (high - low).max()
     extent = np.stack([low - pad, high + pad], axis=1)
@@ -138,12 +111,14 @@ def _frame(axes: Any, points: FloatArray, rig: FloatArray) -> FloatArray:
         getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
         getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(0.25 if b - a < 0.75 else 0.5))
     axes.tick_params(pad=0)
-    towards = rig - points.mean(axis=0)
+    towards = data["cameras"].mean(axis=0) - points.mean(axis=0)  # from the side of the rig
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
-    return extent
+    figure.set_layout_engine()
+    style.legend_below(figure, looks | _CAMERAS, 3)
+    _fit(axes, figure, extent)
 
 
-def _fit(axes: Any, figure: "Figure", extent: FloatArray) -> None:
+def _fit(axes: Any, figure: "style.Figure", extent: FloatArray) -> None:
     """Show the scene as large as its labels and the room above the legend allow."""
     corners = np.array([*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)])
     size = np.ptp(extent, axis=1)

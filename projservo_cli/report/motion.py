@@ -1,6 +1,9 @@
-"""The 3D view of a run: one page of HTML with a time slider, drawn by plotly, that needs no network."""
+"""Runs that move: the 3D view, one page of HTML that needs no network, and the animation of both images.
 
-from collections.abc import Iterator, Mapping
+The view is drawn by plotly and has a time slider; the animation has a column a law.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,12 +12,12 @@ from markupsafe import Markup
 
 from projservo_cli.files import replacing
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.records import BoolArray, FloatArray, InputError, IntArray, Plan, Trace
+from projservo_cli.records import BODY_LAWS, BoolArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
+from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.scene import pyramids, skeleton
-from projservo_cli.report.material import VIEWS, title
+from projservo_cli.report.material import CLASSICAL, PAGE_FILE, VIEWS, title
 from projservo_cli.report.page import template
-from projservo_cli.report.values import PAGE_FILE
 from projservo_cli.robots.simulated import Arm, Plant
 from projservo_cli.task.face import center_of
 
@@ -25,7 +28,7 @@ _HEIGHT = 640  # px of the scene
 _EYE = 1.75  # distance of the eye, in sizes of the scene
 _LOWER = 0.15  # that it looks below the middle, where the names of the axes are
 _PAD = 0.03  # around all that is shown, as a share of it
-_FRAME_MS = 80
+FRAME_MS, LAST_MS = 80, 2000  # what each frame of view and animation lasts, and the last of the animation
 _TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
 # What is wider than high needs more distance where the page is narrow.
 _NEARER = """
@@ -47,7 +50,7 @@ _KEY = (
     ("driven path of the centre", style.GREEN),
 )
 _AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
-_PLAYING = _AT_ONCE | {"frame": {"duration": _FRAME_MS, "redraw": True}, "fromcurrent": True}
+_PLAYING = _AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
 
 
 class _Driven(NamedTuple):
@@ -72,7 +75,9 @@ class _Motion(NamedTuple):
     runs: Mapping[str, _Driven]
 
 
-def motion(robot: Arm, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]) -> _Motion:
+def motion_of(
+    robot: Arm, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
+) -> _Motion:
     """What the view shows of runs with a step at least; ``markers`` (p, 4) at the robot's reference, m."""
     face = plant.M[plant.order]
     start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
@@ -83,7 +88,7 @@ def motion(robot: Arm, plant: Plant, markers: FloatArray, plan: Plan, traces: Ma
     return _Motion(pyramids(plant, start), start, goal, planned, runs)
 
 
-def instants(q: FloatArray) -> IntArray:
+def _instants(q: FloatArray) -> IntArray:
     """At most ``MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
 
     They are spread half over the time, half over the way of the joints: no end of a run is passed over.
@@ -98,22 +103,20 @@ def instants(q: FloatArray) -> IntArray:
 
 
 def _driven(robot: Arm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
-    shown = instants(trace.q)
-    places = []
+    shown, places = _instants(trace.q), []
     for q in trace.q[shown]:
         H = forward_kinematics(plant.model, q)
         polyline = skeleton(joint_operators(plant.model, q), robot.joint_types, (H @ robot.base_tool)[:3, 3])
         places.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
     moved = (np.stack(kind) for kind in zip(*places, strict=True))
-    seconds, path = trace.period * shown.astype(np.float64), _centers(plant, trace.q)
-    verdict = f"{trace.verdict}, {trace.steps} steps"
-    return _Driven(verdict, seconds, trace.self_occluded[shown], path, *moved)
+    verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
+    return _Driven(verdict, trace.period * shown.astype(np.float64), trace.self_occluded[shown], path, *moved)
 
 
 def _centers(plant: Plant, q: FloatArray) -> FloatArray:
     """Centre of the face (k, 3) at joints (k, n), m."""
-    found = [center_of(plant.M @ forward_kinematics(plant.model, joints).T, plant.center)[:3] for joints in q]
-    return np.reshape(np.array(found, dtype=np.float64), (-1, 3))
+    H = (forward_kinematics(plant.model, joints) for joints in q)
+    return np.array([center_of(plant.M @ moved.T, plant.center)[:3] for moved in H]).reshape(-1, 3)
 
 
 def plotly() -> Any:
@@ -143,9 +146,9 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
 def _figure(motion: _Motion) -> Any:
     """The view as a figure of plotly: what stands still, then four traces a run, and a frame an instant."""
     go = plotly()
-    still = [*_still(go, motion)]
-    traces, frames, reach = [*still], [], {}
-    menu: list[Any] = []
+    menu: list[dict[str, Any]] = []
+    traces, frames = [*_still(go, motion)], []
+    still = len(traces)
     for number, (name, run) in enumerate(motion.runs.items()):
         moving = [_moving(go, run, k) for k in range(len(run.seconds))]
         own = [f"{name}/{k}" for k in range(len(moving))]
@@ -154,19 +157,18 @@ def _figure(motion: _Motion) -> Any:
         for trace in (*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)):
             trace.visible = number == 0  # a list of all runs chooses another
             traces.append(trace)
-        shown = [True] * len(still) + [k // 4 == number for k in range(4 * len(motion.runs))]
+        shown = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
         buttons = [
             {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
             {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
         ]
         changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": buttons}
-        reach[name] = _extent(motion, run)
-        changed |= {f"scene.{axis}axis.range": limits for axis, limits in reach[name].items()}
+        changed |= {f"scene.{axis}axis.range": limits for axis, limits in _extent(motion, run).items()}
         menu.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
-    first = menu[0]["args"][1]
+    first: dict[str, Any] = menu[0]["args"][1]
+    buttons = first["updatemenus[1].buttons"]
     left = {"x": 0.0, "xanchor": "left"}
-    playing = {"type": "buttons", "direction": "left", "showactive": False}
-    playing["buttons"] = first["updatemenus[1].buttons"]
+    playing = {"type": "buttons", "direction": "left", "showactive": False, "buttons": buttons}
     layout = {
         "height": _HEIGHT,
         "margin": {"l": 10, "r": 10, "t": 60, "b": 10},
@@ -174,7 +176,7 @@ def _figure(motion: _Motion) -> Any:
         "font": {"family": "system-ui, DejaVu Sans, sans-serif", "size": 13, "color": style.BLACK},
         "paper_bgcolor": "#ffffff",
         "uirevision": "kept",  # the view stays as it was turned
-        "scene": _scene(motion, next(iter(reach.values()))),
+        "scene": _scene(motion, {axis: first[f"scene.{axis}axis.range"] for axis in "xyz"}),
         "sliders": first["sliders"],
         "updatemenus": [
             left | {"y": 1.0, "yanchor": "bottom", "pad": {"b": 8}, "buttons": menu},
@@ -244,16 +246,10 @@ def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
     robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
     robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})
     fan = np.arange(1, run.face.shape[1] - 1)
-    face = go.Mesh3d(
-        **_places(run.face[k]),
-        i=(0 * fan).tolist(),
-        j=fan.tolist(),
-        k=(fan + 1).tolist(),
-        color=_HIDDEN if run.hidden[k].any() else _SEEN,
-        flatshading=True,
-        name="face",
-        hoverinfo="name",
-    )
+    triangles = {"i": (0 * fan).tolist(), "j": fan.tolist(), "k": (fan + 1).tolist()}
+    color = _HIDDEN if run.hidden[k].any() else _SEEN
+    look = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
+    face = go.Mesh3d(**_places(run.face[k]), **triangles, **look)
     return robot, face, _line(go, run.markers[k], "markers", style.GREY)
 
 
@@ -267,3 +263,113 @@ def _line(go: Any, points: FloatArray, name: str, color: str, width: float | Non
 
 def _places(points: FloatArray) -> dict[str, list[float]]:
     return {name: np.round(points[:, i], _DIGITS).tolist() for i, name in enumerate("xyz")}
+
+
+FRAMES = 60
+_MOST_COLUMNS = 4
+SEEN, HIDDEN = style.GREEN, style.ORANGE
+_PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
+_BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
+_PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
+_COLORS = 128
+
+
+def write_animation(
+    path: Path,
+    traces: Mapping[str, Trace],
+    order: IntArray,
+    size: Sequence[float] | None,
+    progress: Callable[[str, int, int], None],
+) -> None:
+    """Write the animation of runs that moved as GIF: the first direct law beside the classical ones.
+
+    ``order`` are the markers around the face, ``size`` is that of the images in px; where it is not known,
+    the animation shows what reaches around all that was seen.
+    """
+    from PIL import Image
+
+    direct = [name for name in traces if name in BODY_LAWS]
+    beside = [*direct[:1], *(name for name in traces if name in CLASSICAL)]
+    columns = {name: traces[name] for name in (beside if len(beside) > 1 else [*traces])[:_MOST_COLUMNS]}
+    if size is None:
+        size = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
+    images = []
+    for pixels in _frames(columns, order, np.array(size, dtype=np.float64)):
+        images.append(Image.fromarray(pixels))
+        progress("animation", len(images), FRAMES)
+    # The last frame has all colours; one palette for all keeps what does not move the same.
+    palette = images[-1].quantize(_COLORS, method=Image.Quantize.MAXCOVERAGE)
+    first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    with replacing(path) as temporary:
+        durations = [*[FRAME_MS] * len(others), LAST_MS]
+        first.save(temporary, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> Iterator[Any]:
+    """Draw one frame after another, a column a run; yields the pixels (height, width, 3) of each.
+
+    They go from the start to the end of the longest run that converged, if any did.
+    """
+    ends = [run.period * run.steps for run in traces.values() if run.verdict == "converged"]
+    end = max(ends or [run.period * run.steps for run in traces.values()])
+    every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
+    near = near_pixels(np.concatenate(every), size)
+    width = max(_LEAST_WIDTH, _PANEL * len(traces) + 0.5)
+    columns: list[list[_Panel]] = []
+
+    def draw(runs: Mapping[str, Trace], figure: "style.Figure") -> None:
+        axes = figure.subplots(2, len(runs), squeeze=False, sharex=True, sharey=True)
+        for column, (name, run) in zip(axes.T, runs.items(), strict=True):
+            for view, (panel, camera) in enumerate(zip(column, VIEWS, strict=True)):
+                style.face(panel, run.s[0, view, order], style.START)
+                style.face(panel, run.s_star[view, order], style.GOAL)
+                style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near)
+                panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
+                panel.set_xlabel("u (px)" if view else "")
+            shown = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
+            columns.append([_Panel(*one) for one in shown])
+        looks = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
+        looks["face hidden from this camera"] = _BEHIND
+        style.legend_below(figure, looks, 4 if len(runs) > 2 else 2)
+        figure.suptitle("time 00.00 s", fontsize=9)
+
+    with style.styled():
+        figure = style.drawn(draw, traces, 2.0 * _PANEL * style.aspect(near) + 1.6, width)
+        for seconds in np.linspace(0.0, end, FRAMES):
+            figure.suptitle(f"time {seconds:.2f} s", fontsize=9)
+            for column, (name, run) in zip(columns, traces.items(), strict=True):
+                now = min(int((seconds + 1e-9) / run.period), run.steps)
+                told = f"{run.verdict}, {run.steps} steps"
+                if now < run.steps:
+                    told = f"later: {told}" if seconds == end else "running"
+                column[0].axes.set_title(f"{title(name)}\n{told}")
+                for panel in column:
+                    panel.show(now)
+            canvas: Any = figure.canvas
+            canvas.draw()
+            yield np.array(canvas.buffer_rgba(), dtype=np.uint8)[:, :, :3]
+
+
+class _Panel:
+    """What moves in the image of one camera under one law: paths (t, m, 2) and a face, hidden (t,) or not."""
+
+    def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray) -> None:
+        self.axes, self.s, self.hidden = axes, s, hidden
+        self.behind, self.paths = ([axes.plot([], [], **look)[0] for _ in s[0]] for look in (_BEHIND, _PATH))
+        (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
+        place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}
+        self.word = axes.text(0.5, 0.03, "", fontweight="bold", fontsize=8, **place)
+
+    def show(self, now: int) -> None:
+        """Show the paths up to an instant, and the face at it."""
+        past, hidden = self.s[: now + 1], self.hidden[: now + 1]
+        for k, (line, behind) in enumerate(zip(self.paths, self.behind, strict=True)):
+            line.set_data(*past[:, k].T)
+            behind.set_data(*np.where(hidden[:, None], past[:, k], np.nan).T)
+        here = past[-1][np.isfinite(past[-1]).all(axis=1)]
+        self.face.set_visible(len(here) > 2)
+        if len(here) > 2:
+            self.face.set_xy(here)
+        self.face.set_facecolor(HIDDEN if hidden[-1] else SEEN)
+        unseen = "MARKERS NOT SEEN" if len(here) < self.s.shape[1] else ""
+        self.word.set_text("FACE HIDDEN" if hidden[-1] else unseen)
