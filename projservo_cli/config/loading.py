@@ -1,18 +1,20 @@
-"""From YAML text and overrides to a checked configuration, or to all that is wrong with it."""
+"""From YAML text and overrides to a checked configuration, or to all that is wrong with it; and back."""
 
 import difflib
+import hashlib
 import json
 import pathlib
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from projservo_cli.config.models import Config
-from projservo_cli.config.robot import CONTRADICTION, Section
+from projservo_cli.config.robot import CONTRADICTIONS, Root
 from projservo_cli.config.yaml_source import MAX_DEPTH, Document, Path, Problem, shortened
 from projservo_cli.records import InputError
 
@@ -38,14 +40,13 @@ _PHRASES = {
     "string_too_short": "must not be empty",
     "string_too_long": "takes at most {max_length} characters",
     "value_error": "{error}",
-    CONTRADICTION: "{what}",
 }
 
 # Values that name files, relative to the configuration.
 _FILES = (("data", "table"), ("calibration", "init"))
 _DIGITS = 9  # of a position in a list
 _MOST = 200  # problems that are looked at; who has more has taken another file
-_Model = TypeVar("_Model", bound=Section)
+_Model = TypeVar("_Model", bound=Root)
 
 
 @dataclass(frozen=True)
@@ -111,15 +112,50 @@ def load_config(
 
 def validated(model: type[_Model], document: Document) -> _Model:
     """The configuration that a document holds; an InputError with all that is wrong with it."""
-    found = document.problems
+    wrong: list[ErrorDetails] = []
     try:
-        if all(problem.path for problem in found):  # of a text that is none, nothing more can be said
+        if all(problem.path for problem in document.problems):  # of a text that is none, no more can be said
             config = model.model_validate(document.values)
     except ValidationError as error:
-        found = [*found, *_translated(model, error.errors(include_url=False))]
-    if found:
-        raise document.refused(found)
+        wrong = error.errors(include_url=False)
+    if broken := {part["loc"][0] for part in wrong if part["loc"]}:
+        rest = {"name": "-"} | {key: value for key, value in document.values.items() if key not in broken}
+        try:
+            model.model_validate(rest, context=broken)
+        except ValidationError as error:
+            more = error.errors(include_url=False)
+            wrong = [*(part for part in more if part["type"] == CONTRADICTIONS), *wrong]
+    if document.problems or wrong:
+        raise document.refused([*document.problems, *_translated(model, wrong)])
     return config
+
+
+def to_yaml(config: Config) -> str:
+    """The whole configuration, defaults written out, as YAML that loads to an equal one."""
+    values = _without_unset(config)
+    return yaml.dump(
+        values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
+    )
+
+
+def digest(
+    config: Config,
+    keys: Sequence[str],
+    *,
+    without: Sequence[str] = (),
+    extra: Mapping[str, Any] | None = None,
+) -> str:
+    """SHA-256 of parts of a configuration, in hexadecimal.
+
+    ``keys`` are sections such as ``control``, or values in them such as ``noise.servo_px``, in any order,
+    less the values ``without``, such as ``control.laws``; ``extra`` are further JSON values.
+    """
+    values = config.model_dump(mode="json")
+    for section, key in (dotted.split(".") for dotted in without):
+        (values[section] or {}).pop(key, None)
+    parts = {dotted: _part(values, dotted.split(".")) for dotted in keys}
+    text = json.dumps([parts, extra or {}], sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _spell_out(values: dict[str, Any]) -> None:
@@ -145,16 +181,19 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
             values.setdefault("name", pathlib.Path(file).stem)
 
 
-def _translated(model: type[Section], errors: Sequence[ErrorDetails]) -> Iterator[Problem]:
+def _translated(model: type[Root], errors: Sequence[ErrorDetails]) -> Iterator[Problem]:
     """What pydantic found, in words."""
     places = [error["loc"] for error in errors]
     for error, place in list(zip(errors, places, strict=True))[:_MOST]:
+        if error["type"] == CONTRADICTIONS:
+            yield from (Problem(path, what) for path, what in error["ctx"]["found"])
+            continue
         inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
         if not (inside and error["type"] == "too_short"):  # a list counts only its valid entries
             yield Problem(place, _phrase(model, error))
 
 
-def _phrase(model: type[Section], error: ErrorDetails) -> str:
+def _phrase(model: type[Root], error: ErrorDetails) -> str:
     kind, path, given = error["type"], error["loc"], error["input"]
     context = error.get("ctx", {})
     if kind == "extra_forbidden":
@@ -197,3 +236,29 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
         yield annotation
     for part in typing.get_args(annotation):
         yield from _models(part)
+
+
+def _part(values: Any, path: Sequence[str]) -> Any:
+    """The value at a path; None in a section that is absent."""
+    for key in path:
+        values = None if values is None else values[key]
+    return values
+
+
+def _without_unset(value: Any) -> Any:
+    """Plain values, less those that are absent by default; a null that overrides a default stays."""
+    if isinstance(value, BaseModel):
+        fields = type(value).model_fields
+        return {
+            key: _without_unset(inner)
+            for key, inner in value
+            if inner is not None or key not in fields or fields[key].default is not None
+        }
+    return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
+
+
+class _Dumper(yaml.SafeDumper):
+    """Dumps without aliases, so that every value stands where it is read."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True

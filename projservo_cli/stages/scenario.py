@@ -43,7 +43,7 @@ from projservo_cli.task.target import task_from_body
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config
-    from projservo_cli.config.models import Task as TaskSettings
+    from projservo_cli.config.models import TaskSettings
 
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)

@@ -26,8 +26,7 @@ from projservo_cli.task.face import MIDPOINT, center_of
 if TYPE_CHECKING:
     from projservo_cli.config import Config
     from projservo_cli.config.models import Goal
-    from projservo_cli.config.robot import Camera, JointVector, Markers, Rig
-    from projservo_cli.config.robot import Robot as DescribedRobot
+    from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, RobotSettings
 
 
 class Joints(NamedTuple):
@@ -161,7 +160,7 @@ def truth_of(config: "Config") -> Truth:
 
 
 @lru_cache(maxsize=16)
-def _built(described: "DescribedRobot", rig: "Rig", markers: "Markers") -> Truth:
+def _built(described: "RobotSettings", rig: "Rig", markers: "Markers") -> Truth:
     robot = robot_of(described)
     numbers = markers.known
     assert numbers is not None
@@ -178,7 +177,7 @@ def _built(described: "DescribedRobot", rig: "Rig", markers: "Markers") -> Truth
     )
 
 
-def robot_of(described: "DescribedRobot") -> Robot:
+def robot_of(described: "RobotSettings") -> Robot:
     """Robot of a DH table or of screws."""
     limits = described.limits
     if described.dh is not None:

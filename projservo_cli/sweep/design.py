@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.config import Config, Override, digest, load_config, to_yaml
-from projservo_cli.config.models import Goal, Task
+from projservo_cli.config.models import Goal, TaskSettings
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.records import FloatArray, InputError, IntArray, law_and_mode, names_of
@@ -242,7 +242,7 @@ class Design:
                 for q in self.tasks(self.base_of(at.cell))
             )
             offset = config.task.start_offset  # stays
-            update["task"] = Task(start=start, start_offset=offset, goal=Goal(joints=goal))
+            update["task"] = TaskSettings(start=start, start_offset=offset, goal=Goal(joints=goal))
         return config.model_copy(update=update)
 
     def drawn(self, run: int) -> dict[str, Any]:

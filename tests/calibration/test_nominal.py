@@ -7,12 +7,16 @@ import json
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, predict
-from projservo_cli.config.nominal import read_nominal
+from projservo_cli.calibration import Nominal, calibrate, predict
+from projservo_cli.config.robot import read_nominal as fields_of
 from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 SIGMA = 0.5
+
+
+def read_nominal(path):
+    return Nominal(**fields_of(path))
 
 
 @pytest.fixture(scope="module")

@@ -197,7 +197,9 @@ def test_screws_are_checked(good):
         "{type: P, w: [0, 0, 1], v: [0, 0.5, 0]}]"
     )
     screws = f"{{reference: {{joints: [0, 0, 0], unit: rad}}, base_tool: {POSE}, joints: {joints}}}"
-    found = [line.split(": robot")[1] for line in errors(good, f"robot={{screws: {screws}}}")]
+    start, *told = errors(good, f"robot={{screws: {screws}}}")
+    assert start.endswith("task.start.joints: 2 values for 3 joints (RRP)")
+    found = [line.split(": robot")[1] for line in told]
     assert found == [
         ".screws.joints.0.w: must be of unit length for a joint of type R, it is 2",
         ".screws.joints.1.v: must be orthogonal to w: a revolute joint has no pitch",
