@@ -6,7 +6,7 @@ Projective Space", ECCV 2000, cited below as [RH00].
 
 from typing import TYPE_CHECKING
 
-from projservo_cli.version import __version__
+from projservo_cli.provenance import __version__
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -52,13 +52,11 @@ def record_table(
     """
     if joint_unit is not None and motions is None:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
-    from projservo_cli.cli.configuration import given_overrides, shipped
-    from projservo_cli.config import load_config
     from projservo_cli.files import working_in
     from projservo_cli.stages.record import prepare, record
     from projservo_cli.tables import read_joints
 
-    settings = load_config(config or shipped(), given_overrides(options))
+    settings = option.configured(config, options)
     poses = None
     if motions is not None:
         types = settings.robot.joint_types if settings.robot is not None else None

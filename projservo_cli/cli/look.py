@@ -11,7 +11,7 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import main
-from projservo_cli.cli.output import Console, wrapped
+from projservo_cli.cli.output import Console, summary, wrapped
 
 
 @main.command(epilog="Example: projservo show results/ur5 --json")
@@ -25,7 +25,6 @@ def show(console: Console, *, run: Path | None, output: Path | None) -> None:
     claim, and the configuration.
     """
     target = option.one_run("show", run, output) or Path("results", "paper")
-    from projservo_cli.cli.words import summary
     from projservo_cli.config import load_config
     from projservo_cli.report.values import stage_object
     from projservo_cli.store import SERVO, load

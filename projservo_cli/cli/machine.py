@@ -11,7 +11,7 @@ import click
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, wrapped
-from projservo_cli.version import __version__
+from projservo_cli.provenance import __version__
 
 _STARTER, _SCHEMA = "projservo.yaml", "projservo.schema.json"  # as the first line of the starter names it
 _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu", "cpu_count", "date", "jit")
@@ -166,12 +166,10 @@ def bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> Non
     in turn with one numpy.linalg.svd of an 8x6 matrix.
     """
     from projservo_cli import provenance
-    from projservo_cli.cli.configuration import shipped
-    from projservo_cli.config import load_config
     from projservo_cli.stages.bench import Case, measure
 
     console.say("compiling kernels where they are not in the cache, then measuring: half a minute")
-    settings = load_config(config or shipped(), sets)
+    settings = option.configured(config, {"sets": sets})
     result = measure(Case(settings))
     collected = provenance.collect(seed=settings.seed)
     machine = {name: collected[name] for name in _MACHINE}

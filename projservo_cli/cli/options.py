@@ -1,20 +1,35 @@
-"""Options that several commands take, as decorators."""
+"""Options that several commands take, as decorators; and which configuration and run they are about."""
 
 import contextlib
 import functools
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from projservo_cli.cli.output import Console
 
+if TYPE_CHECKING:
+    from projservo_cli.config import Config, Override
+    from projservo_cli.store import Run
+
 _Function = Callable[..., Any]
 _Decorator = Callable[[_Function], _Function]
 
 PATH = click.Path(path_type=Path)
+_RESULTS = Path("results")
+_KEYS = {  # that options stand for
+    "data": ("data", "table"),
+    "joints": ("data", "joints"),
+    "joint_unit": ("data", "joint_unit"),
+    "noise_px": ("data", "noise_px"),
+    "init": ("calibration", "init"),
+    "cross_validate": ("calibration", "cross_validate"),
+    "lens": ("calibration", "lens"),
+}
 
 override = click.option(
     "--set",
@@ -138,3 +153,95 @@ def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
     if run is not None and output is not None:
         raise click.UsageError(f"{command} takes one run, as an argument or with -o")
     return run or output
+
+
+def configured(config: str | None, options: Mapping[str, Any]) -> "Config":
+    """The configuration in a file, by default the one that comes with projservo, with what options say."""
+    from projservo_cli.config import load_config
+
+    return load_config(config or _shipped(), _overrides(options))
+
+
+def resolve(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
+    """The configuration with all overrides, and the run as stored so far.
+
+    Raises InputError when either cannot be read or makes no sense.
+    """
+    from projservo_cli.config import load_config
+
+    if options.get("origin") is not None:
+        return _from_sweep(options)
+    stored = _stored(options["output"]) if options["output"] else None
+    if not options["config"] and stored is not None and stored.configuration:
+        config = load_config(stored.path, _overrides(options), text=stored.configuration)
+    elif not options["config"] and options["data"]:
+        config = load_config(None, _overrides(options))
+    else:
+        config = configured(options["config"], options)
+    return config, stored or _run_of(options, config)
+
+
+def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
+    """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
+    from projservo_cli.config import load_config, to_yaml
+    from projservo_cli.records import InputError
+    from projservo_cli.store import Run
+    from projservo_cli.sweep.folder import run_of
+
+    if options["config"]:
+        raise InputError("-c and --from: the configuration is that of the sweep; leave -c out")
+    config, calibration = run_of(options["origin"])
+    if overrides := _overrides(options):
+        config = load_config(config.name, overrides, text=to_yaml(config))
+    run = _run_of(options, config)
+    stored = run.results.get("calibrate")
+    if calibration is not None and (stored is None or stored.key != calibration.key):
+        run = Run(run.path, run.configuration, {"calibrate": calibration})
+    return config, run
+
+
+def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
+    """The run where the user says, else in the folder of the configuration's name; empty where none is."""
+    from projservo_cli.files import require_inside
+    from projservo_cli.store import Run, run_path
+
+    folder = options["output"]
+    if not folder:
+        folder = _RESULTS / config.name
+        require_inside(folder, _RESULTS)
+    return _stored(folder) or Run(run_path(folder))
+
+
+def _stored(target: str | Path) -> "Run | None":
+    """The run in a folder or file; None where there is none yet."""
+    from projservo_cli.store import load, run_path
+
+    return load(target) if run_path(target).exists() else None
+
+
+def _shipped() -> Path:
+    """The configuration that comes with projservo, in a checkout as in an installed package."""
+    package = Path(__file__).resolve().parent.parent
+    path = package / "configs" / "paper.yaml"
+    return path if path.is_file() else package.parent / "configs" / "paper.yaml"
+
+
+def _overrides(options: Mapping[str, Any]) -> list["Override"]:
+    """Options that stand for keys of the configuration, then ``--set``, then ``--speed-scale``."""
+    from projservo_cli.config import Override
+
+    found = []
+    for name, key in _KEYS.items():
+        given = options.get(name)
+        if given is None or given is False:
+            continue
+        flag = f"--{name.replace('_', '-')}" + ("" if given is True else f" {given}")
+        value = os.path.abspath(given) if key[1] in ("table", "init") else given
+        found.append(Override(flag, key, value))
+    if (size := options.get("image_size")) is not None:  # such as 1280x1024
+        sides = size.lower().replace("x", ", ")
+        found.append(Override.parse(f"data.image_size_px=[{sides}]", f"--image-size {size}"))
+    found += map(Override.parse, options["sets"])
+    if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
+        found.append(Override(f"--speed-scale {scale}", ("plant", "speed_scale"), scale))
+    return found

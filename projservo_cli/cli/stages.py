@@ -10,7 +10,7 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
-from projservo_cli.cli.output import Console
+from projservo_cli.cli.output import Console, summary, sweep_summary, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _EXTRAS = ("view", "animation")
@@ -125,9 +125,7 @@ def report_run(stages: Sequence[str], console: Console, *, sweep: Path | None, *
     with intervals, final errors, laws compared on the same tasks.
     """
     if sweep is not None:
-        from projservo_cli.cli.sweep_command import tell_report
-
-        return tell_report(console, sweep, options)
+        return _tell_sweep(console, sweep, options)
     return _make(console, stages, options)
 
 
@@ -175,12 +173,11 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
 def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> _Chain:
     """What is to be done, by the configuration and what the run holds; refused where it must not be."""
-    from projservo_cli.cli.configuration import resolve
     from projservo_cli.files import require_writable
     from projservo_cli.stages.steps import steps_for
 
     given = _law_names(options.get("laws", ()))
-    config, stored = resolve(options)
+    config, stored = option.resolve(options)
     if options.get("suggest") is not None and config.calibration.method != "refined":
         raise click.UsageError(
             f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
@@ -397,8 +394,6 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
 
 
 def _words(chain: _Chain, values: Mapping[str, dict[str, Any]]) -> Iterator[str]:
-    from projservo_cli.cli.words import summary
-
     for name, value in values.items():
         yield from summary(name, value, detailed=chain.console.verbose)
     if chain.run.results:
@@ -428,3 +423,27 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
     # Other profiles are those of the paper, of which the margins are only measured.
     if "plan" in results and chain.run.plan.profile == "constrained" and not chain.run.plan.feasible:
         yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
+
+
+_UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")
+
+
+def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
+    """Write the report of a sweep and print its tables; the exit code."""
+    from projservo_cli.files import working_in
+    from projservo_cli.records import InputError
+    from projservo_cli.report.style import FORMATS
+    from projservo_cli.sweep.folder import Folder
+    from projservo_cli.sweep.report import report
+
+    for name in _UNUSED:
+        if options[name]:
+            flag = name.replace("_", "-").removesuffix("s")
+            raise InputError(f"--{flag}: not used by report {sweep}, which is of a sweep")
+    folder = Folder(sweep)
+    with working_in(folder.path):
+        found, files = report(folder, FORMATS, console.progress)
+    value = {"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]}
+    names = ", ".join(path.name for path in files)
+    console.tell(value, [*sweep_summary(found), wrapped(f"files: {folder.path}: {names}")])
+    return 0

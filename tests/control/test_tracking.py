@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from projservo_cli.cli.words import summary
+from projservo_cli.cli.output import summary
 from projservo_cli.records import WorkFailed
 from projservo_cli.report.values import scalars
 from projservo_cli.stages import calibrate, plan, servo
