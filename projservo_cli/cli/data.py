@@ -29,7 +29,7 @@ _FAR = 20.0
 @option.force("Begin anew, whatever stands in the table.")
 @option.dry_run
 @option.told
-def record_table(
+def _record(
     console: Console,
     *,
     config: str | None,

@@ -48,7 +48,7 @@ def init(console: Console, *, file: Path, force: bool) -> None:
 @click.argument("what", required=False, metavar="[sweep]", type=click.Choice(["sweep"]))
 @option.output("FILE", "File to write. Default: standard output.")
 @option.told
-def print_schema(console: Console, *, what: str | None, output: Path | None) -> None:
+def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     """Print the JSON Schema of the configuration.
 
     Editors that speak YAML complete and check a configuration whose first line names the schema: #

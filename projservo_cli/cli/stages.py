@@ -14,6 +14,11 @@ from projservo_cli.cli.output import Console, summary, sweep_summary, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _EXTRAS = ("view", "animation")
+_NAMING = {
+    "plant": {("plant",), ("plant", "use")},
+    "law": {("control",), ("control", "laws")},
+}  # keys of --set
+_UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
 
 
 def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
@@ -46,7 +51,7 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
     help="Suggest N further poses to record, the most telling first; 5 without N.",
 )
 @option.of_stages
-def calibrate_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Learn the projective kinematics from trial motions.
 
     Estimates both cameras and all joint operators from images alone, simulated from the configuration or
@@ -60,7 +65,7 @@ def calibrate_run(stages: Sequence[str], console: Console, **options: Any) -> in
 
 @main.stage("plan", epilog="Example: projservo plan -c configs/ur5.yaml --set trajectory.profile=exponential")
 @option.of_stages
-def plan_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Plan the task as a translation and two rotations.
 
     Partitions the task by the start and goal images and lays a path on which both cameras keep seeing the
@@ -87,7 +92,7 @@ def plan_run(stages: Sequence[str], console: Console, **options: Any) -> int:
     help="The run of that number of a sweep, made anew as a run of its own.",
 )
 @option.of_stages
-def servo_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Run the control laws in closed loop.
 
     Runs each law of control.laws (or of --law) to its verdict. Calibrates and plans first where needed. Exit
@@ -110,7 +115,7 @@ def servo_run(stages: Sequence[str], console: Console, **options: Any) -> int:
     "--animation", is_flag=True, help="Both camera images under several laws over time, animation.gif."
 )
 @option.of_stages
-def report_run(stages: Sequence[str], console: Console, *, sweep: Path | None, **options: Any) -> int:
+def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **options: Any) -> int:
     """Draw the figures and check the paper's claims.
 
     Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; and
@@ -220,6 +225,7 @@ def _require_named(chain: _Chain) -> None:
     A run file may come from anybody: what is stored in it is shown and compared, never imported. Classes
     that are named are imported, so that what cannot be found is known before any work.
     """
+    from projservo_cli.config import Override
     from projservo_cli.control import CODES
     from projservo_cli.records import InputError, law_and_mode
     from projservo_cli.robots import plugins
@@ -236,35 +242,17 @@ def _require_named(chain: _Chain) -> None:
     wanted = {("law", law): f"--law {law}" for law in laws if law not in CODES}
     if servo and plant is not None:
         wanted["plant", plant] = f"--set plant={plant}"
-    named = wanted.keys() if chain.options["config"] else _named_by(chain.options)
+    paths = {Override.parse(text).path for text in chain.options["sets"]}
+    named = {kind: bool(keys & paths) for kind, keys in _NAMING.items()}
+    named["law"] |= bool(chain.options.get("laws"))
     for (kind, target), flag in wanted.items():
-        if (kind, target) not in named:
+        if not (chain.options["config"] or named[kind]):
             raise InputError(
                 f"{kind} {target} is named by the stored run alone, which starts no code: give the "
                 f"configuration again with -c, or {flag}"
             )
     for kind, target in wanted:
         plugins.find(kind, target, METHODS if kind == "plant" else ("__call__",))
-
-
-def _named_by(options: Mapping[str, Any]) -> set[tuple[str, str | None]]:
-    """Robots and laws that the options name."""
-    from projservo_cli.config import Override
-    from projservo_cli.robots import plugins
-
-    found: set[tuple[str, str | None]] = {("law", name) for name in _law_names(options.get("laws", ()))}
-    for override in map(Override.parse, options["sets"]):
-        kind = {"plant": "plant", "control": "law"}.get(str(override.path[0]))
-        if kind is not None:
-            found |= {(kind, plugins.target_of(kind, text)) for text in _texts(override.value)}
-    return found
-
-
-def _texts(value: Any) -> list[str]:
-    if isinstance(value, str):
-        return [value]
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return [text for item in inner for text in _texts(item)]
 
 
 def _tell_dry(chain: _Chain) -> int:
@@ -423,9 +411,6 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
     # Other profiles are those of the paper, of which the margins are only measured.
     if "plan" in results and chain.run.plan.profile == "constrained" and not chain.run.plan.feasible:
         yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
-
-
-_UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")
 
 
 def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
