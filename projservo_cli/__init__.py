@@ -34,6 +34,8 @@ def load(run: "Path | str") -> "Experiment":
     projservo_cli.records.InputError
         When there is none, it is cut short, or another version made it.
     """
-    from projservo_cli.results import read  # so that importing the package stays light
+    from projservo_cli.results import Experiment  # so that importing the package stays light
+    from projservo_cli.store import load as stored
 
-    return read(run)
+    found = stored(run)
+    return Experiment(found.path, found.configuration, found.results)

@@ -4,8 +4,8 @@ import hashlib
 import os
 import platform
 import re
+import secrets
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -35,7 +35,6 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
             yield temporary
             if lasting:
                 _synchronise(temporary)
-            temporary.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
             temporary.replace(path)
             if lasting:
                 _synchronise(path.parent)
@@ -74,9 +73,12 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
         try:
             lock.acquire()
         except Timeout as error:
+            number = ""
+            with suppress(OSError):  # it may be gone by now
+                number = path.read_text(encoding="ascii", errors="replace").strip()
+            owner = f"process {number}" if number.isdecimal() else "another process"
             raise InputError(
-                f"{folder}: {_owner(path)} is at work there; wait for its end, or choose another folder "
-                "with -o"
+                f"{folder}: {owner} is at work there; wait for its end, or choose another folder with -o"
             ) from error
     try:
         with suppress(OSError):  # who it is only serves the message
@@ -129,11 +131,11 @@ def _neighbour(path: Path, folder: Path) -> Path:
     """A temporary file in ``folder`` for what shall become ``path``, named after who writes it."""
     if not folder.is_dir():
         raise InputError(f"{path}: cannot be written: {folder} is no folder; choose another")
-    prefix = f".{path.name}.{_machine()}.{os.getpid()}."
+    writer = f"{_machine()}.{os.getpid()}.{secrets.token_hex(4)}"
+    temporary = folder / f".{path.name}.{writer}.part"
     with _told(path, "; choose a folder you can write to"):
-        handle, name = tempfile.mkstemp(dir=folder, prefix=prefix, suffix=".part")
-    os.close(handle)
-    return Path(name)
+        temporary.touch(exist_ok=False)
+    return temporary
 
 
 def _clear_leftovers(folder: Path, name: str | None = None) -> None:
@@ -159,13 +161,6 @@ def _machine() -> str:
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
-def _owner(lock: Path) -> str:
-    try:
-        return f"process {int(lock.read_text(encoding='ascii'))}"
-    except (OSError, ValueError):
-        return "another process"
-
-
 def _synchronise(path: Path) -> None:
     if path.is_dir() and os.name == "nt":  # a folder cannot be opened there
         return
@@ -174,9 +169,3 @@ def _synchronise(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

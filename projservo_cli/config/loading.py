@@ -14,8 +14,8 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from projservo_cli.config.models import Config
-from projservo_cli.config.robot import CONTRADICTIONS, Root
-from projservo_cli.config.yaml_source import MAX_DEPTH, Document, Path, Problem, shortened
+from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
+from projservo_cli.config.yaml_source import MAX_DEPTH, Document, Path, shortened
 from projservo_cli.records import InputError
 
 _PHRASES = {
@@ -72,7 +72,7 @@ class Override:
             raise InputError(f"{shortened(flag)}: there is no such key")
         document = Document(value, flag)
         if document.problems:
-            raise InputError(f"{flag}: the value is {document.problems[0].what}")
+            raise InputError(f"{flag}: the value is {document.problems[0][1]}")
         path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(steps))
         if path == ("law",):
             return cls(flag, ("control", "laws"), [document.values])
@@ -100,8 +100,7 @@ def load_config(
     if not isinstance(document.values, dict):
         raise InputError(f"{document.place(())}: expected keys and values such as name: paper")
     if path is not None and not document.values and not document.problems:
-        what = "the configuration is empty; start from one of the shipped ones"
-        document.problems.append(Problem((), what))
+        document.wrong((), "the configuration is empty; start from one of the shipped ones")
     _spell_out(document.values)
     for change in changes:
         document.override(change.path, change.value, change.flag)
@@ -114,7 +113,7 @@ def validated(model: type[_Model], document: Document) -> _Model:
     """The configuration that a document holds; an InputError with all that is wrong with it."""
     wrong: list[ErrorDetails] = []
     try:
-        if all(problem.path for problem in document.problems):  # of a text that is none, no more can be said
+        if all(path for path, *_ in document.problems):  # of a text that is none, no more can be said
             config = model.model_validate(document.values)
     except ValidationError as error:
         wrong = error.errors(include_url=False)
@@ -125,8 +124,10 @@ def validated(model: type[_Model], document: Document) -> _Model:
         except ValidationError as error:
             more = error.errors(include_url=False)
             wrong = [*(part for part in more if part["type"] == CONTRADICTIONS), *wrong]
-    if document.problems or wrong:
-        raise document.refused([*document.problems, *_translated(model, wrong)])
+    for path, what in _translated(model, wrong):
+        document.wrong(path, what)
+    if document.problems:
+        raise document.refused()
     return config
 
 
@@ -181,16 +182,16 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
             values.setdefault("name", pathlib.Path(file).stem)
 
 
-def _translated(model: type[Root], errors: Sequence[ErrorDetails]) -> Iterator[Problem]:
+def _translated(model: type[Root], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
     """What pydantic found, in words."""
     places = [error["loc"] for error in errors]
     for error, place in list(zip(errors, places, strict=True))[:_MOST]:
         if error["type"] == CONTRADICTIONS:
-            yield from (Problem(path, what) for path, what in error["ctx"]["found"])
+            yield from error["ctx"]["found"]
             continue
         inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
         if not (inside and error["type"] == "too_short"):  # a list counts only its valid entries
-            yield Problem(place, _phrase(model, error))
+            yield place, _phrase(model, error)
 
 
 def _phrase(model: type[Root], error: ErrorDetails) -> str:

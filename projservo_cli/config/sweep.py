@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field
 from projservo_cli.config.loading import Override, validated
 from projservo_cli.config.models import FolderName, Plain, one_or_more
 from projservo_cli.config.robot import Count, Finding, Number, Positive, Root, Section, Whole
-from projservo_cli.config.yaml_source import Document, Problem
+from projservo_cli.config.yaml_source import Document
 
 BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 
@@ -114,8 +114,9 @@ def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> Sweep
     """
     document = Document.read(path)
     if not isinstance(document.values, dict):
-        what = "expected keys and values such as base: paper.yaml"
-        raise document.refused(document.problems or [Problem((), what)])
+        if not document.problems:
+            document.wrong((), "expected keys and values such as base: paper.yaml")
+        raise document.refused()
     for change in map(Override.parse, overrides):
         document.override(change.path, change.value, change.flag)
     document.values.setdefault("name", pathlib.Path(path).stem)

@@ -7,8 +7,7 @@ text. Duplicate keys are refused; aliases, nesting and size are bounded.
 import math
 import pathlib
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Any
 
 import yaml
@@ -27,19 +26,6 @@ _MAX_VALUES = 50_000  # aliases counted as often as they are used
 MAX_DEPTH = 32
 _MOST_LINES = 50  # that are told of what is wrong
 _STANDARD = "tag:yaml.org,2002:"
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Something wrong at one place of the configuration.
-
-    ``path`` leads through keys and list positions; ``source`` names a place no path leads to, and
-    then wins.
-    """
-
-    path: Path
-    what: str
-    source: str = ""
 
 
 def shortened(text: str, most: int = 80) -> str:
@@ -69,19 +55,23 @@ class Document:
     def __init__(self, text: str, name: str) -> None:
         self.name = name
         self.places: dict[Path, str] = {}
-        self.problems: list[Problem] = []
+        self.problems: list[tuple[Path, str, str]] = []  # path, what is wrong, place if no path leads to it
         self.values: Any = None
         self._count = 0
         try:
             self._parse(text)
         except _UnfitError as error:
-            self.problems.append(Problem((), str(error), name))
+            self.wrong((), str(error), name)
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark or error.context_mark
             place = self._place(mark) if mark else name
-            self.problems.append(Problem((), f"not valid YAML: {error.problem or error.context}", place))
+            self.wrong((), f"not valid YAML: {error.problem or error.context}", place)
         except yaml.YAMLError as error:
-            self.problems.append(Problem((), f"not valid YAML: {' '.join(str(error).split())}", name))
+            self.wrong((), f"not valid YAML: {' '.join(str(error).split())}", name)
+
+    def wrong(self, path: Path, what: str, place: str = "") -> None:
+        """Note something wrong, where ``path`` stands or at a place that no path leads to."""
+        self.problems.append((path, what, place))
 
     @classmethod
     def read(cls, path: pathlib.Path | str) -> "Document":
@@ -121,7 +111,7 @@ class Document:
         if node.tag not in {_STANDARD + kind for kind in ("map", "seq", "str")}:
             tag = shortened(node.tag.replace(_STANDARD, "!!"))
             what = f"the tag {tag} is not allowed; plain values only"
-            self.problems.append(Problem(path, what, self._place(node.start_mark)))
+            self.wrong(path, what, self._place(node.start_mark))
             return None
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, path)
@@ -136,11 +126,11 @@ class Document:
             place = self._place(key_node.start_mark)
             key = key_node.value
             if not isinstance(key_node, yaml.ScalarNode):
-                self.problems.append(Problem(path, "a key must be plain text", place))
+                self.wrong(path, "a key must be plain text", place)
             elif key in values:
                 first = self.places[(*path, key)].removeprefix(f"{self.name}:")
                 what = f"the key stands here a second time (first at {first}); keep one"
-                self.problems.append(Problem((*path, key), what, place))
+                self.wrong((*path, key), what, place)
             else:
                 self.places[(*path, key)] = place
                 values[key] = self._value(value_node, (*path, key))
@@ -154,7 +144,7 @@ class Document:
             return meaning(node.value)
         except ValueError:  # of more digits than Python converts
             what = "cannot be read as a number"
-            self.problems.append(Problem(path, what, self._place(node.start_mark)))
+            self.wrong(path, what, self._place(node.start_mark))
             return None
 
     def override(self, path: Path, value: Any, flag: str) -> None:
@@ -166,10 +156,10 @@ class Document:
             if isinstance(holder, list):
                 if not isinstance(step, int) or step >= len(holder):
                     what = f"expected a list position from 0 to {len(holder) - 1}"
-                    return self.problems.append(Problem(here, what, flag))
+                    return self.wrong(here, what, flag)
             elif not isinstance(holder, dict):
                 what = "there is a plain value where a section is expected"
-                return self.problems.append(Problem(here, what, flag))
+                return self.wrong(here, what, flag)
             if here == path or (isinstance(holder, dict) and holder.get(key) is None):
                 holder[key] = value if here == path else {}
                 inside = [known for known in self.places if known[: len(here)] == here]
@@ -185,13 +175,12 @@ class Document:
             path = path[:-1]
         return self.places.get(path, self.name)
 
-    def refused(self, found: Sequence[Problem]) -> InputError:
+    def refused(self) -> InputError:
         """One line a problem, flags last, otherwise in the order of the file; of very many the first."""
         told = []
-        for problem in found:
-            place = problem.source or self.place(problem.path)
-            dotted = shortened(".".join(map(str, problem.path)), 200)
-            parts = (place, dotted, shortened(problem.what, 1000))
+        for path, what, source in self.problems:
+            place = source or self.place(path)
+            parts = (place, shortened(".".join(map(str, path)), 200), shortened(what, 1000))
             told.append((_position(place), ": ".join(part for part in parts if part)))
         different = list(dict.fromkeys(line for _, line in sorted(told, key=lambda item: item[0])))
         left = len(different) - _MOST_LINES

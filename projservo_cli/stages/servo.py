@@ -25,7 +25,7 @@ from projservo_cli.records import (
     WorkFailed,
     law_and_mode,
 )
-from projservo_cli.results import ImageModel, image_model
+from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant
@@ -214,7 +214,7 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
     if law not in CODES:
         known = scenario.calibration.marker.tolist()
         face = np.array([known.index(number) for number in scenario.numbers[: scenario.m]])
-        model = image_model(scenario.calibration)
+        model = ImageModel(**vars(scenario.calibration))
         setup = LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period)
         # What a law writes to must not be what other laws are given.
         own = copy.deepcopy(setup)
