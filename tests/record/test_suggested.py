@@ -1,7 +1,6 @@
 """Suggested poses are recorded and make the next calibration better: the loop a user goes through."""
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -73,25 +72,3 @@ def test_a_table_in_degrees_gets_suggestions_in_degrees(projservo):
     assert answer.json["suggestions_unit"] == "deg"
     motions = read_joints("run/suggestions.csv", "RRPRRR", "deg")
     np.testing.assert_allclose(motions.q[0], answer.json["suggestions"][0]["q"], rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["calibrate", "--suggest", "0"], "--suggest"),
-        (["calibrate", "--suggest=many"], "--suggest"),
-        (["calibrate", "--suggest", "3", "--set", "calibration.method=closed_form"], "has no covariance"),
-        (["plan", "--suggest", "3"], "--suggest: not used by plan"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_before_any_work(projservo, words, message):
-    answer = projservo(*words, *STANFORD, "-o", "run")
-    assert answer.code == 2
-    assert message in answer.err.splitlines()[-1]
-    assert not Path("run").exists()
-
-
-def test_dry_run_suggests_nothing(projservo):
-    answer = projservo("calibrate", *STANFORD, "-o", "run", "--suggest", "-n", "--json")
-    assert json.loads(answer.out)["dry_run"] is True
-    assert not Path("run").exists()
