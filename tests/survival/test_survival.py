@@ -16,7 +16,7 @@ from projservo_cli.store import load
 from projservo_cli.tables import read_joints, read_table
 from tests.conftest import ROOT
 from tests.survival.changes import CSV, YAML, Change
-from tests.survival.kills import Study
+from tests.survival.kills import killed
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="calls are forked here")
 SECONDS = 30.0  # of the processor; 7 where lines are counted. What unfolds without bounds takes minutes
@@ -84,7 +84,5 @@ def test_mistaken_configurations_and_tables_end_in_messages(tmp_path, first):
 
 @pytest.mark.volume
 def test_a_killed_call_leaves_whole_files_and_is_finished_by_the_next(tmp_path):
-    kills = Study(tmp_path)
-    for share in (0.3, 0.8):
-        assert kills.kill(share * kills.seconds) == []
+    assert killed(tmp_path / "killed", (0.3, 0.8)) == [[], []]
     assert load(tmp_path / "killed").traces.keys() == {"direct_three", "stacked"}
