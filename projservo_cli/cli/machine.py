@@ -1,5 +1,6 @@
 """A machine and how to begin on it: ``init``, ``schema``, ``doctor`` and ``bench``."""
 
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -27,7 +28,7 @@ def init(console: Console, *, file: Path, force: bool) -> None:
     Writes a configuration that runs as it is, with a comment on every key, and beside it the schema by which
     editors complete and check it.
     """
-    from projservo_cli.config.schema import json_schema, schema_text, starter
+    from projservo_cli.config.schema import json_schema, starter
     from projservo_cli.records import InputError
 
     path = file / _STARTER if file.is_dir() else file
@@ -36,7 +37,7 @@ def init(console: Console, *, file: Path, force: bool) -> None:
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
     _write(path, starter())
-    _write(described, schema_text(json_schema()))
+    _write(described, _as_text(json_schema()))
     words = (
         f"init: {path}, with {described} for editors",
         f"next: projservo calibrate plan servo report -c {path}",
@@ -54,14 +55,18 @@ def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     Editors that speak YAML complete and check a configuration whose first line names the schema: #
     yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.
     """
-    from projservo_cli.config.schema import json_schema, schema_text, sweep_schema
+    from projservo_cli.config.schema import json_schema, sweep_schema
 
     schema = sweep_schema() if what else json_schema()
     if output is None:
         console.as_json = True
         console.tell(schema, ())
     else:
-        _write(output, schema_text(schema))
+        _write(output, _as_text(schema))
+
+
+def _as_text(schema: dict[str, Any]) -> str:
+    return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
 def _write(path: Path, text: str) -> None:

@@ -154,7 +154,10 @@ class Console:
 
 
 def summary(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:
-    """Lines on a stage's object, at most 80 columns wide; ``detailed`` tells every claim and margin."""
+    """Lines on the object of a stage, or of the report of a ``sweep``, at most 80 columns wide.
+
+    ``detailed`` tells every claim and margin.
+    """
     if "failed" in value:  # the reason is told with the exit code
         yield f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
     elif stage == "calibrate":
@@ -163,6 +166,8 @@ def summary(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Ite
         yield from _of_plan(value, detailed)
     elif stage == "servo":
         yield from _of_laws(value)
+    elif stage == "sweep":
+        yield from _of_sweep(value)
     else:
         yield from _of_report(value, detailed)
 
@@ -281,7 +286,7 @@ def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3g}"
 
 
-def sweep_summary(found: dict[str, Any]) -> Iterator[str]:
+def _of_sweep(found: dict[str, Any]) -> Iterator[str]:
     """The table of cells, and that of pairs of laws on the same tasks."""
     yield (
         f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; "

@@ -10,7 +10,7 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
-from projservo_cli.cli.output import Console, summary, sweep_summary, wrapped
+from projservo_cli.cli.output import Console, summary, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _EXTRAS = ("view", "animation")
@@ -430,5 +430,5 @@ def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
         found, files = report(folder, FORMATS, console.progress)
     value = {"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]}
     names = ", ".join(path.name for path in files)
-    console.tell(value, [*sweep_summary(found), wrapped(f"files: {folder.path}: {names}")])
+    console.tell(value, [*summary("sweep", found), wrapped(f"files: {folder.path}: {names}")])
     return 0

@@ -45,7 +45,7 @@ def sweep(
     the work; it needs pip install 'projservo[cluster]' here and there.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
-    from projservo_cli.config.sweep import load_sweep
+    from projservo_cli.config import load_sweep
     from projservo_cli.files import require_writable, working_in
     from projservo_cli.records import InputError
     from projservo_cli.sweep.design import read_design

@@ -15,6 +15,7 @@ from pydantic_core import ErrorDetails
 
 from projservo_cli.config.models import Config
 from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
+from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.config.yaml_source import MAX_DEPTH, Document, Path, shortened
 from projservo_cli.records import InputError
 
@@ -106,10 +107,28 @@ def load_config(
         document.override(change.path, change.value, change.flag)
         _spell_out(document.values)
     _fill_in(document.values, path)
-    return validated(Config, document)
+    return _validated(Config, document)
 
 
-def validated(model: type[_Model], document: Document) -> _Model:
+def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
+    """Read and check the configuration of a sweep; ``base`` becomes absolute paths.
+
+    Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
+    """
+    document = Document.read(path)
+    if not isinstance(document.values, dict):
+        if not document.problems:
+            document.wrong((), "expected keys and values such as base: paper.yaml")
+        raise document.refused()
+    for change in map(Override.parse, overrides):
+        document.override(change.path, change.value, change.flag)
+    document.values.setdefault("name", pathlib.Path(path).stem)
+    sweep = _validated(SweepConfig, document)
+    folder = pathlib.Path(path).parent
+    return sweep.model_copy(update={"base": tuple(str((folder / base).resolve()) for base in sweep.base)})
+
+
+def _validated(model: type[_Model], document: Document) -> _Model:
     """The configuration that a document holds; an InputError with all that is wrong with it."""
     wrong: list[ErrorDetails] = []
     try:

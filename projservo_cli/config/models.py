@@ -127,7 +127,7 @@ _Mode = Literal["replan", "track", "image_track"]
 _Modes = Annotated[tuple[_Mode, ...], Field(min_length=1)]
 
 
-class Noise(Section):
+class _Noise(Section):
     """Standard deviation of simulated pixel noise, per coordinate."""
 
     calibration_px: NotNegative = Field(0.5, description="in the images of trial motions")
@@ -404,16 +404,15 @@ def _joint_vectors(
         vectors["task", "start_offset"] = task.start_offset
         vectors["task", "goal", "joints"] = task.goal.joints
     for path, vector in vectors.items():
-        if vector is None or not types:
-            continue
-        if len(vector.joints) != len(types):
+        if vector is not None and types:
             yield from vector.miscounted(types, *path)
-        elif path[-1] in ("reference", "start") and robot is not None and robot.joint_types == types:
-            yield from _beyond_limits(robot, vector, *path)
+            if path[-1] in ("reference", "start") and robot is not None and robot.joint_types == types:
+                yield from _beyond_limits(robot, vector, *path)
 
 
 def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Iterator[Finding]:
-    for i, (value, joint) in enumerate(zip(vector.values(robot.joint_types), robot.joints, strict=True)):
+    values = vector.values(robot.joint_types) if len(vector.joints) == len(robot.joints) else ()
+    for i, (value, joint) in enumerate(zip(values, robot.joints, strict=False)):
         low, high = joint.limits
         if not low <= value <= high and not any(joint.contradictions()):
             turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
@@ -505,7 +504,7 @@ class Config(Root):
     robot: RobotSettings | None = None
     rig: Rig | None = None
     markers: Markers | None = None
-    noise: Noise = Noise()
+    noise: _Noise = _Noise()
     calibration: _CalibrationSettings = _CalibrationSettings()
     data: _Data | None = None
     task: TaskSettings | None = None

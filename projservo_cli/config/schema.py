@@ -1,6 +1,5 @@
 """What helps to write a configuration: a commented one to start from, and JSON Schemas for editors."""
 
-import json
 import re
 import textwrap
 from collections.abc import Iterator
@@ -49,11 +48,6 @@ class _Generator(GenerateJsonSchema):
 
     def normalize_name(self, name: str) -> str:
         return super().normalize_name(name).lstrip("_")
-
-
-def schema_text(schema: dict[str, Any]) -> str:
-    """A schema as the text of a file."""
-    return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
 def _plain(value: Any) -> Any:

@@ -2,15 +2,13 @@
 
 import json
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from projservo_cli.config.loading import Override, validated
 from projservo_cli.config.models import FolderName, Plain, one_or_more
 from projservo_cli.config.robot import Count, Finding, Number, Positive, Root, Section, Whole
-from projservo_cli.config.yaml_source import Document
 
 BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 
@@ -105,21 +103,3 @@ class SweepConfig(Root):
         """Keys of the configuration that an axis of the grid sets."""
         keys = self.grid[name].keys
         return (name,) if keys == ("",) else keys
-
-
-def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
-    """Read and check the configuration of a sweep; ``base`` becomes absolute paths.
-
-    Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
-    """
-    document = Document.read(path)
-    if not isinstance(document.values, dict):
-        if not document.problems:
-            document.wrong((), "expected keys and values such as base: paper.yaml")
-        raise document.refused()
-    for change in map(Override.parse, overrides):
-        document.override(change.path, change.value, change.flag)
-    document.values.setdefault("name", pathlib.Path(path).stem)
-    sweep = validated(SweepConfig, document)
-    folder = pathlib.Path(path).parent
-    return sweep.model_copy(update={"base": tuple(str((folder / base).resolve()) for base in sweep.base)})

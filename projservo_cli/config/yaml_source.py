@@ -194,15 +194,12 @@ def _position(place: str) -> tuple[float, float]:
 
 
 def _require_bounded(text: str) -> None:
-    """Refuse what is nested too deep or too long before nodes are made of it, which recurses in C."""
-    depth = count = 0
+    """Refuse what is nested too deep before nodes are made of it, which recurses in C."""
+    depth = 0
     for event in yaml.parse(text, Loader=_Loader):
-        count += isinstance(event, yaml.NodeEvent)
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > MAX_DEPTH:
             raise _UnfitError(f"nested more than {MAX_DEPTH} levels deep")
-        if count > 2 * _MAX_VALUES:  # keys and values
-            raise _UnfitError(f"more than {_MAX_VALUES} values")
 
 
 class _UnfitError(ValueError):

@@ -60,18 +60,13 @@ def test_a_configuration_loads_with_defaults_and_units(good):
         config.seed = 3
 
 
-def test_resolved_yaml_loads_to_an_equal_configuration(good):
-    config = load_config(good)
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_resolved_yaml_loads_to_an_equal_configuration(path):
+    config = load_config(path)
     again = load_config("stored.yaml", text=to_yaml(config))
     assert again == config
+    assert config.name == path.stem
     assert digest(again, list(Config.model_fields)) == digest(config, list(Config.model_fields))
-
-
-def test_shipped_configurations_load():
-    for path in SHIPPED:
-        config = load_config(path)
-        assert config.name == path.stem
-        assert load_config(path, text=to_yaml(config)) == config
 
 
 def test_all_errors_come_at_once_each_with_line_and_column(tmp_path):
@@ -212,9 +207,8 @@ def test_screws_are_checked(good):
     ("override", "message"),
     [
         ("control.gain_t", "expected KEY=VALUE"),
-        ("control.gain_t=[1", "not valid YAML"),
+        ("control.gain_t=[1", "the value is not valid YAML"),
         ("control.gain_t=-1", "control.gain_t: must be greater than 0, not -1"),
-        ("control.gain_x=3", "control.gain_x: unknown key; did you mean gain_"),
         ("controls.gain=3", "controls: unknown key; did you mean control?"),
         ("robot.dh.joints.5.d_m=1", "robot.dh.joints.5: expected a list position from 0 to 1"),
         ("seed.x=1", "seed.x: there is a plain value"),
@@ -223,8 +217,7 @@ def test_screws_are_checked(good):
 )
 def test_errors_in_overrides_name_the_flag(good, override, message):
     (found,) = errors(good, override)
-    assert found.startswith(f"--set {override}: ")
-    assert message in found
+    assert found.startswith(f"--set {override}: {message}")
 
 
 def test_overrides_reach_lists_and_make_sections(good):
@@ -271,10 +264,8 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize("case", UNREADABLE)
-def test_unreadable_text_is_refused(tmp_path, case):
-    path = tmp_path / "c.yaml"
-    path.write_text(UNREADABLE[case], encoding="utf-8")
-    assert all(line.startswith(str(path)) for line in errors(path))
+def test_unreadable_text_is_refused(case):
+    assert all(line.startswith("c.yaml") for line in errors("c.yaml", text=UNREADABLE[case]))
 
 
 def test_duplicate_keys_are_refused_with_both_places(good):

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config
+from projservo_cli.config import load_config, load_sweep
 from projservo_cli.config.schema import starter
-from projservo_cli.config.sweep import load_sweep
 from projservo_cli.records import InputError
 from projservo_cli.store import load
 from projservo_cli.tables import read_joints, read_table
