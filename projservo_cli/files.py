@@ -29,9 +29,11 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
     with _told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     _clear_leftovers(path.parent, path.name)
-    temporary = _neighbour(path, path.parent)
+    writer = f"{_machine()}.{os.getpid()}.{secrets.token_hex(4)}"
+    temporary = path.with_name(f".{path.name}.{writer}.part")
     try:
         with _told(path):
+            temporary.touch(exist_ok=False)
             yield temporary
             if lasting:
                 _synchronise(temporary)
@@ -40,16 +42,6 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
                 _synchronise(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def require_writable(path: Path) -> None:
-    """Make sure that ``path`` could be written, before the work whose result it shall hold.
-
-    Nothing is left behind: where folders lack, the nearest one there is stands for them.
-
-    Raises InputError when there is no such folder, or it cannot be written to.
-    """
-    _neighbour(path, next(parent for parent in path.absolute().parents if parent.exists())).unlink()
 
 
 @contextmanager
@@ -125,17 +117,6 @@ def _told(path: Path, remedy: str = "") -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}{remedy}") from error
-
-
-def _neighbour(path: Path, folder: Path) -> Path:
-    """A temporary file in ``folder`` for what shall become ``path``, named after who writes it."""
-    if not folder.is_dir():
-        raise InputError(f"{path}: cannot be written: {folder} is no folder; choose another")
-    writer = f"{_machine()}.{os.getpid()}.{secrets.token_hex(4)}"
-    temporary = folder / f".{path.name}.{writer}.part"
-    with _told(path, "; choose a folder you can write to"):
-        temporary.touch(exist_ok=False)
-    return temporary
 
 
 def _clear_leftovers(folder: Path, name: str | None = None) -> None:

@@ -178,7 +178,6 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
 def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> _Chain:
     """What is to be done, by the configuration and what the run holds; refused where it must not be."""
-    from projservo_cli.files import require_writable
     from projservo_cli.stages.steps import steps_for
 
     given = _law_names(options.get("laws", ()))
@@ -196,8 +195,6 @@ def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -
     chain = _Chain(console, names, options, tuple(s.law for s in steps if s.law), config, stored, steps)
     if not options["dry_run"]:
         _require_named(chain)
-        if any(step.why for step in steps):
-            require_writable(stored.path)
     return chain
 
 

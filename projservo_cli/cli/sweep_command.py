@@ -46,7 +46,7 @@ def sweep(
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config import load_sweep
-    from projservo_cli.files import require_writable, working_in
+    from projservo_cli.files import working_in
     from projservo_cli.records import InputError
     from projservo_cli.sweep.design import read_design
     from projservo_cli.sweep.driver import run as run_sweep
@@ -61,7 +61,6 @@ def sweep(
             raise InputError(
                 "-j and --scheduler: the workers of a scheduler are as many as it has; leave -j out"
             )
-        require_writable(folder.table)
         engine = Cluster(scheduler) if scheduler else Engine(threads or os.cpu_count() or 1)
         where = f"{engine.workers} workers of {scheduler}" if scheduler else "here"
         console.say(f"{design.total} runs, {design.sweep.runs} in each of {design.cells} cells, {where}")

@@ -164,7 +164,10 @@ USAGE = {
     "joints of no table": ([*TINY, "--joints", "RR"], "--joints RR: data.table: is missing"),
     "override of nothing": ([*TINY, "--set", "sed=1"], "--set sed=1: sed: unknown key; did you mean"),
     "a file for a folder": ([*TINY, "-o", "t.csv/out"], "t.csv/out"),
-    "a folder below a file": (["calibrate", "-o", "t.csv/out"], "is no folder; choose another"),
+    "a folder below a file": (
+        ["calibrate", "-o", "t.csv/out"],
+        "cannot be written: Not a directory",
+    ),
     "a table for a run": ([*TINY, "-o", "t.csv"], "not a run file"),
 }
 
