@@ -95,8 +95,7 @@ def read_joints(path: Path | str, joint_types: str | None = None, joint_unit: st
     """Read a list of joint readings, one pose a row: columns ``q1 … qN``, perhaps ``pose, left, right``.
 
     joint_types : as for an observation table.
-    joint_unit : ``deg`` or ``rad`` as for an observation table; ``as is`` for readings that are only passed
-        on.
+    joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
     Raises InputError ``file:line: what`` when the file cannot be read, a row makes no sense or a pose stands
     there twice.
     """
@@ -115,9 +114,8 @@ def read_joints(path: Path | str, joint_types: str | None = None, joint_unit: st
             raise InputError(f"{row.where}: an image has no name; name both, or drop the row")
     if not readings:
         raise InputError(f"{sheet.file}: there is a header but no rows; no pose was given")
-    poses, q = np.array([*lines], dtype=np.int64), np.array(readings)
-    if joint_unit != "as is":
-        q = sheet.in_radians(poses, q, joint_unit)
+    poses = np.array([*lines], dtype=np.int64)
+    q = sheet.in_radians(poses, np.array(readings), joint_unit)
     left, right = zip(*names, strict=True) if names[0] else (None, None)
     return JointList(poses, q, "pose" in sheet.columns, left, right)
 

@@ -162,7 +162,7 @@ def detect(
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
-    joints = read_joints(joints_csv, joint_unit="as is")
+    joints = read_joints(joints_csv, joint_unit="rad")  # as they are, whatever their unit
     pairs = pair_images(left, right, joints, joints_csv)
     observation, found = observe(pairs, joints.q, finder, points, console.progress)
     write_table(observation, output)

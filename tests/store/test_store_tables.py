@@ -125,7 +125,7 @@ LIST = ["pose,q1,q2,left,right", "7,1,90,a.png,b.png", "3,2,-90,c.png,d.png"]
 
 
 def test_a_list_of_joints_has_numbers_and_images_or_not(tmp_path):
-    joints = read_joints(written(tmp_path, *LIST), joint_unit="as is")
+    joints = read_joints(written(tmp_path, *LIST), joint_unit="rad")
     assert (joints.pose.tolist(), joints.q.tolist()) == ([7, 3], [[1, 90], [2, -90]])
     assert (joints.left, joints.right) == (("a.png", "c.png"), ("b.png", "d.png"))
     plain = read_joints(written(tmp_path, "q2,q1", "90,1", "", "-90,2"), "PR", "deg")
