@@ -272,7 +272,7 @@ def _without_unset(value: Any) -> Any:
         return {
             key: _without_unset(inner)
             for key, inner in value
-            if inner is not None or key not in fields or fields[key].default is not None
+            if inner is not None or fields[key].default is not None
         }
     return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
 
