@@ -409,7 +409,7 @@ def _believed(path: Path) -> _Believed:
             "camera_left, camera_right, markers_tool and T_base_tool_at_reference"
         ) from error
     except (RecursionError, ValueError) as error:
-        raise InputError(f"{path}: not UTF-8 text of JSON; expected screws, cameras, markers") from error
+        raise InputError(f"{path}: not JSON, or not UTF-8; expected screws, cameras, markers") from error
 
 
 def _twist(where: str, screw: _Screw) -> FloatArray:
