@@ -14,9 +14,9 @@ _FAR = 20.0
 
 
 @main.command("record", epilog="Example: projservo record -c configs/stanford.yaml --output trials.csv")
-@option.configuration("Configuration (YAML). Default: paper.yaml.")
+@option.configuration(help="Configuration (YAML). Default: paper.yaml.")
 @option.override
-@option.output("TABLE", "Observation table to write (CSV).", required=True)
+@option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
 @click.option(
     "--motions",
     metavar="CSV",
@@ -26,7 +26,7 @@ _FAR = 20.0
 @option.joint_unit
 @option.speed_scale
 @option.confirm
-@option.force("Begin anew, whatever stands in the table.")
+@option.force(help="Begin anew, whatever stands in the table.")
 @option.dry_run
 @option.told
 def _record(
@@ -104,7 +104,7 @@ def _tell_recording(console: Console, recording: Any) -> None:
 )
 @click.argument("left")
 @click.argument("right")
-@option.output("TABLE", "Observation table to write (CSV).", required=True)
+@option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
 @click.option(
     "--joints-csv",
     metavar="CSV",
@@ -126,7 +126,7 @@ def _tell_recording(console: Console, recording: Any) -> None:
     show_default=True,
     help="Four markers a tag, or one.",
 )
-@option.force("Replace the table if there is one.")
+@option.force(help="Replace the table if there is one.")
 @option.told
 def detect(
     console: Console,
@@ -192,7 +192,7 @@ def detect(
 
 @main.command(epilog="Example: projservo validate results/mine --data validation.csv")
 @click.argument("run", required=False, type=option.PATH)
-@option.output("DIR", "The run, instead of an argument.")
+@option.output(metavar="DIR", help="The run, instead of an argument.")
 @click.option("--data", metavar="TABLE", type=option.PATH, required=True, help="Observation table (CSV).")
 @click.option(
     "--joint-unit",

@@ -16,7 +16,7 @@ from projservo_cli.cli.output import Console, summary, wrapped
 
 @main.command(epilog="Example: projservo show results/ur5 --json")
 @click.argument("run", required=False, type=option.PATH)
-@option.output("DIR", "The run, instead of an argument.")
+@option.output(metavar="DIR", help="The run, instead of an argument.")
 @option.told
 def show(console: Console, *, run: Path | None, output: Path | None) -> None:
     """Show what a run holds and how it was made.
@@ -64,8 +64,8 @@ def _made(provenance: Any) -> str:
 
 @main.command(epilog="Example: projservo compare results/paper results/ur5 -o both.html")
 @click.argument("runs", nargs=-1, required=True, type=option.PATH, metavar="RUN RUN ...")
-@option.output("PAGE", "Page to write.", default="compare.html", show_default=True)
-@option.force("Replace the page if there is one.")
+@option.output(metavar="PAGE", help="Page to write.", default="compare.html", show_default=True)
+@option.force(help="Replace the page if there is one.")
 @option.told
 def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bool) -> None:
     """Show runs side by side on one page.
@@ -90,8 +90,8 @@ def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bo
 
 @main.command(epilog="Example: projservo export results/ur5 -o tables")
 @click.argument("run", type=option.PATH)
-@option.output("DIR", "Folder to write. Default: csv beside run.h5.")
-@option.force("Replace what is there.")
+@option.output(metavar="DIR", help="Folder to write. Default: csv beside run.h5.")
+@option.force(help="Replace what is there.")
 @click.option("--to", type=click.Choice(["csv"]), default="csv", help="Kind of files.", expose_value=False)
 @option.told
 def export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:

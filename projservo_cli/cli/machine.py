@@ -20,7 +20,7 @@ _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu"
 
 @main.command(epilog="Example: projservo init mine.yaml")
 @click.argument("file", default=_STARTER, type=option.PATH)
-@option.force("Replace the file if there is one.")
+@option.force(help="Replace the file if there is one.")
 @option.told
 def init(console: Console, *, file: Path, force: bool) -> None:
     """Write a commented configuration to start from.
@@ -47,7 +47,7 @@ def init(console: Console, *, file: Path, force: bool) -> None:
 
 @main.command("schema", epilog="Example: projservo schema -o schema.json")
 @click.argument("what", required=False, metavar="[sweep]", type=click.Choice(["sweep"]))
-@option.output("FILE", "File to write. Default: standard output.")
+@option.output(metavar="FILE", help="File to write. Default: standard output.")
 @option.told
 def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     """Print the JSON Schema of the configuration.
@@ -161,7 +161,7 @@ def _found(value: dict[str, Any]) -> Iterator[str]:
 
 
 @main.command(epilog="Example: projservo bench --json")
-@option.configuration("Configuration (YAML) with a simulated task. Default: paper.yaml.")
+@option.configuration(help="Configuration (YAML) with a simulated task. Default: paper.yaml.")
 @option.override
 @option.told
 def bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> None:

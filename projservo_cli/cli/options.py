@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from projservo_cli.store import Run
 
 _Function = Callable[..., Any]
-_Decorator = Callable[[_Function], _Function]
 
 PATH = click.Path(path_type=Path)
 _RESULTS = Path("results")
@@ -30,6 +29,12 @@ _KEYS = {  # that options stand for
     "cross_validate": ("calibration", "cross_validate"),
     "lens": ("calibration", "lens"),
 }
+
+# Options of which each command says for itself what they do.
+configuration = functools.partial(click.option, "-c", "--config", metavar="FILE", type=click.Path())
+output = functools.partial(click.option, "-o", "--output", type=PATH)
+force = functools.partial(click.option, "--force", is_flag=True)
+threads = functools.partial(click.option, "-j", "--threads", metavar="N", type=click.IntRange(1, 256))
 
 override = click.option(
     "--set",
@@ -47,26 +52,6 @@ dry_run = click.option("-n", "--dry-run", is_flag=True, help="Say what would be 
 speed_scale = click.option(
     "--speed-scale", metavar="S", type=float, help="Scale every command by S, above 0 and at most 1."
 )
-
-
-def configuration(help: str, **settings: Any) -> _Decorator:
-    """``-c``."""
-    return click.option("-c", "--config", metavar="FILE", type=click.Path(), help=help, **settings)
-
-
-def output(metavar: str, help: str, **settings: Any) -> _Decorator:
-    """``-o``, a path."""
-    return click.option("-o", "--output", metavar=metavar, type=PATH, help=help, **settings)
-
-
-def force(help: str) -> _Decorator:
-    """``--force``."""
-    return click.option("--force", is_flag=True, help=help)
-
-
-def threads(help: str) -> _Decorator:
-    """``-j``."""
-    return click.option("-j", "--threads", metavar="N", type=click.IntRange(1, 256), help=help)
 
 
 def _with_terminal(context: click.Context, parameter: click.Parameter, value: bool) -> bool:
@@ -103,15 +88,11 @@ def told(function: _Function) -> _Function:
 
 
 _OF_STAGES = (
-    configuration("Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml."),
-    override,
-    click.option(
-        "-o",
-        "--output",
-        metavar="DIR",
-        type=click.Path(),
-        help="Folder of the run, or its run.h5. Default: results/<configuration name>.",
+    configuration(
+        help="Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml."
     ),
+    override,
+    output(metavar="DIR", help="Folder of the run, or its run.h5. Default: results/<configuration name>."),
     click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     joint_unit,
@@ -122,9 +103,9 @@ _OF_STAGES = (
         metavar="WxH",
         help="Size of the table's images, px. Default: that of rig, else from where markers were seen.",
     ),
-    force("Make the named stages even where they are up to date."),
+    force(help="Make the named stages even where they are up to date."),
     dry_run,
-    threads("Threads. Default: all processors."),
+    threads(help="Threads. Default: all processors."),
     told,
     click.pass_obj,  # the names of the stages of the call
 )

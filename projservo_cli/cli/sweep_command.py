@@ -11,12 +11,12 @@ from projservo_cli.cli.output import Console
 
 
 @main.command(epilog="Example: projservo sweep -c configs/sweep_noise.yaml -j 2")
-@option.configuration("Configuration of the sweep (YAML).", required=True)
+@option.configuration(help="Configuration of the sweep (YAML).", required=True)
 @option.override
-@option.output("DIR", "Folder of the sweep. Default: results/<name of the sweep>.")
-@option.force("Begin anew, whatever is in the folder.")
+@option.output(metavar="DIR", help="Folder of the sweep. Default: results/<name of the sweep>.")
+@option.force(help="Begin anew, whatever is in the folder.")
 @option.dry_run
-@option.threads("Processes. Default: all processors.")
+@option.threads(help="Processes. Default: all processors.")
 @click.option(
     "--scheduler",
     metavar="ADDRESS",
