@@ -75,12 +75,11 @@ def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bo
     """
     if len(runs) < 2:
         raise click.UsageError("compare needs two runs or more: projservo compare RUN RUN")
-    from projservo_cli.records import InputError
     from projservo_cli.report.page import write_comparison
     from projservo_cli.store import load
 
     if output.suffix != ".html":
-        raise InputError(f"{output}: name a page to write, such as {output.name or 'runs'}.html")
+        raise click.UsageError(f"{output}: name a page to write, such as {output.name or 'runs'}.html")
     option.require_new(output, force=force)
     found = [load(target) for target in runs]
     write_comparison(found, output)

@@ -29,11 +29,10 @@ def init(console: Console, *, file: Path, force: bool) -> None:
     editors complete and check it.
     """
     from projservo_cli.config.schema import json_schema, starter
-    from projservo_cli.records import InputError
 
     path = file / _STARTER if file.is_dir() else file
     if path.suffix not in (".yaml", ".yml"):
-        raise InputError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
+        raise click.UsageError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
     _write(path, starter())

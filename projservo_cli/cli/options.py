@@ -121,12 +121,10 @@ def of_stages(function: _Function) -> _Function:
 def require_new(path: Path, *, force: bool) -> None:
     """Refuse to replace unasked what is there.
 
-    Raises InputError where it exists and ``--force`` was not given.
+    Raises UsageError where it exists and ``--force`` was not given.
     """
-    from projservo_cli.records import InputError
-
     if path.exists() and not force:
-        raise InputError(f"{path}: exists already; choose another, or replace it with --force")
+        raise click.UsageError(f"{path}: exists already; choose another, or replace it with --force")
 
 
 def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
@@ -165,12 +163,11 @@ def resolve(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
 def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
     from projservo_cli.config import load_config, to_yaml
-    from projservo_cli.records import InputError
     from projservo_cli.store import Run
     from projservo_cli.sweep.folder import run_of
 
     if options["config"]:
-        raise InputError("-c and --from: the configuration is that of the sweep; leave -c out")
+        raise click.UsageError("-c and --from: the configuration is that of the sweep; leave -c out")
     config, calibration = run_of(options["origin"])
     if overrides := _overrides(options):
         config = load_config(config.name, overrides, text=to_yaml(config))

@@ -224,14 +224,14 @@ def _require_named(chain: _Chain) -> None:
     """
     from projservo_cli.config import Override
     from projservo_cli.control import CODES
-    from projservo_cli.records import InputError, law_and_mode
+    from projservo_cli.records import law_and_mode
     from projservo_cli.robots import plugins
     from projservo_cli.robots.yours import METHODS
 
     plant = chain.config.plant.use
     servo = [step for step in chain.steps if step.stage == "servo" and step.why]
     if servo and plant is not None and "servo" not in chain.names:
-        raise InputError(
+        raise click.UsageError(
             f"{chain.names[-1]} needs a run of {servo[0].law} ({servo[0].why}), which moves {plant}: "
             "run projservo servo first"
         )
@@ -244,7 +244,7 @@ def _require_named(chain: _Chain) -> None:
     named["law"] |= bool(chain.options.get("laws"))
     for (kind, target), flag in wanted.items():
         if not (chain.options["config"] or named[kind]):
-            raise InputError(
+            raise click.UsageError(
                 f"{kind} {target} is named by the stored run alone, which starts no code: give the "
                 f"configuration again with -c, or {flag}"
             )
@@ -413,7 +413,6 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
 def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
     """Write the report of a sweep and print its tables; the exit code."""
     from projservo_cli.files import working_in
-    from projservo_cli.records import InputError
     from projservo_cli.report.style import FORMATS
     from projservo_cli.sweep.folder import Folder
     from projservo_cli.sweep.report import report
@@ -421,7 +420,7 @@ def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
     for name in _UNUSED:
         if options[name]:
             flag = name.replace("_", "-").removesuffix("s")
-            raise InputError(f"--{flag}: not used by report {sweep}, which is of a sweep")
+            raise click.UsageError(f"--{flag}: not used by report {sweep}, which is of a sweep")
     folder = Folder(sweep)
     with working_in(folder.path):
         found, files = report(folder, FORMATS, console.progress)

@@ -47,7 +47,6 @@ def sweep(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config import load_sweep
     from projservo_cli.files import working_in
-    from projservo_cli.records import InputError
     from projservo_cli.sweep.design import read_design
     from projservo_cli.sweep.driver import run as run_sweep
     from projservo_cli.sweep.engine import Cluster, Engine
@@ -58,7 +57,7 @@ def sweep(
     status = folder.status(design, force=force)
     if not (dry_run or status.complete):
         if scheduler is not None and threads is not None:
-            raise InputError(
+            raise click.UsageError(
                 "-j and --scheduler: the workers of a scheduler are as many as it has; leave -j out"
             )
         engine = Cluster(scheduler) if scheduler else Engine(threads or os.cpu_count() or 1)
