@@ -24,7 +24,7 @@ def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
     return {
         "projservo": __version__,
         "python": platform.python_version(),
-        **{package: _version(package) for package in _PACKAGES},
+        **{package: version_of(package) for package in _PACKAGES},
         "git_commit": _git("rev-parse", "HEAD"),
         "git_dirty": None if (status := _git("status", "--porcelain", "-uno")) is None else bool(status),
         "argv": list(sys.argv if argv is None else argv),
@@ -39,7 +39,8 @@ def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
 
 
 @cache
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """The version of an installed package; None where it is not installed."""
     import importlib.metadata
 
     try:

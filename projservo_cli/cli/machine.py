@@ -12,7 +12,7 @@ import click
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, wrapped
-from projservo_cli.provenance import __version__
+from projservo_cli.provenance import __version__, version_of
 
 _STARTER, _SCHEMA = "projservo.yaml", "projservo.schema.json"  # as the first line of the starter names it
 _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu", "cpu_count", "date", "jit")
@@ -118,10 +118,7 @@ def _requirements() -> tuple[dict[str, str | None], dict[str, list[str]]]:
     for text in needed:
         (name,) = re.findall(r"^[\w.-]+", text)
         extra = re.search(r"extra\s*==\s*['\"]([\w.-]+)['\"]", text)
-        try:
-            version = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            version = None
+        version = version_of(name)
         if extra is None:
             packages[name] = version
         else:

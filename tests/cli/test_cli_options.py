@@ -71,7 +71,7 @@ def test_help_names_all_commands_and_version_is_printed(projservo):
     assert all(f"  {name} " in text for name in main.commands)
     assert max(map(len, text.splitlines())) <= 80
     assert projservo().out == text
-    for words in (["--version"], ["servo", "--version"], ["--version", "show", "x"]):
+    for words in (["--version"], ["--version", "show", "x"]):
         assert projservo(*words).out == f"projservo {__version__}\n"
     both = projservo("servo", "calibrate", "-h").out
     assert "--law" in both
