@@ -1,4 +1,4 @@
-"""Writing files so that a reader never meets half of one, and folders that one process works in at a time."""
+"""Files of which a reader never meets half, texts read with care, and folders that one process works in."""
 
 import hashlib
 import os
@@ -42,6 +42,26 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
                 _synchronise(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def text_of(path: Path | str, expected: str, most: int) -> str:
+    """The text of a file in UTF-8, with or without byte-order mark.
+
+    Raises InputError, with what was ``expected``, when it cannot be read, is no such text or has more than
+    ``most`` bytes.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
+    if len(content) > most:
+        raise InputError(f"{path}: larger than {most // 1_000_000} MB; expected {expected}")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise InputError(f"{path}:{line}: not UTF-8 text; expected {expected}") from error
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.files import replacing
+from projservo_cli.files import replacing, text_of
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 
 _MAX_JOINTS = 64  # as many as a configuration may have
@@ -219,7 +219,11 @@ class _Sheet:
         optional: Sequence[str] = (),
     ) -> None:
         self.file = str(path)
-        self._reader = csv.reader(io.StringIO(_text(Path(path)), newline=""), strict=True)
+        text = text_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
+        if "\0" in text:
+            line = text.split("\0", 1)[0].count("\n") + 1
+            raise InputError(f"{path}:{line}: not a text file (it has a NUL byte)")
+        self._reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         header = self._next()
         if header is None:
             raise InputError(f"{self.file}: the table is empty; expected a header {example}")
@@ -291,24 +295,3 @@ class _Sheet:
                 "--joint-unit rad if they are radians after all"
             )
         return q
-
-
-def _text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected a table") from error
-    if len(content) > _MAX_BYTES:
-        raise InputError(
-            f"{path}: larger than {_MAX_BYTES // 1_000_000} MB; expected a table of trial motions"
-        )
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(f"{path}:{line}: not UTF-8 text; export the table as UTF-8 CSV") from error
-    if "\0" in text:
-        line = text.split("\0", 1)[0].count("\n") + 1
-        raise InputError(f"{path}:{line}: not a text file (it has a NUL byte)")
-    return text

@@ -24,6 +24,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from projservo_cli.files import text_of
 from projservo_cli.records import FloatArray, InputError
 
 Number = Annotated[float, Strict()]
@@ -39,6 +40,7 @@ Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
 # The path from a section to a value in it, and what is wrong with that value.
 Finding = tuple[tuple[str | int, ...], str]
 CONTRADICTIONS = "contradictions"  # type of the error that holds them
+_MAX_BYTES = 10_000_000  # of what is believed of a robot
 _TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
 
 _IDENTITY: Matrix44 = (
@@ -367,7 +369,7 @@ def read_nominal(path: Path | str) -> dict[str, Any]:
     (m) with ``T_base_tool_at_reference``, and perhaps ``marker_numbers`` (0, 1 …).
     Raises InputError ``file: key: what`` when it cannot be read or makes no sense.
     """
-    found = _believed(Path(path))
+    found = _believed(path)
     n, pose = len(found.screws), found.T_base_tool_at_reference
     if len(found.q_reference) != n:
         raise InputError(f"{path}: q_reference: {len(found.q_reference)} values for {n} screws")
@@ -393,12 +395,10 @@ def read_nominal(path: Path | str) -> dict[str, Any]:
     }
 
 
-def _believed(path: Path) -> _Believed:
+def _believed(path: Path | str) -> _Believed:
+    text = text_of(path, "screws, cameras and markers (JSON)", _MAX_BYTES)
     try:
-        values = json.loads(path.read_text(encoding="utf-8-sig"))
-        return _Believed.model_validate_json(json.dumps(values))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected JSON") from error
+        return _Believed.model_validate_json(json.dumps(json.loads(text)))
     except json.JSONDecodeError as error:
         raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from error
     except ValidationError as error:
@@ -409,7 +409,7 @@ def _believed(path: Path) -> _Believed:
             "camera_left, camera_right, markers_tool and T_base_tool_at_reference"
         ) from error
     except (RecursionError, ValueError) as error:
-        raise InputError(f"{path}: not JSON, or not UTF-8; expected screws, cameras, markers") from error
+        raise InputError(f"{path}: not JSON that can be read; expected screws, cameras, markers") from error
 
 
 def _twist(where: str, screw: _Screw) -> FloatArray:

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from projservo_cli.files import text_of
 from projservo_cli.records import InputError
 
 try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
@@ -76,17 +77,7 @@ class Document:
     @classmethod
     def read(cls, path: pathlib.Path | str) -> "Document":
         """The document in a file; an InputError where there is none."""
-        try:
-            with pathlib.Path(path).open("rb") as file:
-                content = file.read(_MAX_BYTES + 1)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-        if len(content) > _MAX_BYTES:
-            raise InputError(f"{path}: larger than {_MAX_BYTES} bytes; this is no configuration")
-        try:
-            return cls(content.decode("utf-8-sig"), str(path))
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path}: not UTF-8 text; expected a YAML configuration") from error
+        return cls(text_of(path, "a configuration (YAML)", _MAX_BYTES), str(path))
 
     def _parse(self, text: str) -> None:
         if len(text) > _MAX_BYTES:
