@@ -114,7 +114,7 @@ def tidy(folder: Path, *parts: str) -> None:
             pass
 
 
-def inside(path: Path, folder: Path) -> bool:
+def lies_inside(path: Path, folder: Path) -> bool:
     """Whether a path lies in a folder when all symbolic links are followed."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
@@ -124,7 +124,7 @@ def inside(path: Path, folder: Path) -> bool:
 
 def require_inside(path: Path, folder: Path) -> None:
     """Refuse a path that symbolic links lead out of a folder, with an ``InputError``."""
-    if not inside(path, folder):
+    if not lies_inside(path, folder):
         raise InputError(
             f"{path}: a symbolic link leads out of {folder}; remove it, or choose another folder with -o"
         )
