@@ -91,7 +91,9 @@ def read_table(
     return Observation(numbers, np.array([*markers], dtype=np.int64), q_read, images)
 
 
-def read_joints(path: Path | str, joint_types: str | None = None, joint_unit: str | None = None) -> JointList:
+def read_joint_list(
+    path: Path | str, joint_types: str | None = None, joint_unit: str | None = None
+) -> JointList:
     """Read a list of joint readings, one pose a row: columns ``q1 … qN``, perhaps ``pose, left, right``.
 
     joint_types : as for an observation table.

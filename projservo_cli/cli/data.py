@@ -54,13 +54,13 @@ def _record(
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
     from projservo_cli.files import working_in
     from projservo_cli.stages.record import prepare, record
-    from projservo_cli.tables import read_joints
+    from projservo_cli.tables import read_joint_list
 
     settings = option.configured(config, options)
     poses = None
     if motions is not None:
         types = settings.robot.joint_types if settings.robot is not None else None
-        poses = read_joints(motions, types, joint_unit)
+        poses = read_joint_list(motions, types, joint_unit)
     recording = prepare(settings, output, motions=poses, force=force)
     if dry_run:
         _tell_recording(console, recording)
@@ -158,11 +158,11 @@ def detect(
 
     from projservo_cli.detection import observe, pair_images
     from projservo_cli.detection.tags import TagFinder
-    from projservo_cli.tables import read_joints, write_table
+    from projservo_cli.tables import read_joint_list, write_table
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
-    joints = read_joints(joints_csv, joint_unit="rad")  # as they are, whatever their unit
+    joints = read_joint_list(joints_csv, joint_unit="rad")  # as they are, whatever their unit
     pairs = pair_images(left, right, joints, joints_csv)
     observation, found = observe(pairs, joints.q, finder, points, console.progress)
     write_table(observation, output)

@@ -11,7 +11,7 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import main
-from projservo_cli.cli.output import Console, summary, wrapped
+from projservo_cli.cli.output import Console, words_of, wrapped
 
 
 @main.command(epilog="Example: projservo show results/ur5 --json")
@@ -39,7 +39,7 @@ def show(console: Console, *, run: Path | None, output: Path | None) -> None:
         yield f"run: {found.path}"
         yield wrapped(f"configuration: {config.name}, {'recorded' if config.recorded else 'simulated'}")
         for stage, value in values.items():
-            yield from summary(stage, value, detailed=console.verbose)
+            yield from words_of(stage, value, detailed=console.verbose)
             result = found.results[stage if stage in found.results else SERVO + laws[-1]]
             yield wrapped(_made(result.provenance), "  ")
         if console.verbose:

@@ -153,7 +153,7 @@ class Console:
                     bar.refresh()
 
 
-def summary(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:
+def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:
     """Lines on the object of a stage, or of the report of a ``sweep``, at most 80 columns wide.
 
     ``detailed`` tells every claim and margin.

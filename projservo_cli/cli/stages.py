@@ -10,7 +10,7 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
-from projservo_cli.cli.output import Console, summary, wrapped
+from projservo_cli.cli.output import Console, words_of, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _EXTRAS = ("view", "animation")
@@ -380,7 +380,7 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
 
 def _words(chain: _Chain, values: Mapping[str, dict[str, Any]]) -> Iterator[str]:
     for name, value in values.items():
-        yield from summary(name, value, detailed=chain.console.verbose)
+        yield from words_of(name, value, detailed=chain.console.verbose)
     if chain.run.results:
         yield f"run: {chain.run.path}"
 
@@ -426,5 +426,5 @@ def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
         found, files = report(folder, FORMATS, console.progress)
     value = {"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]}
     names = ", ".join(path.name for path in files)
-    console.tell(value, [*summary("sweep", found), wrapped(f"files: {folder.path}: {names}")])
+    console.tell(value, [*words_of("sweep", found), wrapped(f"files: {folder.path}: {names}")])
     return 0

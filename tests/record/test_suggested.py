@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from projservo_cli import files
-from projservo_cli.tables import read_joints, read_table
+from projservo_cli.tables import read_joint_list, read_table
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 STANFORD = ("-c", CONFIGS / "stanford.yaml", "--set", "calibration.frames_per_joint=4")
@@ -25,7 +25,7 @@ def test_suggest_record_calibrate_again(projservo):
     rows = first.json["suggestions"]
     assert len(rows) == 5
     assert Path(first.json["suggestions_file"]) == Path("run/suggestions.csv").resolve()
-    motions = read_joints("run/suggestions.csv", "RRPRRR")
+    motions = read_joint_list("run/suggestions.csv", "RRPRRR")
     np.testing.assert_array_equal(motions.q, [row["q"] for row in rows])
     with open("run/suggestions.csv", newline="") as file:
         listed = list(csv.DictReader(file))
@@ -70,5 +70,5 @@ def test_a_table_in_degrees_gets_suggestions_in_degrees(projservo):
     table = ("--data", "deg.csv", "--joints", "RRPRRR", "--joint-unit", "deg")
     answer = projservo("calibrate", *table, "-o", "run", "--suggest", "1", "--json")
     assert answer.json["suggestions_unit"] == "deg"
-    motions = read_joints("run/suggestions.csv", "RRPRRR", "deg")
+    motions = read_joint_list("run/suggestions.csv", "RRPRRR", "deg")
     np.testing.assert_allclose(motions.q[0], answer.json["suggestions"][0]["q"], rtol=1e-12)

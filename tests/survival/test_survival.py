@@ -12,7 +12,7 @@ from projservo_cli.config import load_config, load_sweep
 from projservo_cli.config.schema import starter
 from projservo_cli.records import InputError
 from projservo_cli.store import load
-from projservo_cli.tables import read_joints, read_table
+from projservo_cli.tables import read_joint_list, read_table
 from tests.conftest import ROOT
 from tests.survival.changes import CSV, YAML, Change
 from tests.survival.kills import killed
@@ -53,7 +53,7 @@ def mutated(number: int) -> tuple[str, str, bytes]:
 def read(path: Path) -> None:
     """Read a file as the commands do."""
     if path.suffix == ".csv":
-        (read_joints if path.name == "joints.csv" else read_table)(path)
+        (read_joint_list if path.name == "joints.csv" else read_table)(path)
     else:
         (load_sweep if path.name.startswith("sweep") else load_config)(path)
 
