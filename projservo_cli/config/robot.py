@@ -14,7 +14,6 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    FiniteFloat,
     PlainValidator,
     Strict,
     ValidationError,
@@ -343,6 +342,8 @@ def _listed(numbers: Sequence[int]) -> str:
 class _Screw(BaseModel):
     """A unit axis w with v = −w × point, or w zero and a unit direction v."""
 
+    model_config = ConfigDict(allow_inf_nan=False)
+
     w: Vector3
     v: Vector3
 
@@ -350,10 +351,10 @@ class _Screw(BaseModel):
 class _Believed(BaseModel):
     """The keys of a file that are read; others are ignored."""
 
-    model_config = ConfigDict(extra="ignore", strict=True)
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
 
     screws: Annotated[list[_Screw], Field(min_length=1)]
-    q_reference: list[FiniteFloat]
+    q_reference: list[float]
     camera_left: Matrix34
     camera_right: Matrix34
     markers_tool: Annotated[list[Vector3], Field(min_length=1)]

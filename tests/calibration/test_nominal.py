@@ -170,6 +170,7 @@ BAD = {
         {"screws": [{"w": [0, 0, 2], "v": [0, 0, 0]}] * 4},
         r": screws.0: w must be of unit length",
     ),
+    "no axis": ({"screws": [{"w": [0, 0, float("nan")], "v": [0, 0, 0]}] * 4}, r": screws.0.w.2: .*finite"),
     "helix": ({"screws": [{"w": [0, 0, 1], "v": [0, 0, 1]}] * 4}, r": screws.0: v must be orthogonal to w"),
     # As strict as a configured robot: what is written with three digits alone is neither.
     "few digits": (
