@@ -468,15 +468,13 @@ def _plan_to_follow(control: _Control, trajectory: _Trajectory) -> Iterator[Find
         )
 
 
-_RULES: tuple[Callable[..., Iterator[Finding]], ...] = (
-    _same_joints,
-    _joint_vectors,
-    _goal_images,
-    _simulated_alone,
-    _disturbed_joints,
-    _lost_markers,
-    _plan_to_follow,
-)
+_RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes
+    rule: {*inspect.signature(rule).parameters}
+    for rule in (
+        *(_same_joints, _joint_vectors, _goal_images, _simulated_alone),
+        *(_disturbed_joints, _lost_markers, _plan_to_follow),
+    )
+}
 
 
 def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
@@ -519,8 +517,7 @@ class Config(Root):
         """What a simulated run lacks, and what does not fit together between sections."""
         if sound.get("data", "broken") is None:
             yield from _missing(sound)
-        for rule in _RULES:
-            wanted = inspect.signature(rule).parameters.keys()
+        for rule, wanted in _RULES.items():
             if wanted <= sound.keys():
                 yield from rule(**{name: sound[name] for name in wanted})
 

@@ -68,8 +68,8 @@ class Root(Section):
 
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> Self:
-        sound = {key: value for key, value in self if key not in (info.context or ())}
-        if found := [*_contradictions(sound), *self.between(sound)]:
+        sound = {key: value for key, value in vars(self).items() if key not in (info.context or ())}
+        if found := [*_contradictions(sound.items()), *self.between(sound)]:
             told = "; ".join(f"{'.'.join(map(str, path))}: {what}" for path, what in found)
             raise PydanticCustomError(CONTRADICTIONS, "{told}", {"told": told, "found": found})
         return self
@@ -79,18 +79,17 @@ class Root(Section):
         return ()
 
 
-def _contradictions(value: Any, path: tuple[str | int, ...] = ()) -> Iterator[Finding]:
-    """Those of all sections in a value."""
-    inner: Iterable[tuple[Any, Any]] = ()
-    if isinstance(value, Section):
-        yield from (((*path, *at), what) for at, what in value.contradictions())
-        inner = value
-    elif isinstance(value, dict):
-        inner = value.items()
-    elif isinstance(value, tuple):
-        inner = enumerate(value)
-    for key, part in inner:
-        yield from _contradictions(part, (*path, key))
+def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Finding]:
+    """Those of all sections among some values by their keys, and of the sections in these."""
+    for key, part in parts:
+        here = (*path, key)
+        if isinstance(part, Section):
+            yield from ((here + at, what) for at, what in part.contradictions())
+            yield from _contradictions(vars(part).items(), here)
+        elif isinstance(part, dict):
+            yield from _contradictions(part.items(), here)
+        elif isinstance(part, tuple) and part and isinstance(part[0], Section):
+            yield from _contradictions(enumerate(part), here)
 
 
 class JointVector(Section):
