@@ -5,8 +5,7 @@ import math
 import pytest
 import yaml
 
-from projservo_cli.config import Config, digest, load_config, to_yaml
-from projservo_cli.config.yaml_source import Document
+from projservo_cli.config import Config, Override, digest, load_config, to_yaml
 from projservo_cli.records import LAWS, InputError
 from tests.conftest import SHIPPED
 
@@ -298,7 +297,7 @@ def test_a_hash_depends_on_the_parts_named_and_on_nothing_else(good):
 def test_plain_text_means_what_the_core_schema_says():
     text = "[1e-3, .5, 5., -7, on, 12:30, 0x10, 1_000, '5', ~, Null, TRUE, -.inf, !!str a]"
     meant = [0.001, 0.5, 5.0, -7, "on", "12:30", "0x10", "1_000", "5", None, None, True, -math.inf, "a"]
-    assert Document(text, "x").values == meant
+    assert Override.parse(f"x={text}").value == meant
 
 
 def test_a_configuration_made_in_python_is_checked_as_well(good):
