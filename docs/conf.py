@@ -8,7 +8,7 @@ HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 os.environ["NUMBA_DISABLE_JIT"] = "1"  # docstrings are read, nothing is computed
 
-from projservo_cli.version import __version__  # noqa: E402
+from projservo_cli.provenance import __version__  # noqa: E402
 
 project = "projservo"
 release = version = __version__

@@ -6,7 +6,7 @@ Projective Space", ECCV 2000, cited below as [RH00].
 
 from typing import TYPE_CHECKING
 
-from projservo_cli.version import __version__
+from projservo_cli.provenance import __version__
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,6 +34,8 @@ def load(run: "Path | str") -> "Experiment":
     projservo_cli.records.InputError
         When there is none, it is cut short, or another version made it.
     """
-    from projservo_cli.results import read  # so that importing the package stays light
+    from projservo_cli.results import Experiment  # so that importing the package stays light
+    from projservo_cli.store import load as stored
 
-    return read(run)
+    found = stored(run)
+    return Experiment(found.path, found.configuration, found.results)

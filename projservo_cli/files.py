@@ -1,11 +1,11 @@
-"""Writing files so that a reader never meets half of one, and folders that one process works in at a time."""
+"""Files of which a reader never meets half, texts read with care, and folders that one process works in."""
 
 import hashlib
 import os
 import platform
 import re
+import secrets
 import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -29,13 +29,14 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
     with _told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     _clear_leftovers(path.parent, path.name)
-    temporary = _neighbour(path, path.parent)
+    writer = f"{_machine()}.{os.getpid()}.{secrets.token_hex(4)}"
+    temporary = path.with_name(f".{path.name}.{writer}.part")
     try:
         with _told(path):
+            temporary.touch(exist_ok=False)
             yield temporary
             if lasting:
                 _synchronise(temporary)
-            temporary.chmod(0o666 & ~_umask())  # mkstemp makes files that only their owner can read
             temporary.replace(path)
             if lasting:
                 _synchronise(path.parent)
@@ -43,14 +44,24 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def require_writable(path: Path) -> None:
-    """Make sure that ``path`` could be written, before the work whose result it shall hold.
+def text_of(path: Path | str, expected: str, most: int) -> str:
+    """The text of a file in UTF-8, with or without byte-order mark.
 
-    Nothing is left behind: where folders lack, the nearest one there is stands for them.
-
-    Raises InputError when there is no such folder, or it cannot be written to.
+    Raises InputError, with what was ``expected``, when it cannot be read, is no such text or has more than
+    ``most`` bytes.
     """
-    _neighbour(path, next(parent for parent in path.absolute().parents if parent.exists())).unlink()
+    try:
+        with Path(path).open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
+    if len(content) > most:
+        raise InputError(f"{path}: larger than {most // 1_000_000} MB; expected {expected}")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content[: error.start].count(b"\n") + 1
+        raise InputError(f"{path}:{line}: not UTF-8 text; expected {expected}") from error
 
 
 @contextmanager
@@ -74,9 +85,12 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
         try:
             lock.acquire()
         except Timeout as error:
+            number = ""
+            with suppress(OSError):  # it may be gone by now
+                number = path.read_text(encoding="ascii", errors="replace").strip()
+            owner = f"process {number}" if number.isdecimal() else "another process"
             raise InputError(
-                f"{folder}: {_owner(path)} is at work there; wait for its end, or choose another folder "
-                "with -o"
+                f"{folder}: {owner} is at work there; wait for its end, or choose another folder with -o"
             ) from error
     try:
         with suppress(OSError):  # who it is only serves the message
@@ -100,7 +114,7 @@ def tidy(folder: Path, *parts: str) -> None:
             pass
 
 
-def inside(path: Path, folder: Path) -> bool:
+def lies_inside(path: Path, folder: Path) -> bool:
     """Whether a path lies in a folder when all symbolic links are followed."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
@@ -110,7 +124,7 @@ def inside(path: Path, folder: Path) -> bool:
 
 def require_inside(path: Path, folder: Path) -> None:
     """Refuse a path that symbolic links lead out of a folder, with an ``InputError``."""
-    if not inside(path, folder):
+    if not lies_inside(path, folder):
         raise InputError(
             f"{path}: a symbolic link leads out of {folder}; remove it, or choose another folder with -o"
         )
@@ -123,17 +137,6 @@ def _told(path: Path, remedy: str = "") -> Iterator[None]:
         yield
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}{remedy}") from error
-
-
-def _neighbour(path: Path, folder: Path) -> Path:
-    """A temporary file in ``folder`` for what shall become ``path``, named after who writes it."""
-    if not folder.is_dir():
-        raise InputError(f"{path}: cannot be written: {folder} is no folder; choose another")
-    prefix = f".{path.name}.{_machine()}.{os.getpid()}."
-    with _told(path, "; choose a folder you can write to"):
-        handle, name = tempfile.mkstemp(dir=folder, prefix=prefix, suffix=".part")
-    os.close(handle)
-    return Path(name)
 
 
 def _clear_leftovers(folder: Path, name: str | None = None) -> None:
@@ -159,13 +162,6 @@ def _machine() -> str:
     return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
-def _owner(lock: Path) -> str:
-    try:
-        return f"process {int(lock.read_text(encoding='ascii'))}"
-    except (OSError, ValueError):
-        return "another process"
-
-
 def _synchronise(path: Path) -> None:
     if path.is_dir() and os.name == "nt":  # a folder cannot be opened there
         return
@@ -174,9 +170,3 @@ def _synchronise(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask

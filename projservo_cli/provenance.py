@@ -1,17 +1,17 @@
-"""What a result was made with: versions, machine, date, command, state of the sources."""
+"""What a result was made with: versions, machine, date, command, state of the sources.
 
-import importlib.metadata
+The version is told to whoever imports the package, so that slow imports wait until they are needed.
+"""
+
 import os
 import platform
-import subprocess
 import sys
 from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from projservo_cli.version import __version__
-
+__version__ = "0.1.0"
 _PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 
 
@@ -24,7 +24,7 @@ def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
     return {
         "projservo": __version__,
         "python": platform.python_version(),
-        **{package: _version(package) for package in _PACKAGES},
+        **{package: version_of(package) for package in _PACKAGES},
         "git_commit": _git("rev-parse", "HEAD"),
         "git_dirty": None if (status := _git("status", "--porcelain", "-uno")) is None else bool(status),
         "argv": list(sys.argv if argv is None else argv),
@@ -39,7 +39,10 @@ def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
 
 
 @cache
-def _version(package: str) -> str | None:
+def version_of(package: str) -> str | None:
+    """The version of an installed package; None where it is not installed."""
+    import importlib.metadata
+
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -49,6 +52,8 @@ def _version(package: str) -> str | None:
 @cache
 def _git(*arguments: str) -> str | None:
     """Answer of git about the checkout this package runs from; None where it is none."""
+    import subprocess
+
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
         return None

@@ -1,18 +1,17 @@
 """A run file as an object: its calibration predicts images, its plan and traces are arrays."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 
-from projservo_cli import store
 from projservo_cli.calibration import predict
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.geometry.lens import bent_derivative
 from projservo_cli.records import Calibration, FloatArray, InputError
+from projservo_cli.store import Run
 
-AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
+_AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,15 +60,10 @@ class ImageModel(Calibration):
         """
         rows, single = self._rows(q)
         model = self.model()
-        J = np.array(
-            [
-                image_jacobian(
-                    model.P, self.M @ forward_kinematics(model, row).T, joint_operators(model, row)
-                )
-                for row in rows
-            ]
-        )
-        straight = np.array([pixels_of(model.P, self.M @ forward_kinematics(model, row).T) for row in rows])
+        moved = [self.M @ forward_kinematics(model, row).T for row in rows]
+        straight = np.array([pixels_of(model.P, A) for A in moved])
+        operators = [joint_operators(model, row) for row in rows]
+        J = np.array([image_jacobian(model.P, A, H) for A, H in zip(moved, operators, strict=True)])
         J = bent_derivative(model.lens[:, None], straight)[0] @ J
         J[np.isnan(predict(self, rows)[..., 0])] = np.nan
         return np.asarray(J[0] if single else J)
@@ -96,7 +90,7 @@ class ImageModel(Calibration):
         depth = np.einsum("vj,...j->v...", self.P[:, 2], A)
         side = A @ self.a_inf
         norms = np.linalg.norm(A, axis=-1) * np.linalg.norm(self.a_inf)
-        ahead = np.where(np.abs(side) > AT_INFINITY * norms, depth * side > 0.0, depth != 0.0)
+        ahead = np.where(np.abs(side) > _AT_INFINITY * norms, depth * side > 0.0, depth != 0.0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(ahead[..., None], pixels_of(self.P, A, self.model().lens), np.nan)
 
@@ -110,32 +104,11 @@ class ImageModel(Calibration):
         return np.atleast_2d(readings), readings.ndim == 1
 
 
-def image_model(calibration: Calibration) -> ImageModel:
-    """A calibration with its functions."""
-    return ImageModel(**vars(calibration))
-
-
 @dataclasses.dataclass(frozen=True)
-class Experiment(store.Run):
+class Experiment(Run):
     """All that a run file holds."""
 
     @property
     def calibration(self) -> ImageModel:
         """The calibration, with functions that predict images."""
-        return image_model(super().calibration)
-
-
-def read(run: Path | str) -> Experiment:
-    """Read a run file.
-
-    Parameters
-    ----------
-    run : folder of a run, or the file.
-
-    Raises
-    ------
-    InputError
-        When there is none, it is cut short, or another version made it.
-    """
-    found = store.load(run)
-    return Experiment(found.path, found.configuration, found.results)
+        return ImageModel(**vars(super().calibration))

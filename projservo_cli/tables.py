@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.files import replacing
+from projservo_cli.files import replacing, text_of
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 
 _MAX_JOINTS = 64  # as many as a configuration may have
@@ -62,11 +62,11 @@ def read_table(
     seen: dict[tuple[int, int], tuple[int, list[float]]] = {}
     for row in sheet.rows():
         for u, v in (_PIXELS[:2], _PIXELS[2:]):
-            if (row.cells[u] == "") != (row.cells[v] == ""):
+            if (row[u] == "") != (row[v] == ""):
                 raise InputError(f"{row.where}: one of {u}, {v} is empty; give both or neither")
         pose, marker = row.integer("pose"), row.integer("marker")
         q = [row.number(name) for name in sheet.joints]
-        pixels = [row.number(name) if row.cells[name] else math.nan for name in _PIXELS]
+        pixels = [row.number(name) if row[name] else math.nan for name in _PIXELS]
         line, first = readings.setdefault(pose, (row.line, q))
         if q != first:
             i = next(i for i, (a, b) in enumerate(zip(q, first, strict=True)) if a != b)
@@ -91,12 +91,13 @@ def read_table(
     return Observation(numbers, np.array([*markers], dtype=np.int64), q_read, images)
 
 
-def read_joints(path: Path | str, joint_types: str | None = None, joint_unit: str | None = None) -> JointList:
+def read_joint_list(
+    path: Path | str, joint_types: str | None = None, joint_unit: str | None = None
+) -> JointList:
     """Read a list of joint readings, one pose a row: columns ``q1 … qN``, perhaps ``pose, left, right``.
 
     joint_types : as for an observation table.
-    joint_unit : ``deg`` or ``rad`` as for an observation table; ``as is`` for readings that are only passed
-        on.
+    joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
     Raises InputError ``file:line: what`` when the file cannot be read, a row makes no sense or a pose stands
     there twice.
     """
@@ -110,14 +111,13 @@ def read_joints(path: Path | str, joint_types: str | None = None, joint_unit: st
         if lines.setdefault(pose, row.line) != row.line:
             raise InputError(f"{row.where}: pose {pose} is already in line {lines[pose]}")
         readings.append([row.number(name) for name in sheet.joints])
-        names.append([row.cells[side] for side in ("left", "right") if side in sheet.columns])
+        names.append([row[side] for side in ("left", "right") if side in sheet.columns])
         if "" in names[-1]:
             raise InputError(f"{row.where}: an image has no name; name both, or drop the row")
     if not readings:
         raise InputError(f"{sheet.file}: there is a header but no rows; no pose was given")
-    poses, q = np.array([*lines], dtype=np.int64), np.array(readings)
-    if joint_unit != "as is":
-        q = sheet.in_radians(poses, q, joint_unit)
+    poses = np.array([*lines], dtype=np.int64)
+    q = sheet.in_radians(poses, np.array(readings), joint_unit)
     left, right = zip(*names, strict=True) if names[0] else (None, None)
     return JointList(poses, q, "pose" in sheet.columns, left, right)
 
@@ -128,7 +128,7 @@ def recording_of(path: Path | str) -> str | None:
     Raises InputError when the file cannot be read.
     """
     sheet = _Sheet(path, _HEADER, [], optional=[_RECORDING])
-    found = {row.cells[_RECORDING] for row in sheet.rows() if _RECORDING in row.cells}
+    found = {row[_RECORDING] for row in sheet.rows() if _RECORDING in row}
     return found.pop() if len(found) == 1 else None
 
 
@@ -184,31 +184,23 @@ def _shown(value: Any) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
-@dataclass(frozen=True)
-class _Row:
-    """Cells of one line by the names of their columns."""
+class _Row(dict[str, str]):
+    """Cells of one line by the names of their columns; ``where`` is the file with that line."""
 
-    file: str
+    where: str
     line: int
-    cells: Mapping[str, str]
-
-    @property
-    def where(self) -> str:
-        return f"{self.file}:{self.line}"
 
     def integer(self, column: str) -> int:
         """A whole number of at most 18 digits."""
-        text = self.cells[column]
-        if not _INTEGER.fullmatch(text):
-            raise InputError(f"{self.where}: {column} is {text!r}; expected an integer")
-        return int(text)
+        if not _INTEGER.fullmatch(self[column]):
+            raise InputError(f"{self.where}: {column} is {self[column]!r}; expected an integer")
+        return int(self[column])
 
     def number(self, column: str) -> float:
         """A finite number with a decimal point."""
-        text = self.cells[column]
-        value = float(text) if _NUMBER.fullmatch(text) else math.nan
+        value = float(self[column]) if _NUMBER.fullmatch(self[column]) else math.nan
         if not math.isfinite(value):
-            raise InputError(f"{self.where}: {column} is {text!r}; expected a finite number")
+            raise InputError(f"{self.where}: {column} is {self[column]!r}; expected a finite number")
         return value
 
 
@@ -229,48 +221,44 @@ class _Sheet:
         optional: Sequence[str] = (),
     ) -> None:
         self.file = str(path)
-        self._reader = csv.reader(io.StringIO(_text(Path(path)), newline=""), strict=True)
+        text = text_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
+        if "\0" in text:
+            line = text.split("\0", 1)[0].count("\n") + 1
+            raise InputError(f"{path}:{line}: not a text file (it has a NUL byte)")
+        self._reader = csv.reader(io.StringIO(text, newline=""), strict=True)
         header = self._next()
         if header is None:
             raise InputError(f"{self.file}: the table is empty; expected a header {example}")
-        if len(header) > _MAX_COLUMNS:
-            raise InputError(f"{self.file}:1: {len(header)} columns; a table has at most {_MAX_COLUMNS}")
         names = [name.strip().lower() for name in header]
-        if len(names) == 1 and ";" in names[0]:
-            raise InputError(
-                f"{self.file}:1: columns are separated by semicolons; use commas and decimal points"
-            )
-        self._width = len(names)
-        self.joints = sorted(
-            {name for name in names if _JOINT.fullmatch(name)}, key=lambda name: int(name[1:])
-        )
-        missing = [name for name in needed if name not in names] + ([] if self.joints else ["q1"])
-        if missing:
-            raise InputError(f"{self.file}:1: the header lacks the column(s) {', '.join(missing)}")
+        self.joints = sorted(filter(_JOINT.fullmatch, set(names)), key=lambda name: int(name[1:]))
         wanted = [*needed, *self.joints, *(name for name in optional if name in names)]
-        twice = sorted({name for name in wanted if names.count(name) > 1})
-        if twice:
-            raise InputError(
-                f"{self.file}:1: the header names the column(s) {', '.join(twice)} more than once"
-            )
+        if wrong := self._wrong(names, needed, wanted, joint_types):
+            raise InputError(f"{self.file}:1: {wrong}")
+        self._width = len(names)
         self.columns = {name: names.index(name) for name in wanted}
-        self._require_joints(joint_types)
         self._joint_types = joint_types or "R" * len(self.joints)
 
-    def _require_joints(self, joint_types: str | None) -> None:
+    def _wrong(
+        self, names: Sequence[str], needed: Sequence[str], wanted: Sequence[str], joint_types: str | None
+    ) -> str:
+        """What is wrong with the header; empty where nothing is."""
         n = len(self.joints)
+        if len(names) > _MAX_COLUMNS:
+            return f"{len(names)} columns; a table has at most {_MAX_COLUMNS}"
+        if len(names) == 1 and ";" in names[0]:
+            return "columns are separated by semicolons; use commas and decimal points"
+        if missing := [name for name in needed if name not in names] + ([] if n else ["q1"]):
+            return f"the header lacks the column(s) {', '.join(missing)}"
+        if twice := sorted({name for name in wanted if names.count(name) > 1}):
+            return f"the header names the column(s) {', '.join(twice)} more than once"
         if n > _MAX_JOINTS:
-            raise InputError(f"{self.file}:1: {n} joint columns; a robot has at most {_MAX_JOINTS}")
-        gaps = [f"q{i}" for i in range(1, n + 1) if f"q{i}" not in self.joints]
-        if gaps:
-            raise InputError(
-                f"{self.file}:1: joint column {gaps[0]} is missing, though there is {self.joints[-1]}"
-            )
+            return f"{n} joint columns; a robot has at most {_MAX_JOINTS}"
+        if gaps := [f"q{i}" for i in range(1, n + 1) if f"q{i}" not in self.joints]:
+            return f"joint column {gaps[0]} is missing, though there is {self.joints[-1]}"
         if joint_types is not None and len(joint_types) != n:
-            raise InputError(
-                f"{self.file}:1: {n} joint columns q1…q{n}, but joints {joint_types!r} has "
-                f"{len(joint_types)} letters; give one R or P a column"
-            )
+            letters = f"{joint_types!r} has {len(joint_types)} letters"
+            return f"{n} joint columns q1…q{n}, but joints {letters}; give one R or P a column"
+        return ""
 
     def rows(self) -> Iterator[_Row]:
         """Each row that is not blank; an InputError at one of another length than the header."""
@@ -283,7 +271,9 @@ class _Sheet:
                     f"{self.file}:{line}: {len(cells)} cells where the header has {self._width}; the row is "
                     "cut short or malformed"
                 )
-            yield _Row(self.file, line, {name: cells[i].strip() for name, i in self.columns.items()})
+            row = _Row({name: cells[i].strip() for name, i in self.columns.items()})
+            row.where, row.line = f"{self.file}:{line}", line
+            yield row
 
     def _next(self) -> list[str] | None:
         try:
@@ -307,24 +297,3 @@ class _Sheet:
                 "--joint-unit rad if they are radians after all"
             )
         return q
-
-
-def _text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            content = file.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected a table") from error
-    if len(content) > _MAX_BYTES:
-        raise InputError(
-            f"{path}: larger than {_MAX_BYTES // 1_000_000} MB; expected a table of trial motions"
-        )
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        raise InputError(f"{path}:{line}: not UTF-8 text; export the table as UTF-8 CSV") from error
-    if "\0" in text:
-        line = text.split("\0", 1)[0].count("\n") + 1
-        raise InputError(f"{path}:{line}: not a text file (it has a NUL byte)")
-    return text

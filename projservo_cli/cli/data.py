@@ -14,9 +14,9 @@ _FAR = 20.0
 
 
 @main.command("record", epilog="Example: projservo record -c configs/stanford.yaml --output trials.csv")
-@option.configuration("Configuration (YAML). Default: paper.yaml.")
+@option.configuration(help="Configuration (YAML). Default: paper.yaml.")
 @option.override
-@option.output("TABLE", "Observation table to write (CSV).", required=True)
+@option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
 @click.option(
     "--motions",
     metavar="CSV",
@@ -26,10 +26,10 @@ _FAR = 20.0
 @option.joint_unit
 @option.speed_scale
 @option.confirm
-@option.force("Begin anew, whatever stands in the table.")
+@option.force(help="Begin anew, whatever stands in the table.")
 @option.dry_run
 @option.told
-def record_table(
+def _record(
     console: Console,
     *,
     config: str | None,
@@ -52,17 +52,15 @@ def record_table(
     """
     if joint_unit is not None and motions is None:
         raise click.UsageError("--joint-unit is that of --motions, which is not given")
-    from projservo_cli.cli.configuration import given_overrides, shipped
-    from projservo_cli.config import load_config
     from projservo_cli.files import working_in
     from projservo_cli.stages.record import new_recording, record
-    from projservo_cli.tables import read_joints
+    from projservo_cli.tables import read_joint_list
 
-    settings = load_config(config or shipped(), given_overrides(options))
+    settings = option.configured(config, options)
     poses = None
     if motions is not None:
         types = settings.robot.joint_types if settings.robot is not None else None
-        poses = read_joints(motions, types, joint_unit)
+        poses = read_joint_list(motions, types, joint_unit)
     recording = new_recording(settings, output, motions=poses, force=force)
     if dry_run:
         _tell_recording(console, recording)
@@ -106,7 +104,7 @@ def _tell_recording(console: Console, recording: Any) -> None:
 )
 @click.argument("left")
 @click.argument("right")
-@option.output("TABLE", "Observation table to write (CSV).", required=True)
+@option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
 @click.option(
     "--joints-csv",
     metavar="CSV",
@@ -128,7 +126,7 @@ def _tell_recording(console: Console, recording: Any) -> None:
     show_default=True,
     help="Four markers a tag, or one.",
 )
-@option.force("Replace the table if there is one.")
+@option.force(help="Replace the table if there is one.")
 @option.told
 def detect(
     console: Console,
@@ -159,11 +157,11 @@ def detect(
     import numpy as np
 
     from projservo_cli.detection import TagFinder, observe_tags, pair_images
-    from projservo_cli.tables import read_joints, write_table
+    from projservo_cli.tables import read_joint_list, write_table
 
     option.require_new(output, force=force)
     finder = TagFinder(dictionary)
-    joints = read_joints(joints_csv, joint_unit="as is")
+    joints = read_joint_list(joints_csv, joint_unit="rad")  # as they are, whatever their unit
     pairs = pair_images(left, right, joints, joints_csv)
     observation, found = observe_tags(pairs, joints.q, finder, points, console.progress)
     write_table(observation, output)
@@ -193,7 +191,7 @@ def detect(
 
 @main.command(epilog="Example: projservo validate results/mine --data validation.csv")
 @click.argument("run", required=False, type=option.PATH)
-@option.output("DIR", "The run, instead of an argument.")
+@option.output(metavar="DIR", help="The run, instead of an argument.")
 @click.option("--data", metavar="TABLE", type=option.PATH, required=True, help="Observation table (CSV).")
 @click.option(
     "--joint-unit",

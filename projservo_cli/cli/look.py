@@ -11,12 +11,12 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import main
-from projservo_cli.cli.output import Console, wrapped
+from projservo_cli.cli.output import Console, words_of, wrapped
 
 
 @main.command(epilog="Example: projservo show results/ur5 --json")
 @click.argument("run", required=False, type=option.PATH)
-@option.output("DIR", "The run, instead of an argument.")
+@option.output(metavar="DIR", help="The run, instead of an argument.")
 @option.told
 def show(console: Console, *, run: Path | None, output: Path | None) -> None:
     """Show what a run holds and how it was made.
@@ -25,7 +25,6 @@ def show(console: Console, *, run: Path | None, output: Path | None) -> None:
     claim, and the configuration.
     """
     target = option.one_run("show", run, output) or Path("results", "paper")
-    from projservo_cli.cli.words import summary
     from projservo_cli.config import load_config
     from projservo_cli.report.material import stage_object
     from projservo_cli.store import SERVO, load
@@ -40,7 +39,7 @@ def show(console: Console, *, run: Path | None, output: Path | None) -> None:
         yield f"run: {found.path}"
         yield wrapped(f"configuration: {config.name}, {'recorded' if config.recorded else 'simulated'}")
         for stage, value in values.items():
-            yield from summary(stage, value, detailed=console.verbose)
+            yield from words_of(stage, value, detailed=console.verbose)
             result = found.results[stage if stage in found.results else SERVO + laws[-1]]
             yield wrapped(_made(result.provenance), "  ")
         if console.verbose:
@@ -65,8 +64,8 @@ def _made(provenance: Any) -> str:
 
 @main.command(epilog="Example: projservo compare results/paper results/ur5 -o both.html")
 @click.argument("runs", nargs=-1, required=True, type=option.PATH, metavar="RUN RUN ...")
-@option.output("PAGE", "Page to write.", default="compare.html", show_default=True)
-@option.force("Replace the page if there is one.")
+@option.output(metavar="PAGE", help="Page to write.", default="compare.html", show_default=True)
+@option.force(help="Replace the page if there is one.")
 @option.told
 def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bool) -> None:
     """Show runs side by side on one page.
@@ -76,12 +75,11 @@ def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bo
     """
     if len(runs) < 2:
         raise click.UsageError("compare needs two runs or more: projservo compare RUN RUN")
-    from projservo_cli.records import InputError
     from projservo_cli.report.page import write_comparison
     from projservo_cli.store import load
 
     if output.suffix != ".html":
-        raise InputError(f"{output}: name a page to write, such as {output.name or 'runs'}.html")
+        raise click.UsageError(f"{output}: name a page to write, such as {output.name or 'runs'}.html")
     option.require_new(output, force=force)
     found = [load(target) for target in runs]
     write_comparison(found, output)
@@ -91,8 +89,8 @@ def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bo
 
 @main.command(epilog="Example: projservo export results/ur5 -o tables")
 @click.argument("run", type=option.PATH)
-@option.output("DIR", "Folder to write. Default: csv beside run.h5.")
-@option.force("Replace what is there.")
+@option.output(metavar="DIR", help="Folder to write. Default: csv beside run.h5.")
+@option.force(help="Replace what is there.")
 @click.option("--to", type=click.Choice(["csv"]), default="csv", help="Kind of files.", expose_value=False)
 @option.told
 def export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:

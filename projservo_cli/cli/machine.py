@@ -1,5 +1,6 @@
 """A machine and how to begin on it: ``init``, ``schema``, ``doctor`` and ``bench``."""
 
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ import click
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, wrapped
-from projservo_cli.version import __version__
+from projservo_cli.provenance import __version__, version_of
 
 _STARTER, _SCHEMA = "projservo.yaml", "projservo.schema.json"  # as the first line of the starter names it
 _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu", "cpu_count", "date", "jit")
@@ -19,7 +20,7 @@ _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu"
 
 @main.command(epilog="Example: projservo init mine.yaml")
 @click.argument("file", default=_STARTER, type=option.PATH)
-@option.force("Replace the file if there is one.")
+@option.force(help="Replace the file if there is one.")
 @option.told
 def init(console: Console, *, file: Path, force: bool) -> None:
     """Write a commented configuration to start from.
@@ -27,16 +28,15 @@ def init(console: Console, *, file: Path, force: bool) -> None:
     Writes a configuration that runs as it is, with a comment on every key, and beside it the schema by which
     editors complete and check it.
     """
-    from projservo_cli.config.schema import json_schema, schema_text, starter
-    from projservo_cli.records import InputError
+    from projservo_cli.config.schema import json_schema, starter
 
     path = file / _STARTER if file.is_dir() else file
     if path.suffix not in (".yaml", ".yml"):
-        raise InputError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
+        raise click.UsageError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
     _write(path, starter())
-    _write(described, schema_text(json_schema()))
+    _write(described, _as_text(json_schema()))
     words = (
         f"init: {path}, with {described} for editors",
         f"next: projservo calibrate plan servo report -c {path}",
@@ -46,22 +46,26 @@ def init(console: Console, *, file: Path, force: bool) -> None:
 
 @main.command("schema", epilog="Example: projservo schema -o schema.json")
 @click.argument("what", required=False, metavar="[sweep]", type=click.Choice(["sweep"]))
-@option.output("FILE", "File to write. Default: standard output.")
+@option.output(metavar="FILE", help="File to write. Default: standard output.")
 @option.told
-def print_schema(console: Console, *, what: str | None, output: Path | None) -> None:
+def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     """Print the JSON Schema of the configuration.
 
     Editors that speak YAML complete and check a configuration whose first line names the schema: #
     yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.
     """
-    from projservo_cli.config.schema import json_schema, schema_text, sweep_schema
+    from projservo_cli.config.schema import json_schema, sweep_schema
 
     schema = sweep_schema() if what else json_schema()
     if output is None:
         console.as_json = True
         console.tell(schema, ())
     else:
-        _write(output, schema_text(schema))
+        _write(output, _as_text(schema))
+
+
+def _as_text(schema: dict[str, Any]) -> str:
+    return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
 def _write(path: Path, text: str) -> None:
@@ -114,10 +118,7 @@ def _requirements() -> tuple[dict[str, str | None], dict[str, list[str]]]:
     for text in needed:
         (name,) = re.findall(r"^[\w.-]+", text)
         extra = re.search(r"extra\s*==\s*['\"]([\w.-]+)['\"]", text)
-        try:
-            version = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            version = None
+        version = version_of(name)
         if extra is None:
             packages[name] = version
         else:
@@ -156,7 +157,7 @@ def _found(value: dict[str, Any]) -> Iterator[str]:
 
 
 @main.command(epilog="Example: projservo bench --json")
-@option.configuration("Configuration (YAML) with a simulated task. Default: paper.yaml.")
+@option.configuration(help="Configuration (YAML) with a simulated task. Default: paper.yaml.")
 @option.override
 @option.told
 def bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> None:
@@ -166,12 +167,10 @@ def bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> Non
     in turn with one numpy.linalg.svd of an 8x6 matrix.
     """
     from projservo_cli import provenance
-    from projservo_cli.cli.configuration import shipped
-    from projservo_cli.config import load_config
     from projservo_cli.stages.bench import Case, timings
 
     console.say("compiling kernels where they are not in the cache, then measuring: half a minute")
-    settings = load_config(config or shipped(), sets)
+    settings = option.configured(config, {"sets": sets})
     result = timings(Case(settings))
     collected = provenance.collect(seed=settings.seed)
     machine = {name: collected[name] for name in _MACHINE}

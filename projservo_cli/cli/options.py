@@ -1,20 +1,40 @@
-"""Options that several commands take, as decorators."""
+"""Options that several commands take, as decorators; and which configuration and run they are about."""
 
 import contextlib
 import functools
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from projservo_cli.cli.output import Console
 
+if TYPE_CHECKING:
+    from projservo_cli.config import Config, Override
+    from projservo_cli.store import Run
+
 _Function = Callable[..., Any]
-_Decorator = Callable[[_Function], _Function]
 
 PATH = click.Path(path_type=Path)
+_RESULTS = Path("results")
+_KEYS = {  # that options stand for
+    "data": ("data", "table"),
+    "joints": ("data", "joints"),
+    "joint_unit": ("data", "joint_unit"),
+    "noise_px": ("data", "noise_px"),
+    "init": ("calibration", "init"),
+    "cross_validate": ("calibration", "cross_validate"),
+    "lens": ("calibration", "lens"),
+}
+
+# Options of which each command says for itself what they do.
+configuration = functools.partial(click.option, "-c", "--config", metavar="FILE", type=click.Path())
+output = functools.partial(click.option, "-o", "--output", type=PATH)
+force = functools.partial(click.option, "--force", is_flag=True)
+threads = functools.partial(click.option, "-j", "--threads", metavar="N", type=click.IntRange(1, 256))
 
 override = click.option(
     "--set",
@@ -32,26 +52,6 @@ dry_run = click.option("-n", "--dry-run", is_flag=True, help="Say what would be 
 speed_scale = click.option(
     "--speed-scale", metavar="S", type=float, help="Scale every command by S, above 0 and at most 1."
 )
-
-
-def configuration(help: str, **settings: Any) -> _Decorator:
-    """``-c``."""
-    return click.option("-c", "--config", metavar="FILE", type=click.Path(), help=help, **settings)
-
-
-def output(metavar: str, help: str, **settings: Any) -> _Decorator:
-    """``-o``, a path."""
-    return click.option("-o", "--output", metavar=metavar, type=PATH, help=help, **settings)
-
-
-def force(help: str) -> _Decorator:
-    """``--force``."""
-    return click.option("--force", is_flag=True, help=help)
-
-
-def threads(help: str) -> _Decorator:
-    """``-j``."""
-    return click.option("-j", "--threads", metavar="N", type=click.IntRange(1, 256), help=help)
 
 
 def _with_terminal(context: click.Context, parameter: click.Parameter, value: bool) -> bool:
@@ -88,15 +88,11 @@ def told(function: _Function) -> _Function:
 
 
 _OF_STAGES = (
-    configuration("Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml."),
-    override,
-    click.option(
-        "-o",
-        "--output",
-        metavar="DIR",
-        type=click.Path(),
-        help="Folder of the run, or its run.h5. Default: results/<configuration name>.",
+    configuration(
+        help="Configuration (YAML). Default: the one stored in the run that -o names, else paper.yaml."
     ),
+    override,
+    output(metavar="DIR", help="Folder of the run, or its run.h5. Default: results/<configuration name>."),
     click.option("--data", metavar="TABLE", type=click.Path(), help="Calibrate from this table (CSV)."),
     click.option("--joints", metavar="RRPRRR", help="Type of each joint of the table. Default: all R."),
     joint_unit,
@@ -107,9 +103,9 @@ _OF_STAGES = (
         metavar="WxH",
         help="Size of the table's images, px. Default: that of rig, else from where markers were seen.",
     ),
-    force("Make the named stages even where they are up to date."),
+    force(help="Make the named stages even where they are up to date."),
     dry_run,
-    threads("Threads. Default: all processors."),
+    threads(help="Threads. Default: all processors."),
     told,
     click.pass_obj,  # the names of the stages of the call
 )
@@ -125,12 +121,10 @@ def of_stages(function: _Function) -> _Function:
 def require_new(path: Path, *, force: bool) -> None:
     """Refuse to replace unasked what is there.
 
-    Raises InputError where it exists and ``--force`` was not given.
+    Raises UsageError where it exists and ``--force`` was not given.
     """
-    from projservo_cli.records import InputError
-
     if path.exists() and not force:
-        raise InputError(f"{path}: exists already; choose another, or replace it with --force")
+        raise click.UsageError(f"{path}: exists already; choose another, or replace it with --force")
 
 
 def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
@@ -138,3 +132,94 @@ def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
     if run is not None and output is not None:
         raise click.UsageError(f"{command} takes one run, as an argument or with -o")
     return run or output
+
+
+def configured(config: str | None, options: Mapping[str, Any]) -> "Config":
+    """The configuration in a file, by default the one that comes with projservo, with what options say."""
+    from projservo_cli.config import load_config
+
+    return load_config(config or _shipped(), _overrides(options))
+
+
+def resolve(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
+    """The configuration with all overrides, and the run as stored so far.
+
+    Raises InputError when either cannot be read or makes no sense.
+    """
+    from projservo_cli.config import load_config
+
+    if options.get("origin") is not None:
+        return _from_sweep(options)
+    stored = _stored(options["output"]) if options["output"] else None
+    if not options["config"] and stored is not None and stored.configuration:
+        config = load_config(stored.path, _overrides(options), text=stored.configuration)
+    elif not options["config"] and options["data"]:
+        config = load_config(None, _overrides(options))
+    else:
+        config = configured(options["config"], options)
+    return config, stored or _run_of(options, config)
+
+
+def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
+    """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
+    from projservo_cli.config import load_config, to_yaml
+    from projservo_cli.store import Run
+    from projservo_cli.sweep.folder import run_of
+
+    if options["config"]:
+        raise click.UsageError("-c and --from: the configuration is that of the sweep; leave -c out")
+    config, calibration = run_of(options["origin"])
+    if overrides := _overrides(options):
+        config = load_config(config.name, overrides, text=to_yaml(config))
+    run = _run_of(options, config)
+    stored = run.results.get("calibrate")
+    if calibration is not None and (stored is None or stored.key != calibration.key):
+        run = Run(run.path, run.configuration, {"calibrate": calibration})
+    return config, run
+
+
+def _run_of(options: Mapping[str, Any], config: "Config") -> "Run":
+    """The run where the user says, else in the folder of the configuration's name; empty where none is."""
+    from projservo_cli.files import require_inside
+    from projservo_cli.store import Run, run_path
+
+    folder = options["output"]
+    if not folder:
+        folder = _RESULTS / config.name
+        require_inside(folder, _RESULTS)
+    return _stored(folder) or Run(run_path(folder))
+
+
+def _stored(target: str | Path) -> "Run | None":
+    """The run in a folder or file; None where there is none yet."""
+    from projservo_cli.store import load, run_path
+
+    return load(target) if run_path(target).exists() else None
+
+
+def _shipped() -> Path:
+    """The configuration that comes with projservo, in a checkout as in an installed package."""
+    package = Path(__file__).resolve().parent.parent
+    path = package / "configs" / "paper.yaml"
+    return path if path.is_file() else package.parent / "configs" / "paper.yaml"
+
+
+def _overrides(options: Mapping[str, Any]) -> list["Override"]:
+    """Options that stand for keys of the configuration, then ``--set``, then ``--speed-scale``."""
+    from projservo_cli.config import Override
+
+    found = []
+    for name, key in _KEYS.items():
+        given = options.get(name)
+        if given is None or given is False:
+            continue
+        flag = f"--{name.replace('_', '-')}" + ("" if given is True else f" {given}")
+        value = os.path.abspath(given) if key[1] in ("table", "init") else given
+        found.append(Override(flag, key, value))
+    if (size := options.get("image_size")) is not None:  # such as 1280x1024
+        sides = size.lower().replace("x", ", ")
+        found.append(Override.parse(f"data.image_size_px=[{sides}]", f"--image-size {size}"))
+    found += map(Override.parse, options["sets"])
+    if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
+        found.append(Override(f"--speed-scale {scale}", ("plant", "speed_scale"), scale))
+    return found

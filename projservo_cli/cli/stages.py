@@ -10,10 +10,15 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
-from projservo_cli.cli.output import Console
+from projservo_cli.cli.output import Console, words_of, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _EXTRAS = ("view", "animation")
+_NAMING = {
+    "plant": {("plant",), ("plant", "use")},
+    "law": {("control",), ("control", "laws")},
+}  # keys of --set
+_UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
 
 
 def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
@@ -46,7 +51,7 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
     help="Suggest N further poses to record, the most telling first; 5 without N.",
 )
 @option.of_stages
-def calibrate_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+def _calibrate(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Learn the projective kinematics from trial motions.
 
     Estimates both cameras and all joint operators from images alone, simulated from the configuration or
@@ -60,7 +65,7 @@ def calibrate_run(stages: Sequence[str], console: Console, **options: Any) -> in
 
 @main.stage("plan", epilog="Example: projservo plan -c configs/ur5.yaml --set trajectory.profile=exponential")
 @option.of_stages
-def plan_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Plan the task as a translation and two rotations.
 
     Partitions the task by the start and goal images and lays a path on which both cameras keep seeing the
@@ -87,7 +92,7 @@ def plan_run(stages: Sequence[str], console: Console, **options: Any) -> int:
     help="The run of that number of a sweep, made anew as a run of its own.",
 )
 @option.of_stages
-def servo_run(stages: Sequence[str], console: Console, **options: Any) -> int:
+def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Run the control laws in closed loop.
 
     Runs each law of control.laws (or of --law) to its verdict. Calibrates and plans first where needed. Exit
@@ -110,7 +115,7 @@ def servo_run(stages: Sequence[str], console: Console, **options: Any) -> int:
     "--animation", is_flag=True, help="Both camera images under several laws over time, animation.gif."
 )
 @option.of_stages
-def report_run(stages: Sequence[str], console: Console, *, sweep: Path | None, **options: Any) -> int:
+def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **options: Any) -> int:
     """Draw the figures and check the paper's claims.
 
     Writes into the folder of the run: the figures, each with its numbers as CSV; the table of claims; and
@@ -125,9 +130,7 @@ def report_run(stages: Sequence[str], console: Console, *, sweep: Path | None, *
     with intervals, final errors, laws compared on the same tasks.
     """
     if sweep is not None:
-        from projservo_cli.cli.sweep_command import tell_report
-
-        return tell_report(console, sweep, options)
+        return _tell_sweep(console, sweep, options)
     return _make(console, stages, options)
 
 
@@ -175,12 +178,10 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
 def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> _Chain:
     """What is to be done, by the configuration and what the run holds; refused where it must not be."""
-    from projservo_cli.cli.configuration import resolve
-    from projservo_cli.files import require_writable
     from projservo_cli.stages.steps import steps_for
 
     given = _law_names(options.get("laws", ()))
-    config, stored = resolve(options)
+    config, stored = option.resolve(options)
     if options.get("suggest") is not None and config.calibration.method != "refined":
         raise click.UsageError(
             f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
@@ -194,8 +195,6 @@ def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -
     chain = _Chain(console, names, options, tuple(s.law for s in steps if s.law), config, stored, steps)
     if not options["dry_run"]:
         _require_named(chain)
-        if any(step.why for step in steps):
-            require_writable(stored.path)
     return chain
 
 
@@ -223,14 +222,15 @@ def _require_named(chain: _Chain) -> None:
     A run file may come from anybody: what is stored in it is shown and compared, never imported. Classes
     that are named are imported, so that what cannot be found is known before any work.
     """
+    from projservo_cli.config import Override
     from projservo_cli.control import CODES
-    from projservo_cli.records import InputError, law_and_mode
+    from projservo_cli.records import law_and_mode
     from projservo_cli.robots import plugins
 
     plant = chain.config.plant.use
     servo = [step for step in chain.steps if step.stage == "servo" and step.why]
     if servo and plant is not None and "servo" not in chain.names:
-        raise InputError(
+        raise click.UsageError(
             f"{chain.names[-1]} needs a run of {servo[0].law} ({servo[0].why}), which moves {plant}: "
             "run projservo servo first"
         )
@@ -238,35 +238,17 @@ def _require_named(chain: _Chain) -> None:
     wanted = {("law", law): f"--law {law}" for law in laws if law not in CODES}
     if servo and plant is not None:
         wanted["plant", plant] = f"--set plant={plant}"
-    named = wanted.keys() if chain.options["config"] else _named_by(chain.options)
+    paths = {Override.parse(text).path for text in chain.options["sets"]}
+    named = {kind: bool(keys & paths) for kind, keys in _NAMING.items()}
+    named["law"] |= bool(chain.options.get("laws"))
     for (kind, target), flag in wanted.items():
-        if (kind, target) not in named:
-            raise InputError(
+        if not (chain.options["config"] or named[kind]):
+            raise click.UsageError(
                 f"{kind} {target} is named by the stored run alone, which starts no code: give the "
                 f"configuration again with -c, or {flag}"
             )
     for kind, target in wanted:
         plugins.find(kind, target)
-
-
-def _named_by(options: Mapping[str, Any]) -> set[tuple[str, str | None]]:
-    """Robots and laws that the options name."""
-    from projservo_cli.config import Override
-    from projservo_cli.robots import plugins
-
-    found: set[tuple[str, str | None]] = {("law", name) for name in _law_names(options.get("laws", ()))}
-    for override in map(Override.parse, options["sets"]):
-        kind = {"plant": "plant", "control": "law"}.get(str(override.path[0]))
-        if kind is not None:
-            found |= {(kind, plugins.target_of(kind, text)) for text in _texts(override.value)}
-    return found
-
-
-def _texts(value: Any) -> list[str]:
-    if isinstance(value, str):
-        return [value]
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return [text for item in inner for text in _texts(item)]
 
 
 def _tell_dry(chain: _Chain) -> int:
@@ -395,10 +377,8 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
 
 
 def _words(chain: _Chain, values: Mapping[str, dict[str, Any]]) -> Iterator[str]:
-    from projservo_cli.cli.words import summary
-
     for name, value in values.items():
-        yield from summary(name, value, detailed=chain.console.verbose)
+        yield from words_of(name, value, detailed=chain.console.verbose)
     if chain.run.results:
         yield f"run: {chain.run.path}"
 
@@ -426,3 +406,23 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
     # Other profiles are those of the paper, of which the margins are only measured.
     if "plan" in results and chain.run.plan.profile == "constrained" and not chain.run.plan.feasible:
         yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
+
+
+def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:
+    """Write the report of a sweep and print its tables; the exit code."""
+    from projservo_cli.files import working_in
+    from projservo_cli.report.style import FORMATS
+    from projservo_cli.sweep.folder import Folder
+    from projservo_cli.sweep.statistics import report
+
+    for name in _UNUSED:
+        if options[name]:
+            flag = name.replace("_", "-").removesuffix("s")
+            raise click.UsageError(f"--{flag}: not used by report {sweep}, which is of a sweep")
+    folder = Folder(sweep)
+    with working_in(folder.path):
+        found, files = report(folder.assembled(), FORMATS, console.progress)
+    value = {"sweep": folder.path.resolve(), **found, "files": [path.resolve() for path in files]}
+    names = ", ".join(path.name for path in files)
+    console.tell(value, [*words_of("sweep", found), wrapped(f"files: {folder.path}: {names}")])
+    return 0

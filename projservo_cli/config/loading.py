@@ -1,20 +1,35 @@
-"""From YAML text and overrides to a checked configuration, or to all that is wrong with it."""
+"""From YAML text and overrides to a checked configuration, or to all that is wrong with it; and back.
+
+YAML is read safely, each key and value with the place it stands at. Numbers and booleans follow the YAML 1.2
+core schema: ``1e-3`` is a number, ``on`` and ``12:30`` are text. Duplicate keys are refused; aliases, nesting
+and size are bounded.
+"""
 
 import difflib
+import hashlib
 import json
+import math
 import pathlib
+import re
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from projservo_cli.config.models import Config
-from projservo_cli.config.robot import CONTRADICTION, Section
-from projservo_cli.config.yaml_source import MAX_DEPTH, Document, Path, Problem, shortened
+from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
+from projservo_cli.config.sweep import SweepConfig
+from projservo_cli.files import text_of
 from projservo_cli.records import InputError
+
+try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
+    from yaml import CSafeLoader as _Parser
+except ImportError:
+    from yaml import SafeLoader as _Parser  # type: ignore[assignment]  # either will do
 
 _PHRASES = {
     "missing": "is missing",
@@ -38,14 +53,188 @@ _PHRASES = {
     "string_too_short": "must not be empty",
     "string_too_long": "takes at most {max_length} characters",
     "value_error": "{error}",
-    CONTRADICTION: "{what}",
 }
 
 # Values that name files, relative to the configuration.
 _FILES = (("data", "table"), ("calibration", "init"))
 _DIGITS = 9  # of a position in a list
 _MOST = 200  # problems that are looked at; who has more has taken another file
-_Model = TypeVar("_Model", bound=Section)
+_Path = tuple[str | int, ...]
+
+_MAX_BYTES = 1_000_000
+_MAX_VALUES = 50_000  # aliases counted as often as they are used
+_MAX_DEPTH = 32
+_MOST_LINES = 50  # that are told of what is wrong
+_STANDARD = "tag:yaml.org,2002:"
+_Model = TypeVar("_Model", bound=Root)
+
+
+def _shortened(text: str, most: int = 80) -> str:
+    """A text for a message, cut where it is long."""
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+class _Loader(_Parser):
+    """Leaves plain text as it stands."""
+
+
+_Loader.yaml_implicit_resolvers = {}
+
+# Plain text that means something else, and what it means.
+_CORE: tuple[tuple[re.Pattern[str], Callable[[str], Any]], ...] = (
+    (re.compile(r"~|null|Null|NULL|"), lambda text: None),
+    (re.compile(r"true|True|TRUE|false|False|FALSE"), lambda text: text.lower() == "true"),
+    (re.compile(r"[-+]?[0-9]+"), int),
+    (re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"), float),
+    (re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"), lambda text: float(text.replace(".", ""))),
+)
+
+
+class _Document:
+    """A parsed YAML text: plain values, where each stands, and what was wrong with the text."""
+
+    def __init__(self, text: str, name: str) -> None:
+        self.name = name
+        self.places: dict[_Path, str] = {}
+        self.problems: list[tuple[_Path, str, str]] = []  # path, what is wrong, place if no path leads to it
+        self.values: Any = None
+        self._count = 0
+        try:
+            self._parse(text)
+        except _UnfitError as error:
+            self.wrong((), str(error), name)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            place = self._place(mark) if mark else name
+            self.wrong((), f"not valid YAML: {error.problem or error.context}", place)
+        except yaml.YAMLError as error:
+            self.wrong((), f"not valid YAML: {' '.join(str(error).split())}", name)
+
+    def wrong(self, path: _Path, what: str, place: str = "") -> None:
+        """Note something wrong, where ``path`` stands or at a place that no path leads to."""
+        self.problems.append((path, what, place))
+
+    @classmethod
+    def read(cls, path: pathlib.Path | str) -> "_Document":
+        """The document in a file; an InputError where there is none."""
+        return cls(text_of(path, "a configuration (YAML)", _MAX_BYTES), str(path))
+
+    def _parse(self, text: str) -> None:
+        if len(text) > _MAX_BYTES:
+            raise _UnfitError(f"larger than {_MAX_BYTES} bytes; this is no configuration")
+        if any("\ud800" <= character <= "\udfff" for character in text):
+            raise _UnfitError("not UTF-8 text")
+        _require_bounded(text)
+        root = _Loader(text).get_single_node()
+        if root is not None:
+            self.values = self._value(root, ())
+
+    def _place(self, mark: yaml.Mark) -> str:
+        return f"{self.name}:{mark.line + 1}:{mark.column + 1}"
+
+    def _value(self, node: yaml.Node, path: _Path) -> Any:
+        self._count += 1
+        if self._count > _MAX_VALUES:
+            raise _UnfitError(f"more than {_MAX_VALUES} values, aliases expanded")
+        if len(path) > _MAX_DEPTH:
+            raise _UnfitError(f"nested more than {_MAX_DEPTH} levels deep, or an alias holds itself")
+        self.places.setdefault(path, self._place(node.start_mark))
+        if node.tag not in {_STANDARD + kind for kind in ("map", "seq", "str")}:
+            tag = _shortened(node.tag.replace(_STANDARD, "!!"))
+            what = f"the tag {tag} is not allowed; plain values only"
+            self.wrong(path, what, self._place(node.start_mark))
+            return None
+        if isinstance(node, yaml.MappingNode):
+            return self._mapping(node, path)
+        if isinstance(node, yaml.SequenceNode):
+            return [self._value(item, (*path, i)) for i, item in enumerate(node.value)]
+        assert isinstance(node, yaml.ScalarNode)
+        return self._scalar(node, path)
+
+    def _mapping(self, node: yaml.MappingNode, path: _Path) -> dict[str, Any]:
+        values: dict[str, Any] = {}
+        for key_node, value_node in node.value:
+            place = self._place(key_node.start_mark)
+            key = key_node.value
+            if not isinstance(key_node, yaml.ScalarNode):
+                self.wrong(path, "a key must be plain text", place)
+            elif key in values:
+                first = self.places[(*path, key)].removeprefix(f"{self.name}:")
+                what = f"the key stands here a second time (first at {first}); keep one"
+                self.wrong((*path, key), what, place)
+            else:
+                self.places[(*path, key)] = place
+                values[key] = self._value(value_node, (*path, key))
+        return values
+
+    def _scalar(self, node: yaml.ScalarNode, path: _Path) -> Any:
+        if node.style:  # in quotes, or a block of text
+            return node.value
+        meaning = next((meaning for pattern, meaning in _CORE if pattern.fullmatch(node.value)), str)
+        try:
+            return meaning(node.value)
+        except ValueError:  # of more digits than Python converts
+            what = "cannot be read as a number"
+            self.wrong(path, what, self._place(node.start_mark))
+            return None
+
+    def override(self, path: _Path, value: Any, flag: str) -> None:
+        """Set a value that comes from elsewhere, making the mappings on the way to it."""
+        holder: Any = self.values
+        for i, step in enumerate(path):
+            here = path[: i + 1]
+            key = str(step) if isinstance(holder, dict) else step
+            if isinstance(holder, list):
+                if not isinstance(step, int) or step >= len(holder):
+                    what = f"expected a list position from 0 to {len(holder) - 1}"
+                    return self.wrong(here, what, flag)
+            elif not isinstance(holder, dict):
+                what = "there is a plain value where a section is expected"
+                return self.wrong(here, what, flag)
+            if here == path or (isinstance(holder, dict) and holder.get(key) is None):
+                holder[key] = value if here == path else {}
+                inside = [known for known in self.places if known[: len(here)] == here]
+                for known in inside:
+                    del self.places[known]
+                self.places[here] = flag
+            holder = holder[key]
+        return None
+
+    def place(self, path: _Path) -> str:
+        """Where ``path`` stands, or the nearest mapping or list around it."""
+        while path and path not in self.places:
+            path = path[:-1]
+        return self.places.get(path, self.name)
+
+    def refused(self) -> InputError:
+        """One line a problem, flags last, otherwise in the order of the file; of very many the first."""
+        told = []
+        for path, what, source in self.problems:
+            place = source or self.place(path)
+            parts = (place, _shortened(".".join(map(str, path)), 200), _shortened(what, 1000))
+            told.append((_position(place), ": ".join(part for part in parts if part)))
+        different = list(dict.fromkeys(line for _, line in sorted(told, key=lambda item: item[0])))
+        left = len(different) - _MOST_LINES
+        more = [f"{self.name}: and {left} more"] if left > 0 else []
+        return InputError("\n".join(different[:_MOST_LINES] + more))
+
+
+def _position(place: str) -> tuple[float, float]:
+    numbers = re.search(r":(\d+):(\d+)$", place)
+    return (float(numbers[1]), float(numbers[2])) if numbers else (math.inf, math.inf)
+
+
+def _require_bounded(text: str) -> None:
+    """Refuse what is nested too deep before nodes are made of it, which recurses in C."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _MAX_DEPTH:
+            raise _UnfitError(f"nested more than {_MAX_DEPTH} levels deep")
+
+
+class _UnfitError(ValueError):
+    """The text cannot be that of a configuration."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +242,7 @@ class Override:
     """A value given on the command line; ``flag`` is how the user wrote it."""
 
     flag: str
-    path: Path
+    path: _Path
     value: Any
 
     @classmethod
@@ -67,11 +256,11 @@ class Override:
         steps = [step.strip() for step in key.split(".")]
         if not sign or not all(steps):
             raise InputError(f"{flag}: expected KEY=VALUE, with a key such as control.gain_t")
-        if len(steps) > MAX_DEPTH or any(step.isdecimal() and len(step) > _DIGITS for step in steps):
-            raise InputError(f"{shortened(flag)}: there is no such key")
-        document = Document(value, flag)
+        if len(steps) > _MAX_DEPTH or any(step.isdecimal() and len(step) > _DIGITS for step in steps):
+            raise InputError(f"{_shortened(flag)}: there is no such key")
+        document = _Document(value, flag)
         if document.problems:
-            raise InputError(f"{flag}: the value is {document.problems[0].what}")
+            raise InputError(f"{flag}: the value is {document.problems[0][1]}")
         path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(steps))
         if path == ("law",):
             return cls(flag, ("control", "laws"), [document.values])
@@ -83,7 +272,7 @@ def load_config(
 ) -> Config:
     """Read and check a configuration.
 
-    path : Path, str or None, the YAML file. None for a blank recorded configuration, which overrides fill.
+    path : _Path, str or None, the YAML file. None for a blank recorded configuration, which overrides fill.
     overrides : sequence of str or Override ``a.b=v`` as for ``--set``, applied in order.
     text : str, optional, its content, where it is already at hand; ``path`` then only names it in messages.
     Returns Config: ``data.table`` and ``calibration.init`` are absolute paths, whatever the working directory
@@ -91,35 +280,89 @@ def load_config(
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
     if path is not None and text is None:
-        document = Document.read(path)
+        document = _Document.read(path)
     else:
-        document = Document(text or "", str(path or ""))
+        document = _Document(text or "", str(path or ""))
     if document.values is None:
         document.values = {}
     if not isinstance(document.values, dict):
         raise InputError(f"{document.place(())}: expected keys and values such as name: paper")
     if path is not None and not document.values and not document.problems:
-        what = "the configuration is empty; start from one of the shipped ones"
-        document.problems.append(Problem((), what))
+        document.wrong((), "the configuration is empty; start from one of the shipped ones")
     _spell_out(document.values)
     for change in changes:
         document.override(change.path, change.value, change.flag)
         _spell_out(document.values)
     _fill_in(document.values, path)
-    return validated(Config, document)
+    return _validated(Config, document)
 
 
-def validated(model: type[_Model], document: Document) -> _Model:
+def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
+    """Read and check the configuration of a sweep; ``base`` becomes absolute paths.
+
+    Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
+    """
+    document = _Document.read(path)
+    if not isinstance(document.values, dict):
+        if not document.problems:
+            document.wrong((), "expected keys and values such as base: paper.yaml")
+        raise document.refused()
+    for change in map(Override.parse, overrides):
+        document.override(change.path, change.value, change.flag)
+    document.values.setdefault("name", pathlib.Path(path).stem)
+    sweep = _validated(SweepConfig, document)
+    folder = pathlib.Path(path).parent
+    return sweep.model_copy(update={"base": tuple(str((folder / base).resolve()) for base in sweep.base)})
+
+
+def _validated(model: type[_Model], document: _Document) -> _Model:
     """The configuration that a document holds; an InputError with all that is wrong with it."""
-    found = document.problems
+    wrong: list[ErrorDetails] = []
     try:
-        if all(problem.path for problem in found):  # of a text that is none, nothing more can be said
+        if all(path for path, *_ in document.problems):  # of a text that is none, no more can be said
             config = model.model_validate(document.values)
     except ValidationError as error:
-        found = [*found, *_translated(model, error.errors(include_url=False))]
-    if found:
-        raise document.refused(found)
+        wrong = error.errors(include_url=False)
+    if broken := {part["loc"][0] for part in wrong if part["loc"]}:
+        rest = {"name": "-"} | {key: value for key, value in document.values.items() if key not in broken}
+        try:
+            model.model_validate(rest, context=broken)
+        except ValidationError as error:
+            more = error.errors(include_url=False)
+            wrong = [*(part for part in more if part["type"] == CONTRADICTIONS), *wrong]
+    for path, what in _translated(model, wrong):
+        document.wrong(path, what)
+    if document.problems:
+        raise document.refused()
     return config
+
+
+def to_yaml(config: Config) -> str:
+    """The whole configuration, defaults written out, as YAML that loads to an equal one."""
+    values = _without_unset(config)
+    return yaml.dump(
+        values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
+    )
+
+
+def digest(
+    config: Config,
+    keys: Sequence[str],
+    *,
+    without: Sequence[str] = (),
+    extra: Mapping[str, Any] | None = None,
+) -> str:
+    """SHA-256 of parts of a configuration, in hexadecimal.
+
+    ``keys`` are sections such as ``control``, or values in them such as ``noise.servo_px``, in any order,
+    less the values ``without``, such as ``control.laws``; ``extra`` are further JSON values.
+    """
+    values = config.model_dump(mode="json")
+    for section, key in (dotted.split(".") for dotted in without):
+        (values[section] or {}).pop(key, None)
+    parts = {dotted: _part(values, dotted.split(".")) for dotted in keys}
+    text = json.dumps([parts, extra or {}], sort_keys=True, allow_nan=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _spell_out(values: dict[str, Any]) -> None:
@@ -145,16 +388,19 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
             values.setdefault("name", pathlib.Path(file).stem)
 
 
-def _translated(model: type[Section], errors: Sequence[ErrorDetails]) -> Iterator[Problem]:
+def _translated(model: type[Root], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
     """What pydantic found, in words."""
     places = [error["loc"] for error in errors]
     for error, place in list(zip(errors, places, strict=True))[:_MOST]:
+        if error["type"] == CONTRADICTIONS:
+            yield from error["ctx"]["found"]
+            continue
         inside = any(len(other) > len(place) and other[: len(place)] == place for other in places)
         if not (inside and error["type"] == "too_short"):  # a list counts only its valid entries
-            yield Problem(place, _phrase(model, error))
+            yield place, _phrase(model, error)
 
 
-def _phrase(model: type[Section], error: ErrorDetails) -> str:
+def _phrase(model: type[Root], error: ErrorDetails) -> str:
     kind, path, given = error["type"], error["loc"], error["input"]
     context = error.get("ctx", {})
     if kind == "extra_forbidden":
@@ -173,8 +419,8 @@ def _phrase(model: type[Section], error: ErrorDetails) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A value as it would stand in YAML, shortened."""
-    return shortened(json.dumps(value) if value is None or isinstance(value, bool) else repr(value), 40)
+    """A value as it would stand in YAML, _shortened."""
+    return _shortened(json.dumps(value) if value is None or isinstance(value, bool) else repr(value), 40)
 
 
 def _nearest(word: object, valid: Sequence[str]) -> str:
@@ -183,7 +429,7 @@ def _nearest(word: object, valid: Sequence[str]) -> str:
     return f"did you mean {close[0]}?" if close else f"valid: {', '.join(valid)}"
 
 
-def _keys_at(model: type[BaseModel], path: Path) -> list[str]:
+def _keys_at(model: type[BaseModel], path: _Path) -> list[str]:
     """Keys that the mapping at ``path`` may have."""
     for step in path:
         if step in model.model_fields:  # else a position in a list, or any key of a mapping
@@ -197,3 +443,29 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
         yield annotation
     for part in typing.get_args(annotation):
         yield from _models(part)
+
+
+def _part(values: Any, path: Sequence[str]) -> Any:
+    """The value at a path; None in a section that is absent."""
+    for key in path:
+        values = None if values is None else values[key]
+    return values
+
+
+def _without_unset(value: Any) -> Any:
+    """Plain values, less those that are absent by default; a null that overrides a default stays."""
+    if isinstance(value, BaseModel):
+        fields = type(value).model_fields
+        return {
+            key: _without_unset(inner)
+            for key, inner in value
+            if inner is not None or fields[key].default is not None
+        }
+    return [_without_unset(inner) for inner in value] if isinstance(value, tuple) else value
+
+
+class _Dumper(yaml.SafeDumper):
+    """Dumps without aliases, so that every value stands where it is read."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True

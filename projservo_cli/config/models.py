@@ -4,28 +4,20 @@ import inspect
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
-    ModelWrapValidatorHandler,
     StrictBool,
     StrictInt,
     StringConstraints,
-    ValidationError,
-    ValidationInfo,
     WithJsonSchema,
-    model_validator,
 )
 from pydantic_core import PydanticCustomError
 
 from projservo_cli.config.robot import (
-    CONTRADICTION,
-    LENIENT,
     Count,
     Finding,
     JointVector,
@@ -34,17 +26,18 @@ from projservo_cli.config.robot import (
     Number,
     Positive,
     Rig,
-    Robot,
+    RobotSettings,
+    Root,
     Section,
     Vector2,
     Vector3,
     Whole,
 )
-from projservo_cli.records import LAWS, MODES, REPLAN
+from projservo_cli.records import LAWS, REPLAN
 from projservo_cli.robots import plugins
 
 
-class LostMarkers(Section):
+class _LostMarkers(Section):
     """Markers that neither camera sees for a while; all of them where none is named."""
 
     from_step: Whole = Field(description="first step at which they are unseen")
@@ -54,7 +47,7 @@ class LostMarkers(Section):
     )
 
 
-class Bump(Section):
+class _Bump(Section):
     """A joint knocked aside; ``read: false`` for a joint that slips on its encoder."""
 
     at_step: Count = Field(description="step at which it is knocked")
@@ -69,7 +62,7 @@ class Bump(Section):
             yield (), "give exactly one of by_deg and by_m"
 
 
-class FrozenJoint(Section):
+class _FrozenJoint(Section):
     """A joint whose reading stands still while it moves."""
 
     joint: Count = Field(description="the joint, counted from 1")
@@ -77,12 +70,12 @@ class FrozenJoint(Section):
     steps: Count | None = Field(None, description="for how many steps; null for ever")
 
 
-class Disturbance(Section):
+class _Disturbance(Section):
     """Everything that befalls the simulated robot and its images."""
 
-    lost_markers: LostMarkers | None = None
-    bump: Bump | None = None
-    frozen_joint: FrozenJoint | None = None
+    lost_markers: _LostMarkers | None = None
+    bump: _Bump | None = None
+    frozen_joint: _FrozenJoint | None = None
     delay_periods: StrictInt = Field(0, ge=0, le=1000, description="by how many periods images are late")
 
 
@@ -125,32 +118,16 @@ def _plain(value: Any) -> Any:
 Plain = Annotated[Any, AfterValidator(_plain)]
 
 
-class Options(BaseModel):
-    """What the class of a plant is made with: any keys, any plain values."""
-
-    model_config = ConfigDict(frozen=True, extra="allow")
-    __pydantic_extra__: dict[str, Plain]
-
-    def values(self) -> dict[str, Any]:
-        """The options by name."""
-        return dict(self.model_extra or {})
-
-
-def _list(value: Any) -> Any:
+def one_or_more(value: Any) -> Any:
+    """Some text stands for a list of it alone."""
     return [value] if isinstance(value, str) else value
 
 
-_MODE = {"enum": list(MODES)}
-# One mode may stand for a list of it.
-_Modes = Annotated[
-    tuple[Literal["replan", "track", "image_track"], ...],
-    BeforeValidator(_list),
-    Field(min_length=1),
-    WithJsonSchema({"anyOf": [_MODE, {"type": "array", "items": _MODE, "minItems": 1}]}),
-]
+_Mode = Literal["replan", "track", "image_track"]
+_Modes = Annotated[tuple[_Mode, ...], Field(min_length=1)]
 
 
-class Noise(Section):
+class _Noise(Section):
     """Standard deviation of simulated pixel noise, per coordinate."""
 
     calibration_px: NotNegative = Field(0.5, description="in the images of trial motions")
@@ -160,7 +137,7 @@ class Noise(Section):
     )
 
 
-class CalibrationSettings(Section):
+class _CalibrationSettings(Section):
     """Trial motions of one joint each around a reference, and the method that evaluates them."""
 
     method: Literal["refined", "closed_form"] = Field(
@@ -197,7 +174,7 @@ class CalibrationSettings(Section):
                 yield (key,), f"belongs to the method refined, not to {self.method}"
 
 
-class Data(Section):
+class _Data(Section):
     """A recorded run: the observation table that stands in for simulated trial motions."""
 
     table: Annotated[str, StringConstraints(min_length=1)] = Field(
@@ -215,14 +192,14 @@ class Data(Section):
     )
 
 
-class Perturbation(Section):
+class _Perturbation(Section):
     """A small displacement of the goal pose, in the tool frame."""
 
     translation_m: Vector3 = Field((0.0, 0.0, 0.0), description="along the axes of the tool")
     rotation_rad: Vector3 = Field((0.0, 0.0, 0.0), description="rotation vector in the axes of the tool")
 
 
-class GoalImages(Section):
+class _GoalImages(Section):
     """Pixels of the face at the goal, in the order of ``markers.face``."""
 
     left: tuple[Vector2, ...] = Field(description="u and v of each marker in the left image, px")
@@ -236,10 +213,10 @@ class Goal(Section):
     turn_deg: Number | None = Field(
         None, ge=-360, le=360, description="turn from the start about the roll axis of the rig"
     )
-    perturbation: Perturbation | None = Field(
+    perturbation: _Perturbation | None = Field(
         None, description="small displacement of a goal given by turn_deg, in the tool frame"
     )
-    images: GoalImages | None = Field(None, description="pixels of the face, recorded at the goal")
+    images: _GoalImages | None = Field(None, description="pixels of the face, recorded at the goal")
 
     def contradictions(self) -> Iterator[Finding]:
         """No goal, or several."""
@@ -251,7 +228,7 @@ class Goal(Section):
             yield ("perturbation",), "belongs to a goal given by turn_deg"
 
 
-class Task(Section):
+class TaskSettings(Section):
     """A reaching task from ``start`` to ``goal``.
 
     ``start_offset`` moves the start alone: a goal that is a turn stays that of the start without it.
@@ -291,7 +268,7 @@ class Trajectory(Section):
     )
 
 
-class Control(Section):
+class _Control(Section):
     """The laws to run, in which modes, their gains in 1/s, and how fast the joints may move."""
 
     laws: tuple[Law, ...] = Field(
@@ -299,7 +276,7 @@ class Control(Section):
         min_length=1,
         description="laws to run, each from the start; module:Class for a law of yours",
     )
-    mode: _Modes = Field(
+    mode: Annotated[_Modes, BeforeValidator(one_or_more, json_schema_input_type=_Mode | _Modes)] = Field(
         ("replan",),
         description="whether each step plans anew or the plan is followed; with a list, each law in those "
         "of the modes that it has",
@@ -340,7 +317,7 @@ class Control(Section):
                 )
 
 
-class PlantSettings(Section):
+class _PlantSettings(Section):
     """What is driven, and what the simulated robot does at its borders.
 
     ``use`` names the class of a robot that is not simulated, ``options`` are what it is made with;
@@ -350,7 +327,7 @@ class PlantSettings(Section):
     use: PlantClass | None = Field(
         None, description="class of a robot of yours, module:Class; null for the simulated one"
     )
-    options: Options = Field(Options(), description="arguments that the class is made with")
+    options: dict[str, Plain] = Field({}, description="arguments that the class is made with")
     timeout_s: Positive = Field(1.0, description="most time an answer of the robot may take")
     speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of every command to the robot")
     self_occlusion: Literal["transparent", "opaque"] = Field(
@@ -364,7 +341,7 @@ class PlantSettings(Section):
     )
 
 
-class Stop(Section):
+class _Stop(Section):
     """When a closed loop ends."""
 
     image_px: Positive = Field(0.01, description="converged within this image error, rms")
@@ -382,7 +359,7 @@ class Stop(Section):
     )
 
 
-class ReportSettings(Section):
+class _ReportSettings(Section):
     """What the report writes."""
 
     formats: tuple[Literal["svg", "pdf", "png"], ...] = Field(
@@ -400,21 +377,24 @@ def _folder_name(name: str) -> str:
 FolderName = Annotated[str, StringConstraints(max_length=100), AfterValidator(_folder_name)]
 
 
-def _joint_types(robot: Robot | None, data: Data | None) -> str:
+def _joint_types(robot: RobotSettings | None, data: _Data | None) -> str:
     """One letter a joint, R or P; empty where only the table tells how many there are."""
     if data is not None and data.joints is not None:
         return data.joints
     return robot.joint_types if robot is not None else ""
 
 
-def _same_joints(robot: Robot | None, data: Data | None) -> Iterator[Finding]:
+def _same_joints(robot: RobotSettings | None, data: _Data | None) -> Iterator[Finding]:
     given = _joint_types(robot, data)
     if robot is not None and robot.joints and given != robot.joint_types:
         yield ("data", "joints"), f"{given} are not the joints of the robot, {robot.joint_types}"
 
 
 def _joint_vectors(
-    robot: Robot | None, data: Data | None, calibration: CalibrationSettings, task: Task | None
+    robot: RobotSettings | None,
+    data: _Data | None,
+    calibration: _CalibrationSettings,
+    task: TaskSettings | None,
 ) -> Iterator[Finding]:
     """Vectors that are not of the robot's joints, and poses beyond their limits."""
     types = _joint_types(robot, data)
@@ -424,16 +404,15 @@ def _joint_vectors(
         vectors["task", "start_offset"] = task.start_offset
         vectors["task", "goal", "joints"] = task.goal.joints
     for path, vector in vectors.items():
-        if vector is None or not types:
-            continue
-        if len(vector.joints) != len(types):
+        if vector is not None and types:
             yield from vector.miscounted(types, *path)
-        elif path[-1] in ("reference", "start") and robot is not None and robot.joint_types == types:
-            yield from _beyond_limits(robot, vector, *path)
+            if path[-1] in ("reference", "start") and robot is not None and robot.joint_types == types:
+                yield from _beyond_limits(robot, vector, *path)
 
 
-def _beyond_limits(robot: Robot, vector: JointVector, *path: str) -> Iterator[Finding]:
-    for i, (value, joint) in enumerate(zip(vector.values(robot.joint_types), robot.joints, strict=True)):
+def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Iterator[Finding]:
+    values = vector.values(robot.joint_types) if len(vector.joints) == len(robot.joints) else ()
+    for i, (value, joint) in enumerate(zip(values, robot.joints, strict=False)):
         low, high = joint.limits
         if not low <= value <= high and not any(joint.contradictions()):
             turn, unit = (math.degrees, "deg") if joint.type == "R" else (float, "m")
@@ -441,7 +420,7 @@ def _beyond_limits(robot: Robot, vector: JointVector, *path: str) -> Iterator[Fi
             yield (*path, "joints", i), f"{what}, {turn(low):.6g} to {turn(high):.6g} {unit}"
 
 
-def _goal_images(task: Task | None, markers: Markers | None) -> Iterator[Finding]:
+def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator[Finding]:
     if task is None or task.goal.images is None:
         return
     path = ("task", "goal", "images")
@@ -454,12 +433,12 @@ def _goal_images(task: Task | None, markers: Markers | None) -> Iterator[Finding
             yield (*path, side), what
 
 
-def _simulated_alone(disturbance: Disturbance, plant: PlantSettings) -> Iterator[Finding]:
-    if plant.use is not None and disturbance != Disturbance():
+def _simulated_alone(disturbance: _Disturbance, plant: _PlantSettings) -> Iterator[Finding]:
+    if plant.use is not None and disturbance != _Disturbance():
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
 
 
-def _disturbed_joints(disturbance: Disturbance, robot: Robot | None) -> Iterator[Finding]:
+def _disturbed_joints(disturbance: _Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
     if robot is None or not robot.joints:
         return
     types, bump = robot.joint_types, disturbance.bump
@@ -473,13 +452,13 @@ def _disturbed_joints(disturbance: Disturbance, robot: Robot | None) -> Iterator
             yield ("disturbance", "bump"), f"joint {bump.joint} is of type {letter}: give {fitting}"
 
 
-def _lost_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Finding]:
+def _lost_markers(disturbance: _Disturbance, markers: Markers | None) -> Iterator[Finding]:
     lost = disturbance.lost_markers
     if lost is not None and lost.markers is not None and markers is not None:
         yield from markers.unknown(lost.markers, "disturbance", "lost_markers", "markers")
 
 
-def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Finding]:
+def _plan_to_follow(control: _Control, trajectory: Trajectory) -> Iterator[Finding]:
     limits = (control.joint_speed_limit_deg_s, control.prismatic_speed_limit_m_s)
     if any(mode != REPLAN for mode in control.mode) and {*limits, trajectory.duration_s} == {None}:
         yield (
@@ -489,16 +468,13 @@ def _plan_to_follow(control: Control, trajectory: Trajectory) -> Iterator[Findin
         )
 
 
-_RULES: tuple[Callable[..., Iterator[Finding]], ...] = (
-    _same_joints,
-    _joint_vectors,
-    _goal_images,
-    _simulated_alone,
-    _disturbed_joints,
-    _lost_markers,
-    _plan_to_follow,
-)
-_TAKES = {rule: frozenset(inspect.signature(rule).parameters) for rule in _RULES}  # names of sections
+_RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes
+    rule: {*inspect.signature(rule).parameters}
+    for rule in (
+        *(_same_joints, _joint_vectors, _goal_images, _simulated_alone),
+        *(_disturbed_joints, _lost_markers, _plan_to_follow),
+    )
+}
 
 
 def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
@@ -514,16 +490,7 @@ def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
         yield ("task",), f"{reason}, or calibration.reference"
 
 
-def _between(sections: Mapping[str, Any]) -> Iterator[Finding]:
-    """What does not fit together between these sections, of which broken ones are left out."""
-    if "data" in sections and sections["data"] is None:
-        yield from _missing(sections)
-    for rule, wanted in _TAKES.items():
-        if wanted <= sections.keys():
-            yield from rule(**{name: sections[name] for name in wanted})
-
-
-class Config(Section):
+class Config(Root):
     """Everything a run depends on.
 
     ``robot``, ``rig``, ``markers`` and ``task`` may be absent in a recorded run (``data`` set) as
@@ -532,42 +499,27 @@ class Config(Section):
 
     name: FolderName = Field(description="of the run and its folder; by default that of the file")
     seed: Whole = Field(0, description="of all random numbers; the same seed gives the same run")
-    robot: Robot | None = None
+    robot: RobotSettings | None = None
     rig: Rig | None = None
     markers: Markers | None = None
-    noise: Noise = Noise()
-    calibration: CalibrationSettings = CalibrationSettings()
-    data: Data | None = None
-    task: Task | None = None
+    noise: _Noise = _Noise()
+    calibration: _CalibrationSettings = _CalibrationSettings()
+    data: _Data | None = None
+    task: TaskSettings | None = None
     trajectory: Trajectory = Trajectory()
-    control: Control = Control()
-    plant: PlantSettings = PlantSettings()
-    disturbance: Disturbance = Disturbance()
-    stop: Stop = Stop()
-    report: ReportSettings = ReportSettings()
+    control: _Control = _Control()
+    plant: _PlantSettings = _PlantSettings()
+    disturbance: _Disturbance = _Disturbance()
+    stop: _Stop = _Stop()
+    report: _ReportSettings = _ReportSettings()
 
-    @model_validator(mode="wrap")
-    @classmethod
-    def _all_at_once(
-        cls, values: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
-    ) -> Self:
-        """Tell what is wrong in the sections together with what is wrong between the well-formed ones."""
-        try:
-            config = handler(values)
-        except ValidationError as error:
-            wrong = error.errors(include_url=False)
-            found = [(part["loc"], part["ctx"]["what"]) for part in wrong if part["type"] == CONTRADICTION]
-            wrong = [part for part in wrong if part["type"] != CONTRADICTION]
-            if any(not part["loc"] for part in wrong):
-                raise
-            broken = {part["loc"][0] for part in wrong}
-            rest = {key: value for key, value in values.items() if key not in broken}
-            sections = cls.model_validate({"name": "-", **rest}, context=LENIENT)
-            found += _between({key: value for key, value in sections if key not in broken})
-            raise cls.refusal(found, wrong) from None
-        if info.context != LENIENT and (found := list(_between(dict(config)))):
-            raise cls.refusal(found)
-        return config
+    def between(self, sound: Mapping[str, Any]) -> Iterator[Finding]:
+        """What a simulated run lacks, and what does not fit together between sections."""
+        if sound.get("data", "broken") is None:
+            yield from _missing(sound)
+        for rule, wanted in _RULES.items():
+            if wanted <= sound.keys():
+                yield from rule(**{name: sound[name] for name in wanted})
 
     @property
     def recorded(self) -> bool:

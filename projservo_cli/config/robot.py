@@ -1,12 +1,16 @@
-"""The robot, its rig and its markers, in metric terms: what a simulation takes as true."""
+"""The robot, its rig and its markers, in metric terms: what a simulation takes as true.
 
+Or, in a file of its own, what is believed of them, as a start for a calibration.
+"""
+
+import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -17,7 +21,10 @@ from pydantic import (
     WithJsonSchema,
     model_validator,
 )
-from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
+from pydantic_core import PydanticCustomError
+
+from projservo_cli.files import text_of
+from projservo_cli.records import FloatArray, InputError
 
 Number = Annotated[float, Strict()]
 Positive = Annotated[float, Strict(), Field(gt=0)]
@@ -31,9 +38,9 @@ Matrix34 = tuple[Vector4, Vector4, Vector4]
 Matrix44 = tuple[Vector4, Vector4, Vector4, Vector4]
 # The path from a section to a value in it, and what is wrong with that value.
 Finding = tuple[tuple[str | int, ...], str]
-CONTRADICTION = "contradiction"  # type of their errors
-LENIENT = {"contradictions": "kept"}  # context of a validation that lets them be
-TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
+CONTRADICTIONS = "contradictions"  # type of the error that holds them
+_MAX_BYTES = 10_000_000  # of what is believed of a robot
+_TOLERANCE = 1e-6  # of rotations and unit axes written with seven digits or more
 
 _IDENTITY: Matrix44 = (
     (1.0, 0.0, 0.0, 0.0),
@@ -43,34 +50,46 @@ _IDENTITY: Matrix44 = (
 )
 
 
-def _contradiction(what: str) -> PydanticCustomError:
-    return PydanticCustomError(CONTRADICTION, "{what}", {"what": what})
-
-
 class Section(BaseModel):
-    """A mapping of the configuration: immutable, no unknown keys, its values fitting together."""
+    """A mapping of the configuration: immutable, no unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def contradictions(self) -> Iterable[Finding]:
-        """What does not fit together in this section."""
+        """What does not fit together in this section, of which each value is right by itself."""
         return ()
+
+
+class Root(Section):
+    """A configuration as a whole, of which all contradictions are found at once.
+
+    The context of a validation names keys whose values are wrong by themselves, and which are left out.
+    """
 
     @model_validator(mode="after")
     def _consistent(self, info: ValidationInfo) -> Self:
-        if info.context != LENIENT and (found := list(self.contradictions())):
-            raise self.refusal(found)
+        sound = {key: value for key, value in vars(self).items() if key not in (info.context or ())}
+        if found := [*_contradictions(sound.items()), *self.between(sound)]:
+            told = "; ".join(f"{'.'.join(map(str, path))}: {what}" for path, what in found)
+            raise PydanticCustomError(CONTRADICTIONS, "{told}", {"told": told, "found": found})
         return self
 
-    @classmethod
-    def refusal(cls, found: Iterable[Finding], also: Iterable[ErrorDetails] = ()) -> ValidationError:
-        """One error for all that is wrong in the section, each at the path of its value."""
-        errors = [InitErrorDetails(type=_contradiction(what), loc=path, input=cls) for path, what in found]
-        errors += [
-            InitErrorDetails(type=part["type"], loc=part["loc"], input=part["input"], ctx=part.get("ctx", {}))
-            for part in also
-        ]
-        return ValidationError.from_exception_data(cls.__name__, errors)
+    def between(self, sound: Mapping[str, Any]) -> Iterable[Finding]:
+        """What does not fit together between values by key."""
+        return ()
+
+
+def _contradictions(parts: Iterable[tuple[Any, Any]], path: tuple[str | int, ...] = ()) -> Iterator[Finding]:
+    """Those of all sections among some values by their keys, and of the sections in these."""
+    for key, part in parts:
+        here = (*path, key)
+        if isinstance(part, Section):
+            yield from ((here + at, what) for at, what in part.contradictions())
+            yield from _contradictions(vars(part).items(), here)
+        elif isinstance(part, dict):
+            yield from _contradictions(part.items(), here)
+        elif isinstance(part, tuple) and part and isinstance(part[0], Section):
+            yield from _contradictions(enumerate(part), here)
 
 
 class JointVector(Section):
@@ -125,7 +144,7 @@ class _Joint(Section):
                 yield (name,), f"the lower limit {low:g} must be below the upper limit {high:g}"
 
 
-class DHJoint(_Joint):
+class _DHJoint(_Joint):
     """A row of a Denavit-Hartenberg table; the joint reading adds to theta (R) or d (P)."""
 
     theta_deg: Number = Field(0.0, description="turn about z")
@@ -134,7 +153,7 @@ class DHJoint(_Joint):
     alpha_deg: Number = Field(0.0, description="turn about x")
 
 
-class ScrewJoint(_Joint):
+class _ScrewJoint(_Joint):
     """A spatial twist (w, v) in the base frame at the reference, per rad or per m."""
 
     w: Vector3 = Field(description="unit axis of a revolute joint, zero for a prismatic one")
@@ -145,55 +164,57 @@ class ScrewJoint(_Joint):
         yield from super().contradictions()
         axis = "w" if self.type == "R" else "v"
         length = math.hypot(*getattr(self, axis))
-        if abs(length - 1) > TOLERANCE:
+        if abs(length - 1) > _TOLERANCE:
             yield (axis,), f"must be of unit length for a joint of type {self.type}, it is {length:g}"
-        if self.type == "P" and math.hypot(*self.w) > TOLERANCE:
+        if self.type == "P" and math.hypot(*self.w) > _TOLERANCE:
             yield ("w",), "must be zero for a joint of type P"
-        if self.type == "R" and abs(np.dot(self.w, self.v)) > TOLERANCE:
+        if self.type == "R" and abs(np.dot(self.w, self.v)) > _TOLERANCE:
             yield ("v",), "must be orthogonal to w: a revolute joint has no pitch"
 
 
-def _rigid(T: Matrix44, info: ValidationInfo) -> Matrix44:
+def _not_rigid(T: Matrix44) -> str:
+    """Why a matrix is no pose; empty where it is one."""
     R = np.array(T)[:3, :3]
-    what = ""
     if T[3] != (0, 0, 0, 1):
-        what = "the last row must be [0, 0, 0, 1]"
-    elif abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > TOLERANCE or np.linalg.det(R) < 0:
-        what = "the upper left 3×3 block must be a rotation, written with seven digits or more"
-    if what and info.context != LENIENT:
-        raise _contradiction(what)
-    return T
+        return "the last row must be [0, 0, 0, 1]"
+    if abs(R).max() > 2 or abs(R @ R.T - np.eye(3)).max() > _TOLERANCE or np.linalg.det(R) < 0:
+        return "the upper left 3×3 block must be a rotation, written with seven digits or more"
+    return ""
 
 
-Pose = Annotated[Matrix44, AfterValidator(_rigid)]
-
-
-class DH(Section):
+class _DH(Section):
     """A Denavit-Hartenberg table, standard or modified (Craig)."""
 
     convention: Literal["standard", "modified"] = Field("standard", description="of the table")
-    joints: tuple[DHJoint, ...] = Field(min_length=1, max_length=64, description="rows, base to tool")
-    tool: Pose = Field(_IDENTITY, description="pose of the tool in the last joint's frame, m")
+    joints: tuple[_DHJoint, ...] = Field(min_length=1, max_length=64, description="rows, base to tool")
+    tool: Matrix44 = Field(_IDENTITY, description="pose of the tool in the last joint's frame, m")
+
+    def contradictions(self) -> Iterator[Finding]:
+        """A tool that is nowhere."""
+        if what := _not_rigid(self.tool):
+            yield ("tool",), what
 
 
-class Screws(Section):
+class _Screws(Section):
     """Joint screws at a reference: T(q) = Π exp(screw_i (q_i − reference_i)) · base_tool."""
 
     reference: JointVector = Field(description="joint readings at which the screws hold")
-    base_tool: Pose = Field(description="pose of the tool in the base frame there, m")
-    joints: tuple[ScrewJoint, ...] = Field(min_length=1, max_length=64, description="screws, base to tool")
+    base_tool: Matrix44 = Field(description="pose of the tool in the base frame there, m")
+    joints: tuple[_ScrewJoint, ...] = Field(min_length=1, max_length=64, description="screws, base to tool")
 
-    def contradictions(self) -> Iterable[Finding]:
-        """A reading too many or too few."""
-        return self.reference.miscounted("".join(joint.type for joint in self.joints), "reference")
+    def contradictions(self) -> Iterator[Finding]:
+        """A reading too many or too few, or a tool that is nowhere."""
+        yield from self.reference.miscounted("".join(joint.type for joint in self.joints), "reference")
+        if what := _not_rigid(self.base_tool):
+            yield ("base_tool",), what
 
 
-class Robot(Section):
+class RobotSettings(Section):
     """A serial arm, given by a DH table or by screws."""
 
     name: str = Field("", description="for figures and reports")
-    dh: DH | None = Field(None, description="a Denavit-Hartenberg table")
-    screws: Screws | None = Field(None, description="joint screws at a reference, instead of dh")
+    dh: _DH | None = Field(None, description="a Denavit-Hartenberg table")
+    screws: _Screws | None = Field(None, description="joint screws at a reference, instead of dh")
 
     @property
     def joints(self) -> tuple[_Joint, ...]:
@@ -315,3 +336,92 @@ class Markers(Section):
 def _listed(numbers: Sequence[int]) -> str:
     shown = ", ".join(map(str, numbers[:20]))
     return shown + (" …" if len(numbers) > 20 else "")
+
+
+class _Screw(BaseModel):
+    """A unit axis w with v = −w × point, or w zero and a unit direction v."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    w: Vector3
+    v: Vector3
+
+
+class _Believed(BaseModel):
+    """The keys of a file that are read; others are ignored."""
+
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+
+    screws: Annotated[list[_Screw], Field(min_length=1)]
+    q_reference: list[float]
+    camera_left: Matrix34
+    camera_right: Matrix34
+    markers_tool: Annotated[list[Vector3], Field(min_length=1)]
+    marker_numbers: list[int] | None = None
+    T_base_tool_at_reference: Matrix44
+
+
+def read_nominal(path: Path | str) -> dict[str, Any]:
+    """Read what is believed of a robot, its rig and its markers: the fields of ``calibration.Nominal``.
+
+    path : JSON with ``screws`` (w and v of each joint at the reference, base frame, rad and m),
+    ``q_reference`` (rad or m), ``camera_left`` and ``camera_right`` (3×4 matrices to px), ``markers_tool``
+    (m) with ``T_base_tool_at_reference``, and perhaps ``marker_numbers`` (0, 1 …).
+    Raises InputError ``file: key: what`` when it cannot be read or makes no sense.
+    """
+    found = _believed(path)
+    n, pose = len(found.screws), found.T_base_tool_at_reference
+    if len(found.q_reference) != n:
+        raise InputError(f"{path}: q_reference: {len(found.q_reference)} values for {n} screws")
+    numbers = found.marker_numbers or list(range(len(found.markers_tool)))
+    if len(numbers) != len(found.markers_tool) or len(set(numbers)) < len(numbers):
+        raise InputError(
+            f"{path}: marker_numbers: give each of the {len(found.markers_tool)} markers its own number"
+        )
+    cameras = np.array([found.camera_left, found.camera_right])
+    for name, P in zip(("camera_left", "camera_right"), cameras, strict=True):
+        if np.linalg.matrix_rank(P) < 3:
+            raise InputError(f"{path}: {name}: a camera matrix has three independent rows")
+    if what := _not_rigid(pose):
+        raise InputError(f"{path}: T_base_tool_at_reference: {what}")
+    body = np.c_[np.array(found.markers_tool), np.ones(len(numbers))]
+    return {
+        "where": str(path),
+        "P": cameras,
+        "H_hat": np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(found.screws)]),
+        "q_reference": np.array(found.q_reference, dtype=np.float64),
+        "marker": np.array(numbers, dtype=np.int64),
+        "M": body @ np.array(pose).T,
+    }
+
+
+def _believed(path: Path | str) -> _Believed:
+    text = text_of(path, "screws, cameras and markers (JSON)", _MAX_BYTES)
+    try:
+        return _Believed.model_validate_json(json.dumps(json.loads(text)))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from error
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key, what = ".".join(map(str, first["loc"])), first["msg"]
+        raise InputError(
+            f"{path}: {key or 'the file'}: {what[:1].lower()}{what[1:]}; expected screws, q_reference, "
+            "camera_left, camera_right, markers_tool and T_base_tool_at_reference"
+        ) from error
+    except (RecursionError, ValueError) as error:
+        raise InputError(f"{path}: not JSON that can be read; expected screws, cameras, markers") from error
+
+
+def _twist(where: str, screw: _Screw) -> FloatArray:
+    """Twist (4, 4) of a screw that a configured robot may have, freed of what rounding left of a pitch."""
+    w, v = np.array(screw.w), np.array(screw.v)
+    for (key, *_), what in _ScrewJoint(type="R" if w.any() else "P", w=screw.w, v=screw.v).contradictions():
+        raise InputError(f"{where}: {key} {what}")
+    twist = np.zeros((4, 4))
+    if not w.any():
+        twist[:3, 3] = v / np.linalg.norm(v)
+        return twist
+    w = w / np.linalg.norm(w)
+    twist[:3, :3] = np.cross(np.eye(3), w)
+    twist[:3, 3] = v - w * (w @ v)
+    return twist

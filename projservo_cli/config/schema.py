@@ -1,6 +1,5 @@
 """What helps to write a configuration: a commented one to start from, and JSON Schemas for editors."""
 
-import json
 import re
 import textwrap
 from collections.abc import Iterator
@@ -8,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from pydantic import BaseModel
+from pydantic.json_schema import GenerateJsonSchema
 
 from projservo_cli.config.models import Config
 from projservo_cli.config.sweep import SweepConfig
@@ -18,8 +19,7 @@ _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 def json_schema() -> dict[str, Any]:
     """The schema of a configuration file; what must hold between values, only loading it tells."""
-    schema: dict[str, Any] = _plain(Config.model_json_schema())
-    schema["required"].remove("name")  # by default that of the file
+    schema = _schema(Config)
     keys = schema["properties"]
     keys["plant"] = {  # the short forms of plant.use
         "anyOf": [keys["plant"], {"type": "string"}],
@@ -29,24 +29,25 @@ def json_schema() -> dict[str, Any]:
         **schema["$defs"]["Control"]["properties"]["laws"]["items"],
         "description": "Short for control.laws with this law alone.",
     }
-    return {"$schema": _DRAFT, **schema, "title": "Configuration of projservo"}
+    return {**schema, "title": "Configuration of projservo"}
 
 
 def sweep_schema() -> dict[str, Any]:
     """The schema of the configuration of a sweep."""
-    schema: dict[str, Any] = _plain(SweepConfig.model_json_schema())
-    schema["required"].remove("name")
-    keys = schema["properties"]
-    described = keys["base"].pop("description")
-    keys["base"] = {"anyOf": [keys["base"], {"type": "string"}], "description": described}
-    values = schema["$defs"]["Linked"]["properties"]["values"]  # alone: of the key that names the axis
-    keys["grid"]["additionalProperties"] = {"anyOf": [keys["grid"]["additionalProperties"], values]}
-    return {"$schema": _DRAFT, **schema, "title": "Sweep of projservo"}
+    return {**_schema(SweepConfig), "title": "Sweep of projservo"}
 
 
-def schema_text(schema: dict[str, Any]) -> str:
-    """A schema as the text of a file."""
-    return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
+def _schema(model: type[BaseModel]) -> dict[str, Any]:
+    schema: dict[str, Any] = _plain(model.model_json_schema(schema_generator=_Generator))
+    schema["required"].remove("name")  # by default that of the file
+    return {"$schema": _DRAFT, **schema}
+
+
+class _Generator(GenerateJsonSchema):
+    """Names sections without the underscore of their classes."""
+
+    def normalize_name(self, name: str) -> str:
+        return super().normalize_name(name).lstrip("_")
 
 
 def _plain(value: Any) -> Any:

@@ -2,24 +2,18 @@
 
 import json
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from projservo_cli.config.loading import Override, validated
-from projservo_cli.config.models import FolderName, Plain
-from projservo_cli.config.robot import Count, Finding, Number, Positive, Section, Whole
-from projservo_cli.config.yaml_source import Document, Problem
+from projservo_cli.config.models import FolderName, Plain, one_or_more
+from projservo_cli.config.robot import Count, Finding, Number, Positive, Root, Section, Whole
 
 BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 
 
-def _one_or_more(value: Any) -> Any:
-    return [value] if isinstance(value, str) else value
-
-
-class Linked(Section):
+class _Linked(Section):
     """Several keys that take the same values together."""
 
     keys: tuple[str, ...] = Field(
@@ -33,7 +27,9 @@ def _axis(value: Any) -> Any:
     return {"keys": [""], "values": value} if isinstance(value, list) else value
 
 
-Axis = Annotated[Linked, BeforeValidator(_axis)]
+_Values = Annotated[tuple[Plain, ...], Field(min_length=1)]
+_Axis = Annotated[_Linked, BeforeValidator(_axis, json_schema_input_type=_Linked | _Values)]
+_Bases = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 class Distribution(Section):
@@ -56,13 +52,13 @@ class Distribution(Section):
                 yield (), f"{name} needs a least value below the largest"
 
 
-class Tasks(Section):
+class _Tasks(Section):
     """Reaching tasks instead of that of the base."""
 
     random: Count = Field(description="number of random tasks, which the runs of a cell take in turn")
 
 
-class SweepConfig(Section):
+class SweepConfig(Root):
     """Closed-loop runs over a grid of values, each drawn by its number alone.
 
     A cell is one combination of the values of the grid. Run r of a cell has the same task, noise and
@@ -71,19 +67,19 @@ class SweepConfig(Section):
 
     name: FolderName = Field(description="of the sweep and its folder; by default that of the file")
     seed: Whole = Field(0, description="of all that is drawn: tasks, noise, calibrations and random values")
-    base: Annotated[tuple[str, ...], BeforeValidator(_one_or_more)] = Field(
-        min_length=1, description="configurations (YAML) beside this file; several are an axis of the grid"
+    base: Annotated[_Bases, BeforeValidator(one_or_more, json_schema_input_type=_Bases | str)] = Field(
+        description="configurations (YAML) beside this file; several are an axis of the grid"
     )
     set: dict[str, Plain] = Field({}, description="values that every run takes instead of those of the base")
     runs: Annotated[int, Field(ge=1, le=100_000_000, strict=True)] = Field(
         100, description="runs of each cell"
     )
-    grid: dict[str, Axis] = Field({}, description="values of each key; law is short for control.laws")
+    grid: dict[str, _Axis] = Field({}, description="values of each key; law is short for control.laws")
     random: dict[str, Distribution] = Field(
         {}, description="what the value of a key is drawn from, for each run; for each calibration where "
         "that depends on the key"
     )  # fmt: skip
-    tasks: Tasks | None = Field(None, description="null for the task of the base")
+    tasks: _Tasks | None = Field(None, description="null for the task of the base")
     calibrations: Count = Field(1, description="calibrations of a cell; run r is made with number r mod this")
     traces: tuple[Whole, ...] = Field((), description="numbers of the runs whose whole traces are kept")
     between_samples: Annotated[bool, Field(strict=True)] = Field(
@@ -91,7 +87,7 @@ class SweepConfig(Section):
     )
     chunk: Count | None = Field(None, description="runs made and stored at a time; null for about a second's")
 
-    def contradictions(self) -> Iterator[Finding]:
+    def between(self, sound: Mapping[str, Any]) -> Iterator[Finding]:
         """Names and values that stand twice."""
         if len(names := {pathlib.Path(base).stem for base in self.base}) < len(self.base):
             yield ("base",), f"two files of one name, {', '.join(sorted(names))}: rename one"
@@ -107,20 +103,3 @@ class SweepConfig(Section):
         """Keys of the configuration that an axis of the grid sets."""
         keys = self.grid[name].keys
         return (name,) if keys == ("",) else keys
-
-
-def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
-    """Read and check the configuration of a sweep; ``base`` becomes absolute paths.
-
-    Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
-    """
-    document = Document.read(path)
-    if not isinstance(document.values, dict):
-        what = "expected keys and values such as base: paper.yaml"
-        raise document.refused(document.problems or [Problem((), what)])
-    for change in map(Override.parse, overrides):
-        document.override(change.path, change.value, change.flag)
-    document.values.setdefault("name", pathlib.Path(path).stem)
-    sweep = validated(SweepConfig, document)
-    folder = pathlib.Path(path).parent
-    return sweep.model_copy(update={"base": tuple(str((folder / base).resolve()) for base in sweep.base)})

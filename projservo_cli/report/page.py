@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from projservo_cli.calibration import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
 from projservo_cli.config import Config, load_config
-from projservo_cli.files import inside, replacing
+from projservo_cli.files import lies_inside, replacing
 from projservo_cli.records import Plan, Report, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.drift import drift_rows
@@ -161,7 +161,7 @@ def _drawing(path: Path, kind: str, alt: str) -> Markup | None:
     files may come from strangers.
     """
     try:
-        content = path.read_bytes() if inside(path, path.parents[1]) else None
+        content = path.read_bytes() if lies_inside(path, path.parents[1]) else None
     except OSError:
         content = None
     if content is None or len(content) > _MOST_BYTES:

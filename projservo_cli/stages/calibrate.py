@@ -6,9 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from projservo_cli.calibration import Region, Solution, Suggestion, calibrate, cross_validate, suggest
+from projservo_cli.calibration import (
+    Nominal,
+    Region,
+    Solution,
+    Suggestion,
+    calibrate,
+    cross_validate,
+    suggest,
+)
 from projservo_cli.config import Config
-from projservo_cli.config.nominal import read_nominal
 from projservo_cli.files import replacing
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
@@ -83,8 +90,10 @@ def run(
     InputError if the table or the configuration cannot be used; WorkFailed if the data do not support a
     calibration.
     """
+    from projservo_cli.config.robot import read_nominal
+
     settings, seed = config.calibration, _seed(config)
-    init = read_nominal(settings.init) if settings.init is not None else None
+    init = Nominal(**read_nominal(settings.init)) if settings.init is not None else None
     observation, types, sigma_px = _observed(config)
     held_out: list[CrossValidation] = []
 

@@ -30,7 +30,7 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
             raise InputError(
                 f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot: Robot = plugins.make("plant", target, (), config.plant.options.values())
+    robot: Robot = plugins.make("plant", target, (), config.plant.options)
     return ForeignRobot(robot, f"plant {target}", len(joints.types), markers, config.plant.timeout_s)
 
 

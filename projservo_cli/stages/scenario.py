@@ -12,7 +12,7 @@ import numpy as np
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config
-from projservo_cli.config.models import Task as TaskSettings
+from projservo_cli.config.models import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.loop.step import Limits

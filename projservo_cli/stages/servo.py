@@ -29,7 +29,7 @@ from projservo_cli.records import (
     WorkFailed,
     law_and_mode,
 )
-from projservo_cli.results import ImageModel, image_model
+from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
@@ -345,7 +345,7 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
         assert scenario.calibration is not None
         known = scenario.calibration.marker.tolist()
         face = np.array([known.index(number) for number in scenario.numbers[: scenario.m]])
-        model = image_model(scenario.calibration)
+        model = ImageModel(**vars(scenario.calibration))
         # Its own: what a law writes to must not be what other laws are given.
         setup = copy.deepcopy(LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period))
         return ForeignLaw(plugins.make("law", law, (setup,), {}), f"law {law}")

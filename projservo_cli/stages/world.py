@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.config import Config
 from projservo_cli.config.models import Goal
-from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, Robot
+from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, RobotSettings
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
 from projservo_cli.robots.simulated import Arm, Ends, roll_axis
@@ -160,7 +160,7 @@ def truth_of(config: Config) -> Truth:
 
 
 @lru_cache(maxsize=16)
-def _built(described: Robot, rig: Rig, markers: Markers) -> Truth:
+def _built(described: RobotSettings, rig: Rig, markers: Markers) -> Truth:
     robot = _robot_of(described)
     numbers = markers.known
     assert numbers is not None
@@ -195,7 +195,7 @@ def _about_axis(point: FloatArray, direction: FloatArray, theta: float) -> Float
     return _rigid(R, point - R.as_matrix() @ point)
 
 
-def _robot_of(described: Robot) -> Arm:
+def _robot_of(described: RobotSettings) -> Arm:
     """Arm of screws, or of a Denavit–Hartenberg table, whose reference is all joints zero.
 
     In Craig's modified convention a and α come before θ and d; the joint variable is added to θ or d.

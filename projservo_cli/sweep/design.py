@@ -14,7 +14,7 @@ import numpy as np
 
 from projservo_cli.calibration.forward import displacements, image_points, moved_points
 from projservo_cli.config import Config, Override, digest, load_config, to_yaml
-from projservo_cli.config.models import Goal, Task
+from projservo_cli.config.models import Goal, TaskSettings
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.geometry.stereo import optical_centers
@@ -320,7 +320,7 @@ class Design:
             ends = self.tasks(self.base_of(cell))
             start, goal = (JointVector(joints=tuple(q[task].tolist()), unit="rad") for q in ends)
             offset = config.task.start_offset  # stays
-            update["task"] = Task(start=start, start_offset=offset, goal=Goal(joints=goal))
+            update["task"] = TaskSettings(start=start, start_offset=offset, goal=Goal(joints=goal))
         return config.model_copy(update=update)
 
     def drawn(self, run: int) -> dict[str, Any]:

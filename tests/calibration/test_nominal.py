@@ -7,14 +7,18 @@ import json
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, predict
+from projservo_cli.calibration import Nominal, calibrate, predict
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.readings import Readings
-from projservo_cli.config.nominal import read_nominal
+from projservo_cli.config.robot import read_nominal as fields_of
 from projservo_cli.records import InputError, WorkFailed
 from tests.calibration.simulated_robot import around, random_robot, trials
 
 SIGMA = 0.5
+
+
+def read_nominal(path):
+    return Nominal(**fields_of(path))
 
 
 @pytest.fixture(scope="module")
@@ -163,6 +167,7 @@ BAD = {
         {"screws": [{"w": [0, 0, 2], "v": [0, 0, 0]}] * 4},
         r": screws.0: w must be of unit length",
     ),
+    "no axis": ({"screws": [{"w": [0, 0, float("nan")], "v": [0, 0, 0]}] * 4}, r": screws.0.w.2: .*finite"),
     "helix": ({"screws": [{"w": [0, 0, 1], "v": [0, 0, 1]}] * 4}, r": screws.0: v must be orthogonal to w"),
     # As strict as a configured robot: what is written with three digits alone is neither.
     "few digits": (

@@ -68,12 +68,9 @@ class Stages:
     def plan(self, config: Any, calibration: Any) -> Any:
         self._make("plan")
         verdict = self.verdicts.get("plan", "")
-        given = {
-            "profile": config.trajectory.profile,
-            "feasible": verdict != "infeasible",
-            "reason": "too near",
-        }
-        return fake(Plan, config.seed, {"joint": len(calibration.q_reference)}, **given)
+        given = {"profile": config.trajectory.profile, "feasible": verdict != "infeasible"}
+        joints = {"joint": len(calibration.q_reference)}
+        return fake(Plan, config.seed, joints, reason="too near", **given)
 
     def servo(self, config: Any, calibration: Any, plan: Any, law: str) -> Any:
         self._make(law)

@@ -71,7 +71,7 @@ def test_help_names_all_commands_and_version_is_printed(projservo):
     assert all(f"  {name} " in text for name in main.commands)
     assert max(map(len, text.splitlines())) <= 80
     assert projservo().out == text
-    for words in (["--version"], ["servo", "--version"], ["--version", "show", "x"]):
+    for words in (["--version"], ["--version", "show", "x"]):
         assert projservo(*words).out == f"projservo {__version__}\n"
     both = projservo("servo", "calibrate", "-h").out
     assert "--law" in both
@@ -117,6 +117,7 @@ def test_a_shell_completes_commands_stages_laws_and_files(line, offered, monkeyp
     assert complete(line, monkeypatch, capsys) == offered
 
 
+RECORDED, TINY = ["calibrate", "--data", "t.csv"], ["calibrate", "-c", "tiny.yaml"]
 USAGE = {
     "unknown command": (["calibrat"], "did you mean calibrate?"),
     "unknown option": (["calibrate", "--nose-px", "1"], "--nose-px"),
@@ -148,15 +149,55 @@ USAGE = {
     "no yaml": (["init", "mine.json"], "mine.yaml"),
     "cross-validation of a plan": (["plan", "--cross-validate", "3"], "--cross-validate: not used by plan"),
     "confirmed by nobody": (["servo", "--confirm"], "no terminal"),
+    "no poses": (["calibrate", "--suggest", "0"], "--suggest"),
+    "many poses": (["calibrate", "--suggest=many"], "--suggest"),
+    "poses of a plan": (["plan", "--suggest", "3"], "--suggest: not used by plan"),
+    "no configuration": (["plan", "-c", "none.yaml"], "none.yaml: cannot be read"),
+    "key twice": (["plan", "-c", "twice.yaml"], "projservo: twice.yaml:3:1: seed: the key"),
+    "no table": ([*RECORDED[:2], "none.csv"], "none.csv: cannot be read"),
+    "table cut short": ([*RECORDED[:2], "bad.csv", "-q", "-o", "out"], "bad.csv:2: 4 cells"),
+    "other letters": ([*RECORDED, "--joints", "RX"], "--joints RX: data.joints: 'RX' must be"),
+    "no noise at all": (
+        [*RECORDED, "--noise-px", "0"],
+        "--noise-px 0.0: data.noise_px: must be",
+    ),
+    "joints of no table": ([*TINY, "--joints", "RR"], "--joints RR: data.table: is missing"),
+    "override of nothing": ([*TINY, "--set", "sed=1"], "--set sed=1: sed: unknown key; did you mean"),
+    "a file for a folder": ([*TINY, "-o", "t.csv/out"], "t.csv/out"),
+    "a folder below a file": (
+        ["calibrate", "-o", "t.csv/out"],
+        "cannot be written: Not a directory",
+    ),
+    "a table for a run": ([*TINY, "-o", "t.csv"], "not a run file"),
 }
 
 
 @pytest.mark.parametrize("case", USAGE)
-def test_usage_is_refused_in_one_line(projservo, stages, case):
+def test_what_makes_no_sense_is_refused_in_one_line_before_any_work(projservo, stages, tmp_path, case):
+    """What else is refused in configurations and tables is tested where they are read."""
+    (tmp_path / "twice.yaml").write_text("data: {table: t.csv}\nseed: 1\nseed: 2\n", encoding="utf-8")
+    (tmp_path / "bad.csv").write_text("pose,marker,q1,u_left,v_left,u_right,v_right\n1,0,1,2\n")
+    there = set(tmp_path.iterdir())
     arguments, message = USAGE[case]
     answer = projservo(*arguments)
-    assert answer.code == 2
-    assert answer.out == ""
+    assert (answer.code, answer.out) == (2, "")
     assert message in answer.err
     assert answer.err.startswith("projservo: ")
     assert answer.err.count("\n") == 1
+    assert (stages.made, set(tmp_path.iterdir())) == ([], there)
+
+
+def test_several_errors_are_several_lines(projservo, stages):
+    answer = projservo("calibrate", "-c", "tiny.yaml", "--set", "seed=-1", "--set", "noise.calibration_px=a")
+    assert "projservo: --set seed=-1: seed: must be at least 0" in answer.err
+    assert answer.err.count("\nprojservo: ") == 1
+
+
+def test_runs_that_are_none(projservo, reported, tmp_path):
+    whole = (tmp_path / "out/run.h5").read_bytes()
+    (tmp_path / "out/run.h5").write_bytes(whole[: len(whole) // 2])
+    for words in (["show"], ["validate", "--data", "t.csv"], ["calibrate", "-c", "tiny.yaml", "-o"]):
+        answer = projservo(*words, "out")
+        assert (answer.code, answer.out) == (2, "")
+        assert "cut short" in answer.err
+    assert "there is no run file" in projservo("show", "nowhere").err

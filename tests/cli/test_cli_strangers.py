@@ -28,15 +28,12 @@ def plain(text):
     return all(character.isprintable() or character in "\n\u202f" for character in text)
 
 
-def test_texts_of_a_run_do_not_command_the_terminal(projservo, hostile):
-    for arguments in (["show", "out"], ["show", "out", "-v"], ["show", "out", "--json"]):
-        answer = projservo(*arguments)
+def test_texts_of_a_run_command_no_terminal_and_become_no_part_of_the_page(projservo, hostile):
+    for more in ([], ["-v"], ["--json"]):
+        answer = projservo("show", "out", *more)
         assert answer.code == 0
         assert plain(answer.out + answer.err), [c for c in answer.out if not c.isprintable()]
-    assert projservo("show", "out", "--json").json["plan"]["reason"] == ESCAPES
-
-
-def test_texts_of_a_run_do_not_become_part_of_the_page(hostile):
+    assert answer.json["plan"]["reason"] == ESCAPES
     text = write_page(load(hostile)).read_text(encoding="utf-8")
     assert "<img src=x" not in text
     assert "</script>" not in text

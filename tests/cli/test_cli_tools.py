@@ -2,7 +2,6 @@
 
 import csv
 import importlib.metadata
-import io
 import json
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,42 +13,32 @@ from projservo_cli.config.schema import json_schema
 from projservo_cli.store import load
 
 
-def fields(run):
-    """Every array and scalar of the run by the name of its place."""
-    for name, result in run.results.items():
-        for label, record in result.records.items():
-            for field, value in vars(record).items():
-                if value is not None:
-                    yield (f"{name}/{label}" if label else name), field, value
-
-
 def test_an_export_holds_every_array_and_says_what_it_is(projservo, reported, tmp_path):
-    run = load("out")
     answer = projservo("export", "out", "--json")
     assert answer.code == 0, answer.err
     folder = tmp_path / "out" / "csv"
     assert {Path(file).parent for file in answer.json["files"]} == {folder}
-    about = {
-        (row["file"], row["field"]): row
-        for row in csv.DictReader(io.StringIO((folder / "fields.csv").read_text()))
-    }
-    for place, field, value in fields(run):
-        file = f"{place.replace('/', '_')}.csv"
-        row = about[file, field]
-        if not isinstance(value, np.ndarray):
-            assert row["value"] == (value if isinstance(value, str) else row["value"])
-            continue
-        table = list(csv.reader(io.StringIO((folder / file).read_text())))
-        again = np.full(value.shape, np.nan)
-        for k, heading in enumerate(table[0]):
-            label, _, index = heading.rstrip("]").partition("[")
-            if label == field:
-                place_in = tuple(slice(None) if i == ":" else int(i) for i in index.split(",") if i)
-                column = [float(cells[k]) for cells in table[1:] if cells[k] != ""]
-                again[place_in] = column if value.ndim else column[0]
-        np.testing.assert_array_equal(again, value.astype(float), err_msg=f"{file} {field}")
-        assert len(row["dimensions"].split()) == value.ndim
-        assert row["unit"]
+    with (folder / "fields.csv").open(newline="") as file:
+        about = {(row["file"], row["field"]): row for row in csv.DictReader(file)}
+    results = load("out").results.items()
+    records = {(name, part): record for name, result in results for part, record in result.records.items()}
+    for (name, part), record in records.items():
+        table = "_".join(filter(None, (*name.split("/"), part))) + ".csv"
+        values = {field: value for field, value in vars(record).items() if value is not None}
+        counts = dict.fromkeys(values, 0)
+        with (folder / table).open(newline="") as file:
+            for heading, *cells in zip(*csv.reader(file), strict=True):
+                column = np.atleast_1d(eval(heading, values.copy())).astype(float)
+                counts[heading.partition("[")[0]] += column.size
+                shown = [float(cell) for cell in cells[: column.size]]
+                np.testing.assert_array_equal(shown, column, err_msg=f"{table} {heading}")
+        for field, value in values.items():
+            row = about[table, field]
+            if isinstance(value, np.ndarray):
+                assert (counts[field], len(row["dimensions"].split())) == (value.size, value.ndim)
+                assert row["unit"]
+            elif isinstance(value, str):
+                assert row["value"] == value
     again = projservo("export", "out/run.h5")
     assert again.code == 2
     assert "--force" in again.err

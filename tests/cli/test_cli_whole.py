@@ -25,13 +25,11 @@ def elsewhere(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
 
 
+NO_ANGLE, NO_FRAME = "calibration.amplitude_deg=0", "calibration.frames_per_joint=0"
+
+
 @pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ("calibration.amplitude_deg=0", "joint 1"),
-        ("calibration.frames_per_joint=0", "pose"),
-        (ON_A_LINE, "line"),
-    ],
+    ("given", "message"), [(NO_ANGLE, "joint 1"), (NO_FRAME, "pose"), (ON_A_LINE, "line")]
 )
 def test_data_that_support_no_calibration(projservo, given, message):
     answer = projservo("calibrate", *PAPER, "--set", given, "-o", "out", "-q", "--json")
@@ -63,10 +61,8 @@ def test_a_recorded_run_says_which_key_a_stage_lacks(projservo, shared_data):
 def held_out(tmp_path_factory):
     """A run with cross-validation, made once."""
     folder = tmp_path_factory.mktemp("run")
-    assert (
-        cli.run([str(a) for a in ("--cross-validate", 3, *PAPER, "--set", FEW, "calibrate", "-o", folder)])
-        == 0
-    )
+    words = ("--cross-validate", 3, *PAPER, "--set", FEW, "calibrate", "-o", folder)
+    assert cli.run([str(word) for word in words]) == 0
     return folder
 
 

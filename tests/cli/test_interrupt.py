@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 from tests.conftest import ROOT
 
 COMMAND = """\
@@ -11,30 +13,26 @@ from projservo_cli import cli
 
 class Ended:
     def __del__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(1)  # the interrupt is raised here, where it can only be ignored
+        {at_the_end}
+        time.sleep(1)  # what was raised is raised here, where it can only be ignored
 
 def work(arguments):
     Ended()
-    time.sleep(60)
+    time.sleep({seconds})
 
 cli.main.invoke = work
 cli.main(["doctor"])
 """
+INTERRUPT = ("os.kill(os.getpid(), signal.SIGINT)", 60, 130, "projservo: interrupted\n")
+ELSE = ("raise ValueError('odd')", 0, 0, "ValueError: odd")
 
 
-def test_an_interrupt_that_comes_at_the_end_of_an_object_is_not_lost():
-    done = subprocess.run(
-        [sys.executable, "-c", COMMAND], cwd=ROOT, capture_output=True, text=True, timeout=50, check=False
-    )
-    assert (done.returncode, done.stderr) == (130, "projservo: interrupted\n")
-
-
-def test_what_else_cannot_be_raised_is_still_told():
-    command = COMMAND.replace("os.kill(os.getpid(), signal.SIGINT)", "raise ValueError('odd')").replace(
-        "60", "0"
-    )
+@pytest.mark.parametrize(("at_the_end", "seconds", "code", "told"), [INTERRUPT, ELSE])
+def test_what_comes_at_the_end_of_an_object_is_not_lost(at_the_end, seconds, code, told):
+    command = COMMAND.format(at_the_end=at_the_end, seconds=seconds)
     done = subprocess.run(
         [sys.executable, "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=50, check=False
     )
-    assert "ValueError: odd" in done.stderr
+    assert done.returncode == code
+    assert told in done.stderr
+    assert (done.stderr == told) == (code == 130)

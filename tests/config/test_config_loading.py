@@ -5,8 +5,7 @@ import math
 import pytest
 import yaml
 
-from projservo_cli.config import Config, digest, load_config, to_yaml
-from projservo_cli.config.yaml_source import Document
+from projservo_cli.config import Config, Override, digest, load_config, to_yaml
 from projservo_cli.records import LAWS, InputError
 from tests.conftest import SHIPPED
 
@@ -60,18 +59,13 @@ def test_a_configuration_loads_with_defaults_and_units(good):
         config.seed = 3
 
 
-def test_resolved_yaml_loads_to_an_equal_configuration(good):
-    config = load_config(good)
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_resolved_yaml_loads_to_an_equal_configuration(path):
+    config = load_config(path)
     again = load_config("stored.yaml", text=to_yaml(config))
     assert again == config
+    assert config.name == path.stem
     assert digest(again, list(Config.model_fields)) == digest(config, list(Config.model_fields))
-
-
-def test_shipped_configurations_load():
-    for path in SHIPPED:
-        config = load_config(path)
-        assert config.name == path.stem
-        assert load_config(path, text=to_yaml(config)) == config
 
 
 def test_all_errors_come_at_once_each_with_line_and_column(tmp_path):
@@ -197,7 +191,9 @@ def test_screws_are_checked(good):
         "{type: P, w: [0, 0, 1], v: [0, 0.5, 0]}]"
     )
     screws = f"{{reference: {{joints: [0, 0, 0], unit: rad}}, base_tool: {POSE}, joints: {joints}}}"
-    found = [line.split(": robot")[1] for line in errors(good, f"robot={{screws: {screws}}}")]
+    start, *told = errors(good, f"robot={{screws: {screws}}}")
+    assert start.endswith("task.start.joints: 2 values for 3 joints (RRP)")
+    found = [line.split(": robot")[1] for line in told]
     assert found == [
         ".screws.joints.0.w: must be of unit length for a joint of type R, it is 2",
         ".screws.joints.1.v: must be orthogonal to w: a revolute joint has no pitch",
@@ -210,9 +206,8 @@ def test_screws_are_checked(good):
     ("override", "message"),
     [
         ("control.gain_t", "expected KEY=VALUE"),
-        ("control.gain_t=[1", "not valid YAML"),
+        ("control.gain_t=[1", "the value is not valid YAML"),
         ("control.gain_t=-1", "control.gain_t: must be greater than 0, not -1"),
-        ("control.gain_x=3", "control.gain_x: unknown key; did you mean gain_"),
         ("controls.gain=3", "controls: unknown key; did you mean control?"),
         ("robot.dh.joints.5.d_m=1", "robot.dh.joints.5: expected a list position from 0 to 1"),
         ("seed.x=1", "seed.x: there is a plain value"),
@@ -221,8 +216,7 @@ def test_screws_are_checked(good):
 )
 def test_errors_in_overrides_name_the_flag(good, override, message):
     (found,) = errors(good, override)
-    assert found.startswith(f"--set {override}: ")
-    assert message in found
+    assert found.startswith(f"--set {override}: {message}")
 
 
 def test_overrides_reach_lists_and_make_sections(good):
@@ -269,10 +263,8 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize("case", UNREADABLE)
-def test_unreadable_text_is_refused(tmp_path, case):
-    path = tmp_path / "c.yaml"
-    path.write_text(UNREADABLE[case], encoding="utf-8")
-    assert all(line.startswith(str(path)) for line in errors(path))
+def test_unreadable_text_is_refused(case):
+    assert all(line.startswith("c.yaml") for line in errors("c.yaml", text=UNREADABLE[case]))
 
 
 def test_duplicate_keys_are_refused_with_both_places(good):
@@ -305,7 +297,7 @@ def test_a_hash_depends_on_the_parts_named_and_on_nothing_else(good):
 def test_plain_text_means_what_the_core_schema_says():
     text = "[1e-3, .5, 5., -7, on, 12:30, 0x10, 1_000, '5', ~, Null, TRUE, -.inf, !!str a]"
     meant = [0.001, 0.5, 5.0, -7, "on", "12:30", "0x10", "1_000", "5", None, None, True, -math.inf, "a"]
-    assert Document(text, "x").values == meant
+    assert Override.parse(f"x={text}").value == meant
 
 
 def test_a_configuration_made_in_python_is_checked_as_well(good):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.cli.words import summary
+from projservo_cli.cli.output import words_of
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import idealized, scenario_of
@@ -107,7 +107,7 @@ def test_without_a_plan_to_follow_the_law_goes_alone_and_says_so(lost):
     assert trace.unplanned == "no joints can follow the plan: too near to something"
     assert alone.unplanned == ""
     np.testing.assert_array_equal(trace.q, alone.q)
-    words = " ".join(" ".join(summary("servo", {"laws": [vars(trace)]})).split())
+    words = " ".join(" ".join(words_of("servo", {"laws": [vars(trace)]})).split())
     assert "driven without a plan: no joints can follow the plan: too near to something" in words
 
 

@@ -23,22 +23,13 @@ NUMBER = re.compile(r"[-+±]?\d[\d.e+-]*")
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block.
+    """A fenced block."""
 
-    Attributes
-    ----------
-    language : ``sh``, ``python``, ``text`` ..., or ``{name}`` of a directive.
-    text : what is in it.
-    file : name of the file it shows, empty for none.
-    excuse : why it cannot be run, empty where it can.
-    follows : whether nothing but an empty line is between it and the block before.
-    """
-
-    language: str
+    language: str  # sh, python, text ..., or {name} of a directive
     text: str
-    file: str
-    excuse: str
-    follows: bool
+    file: str  # name of the file it shows, empty for none
+    excuse: str  # why it cannot be run, empty where it can
+    follows: bool  # whether nothing but an empty line is between it and the block before
 
 
 def imported(*names):
@@ -58,21 +49,8 @@ def blocks_of(page):
         language = info.removeprefix("{code-block} ") if captioned else info
         follows = end > 0 and not text[end : match.start()].strip()
         end = match.end()
-        yield Block(
-            language,
-            captioned["text"] if captioned else body,
-            captioned["file"] if captioned else "",
-            match["excuse"] or "",
-            follows,
-        )
-
-
-def run_commands(text):
-    """Run the lines of a block of commands; all must succeed."""
-    for line in text.splitlines():
-        program, *words = shlex.split(line, comments=True)
-        assert program == "projservo", line
-        assert cli.run(words) == 0, line
+        body, file = (captioned["text"], captioned["file"]) if captioned else (body, "")
+        yield Block(language, body, file, match["excuse"] or "", follows)
 
 
 def masked(text):
@@ -83,16 +61,8 @@ def masked(text):
 def run_page(page, read):
     """Write the files of a page, run its commands and its Python, and compare the outputs it shows.
 
-    An output stands in a block of text right after the commands, and is part of what they print.
-
-    Parameters
-    ----------
-    page : the page.
-    read : returns what was printed since it was last called.
-
-    Returns
-    -------
-    The names that the Python of the page defines.
+    An output stands in a block of text right after the commands, and is part of what they print; ``read``
+    returns what was printed since it was last called. Returns the names that the Python of the page defines.
     """
     names = {}
     printed = ""
@@ -103,7 +73,10 @@ def run_page(page, read):
             Path(block.file).write_text(block.text, encoding="utf-8")
         elif block.language == "sh":
             read()
-            run_commands(block.text)
+            for line in block.text.splitlines():
+                program, *words = shlex.split(line, comments=True)
+                assert program == "projservo", line
+                assert cli.run(words) == 0, line
             printed = read()
         elif block.language == "python":
             exec(compile(block.text, page.name, "exec"), names)

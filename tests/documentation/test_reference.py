@@ -75,10 +75,6 @@ def test_every_command_and_equation_is_there():
     assert len(cells(reference.equations())) == 2 + len(REGISTER)
 
 
-def test_words_of_the_code_are_shown_as_they_are():
-    assert keys.text("t_* with |p_0| `x`") == r"t\_\* with \|p\_0\| \`x\`"
-
-
 def test_sections_of_docstrings_become_lists():
     given = "Parameters\n----------\nq, q_dot : (n,) readings,\n    rad or m.\n\n"
     raised = "Raises\n------\nInputError\n    If not."
@@ -97,9 +93,10 @@ def test_links_lead_to_files_and_to_no_site(page):
         assert (page.parent / target).is_file(), target
 
 
-def test_what_a_page_loads_from_the_network_is_found():
+def test_what_a_page_loads_from_the_network_is_found_and_words_of_the_code_are_shown_as_they_are():
     text = '<a href="https://a.org"></a><img src="a.png"><script src="//b.org/x.js"></script>'
     assert mathml.FROM_NETWORK.findall(text) == ['<script src="//b.org/x.js']
+    assert keys.text("t_* with |p_0| `x`") == r"t\_\* with \|p\_0\| \`x\`"
 
 
 def resolved(name):

@@ -108,7 +108,6 @@ def test_the_short_and_the_long_form_are_one():
     short = load_config(UR5, ["plant=a.b:C", "plant.timeout_s=2", "law=a:L"])
     long = load_config(UR5, ["plant={use: 'a.b:C', timeout_s: 2}", "control.laws=['a:L']"])
     assert short == long
-    hash(short)
     Path("both.yaml").write_text("law: exact\ncontrol: {laws: [exact]}\ndata: {table: t.csv}\n")
     with pytest.raises(InputError, match=r"both.yaml:1:1: law: control.laws is set as well"):
         load_config("both.yaml")

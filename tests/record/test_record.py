@@ -13,7 +13,7 @@ from projservo_cli.stages.calibrate import simulate
 from projservo_cli.stages.own_robot import drive_to
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.store import load
-from projservo_cli.tables import read_joints, read_table
+from projservo_cli.tables import read_joint_list, read_table
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 UR5, STANFORD = CONFIGS / "ur5.yaml", CONFIGS / "stanford.yaml"
@@ -150,7 +150,7 @@ def test_further_motions_follow_the_trials_and_continue_their_table(projservo):
     table = read_table("t.csv")
     assert table.pose.tolist() == list(range(15))
     np.testing.assert_array_equal(table.images[:13], trials.images)
-    np.testing.assert_array_equal(table.q[13:], read_joints("more.csv", "RRRRRR", "deg").q)
+    np.testing.assert_array_equal(table.q[13:], read_joint_list("more.csv", "RRRRRR", "deg").q)
     truth = truth_of(load_config(UR5))
     clean = np.stack([truth.images(q, truth.M) for q in table.q])
     assert 0.3 < np.std(table.images[13:] - clean[13:]) < 0.7  # 80 draws of sigma 0.5: ± 5 standard errors

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config.models import Noise
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import scenario_of
@@ -53,7 +52,7 @@ def steady(law, sigma, observation, runs):
     if observation == "points":
         scenario = replace(scenario, numbers=scenario.numbers[:4], exact=scenario.exact.by_points())
     sense = planned.rotation_sense()
-    noise = Noise(servo_px=sigma, shown_frames=1)
+    noise = scenario.config.noise.model_copy(update={"servo_px": sigma, "shown_frames": 1})
     position, rotation, verdicts = [], [], Counter()
     for seed in range(runs):
         config = scenario.config.model_copy(update={"noise": noise, "seed": seed})

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from projservo_cli.records import InputError, Observation
-from projservo_cli.tables import read_joints, read_table, recording_of, write_table
+from projservo_cli.tables import read_joint_list, read_table, recording_of, write_table
 
 HEADER = "pose,marker,q1,q2,u_left,v_left,u_right,v_right"
 ROWS = ["0,1,0.5,-1,10,20,30,40", "0,0,0.5,-1,11,21,31,41", "7,1,0.25,2e-1,12.5,22,,"]
@@ -124,10 +124,10 @@ LIST = ["pose,q1,q2,left,right", "7,1,90,a.png,b.png", "3,2,-90,c.png,d.png"]
 
 
 def test_a_list_of_joints_has_numbers_and_images_or_not(tmp_path):
-    joints = read_joints(written(tmp_path, *LIST), joint_unit="as is")
+    joints = read_joint_list(written(tmp_path, *LIST), joint_unit="rad")
     assert (joints.pose.tolist(), joints.q.tolist()) == ([7, 3], [[1, 90], [2, -90]])
     assert (joints.left, joints.right) == (("a.png", "c.png"), ("b.png", "d.png"))
-    plain = read_joints(written(tmp_path, "q2,q1", "90,1", "", "-90,2"), "PR", "deg")
+    plain = read_joint_list(written(tmp_path, "q2,q1", "90,1", "", "-90,2"), "PR", "deg")
     assert (plain.pose.tolist(), plain.numbered, plain.left) == ([0, 1], False, None)
     np.testing.assert_allclose(plain.q, [[1, np.pi / 2], [2, -np.pi / 2]], rtol=1e-15)
 
@@ -145,7 +145,7 @@ BAD_LISTS = {
 def test_bad_lists_of_joints_are_refused_with_the_line(tmp_path):
     for lines, message in BAD_LISTS.values():
         with pytest.raises(InputError, match=message):
-            read_joints(written(tmp_path, *lines))
+            read_joint_list(written(tmp_path, *lines))
 
 
 def test_a_recording_is_told_by_a_column_of_its_own(tmp_path):

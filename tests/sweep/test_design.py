@@ -6,7 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.config.sweep import SweepConfig, load_sweep
+from projservo_cli.config import load_sweep
+from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.records import InputError
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.design import Design, read_design
