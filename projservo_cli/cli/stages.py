@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -262,7 +263,8 @@ def _work(chain: _Chain) -> int:
     """Make what has to be made, and tell what came out; the exit code."""
     _announce(chain)
     _say_compilation(chain)
-    _make_steps(chain)
+    with _compiling(chain):
+        _make_steps(chain)
     if (count := chain.options.get("suggest")) is not None and not chain.lacks("calibrate"):
         chain.beside["calibrate"] = _suggestions(chain, count)
     if (wanted := _extras(chain.options)) and not chain.lacks("report"):
@@ -325,6 +327,16 @@ def _make_steps(chain: _Chain) -> None:
     text = to_yaml(chain.config)
     if chain.run.configuration != text:  # overrides are stored also where nothing had to be made
         chain.run = save(replace(chain.run, configuration=text))
+
+
+def _compiling(chain: _Chain) -> AbstractContextManager[None]:
+    """What compiles beside the work where a calibration is made and runs are to follow."""
+    made = [step.stage for step in chain.steps if step.why]
+    if "calibrate" not in made or "servo" not in made:
+        return nullcontext()
+    from projservo_cli.loop.beside import compiling_beside
+
+    return compiling_beside()
 
 
 def _say_compilation(chain: _Chain) -> None:
