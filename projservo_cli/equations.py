@@ -212,9 +212,8 @@ REGISTER = (
         "task.visibility.visibility_angles task.visibility.choose_sense "
         "task.visibility.limited_translation task.planning.turning_sense",
         "task/test_visibility.py::test_neutral_along_the_ray_of_a_point_of_the_face "
-        "task/test_visibility.py::test_neutral_parallel_to_the_face "
+        "task/test_visibility.py::test_neutral_parallel_to_the_face_and_within_its_plane "
         "task/test_visibility.py::test_neutral_about_any_axis_through_the_optical_center "
-        "task/test_visibility.py::test_neutral_within_the_plane_of_the_face "
         "task/test_visibility.py::test_the_optical_axis_itself_is_not_neutral "
         "task/test_visibility.py::test_sense_of_the_turn_by_brute_force",
         "Translation along the optical axis changes visibility unless the ray passes through the face's "

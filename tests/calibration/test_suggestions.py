@@ -114,7 +114,7 @@ def test_what_cannot_be_suggested_says_why(robot, few, region):
         suggest(bare, observation, region, region, 1, np.random.default_rng(0))
 
 
-def test_a_recorded_table_gives_poses_near_its_own(shared_data):
+def test_a_recorded_table_gives_poses_near_its_own(shared_data, tmp_path):
     from projservo_cli.config import load_config
     from projservo_cli.stages import calibrate as stage
     from projservo_cli.tables import read_table
@@ -124,7 +124,8 @@ def test_a_recorded_table_gives_poses_near_its_own(shared_data):
     some = np.arange(len(table.pose)) % 2 == 0
     table = Observation(table.pose[some], table.marker, table.q[some], table.images[some])
     calibration = calibrate(table, "RRRRRR", source="recorded")
-    found = stage.suggested(load_config(None, [f"data.table={path}"]), table, calibration, 3)
+    config = load_config(None, [f"data.table={path}"])
+    found = stage.suggest_motions(config, table, calibration, 3, tmp_path / "suggestions.csv")
     span = np.ptp(table.q, axis=0)
     for one in found:
         assert (one.q >= table.q.min(axis=0) - 0.15 * span).all()

@@ -53,6 +53,14 @@ def blocks_of(page):
         yield Block(language, body, file, match["excuse"] or "", follows)
 
 
+def run_commands(text):
+    """Run the lines of a block of commands; all must succeed."""
+    for line in text.splitlines():
+        program, *words = shlex.split(line, comments=True)
+        assert program == "projservo", line
+        assert cli.run(words) == 0, line
+
+
 def masked(text):
     """Words of an output with ``#`` for every number, whatever the line breaks."""
     return " ".join(NUMBER.sub("#", text).split())
@@ -73,10 +81,7 @@ def run_page(page, read):
             Path(block.file).write_text(block.text, encoding="utf-8")
         elif block.language == "sh":
             read()
-            for line in block.text.splitlines():
-                program, *words = shlex.split(line, comments=True)
-                assert program == "projservo", line
-                assert cli.run(words) == 0, line
+            run_commands(block.text)
             printed = read()
         elif block.language == "python":
             exec(compile(block.text, page.name, "exec"), names)
