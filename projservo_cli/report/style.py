@@ -87,6 +87,9 @@ def styled() -> Iterator[None]:
         yield
 
 
+HALF_LABEL = 0.16  # in, half of what a pixel of four digits takes below an axis
+
+
 def drawn(draw: Callable[[Any, "Figure"], None], data: Any, height: float, width: float = WIDTH) -> "Figure":
     """A figure of a size in inches, drawn from data and arranged, so that every format shows the same."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -119,6 +122,8 @@ def _arrange(figure: "Figure") -> None:
     share, edges = 1.0 - legend / height, figure.subplotpars
     if legend:
         figure.subplots_adjust(bottom=1.0 - share * (1.0 - edges.bottom), top=1.0 - share * (1.0 - edges.top))
+    if images:  # the last tick of an image, set when its scales are, may stand at the very edge
+        figure.subplots_adjust(right=min(edges.right, 1.0 - HALF_LABEL / figure.get_figwidth()))
     for axes in images:
         axes.apply_aspect()
     figure.set_layout_engine()  # with an engine, even one that does nothing, saving draws twice
