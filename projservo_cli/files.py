@@ -1,8 +1,6 @@
 """Files of which a reader never meets half, texts read with care, and folders that one process works in."""
 
-import hashlib
 import os
-import platform
 import re
 import secrets
 import sys
@@ -13,7 +11,7 @@ from pathlib import Path
 from projservo_cli.records import InputError
 
 _LOCK = ".lock"
-_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<machine>[0-9a-f]{8})\.(?P<process>[0-9]+)\.[^.]+\.part")
+_TEMPORARY = re.compile(r"\..+\.([0-9]+)\.[0-9a-f]{8}\.part")  # with the number of the process
 
 
 @contextmanager
@@ -21,16 +19,12 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
     """Yield a temporary neighbour of ``path`` that takes its place when the block succeeds.
 
     The new content is on the disk before the old name points to it, unless it need not be ``lasting``: what
-    can be made again at any time need not wait for the disk. When the block raises, the
-    temporary file is removed and whatever stood at ``path`` before stays.
-
-    Raises InputError when the folder cannot be made or written to, or the disk is full.
+    can be made again at any time need not wait for the disk. When the block raises, whatever stood at
+    ``path`` before stays. Raises InputError when it cannot be written, or the disk is full.
     """
     with _told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    _clear_leftovers(path.parent, path.name)
-    writer = f"{_machine()}.{os.getpid()}.{secrets.token_hex(4)}"
-    temporary = path.with_name(f".{path.name}.{writer}.part")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
         with _told(path):
             temporary.touch(exist_ok=False)
@@ -42,6 +36,13 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
                 _synchronise(path.parent)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: str | bytes) -> Path:
+    """Write a file as ``replacing`` does, text in UTF-8; its path."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
 
 
 def text_of(path: Path | str, expected: str, most: int) -> str:
@@ -107,13 +108,6 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
                 folder.rmdir()
 
 
-def tidy(folder: Path, *parts: str) -> None:
-    """Remove what a killed process left in a folder, where no other works there and nothing is to be done."""
-    if (folder / _LOCK).exists():
-        with suppress(InputError), working_in(folder, *parts):
-            pass
-
-
 def lies_inside(path: Path, folder: Path) -> bool:
     """Whether a path lies in a folder when all symbolic links are followed."""
     try:
@@ -139,27 +133,20 @@ def _told(path: Path, remedy: str = "") -> Iterator[None]:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}{remedy}") from error
 
 
-def _clear_leftovers(folder: Path, name: str | None = None) -> None:
-    """Remove temporary files whose writers were killed, of one file or of all in a folder.
-
-    Those of processes that run, or that ran on another machine, stay.
-    """
+def _clear_leftovers(folder: Path) -> None:
+    """Remove the temporary files in a folder whose writers were killed; those of processes that run stay."""
     if sys.platform == "win32" or not folder.is_dir():  # no process can be asked for there
         return
     for path in folder.iterdir():
         found = _TEMPORARY.fullmatch(path.name)
-        if found is None or found["machine"] != _machine() or name not in (None, found["name"]):
+        if found is None:
             continue
         try:
-            os.kill(int(found["process"]), 0)
+            os.kill(int(found[1]), 0)
         except ProcessLookupError:
             path.unlink(missing_ok=True)
         except (PermissionError, OverflowError):  # it runs for somebody else, or is no process
             pass
-
-
-def _machine() -> str:
-    return hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 
 
 def _synchronise(path: Path) -> None:

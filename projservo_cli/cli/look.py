@@ -113,7 +113,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     """A table that says what every field is, and one for each record."""
     import numpy as np
 
-    from projservo_cli.files import replacing
+    from projservo_cli.files import write_whole
     from projservo_cli.tables import to_csv
 
     rows, tables = [], {}
@@ -138,9 +138,7 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
     names = ("file", "field", "dimensions", "unit", "about", "value")
     tables["fields.csv"] = to_csv(dict(zip(names, np.array(rows, dtype=object).T, strict=True)))
     for file, text in tables.items():
-        with replacing(folder / file) as temporary:
-            temporary.write_bytes(text.encode())
-        yield folder / file
+        yield write_whole(folder / file, text)
 
 
 @main.command(epilog="Example: projservo equations --json")

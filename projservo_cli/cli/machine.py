@@ -29,14 +29,15 @@ def init(console: Console, *, file: Path, force: bool) -> None:
     editors complete and check it.
     """
     from projservo_cli.config.schema import json_schema, starter
+    from projservo_cli.files import write_whole
 
     path = file / _STARTER if file.is_dir() else file
     if path.suffix not in (".yaml", ".yml"):
         raise click.UsageError(f"{path}: name a YAML file to write, such as {path.with_suffix('.yaml')}")
     option.require_new(path, force=force)
     described = path.with_name(_SCHEMA)
-    _write(path, starter())
-    _write(described, _as_text(json_schema()))
+    write_whole(path, starter())
+    write_whole(described, _as_text(json_schema()))
     words = (
         f"init: {path}, with {described} for editors",
         f"next: projservo calibrate plan servo report -c {path}",
@@ -55,24 +56,18 @@ def _schema(console: Console, *, what: str | None, output: Path | None) -> None:
     yaml-language-server: $schema=FILE. That of sweeps is projservo schema sweep.
     """
     from projservo_cli.config.schema import json_schema, sweep_schema
+    from projservo_cli.files import write_whole
 
     schema = sweep_schema() if what else json_schema()
     if output is None:
         console.as_json = True
         console.tell(schema, ())
     else:
-        _write(output, _as_text(schema))
+        write_whole(output, _as_text(schema))
 
 
 def _as_text(schema: dict[str, Any]) -> str:
     return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
-
-
-def _write(path: Path, text: str) -> None:
-    from projservo_cli.files import replacing
-
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
 
 
 @main.command(epilog="Example: projservo doctor --json")

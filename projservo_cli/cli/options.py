@@ -21,13 +21,13 @@ _Function = Callable[..., Any]
 PATH = click.Path(path_type=Path)
 _RESULTS = Path("results")
 _KEYS = {  # that options stand for
-    "data": ("data", "table"),
-    "joints": ("data", "joints"),
-    "joint_unit": ("data", "joint_unit"),
-    "noise_px": ("data", "noise_px"),
-    "init": ("calibration", "init"),
-    "cross_validate": ("calibration", "cross_validate"),
-    "lens": ("calibration", "lens"),
+    "data": "data.table",
+    "joints": "data.joints",
+    "joint_unit": "data.joint_unit",
+    "noise_px": "data.noise_px",
+    "init": "calibration.init",
+    "cross_validate": "calibration.cross_validate",
+    "lens": "calibration.lens",
 }
 
 # Options of which each command says for itself what they do.
@@ -214,12 +214,12 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
         if given is None or given is False:
             continue
         flag = f"--{name.replace('_', '-')}" + ("" if given is True else f" {given}")
-        value = os.path.abspath(given) if key[1] in ("table", "init") else given
+        value = os.path.abspath(given) if name in ("data", "init") else given
         found.append(Override(flag, key, value))
     if (size := options.get("image_size")) is not None:  # such as 1280x1024
         sides = size.lower().replace("x", ", ")
         found.append(Override.parse(f"data.image_size_px=[{sides}]", f"--image-size {size}"))
     found += map(Override.parse, options["sets"])
     if (scale := options.get("speed_scale")) is not None:  # --set plant=… would else undo it
-        found.append(Override(f"--speed-scale {scale}", ("plant", "speed_scale"), scale))
+        found.append(Override(f"--speed-scale {scale}", "plant.speed_scale", scale))
     return found

@@ -15,10 +15,7 @@ from projservo_cli.cli.output import Console, words_of, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _EXTRAS = ("view", "animation")
-_NAMING = {
-    "plant": {("plant",), ("plant", "use")},
-    "law": {("control",), ("control", "laws")},
-}  # keys of --set
+_NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
 
 
@@ -162,17 +159,15 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     from projservo_cli.config import to_yaml
-    from projservo_cli.files import tidy, working_in
+    from projservo_cli.files import working_in
 
     chain = _asked(console, names, options)
     if options["dry_run"]:
         return _tell_dry(chain)
-    folder = chain.run.path.parent
     up_to_date = chain.run.configuration == to_yaml(chain.config) and not any(s.why for s in chain.steps)
     if up_to_date and not _extras(options):
-        tidy(folder, _FIGURES)
         return _work(chain)
-    with working_in(folder, _FIGURES):
+    with working_in(chain.run.path.parent, _FIGURES):
         # Anew, since another process may have written the run until now.
         return _work(_asked(console, names, options))
 
@@ -239,8 +234,8 @@ def _require_named(chain: _Chain) -> None:
     wanted = {("law", law): f"--law {law}" for law in laws if law not in CODES}
     if servo and plant is not None:
         wanted["plant", plant] = f"--set plant={plant}"
-    paths = {Override.parse(text).path for text in chain.options["sets"]}
-    named = {kind: bool(keys & paths) for kind, keys in _NAMING.items()}
+    given = {Override.parse(text).key for text in chain.options["sets"]}
+    named = {kind: bool(keys & given) for kind, keys in _NAMING.items()}
     named["law"] |= bool(chain.options.get("laws"))
     for (kind, target), flag in wanted.items():
         if not (chain.options["config"] or named[kind]):
@@ -300,7 +295,7 @@ def _make_steps(chain: _Chain) -> None:
     """Make what has to be made, stop at the first failure, keep what was made until then."""
     from projservo_cli.config import to_yaml
     from projservo_cli.records import WorkFailed
-    from projservo_cli.stages.chain import make_result
+    from projservo_cli.stages.steps import make_result
     from projservo_cli.store import save
 
     console = chain.console
@@ -376,7 +371,7 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
     """Write what is wanted, and the page anew, which links to it; the paths by name."""
     from projservo_cli.report.page import write_page
     from projservo_cli.stages import report as reporting
-    from projservo_cli.stages.chain import reported
+    from projservo_cli.stages.steps import reported
 
     told = reported(chain.config, chain.run, chain.laws)
     makers = {"view": reporting.view, "animation": reporting.animation}

@@ -120,8 +120,6 @@ class _Document:
         return cls(text_of(path, "a configuration (YAML)", _MAX_BYTES), str(path))
 
     def _parse(self, text: str) -> None:
-        if len(text) > _MAX_BYTES:
-            raise _UnfitError(f"larger than {_MAX_BYTES} bytes; this is no configuration")
         if any("\ud800" <= character <= "\udfff" for character in text):
             raise _UnfitError("not UTF-8 text")
         _require_bounded(text)
@@ -141,8 +139,7 @@ class _Document:
         self.places.setdefault(path, self._place(node.start_mark))
         if node.tag not in {_STANDARD + kind for kind in ("map", "seq", "str")}:
             tag = _shortened(node.tag.replace(_STANDARD, "!!"))
-            what = f"the tag {tag} is not allowed; plain values only"
-            self.wrong(path, what, self._place(node.start_mark))
+            self.wrong(path, f"the tag {tag} is not allowed; plain values only", self._place(node.start_mark))
             return None
         if isinstance(node, yaml.MappingNode):
             return self._mapping(node, path)
@@ -160,8 +157,9 @@ class _Document:
                 self.wrong(path, "a key must be plain text", place)
             elif key in values:
                 first = self.places[(*path, key)].removeprefix(f"{self.name}:")
-                what = f"the key stands here a second time (first at {first}); keep one"
-                self.wrong((*path, key), what, place)
+                self.wrong(
+                    (*path, key), f"the key stands here a second time (first at {first}); keep one", place
+                )
             else:
                 self.places[(*path, key)] = place
                 values[key] = self._value(value_node, (*path, key))
@@ -174,12 +172,12 @@ class _Document:
         try:
             return meaning(node.value)
         except ValueError:  # of more digits than Python converts
-            what = "cannot be read as a number"
-            self.wrong(path, what, self._place(node.start_mark))
+            self.wrong(path, "cannot be read as a number", self._place(node.start_mark))
             return None
 
-    def override(self, path: _Path, value: Any, flag: str) -> None:
+    def override(self, change: "Override") -> None:
         """Set a value that comes from elsewhere, making the mappings on the way to it."""
+        path, value, flag = change.path, change.value, change.flag
         holder: Any = self.values
         for i, step in enumerate(path):
             here = path[: i + 1]
@@ -193,10 +191,8 @@ class _Document:
                 return self.wrong(here, what, flag)
             if here == path or (isinstance(holder, dict) and holder.get(key) is None):
                 holder[key] = value if here == path else {}
-                inside = [known for known in self.places if known[: len(here)] == here]
-                for known in inside:
-                    del self.places[known]
-                self.places[here] = flag
+                places = {known: at for known, at in self.places.items() if known[: len(here)] != here}
+                self.places = {**places, here: flag}
             holder = holder[key]
         return None
 
@@ -239,18 +235,21 @@ class _UnfitError(ValueError):
 
 @dataclass(frozen=True)
 class Override:
-    """A value given on the command line; ``flag`` is how the user wrote it."""
+    """A value given on the command line."""
 
-    flag: str
-    path: _Path
+    flag: str  # how the user wrote it
+    key: str  # such as control.gain_t
     value: Any
+
+    @property
+    def path(self) -> _Path:
+        """Steps to the value; list positions are numbers."""
+        steps = enumerate(self.key.split("."))
+        return tuple(int(step) if step.isdecimal() and i else step for i, step in steps)
 
     @classmethod
     def parse(cls, text: str, flag: str = "") -> "Override":
-        """Read ``a.b=v``; the value is YAML, list positions are numbers.
-
-        Raises InputError when there is no ``=``, no key, or the value is not YAML.
-        """
+        """Read ``a.b=v``; the value is YAML."""
         flag = flag or f"--set {text}"
         key, sign, value = text.partition("=")
         steps = [step.strip() for step in key.split(".")]
@@ -261,22 +260,20 @@ class Override:
         document = _Document(value, flag)
         if document.problems:
             raise InputError(f"{flag}: the value is {document.problems[0][1]}")
-        path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(steps))
-        if path == ("law",):
-            return cls(flag, ("control", "laws"), [document.values])
-        return cls(flag, path, document.values)
+        if steps == ["law"]:
+            return cls(flag, "control.laws", [document.values])
+        return cls(flag, ".".join(steps), document.values)
 
 
 def load_config(
     path: pathlib.Path | str | None, overrides: Sequence[str | Override] = (), *, text: str | None = None
 ) -> Config:
-    """Read and check a configuration.
+    """Read and check a configuration; paths in it become absolute.
 
-    path : _Path, str or None, the YAML file. None for a blank recorded configuration, which overrides fill.
-    overrides : sequence of str or Override ``a.b=v`` as for ``--set``, applied in order.
-    text : str, optional, its content, where it is already at hand; ``path`` then only names it in messages.
-    Returns Config: ``data.table`` and ``calibration.init`` are absolute paths, whatever the working directory
-    later. Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
+    path : the YAML file; None for a blank recorded configuration, which overrides fill.
+    overrides : ``a.b=v`` as for ``--set``, applied in order.
+    text : its content, where it is already at hand; ``path`` then only names it in messages.
+    Raises InputError, one line ``file:line:column: path: what`` for each thing that is wrong.
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
     if path is not None and text is None:
@@ -291,28 +288,26 @@ def load_config(
         document.wrong((), "the configuration is empty; start from one of the shipped ones")
     _spell_out(document.values)
     for change in changes:
-        document.override(change.path, change.value, change.flag)
+        document.override(change)
         _spell_out(document.values)
     _fill_in(document.values, path)
     return _validated(Config, document)
 
 
 def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
-    """Read and check the configuration of a sweep; ``base`` becomes absolute paths.
-
-    Raises InputError all that is wrong, one line ``file:line:column: path: what`` each.
-    """
+    """Read and check the configuration of a sweep; ``base`` becomes absolute paths."""
     document = _Document.read(path)
     if not isinstance(document.values, dict):
         if not document.problems:
             document.wrong((), "expected keys and values such as base: paper.yaml")
         raise document.refused()
     for change in map(Override.parse, overrides):
-        document.override(change.path, change.value, change.flag)
-    document.values.setdefault("name", pathlib.Path(path).stem)
+        document.override(change)
+    file = pathlib.Path(path)
+    document.values.setdefault("name", file.stem)
     sweep = _validated(SweepConfig, document)
-    folder = pathlib.Path(path).parent
-    return sweep.model_copy(update={"base": tuple(str((folder / base).resolve()) for base in sweep.base)})
+    base = tuple(str((file.parent / name).resolve()) for name in sweep.base)
+    return sweep.model_copy(update={"base": base})
 
 
 def _validated(model: type[_Model], document: _Document) -> _Model:

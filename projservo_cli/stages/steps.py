@@ -1,4 +1,4 @@
-"""What is up to date and what has to be made first.
+"""What is up to date, what has to be made first, and making it.
 
 Every result carries a key: a hash of the configuration its stage depends on and of the key of the
 stage before it. Keys follow from the configuration alone, so what is to be done is known before
@@ -15,15 +15,16 @@ from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.records import InputError, names_of
 from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
+from projservo_cli.stages import Progress
 from projservo_cli.stages.world import has_task
-from projservo_cli.store import SERVO, Result, Run
+from projservo_cli.store import SERVO, Result, Run, save
 
 STAGES = ("calibrate", "plan", "servo", "report")
 # What of the configuration each stage depends on, beside the stage before it.
 _WORLD = ("robot", "rig", "markers")
 _TASK = ("seed", *_WORLD, "noise.servo_px", "noise.shown_frames", "task")
 _SPEED = ("control.joint_speed_limit_deg_s", "control.prismatic_speed_limit_m_s")
-DEPENDS_ON: dict[str, tuple[str, ...]] = {
+_DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "calibrate": ("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start"),
     "plan": (*_TASK, "trajectory", "control.observation", "plant.use", *_SPEED),
     "servo": (*_TASK, "trajectory.delta", "control", "plant", "disturbance", "stop"),
@@ -31,14 +32,12 @@ DEPENDS_ON: dict[str, tuple[str, ...]] = {
 }
 # Where a file lies does not matter, only what it says. Which laws are run, in which modes, and which of
 # them must converge, changes the run of none of them.
-NOT_HASHED: dict[str, tuple[str, ...]] = {
+_NOT_HASHED: dict[str, tuple[str, ...]] = {
     "calibrate": ("data.table", "calibration.init"),
     "plan": ("data.table",),
     "servo": ("data.table", "control.laws", "control.mode", "control.must_converge"),
     "report": ("data.table",),
 }
-
-EXPECTED = {"table": "a table", "init": "JSON with screws, cameras and markers"}
 
 
 @dataclass(frozen=True)
@@ -81,6 +80,16 @@ def steps_for(
     return steps
 
 
+def key_of(config: Config, stage: str, **before: Any) -> str:
+    """Hash of what a stage depends on: of the configuration, and of JSON values on what it is made from."""
+    return digest(config, _DEPENDS_ON[stage], without=_NOT_HASHED[stage], extra=before)
+
+
+def affects(key: str, stage: str) -> bool:
+    """Whether a stage depends on a key of the configuration."""
+    return any(f"{key}.".startswith(f"{part}.") for part in _DEPENDS_ON[stage])
+
+
 def _needed(config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]) -> Iterator[Step]:
     """Every result of the stages with its key, each made from those before."""
     inputs = _file_hashes(config, run)
@@ -88,8 +97,7 @@ def _needed(config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]
     for stage in stages:
         keys = []
         for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
-            extra = {"before": before, "law": law}
-            keys.append(digest(config, DEPENDS_ON[stage], without=NOT_HASHED[stage], extra=extra))
+            keys.append(key_of(config, stage, before=before, law=law))
             yield Step(stage, law, keys[-1], inputs if stage == "calibrate" else {})
         before = [*keys]
 
@@ -109,8 +117,9 @@ def _file_hashes(config: Config, run: Run) -> dict[str, str]:
         try:
             found |= {name: given, digested: hashlib.sha256(path.read_bytes()).hexdigest()}
         except OSError as error:
+            expected = "a table" if name == "table" else "JSON with screws, cameras and markers"
             raise InputError(
-                f"{path}: cannot be read: {error.strerror or error}; expected {EXPECTED[name]}"
+                f"{path}: cannot be read: {error.strerror or error}; expected {expected}"
             ) from error
     return found
 
@@ -150,3 +159,44 @@ def result_of(step: Step, config: Config, *made: Any) -> Result:
     labels = ("observation", "calibration", "cross_validation") if step.stage == "calibrate" else ("",)
     records = {label: record for label, record in zip(labels, made, strict=True) if record is not None}
     return Result(step.key, to_yaml(config), provenance.collect(seed=config.seed), step.inputs, records)
+
+
+def make_result(
+    step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress
+) -> tuple[Run, list[str]]:
+    """Make one result from those before it, and put it into the run file, which stays where a stage raises.
+
+    laws : names of the runs a report is about; others may be stored, of other settings perhaps.
+    Returns the run with it, and the names of results dropped because they were made from older ones.
+    """
+    run = replace(run, configuration=to_yaml(config))
+    result = result_of(step, config, *_made(step, config, run, laws, progress))
+    place = STAGES.index(step.stage)
+    after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
+    results = {name: stored for name, stored in run.results.items() if name not in after}
+    return save(replace(run, results={**results, step.name: result})), after
+
+
+def _made(step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress) -> tuple[Any, ...]:
+    """What a stage makes; its module is imported when it is needed."""
+    if step.stage == "calibrate":
+        from projservo_cli.stages import calibrate
+
+        return calibrate.run(config, progress=progress)
+    if step.stage == "plan":
+        from projservo_cli.stages import plan
+
+        return (plan.run(config, run.calibration),)
+    if step.stage == "servo":
+        from projservo_cli.stages import servo
+
+        return (servo.run(config, run.calibration, run.plan, step.law),)
+    from projservo_cli.stages import report
+
+    return (report.run(reported(config, run, laws), run.path.parent, progress=progress),)
+
+
+def reported(config: Config, run: Run, laws: Sequence[str]) -> Run:
+    """What a report is about: of the results before it those that the named runs of laws rest on."""
+    names = ["calibrate", *(["plan", *(SERVO + law for law in laws)] if has_task(config) else [])]
+    return replace(run, results={name: run.results[name] for name in names})

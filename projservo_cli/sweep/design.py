@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import product
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.forward import displacements, image_points, moved_points
-from projservo_cli.config import Config, Override, digest, load_config, to_yaml
+from projservo_cli.config import Config, Override, load_config, to_yaml
 from projservo_cli.config.models import Goal, TaskSettings
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
@@ -28,7 +28,7 @@ from projservo_cli.records import (
     names_of,
 )
 from projservo_cli.robots.simulated import METRIC_A_INF
-from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
+from projservo_cli.stages.steps import affects, key_of
 from projservo_cli.stages.world import Truth, truth_of
 
 RANGE = 0.9
@@ -111,10 +111,11 @@ def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
     changes = [_override(what, key, value) for key, value in values.items()]
     try:
         for change in changes:
+            *way, last = change.path
             section: Any = resolved
-            for step in change.path[:-1]:
+            for step in way:
                 section = section[step]
-            section[change.path[-1]] = change.value
+            section[last] = change.value
         return Config.model_validate(resolved)
     except (ValueError, KeyError, IndexError, TypeError):
         load_config(config.name, changes, text=to_yaml(config))  # says what is wrong in the user's words
@@ -123,8 +124,7 @@ def _changed(config: Config, values: Mapping[str, Any], what: str) -> Config:
 
 def _override(what: str, key: str, value: Any) -> Override:
     """A value as an override, which messages call by what it is of."""
-    path = tuple(int(step) if step.isdecimal() and i else step for i, step in enumerate(key.split(".")))
-    return Override(f"{what}: {key}={json.dumps(value)}", path, value)
+    return Override(f"{what}: {key}={json.dumps(value)}", key, value)
 
 
 def _overrides(what: str, key: str, value: Any) -> list[Override]:
@@ -132,9 +132,9 @@ def _overrides(what: str, key: str, value: Any) -> list[Override]:
     if key != LAW:
         return [_override(what, key, value)]
     law, mode = law_and_mode(value)
-    flag = f"{what}: {key}={json.dumps(value)}"
-    found = [Override(flag, ("control", "laws"), [law])]
-    return found if law == value else [*found, Override(flag, ("control", "mode"), [mode])]
+    change = _override(what, key, value)
+    found = [replace(change, key="control.laws", value=[law])]
+    return found if law == value else [*found, replace(change, key="control.mode", value=[mode])]
 
 
 # Streams of the sweep's seed.
@@ -283,8 +283,7 @@ class Design:
     @lru_cache(maxsize=4096)  # noqa: B019 - a process has one design
     def calibration_key(self, cell: int, calibration: int) -> str:
         """Hash of all a calibration depends on; cells that share it share the calibration."""
-        config = self.calibrated(cell, calibration).model_copy(update={"seed": 0})
-        return digest(config, DEPENDS_ON["calibrate"], without=NOT_HASHED["calibrate"])
+        return key_of(self.calibrated(cell, calibration).model_copy(update={"seed": 0}), "calibrate")
 
     def calibrations(self) -> Iterator[tuple[str, Config]]:
         """Key of each calibration that is needed, each once, and a configuration that needs it."""
@@ -337,7 +336,7 @@ class Design:
     def _drawn(self, stream: int, number: int) -> dict[str, Any]:
         """Values of the keys that a stream is for: whether the calibration depends on them."""
         of_calibration = stream == CALIBRATION_VALUES
-        keys = [key for key in self.sweep.random if _for_calibration(key) is of_calibration]
+        keys = [key for key in self.sweep.random if affects(key, "calibrate") is of_calibration]
         if not keys:
             return {}
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(stream, number)))
@@ -367,8 +366,3 @@ def name_of_run(config: Config) -> str:
             "law: [exact, exact_track]"
         )
     return names[0]
-
-
-def _for_calibration(key: str) -> bool:
-    """Whether the calibration depends on a key of the configuration."""
-    return any(f"{key}.".startswith(f"{part}.") for part in DEPENDS_ON["calibrate"])

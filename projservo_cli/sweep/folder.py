@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli import provenance
 from projservo_cli.config import Config, to_yaml
-from projservo_cli.files import replacing
+from projservo_cli.files import write_whole
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, WorkFailed
 from projservo_cli.stages import Progress, calibrate
@@ -85,11 +85,7 @@ class Folder:
                 yield first, last
 
     def status(self, design: Design, *, force: bool = False) -> _Status:
-        """How far a sweep is.
-
-        Raises InputError if the folder holds another sweep, or one made with other versions, and ``force`` is
-        not set.
-        """
+        """How far a sweep is; refuses a folder of another sweep or other versions unless ``force`` is set."""
         total = design.total
         if not force and self.table.exists() and not self.manifest.exists():
             raise InputError(
@@ -138,8 +134,7 @@ class Folder:
         """Write the manifest."""
         origin = provenance.collect(seed=design.sweep.seed)
         values = {"key": design.key, "chunk": chunk, "provenance": origin, "recipe": design.recipe}
-        with replacing(self.manifest) as temporary:
-            temporary.write_text(json.dumps(values), encoding="utf-8")
+        write_whole(self.manifest, json.dumps(values))
 
     def clear(self) -> None:
         """Remove what a sweep of another configuration left."""
@@ -184,8 +179,7 @@ class Folder:
         """Store a calibration as a run file of its own, or why there is none."""
         path = self.calibration(made.key)
         if made.records is None:
-            with replacing(path.with_suffix(REFUSED)) as temporary:
-                temporary.write_text(made.reason + "\n", encoding="utf-8")
+            write_whole(path.with_suffix(REFUSED), made.reason + "\n")
             return
         (step,) = steps_for(made.config, Run(path), ["calibrate"])
         save(Run(path, to_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
@@ -201,12 +195,7 @@ class Folder:
 
 
 def run_of(target: str) -> tuple[Config, Result | None]:
-    """Configuration of a run of a sweep, and the calibration it was made with.
-
-    target : SWEEP:INDEX, the folder of a sweep (or its table) and the number of the run.
-    Returns the calibration is None where the sweep has not come to it yet. Raises InputError if there is no
-    such sweep or run; WorkFailed if the calibration of the run was refused.
-    """
+    """Configuration of the run SWEEP:INDEX, and its calibration, None where the sweep has not come to it."""
     sweep, _, index = target.rpartition(":")
     if not sweep or not index.isdecimal():
         raise InputError(f"--from {target}: expected SWEEP:INDEX, such as results/sweep_noise:17")
@@ -234,12 +223,7 @@ def run_sweep(
     *,
     force: bool = False,
 ) -> _Status:
-    """Make the runs of a sweep that are not stored yet, and the table.
-
-    Raises InputError if the folder holds another sweep, a file cannot be written, or a drawn value is
-    invalid; WorkFailed if tasks cannot be drawn, or workers are lost again and again; what was stored is
-    kept; KeyboardInterrupt after the table of what was stored has been assembled.
-    """
+    """Make the runs of a sweep that are not stored yet, and the table; of what was stored also at Ctrl-C."""
     status = folder.status(design, force=force)
     if status.complete:
         return status
@@ -293,9 +277,10 @@ def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status,
     progress("runs", 0, left)
     parts = (part(*pair) for pair in folder.missing(design, chunk))
     with closing(engine.completed(run_part, parts, threads=threads)) as made_parts:
-        for made in made_parts:
-            write_part(folder.part(made.first, made.last), made.columns, made.traces)
-            done += made.last - made.first
+        for columns, traces in made_parts:
+            first, last = int(columns["run"][0]), int(columns["run"][-1]) + 1
+            write_part(folder.part(first, last), columns, traces)
+            done += last - first
             progress("runs", done, left)
 
 

@@ -3,14 +3,13 @@
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from projservo_cli.config import Config, digest
+from projservo_cli.config import Config
 from projservo_cli.control import CODES
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.compiled import Course
@@ -21,7 +20,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
-from projservo_cli.stages.steps import DEPENDS_ON, NOT_HASHED
+from projservo_cli.stages.steps import key_of
 from projservo_cli.sweep.design import RUNS, Design, name_of_run
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
@@ -101,8 +100,7 @@ _SAID = {code: name.encode() for code, name in enumerate(VERDICTS)}
 _COUNTS = tuple(column.name for column in MEASURED if column.dtype.startswith("i") and column.name in NUMBERS)
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
+class Part(NamedTuple):
     """Runs ``first`` to ``last`` - 1 and all they need."""
 
     design: Design
@@ -111,21 +109,15 @@ class Part:
     calibrations: Mapping[str, Calibration | None]  # by their key; None where there could be none
 
 
-@dataclass(frozen=True, eq=False)
-class _Made:
+class _Made(NamedTuple):
     """Rows of a part, and the traces that are kept."""
 
-    first: int
-    last: int
     columns: _Columns
     traces: dict[int, Trace]
 
 
 def run_part(part: Part) -> _Made:
-    """Make the runs of a part; the same on any machine of one kind, whatever ran before.
-
-    Raises InputError if a drawn value is not one that its key takes.
-    """
+    """Make the runs of a part; the same on any machine of one kind, whatever ran before."""
     design = _interned(part.design)
     runs = np.arange(part.first, part.last)
     table = _numbered(design, runs)
@@ -152,7 +144,7 @@ def run_part(part: Part) -> _Made:
                 _put(table, np.array([run - part.first]), row)
                 if trace is not None:
                     traces[run] = trace
-    return _Made(part.first, part.last, table, traces)
+    return _Made(table, traces)
 
 
 def _alike(design: Design, runs: IntArray) -> Iterator[IntArray]:
@@ -257,7 +249,6 @@ def _interned(design: Design) -> Design:
 
 
 _senses: dict[str, FloatArray] = {}
-MOST_SENSES = 4_096  # that are kept
 
 
 def _sense(scenario: Scenario, calibration_key: str) -> FloatArray:
@@ -265,10 +256,8 @@ def _sense(scenario: Scenario, calibration_key: str) -> FloatArray:
     config = scenario.config
     if rehearses(config.trajectory.profile):
         return rotation_sense(scenario)
-    key = digest(config, DEPENDS_ON["plan"], without=NOT_HASHED["plan"], extra={"before": calibration_key})
+    key = key_of(config, "plan", before=calibration_key)
     if key not in _senses:
-        if len(_senses) == MOST_SENSES:
-            _senses.clear()
         _senses[key] = rotation_sense(scenario)
     return _senses[key]
 

@@ -5,14 +5,14 @@ import math
 from collections.abc import Iterator, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.stats import binomtest
 
 from projservo_cli.config.sweep import LAW
-from projservo_cli.files import replacing
+from projservo_cli.files import write_whole
 from projservo_cli.records import BoolArray
 from projservo_cli.report import style
 from projservo_cli.report.material import Data
@@ -171,60 +171,41 @@ BINS = 8  # of a value that is drawn
 POINTS = 2_000  # of a curve
 
 
-class _Picture(NamedTuple):
-    """A figure: the name of its files, its numbers, how it is drawn, its height in inches."""
-
-    name: str
-    data: Data
-    draw: Any
-    height: float
-
-
 def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
     """Write statistics and figures of the table of a sweep beside it; the statistics and the files."""
     table, folder = SweepTable(path), path.parent
     rows = _Rows(table)
     found = {"runs": table.rows, "total": table.attributes["total"], **_statistics(rows)}
     text = json.dumps(found, indent=1, allow_nan=False) + "\n"
-    files = [_written(folder / STATISTICS, text.encode())]
+    files = [write_whole(folder / STATISTICS, text)]
     pictures = list(_pictures(rows))
-    for done, picture in enumerate(pictures):
+    for done, (name, data, draw) in enumerate(pictures):
         progress("figures", done, len(pictures))
-        made = {**_drawn(picture, formats), "csv": to_csv(picture.data).encode()}
-        files += [_written(folder / f"{picture.name}.{kind}", made[kind]) for kind in made]
+        height, width = (4.0, style.WIDTH) if draw is _draw_basin else (2.9, 0.65 * style.WIDTH)
+        made = style.contents(style.drawn(draw, data, height, width), formats)
+        files += [write_whole(folder / f"{name}.{kind}", content) for kind, content in made.items()]
+        files.append(write_whole(folder / f"{name}.csv", to_csv(data)))
     progress("figures", len(pictures), len(pictures))
     return found, files
 
 
-def _written(path: Path, content: bytes) -> Path:
-    with replacing(path) as temporary:
-        temporary.write_bytes(content)
-    return path
-
-
-def _drawn(picture: _Picture, formats: Sequence[str]) -> dict[str, bytes]:
-    width = 0.65 * style.WIDTH if picture.height < 4 else style.WIDTH
-    return style.contents(style.drawn(picture.draw, picture.data, picture.height, width), formats)
-
-
-def _pictures(rows: _Rows) -> Iterator[_Picture]:
-    """Every figure that the columns of a sweep allow."""
+def _pictures(rows: _Rows) -> Iterator[tuple[str, Data, Any]]:
+    """Every figure that the columns of a sweep allow: the name of its files, its numbers, how it is drawn."""
     axes = {name: values for name, values in rows.axes if len(values) > 1 and _numeric(values)}
     for name in axes:
-        yield _Picture(f"success_over_{name}", _success(rows, name, name, None), _draw_success, 2.9)
+        yield f"success_over_{name}", _success(rows, name, name, None), _draw_success
     drawn = [name for name in rows.table.names if name in rows.table.attributes["random"]]
     for name in (name for name in drawn if rows[name].dtype.kind == "f"):
         edges = np.linspace(rows[name].min(), np.nextafter(rows[name].max(), math.inf), BINS + 1)
-        yield _Picture(f"success_over_{name}", _success(rows, name, name, edges.tolist()), _draw_success, 2.9)
+        yield f"success_over_{name}", _success(rows, name, name, edges.tolist()), _draw_success
     if np.nanmax(rows["rotation_deg"], initial=0.0) - np.nanmin(rows["rotation_deg"], initial=180.0) > 1.0:
         data = _success(rows, "rotation_deg", "rotation from start to goal (deg)", [*ANGLES[:-1], 180.1])
-        yield _Picture("success_over_rotation", data, _draw_success, 2.9)
+        yield "success_over_rotation", data, _draw_success
     offsets = [name for name in axes if name.startswith(OFFSET)]
     if len(offsets) >= 2:
-        yield _Picture("basin", _basin(rows, offsets[0], offsets[1]), _draw_basin, 4.0)
-    errors = _final_errors(rows)
-    if errors:
-        yield _Picture("final_error", errors, _draw_final_errors, 2.9)
+        yield "basin", _basin(rows, offsets[0], offsets[1]), _draw_basin
+    if errors := _final_errors(rows):
+        yield "final_error", errors, _draw_final_errors
 
 
 def _numeric(values: Sequence[Any]) -> bool:
