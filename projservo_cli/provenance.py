@@ -15,19 +15,15 @@ __version__ = "0.1.0"
 _PACKAGES = ("numpy", "scipy", "numba", "llvmlite", "h5py", "matplotlib")
 
 
-def collect(*, seed: int, argv: list[str] | None = None) -> dict[str, Any]:
-    """Everything that may explain a difference between two runs; values are JSON.
-
-    seed : int, the seed of the configuration.
-    argv : list of str, optional, the command, by default that of this process.
-    """
+def collect(*, seed: int) -> dict[str, Any]:
+    """Everything that may explain a difference between two runs of a seed; values are JSON."""
     return {
         "projservo": __version__,
         "python": platform.python_version(),
         **{package: version_of(package) for package in _PACKAGES},
         "git_commit": _git("rev-parse", "HEAD"),
         "git_dirty": None if (status := _git("status", "--porcelain", "-uno")) is None else bool(status),
-        "argv": list(sys.argv if argv is None else argv),
+        "argv": list(sys.argv),
         "seed": seed,
         "jit": os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0"),
         "host": platform.node(),

@@ -98,8 +98,7 @@ def read_joint_list(
 
     joint_types : as for an observation table.
     joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
-    Raises InputError ``file:line: what`` when the file cannot be read, a row makes no sense or a pose stands
-    there twice.
+    Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
     """
     sheet = _Sheet(path, "q1…qN", [], joint_types, optional=["pose", "left", "right"])
     if ("left" in sheet.columns) != ("right" in sheet.columns):
@@ -123,10 +122,7 @@ def read_joint_list(
 
 
 def recording_of(path: Path | str) -> str | None:
-    """The recording that all rows of a table belong to; None where they name none or several.
-
-    Raises InputError when the file cannot be read.
-    """
+    """The recording that all rows of a table belong to; None where they name none or several."""
     sheet = _Sheet(path, _HEADER, [], optional=[_RECORDING])
     found = {row[_RECORDING] for row in sheet.rows() if _RECORDING in row}
     return found.pop() if len(found) == 1 else None
@@ -135,14 +131,14 @@ def recording_of(path: Path | str) -> str | None:
 def write_table(observation: Observation, path: Path | str, *, recording: str = "") -> None:
     """Write an observation table that ``read_table`` reads back to the last bit.
 
-    Every marker of every pose has a row, with empty cells where unseen. The file appears whole or
-    not at all. ``recording``, if given, stands in a further column of every row.
+    Every marker of every pose has a row, with empty cells where unseen. ``recording``, if given, stands in a
+    further column of every row.
     """
     joints = [f"q{i}" for i in range(1, observation.q.shape[1] + 1)]
-    mark = [recording] if recording else []
+    heading, mark = ([_RECORDING], [recording]) if recording else ([], [])
     with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["pose", "marker", *joints, *_PIXELS, *([_RECORDING] if recording else [])])
+        writer.writerow(["pose", "marker", *joints, *_PIXELS, *heading])
         for k, pose in enumerate(observation.pose.tolist()):
             q = [repr(value) for value in observation.q[k].tolist()]
             for j, marker in enumerate(observation.marker.tolist()):

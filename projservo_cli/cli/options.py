@@ -119,10 +119,7 @@ def of_stages(function: _Function) -> _Function:
 
 
 def require_new(path: Path, *, force: bool) -> None:
-    """Refuse to replace unasked what is there.
-
-    Raises UsageError where it exists and ``--force`` was not given.
-    """
+    """Refuse to replace what is there without ``--force``."""
     if path.exists() and not force:
         raise click.UsageError(f"{path}: exists already; choose another, or replace it with --force")
 
@@ -142,10 +139,7 @@ def configured(config: str | None, options: Mapping[str, Any]) -> "Config":
 
 
 def resolve(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
-    """The configuration with all overrides, and the run as stored so far.
-
-    Raises InputError when either cannot be read or makes no sense.
-    """
+    """The configuration with all overrides, and the run as stored so far."""
     from projservo_cli.config import load_config
 
     if options.get("origin") is not None:

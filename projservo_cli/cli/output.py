@@ -65,8 +65,6 @@ class Console:
         self.as_json = as_json
         self._data = sys.stdout  # while a command works, what others print goes elsewhere
         self._bar: Any = None
-        self._what = ""
-        self._lock = threading.RLock()
 
     def __enter__(self) -> "Console":
         return self
@@ -85,14 +83,10 @@ class Console:
 
     def say(self, text: str) -> None:
         """A message on standard error."""
-        if self.quiet:
-            return
-        with self._lock:
-            if self._bar is not None:
-                self._bar.clear()
+        if self._bar is not None:
+            self._bar.write(wrapped(visible(text)), file=sys.stderr)
+        elif not self.quiet:
             click.echo(wrapped(visible(text)), err=True)
-            if self._bar is not None:
-                self._bar.refresh()
 
     def detail(self, text: str) -> None:
         """A message that only -v shows."""
@@ -100,10 +94,7 @@ class Console:
             self.say(text)
 
     def confirm(self, command: str, plant: Any) -> None:
-        """Ask before the first motion of a robot, by the section ``plant`` of the configuration.
-
-        Raises KeyboardInterrupt where the answer is not yes.
-        """
+        """Ask before the first motion of a ``plant``; a KeyboardInterrupt where the answer is not yes."""
         self._finish()
         try:
             agreed = click.confirm(
@@ -121,36 +112,28 @@ class Console:
         """Move a progress bar; silent where standard error is not a terminal."""
         if self.quiet or not sys.stderr.isatty():
             return
-        with self._lock:
-            if self._bar is None or self._what != what:
-                self._begin(what, total)
-            self._bar.total = total
-            self._bar.update(done - self._bar.n)
-            if done >= total:
-                self._finish()
+        if self._bar is None or self._bar.desc != what:
+            from tqdm import tqdm
+
+            self._finish()
+            self._bar = tqdm(total=total, desc=what, leave=False, ncols=80)
+            threading.Thread(target=self._tick, args=(self._bar,), daemon=True).start()
+        self._bar.total = total
+        self._bar.update(done - self._bar.n)
+        if done >= total:
+            self._finish()
 
     def _finish(self) -> None:
         """Remove the progress bar."""
-        with self._lock:
-            if self._bar is not None:
-                self._bar.close()
-                self._bar = None
-
-    def _begin(self, what: str, total: int) -> None:
-        from tqdm import tqdm
-
-        self._finish()
-        self._what = what
-        self._bar = tqdm(total=total, desc=what, leave=False, ncols=80)
-        threading.Thread(target=self._tick, args=(self._bar,), daemon=True).start()
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
 
     def _tick(self, bar: Any) -> None:
         """Let the clock of a bar go on while its work reports nothing."""
         while self._bar is bar:
+            bar.refresh()
             time.sleep(TICK_S)
-            with self._lock:
-                if self._bar is bar:
-                    bar.refresh()
 
 
 def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:

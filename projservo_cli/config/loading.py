@@ -100,7 +100,11 @@ class _Document:
         self.values: Any = None
         self._count = 0
         try:
-            self._parse(text)
+            if any("\ud800" <= character <= "\udfff" for character in text):
+                raise _UnfitError("not UTF-8 text")
+            _require_bounded(text)
+            root = _Loader(text).get_single_node()
+            self.values = None if root is None else self._value(root, ())
         except _UnfitError as error:
             self.wrong((), str(error), name)
         except yaml.MarkedYAMLError as error:
@@ -118,14 +122,6 @@ class _Document:
     def read(cls, path: pathlib.Path | str) -> "_Document":
         """The document in a file; an InputError where there is none."""
         return cls(text_of(path, "a configuration (YAML)", _MAX_BYTES), str(path))
-
-    def _parse(self, text: str) -> None:
-        if any("\ud800" <= character <= "\udfff" for character in text):
-            raise _UnfitError("not UTF-8 text")
-        _require_bounded(text)
-        root = _Loader(text).get_single_node()
-        if root is not None:
-            self.values = self._value(root, ())
 
     def _place(self, mark: yaml.Mark) -> str:
         return f"{self.name}:{mark.line + 1}:{mark.column + 1}"

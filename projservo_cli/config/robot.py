@@ -360,6 +360,19 @@ class _Believed(BaseModel):
     marker_numbers: list[int] | None = None
     T_base_tool_at_reference: Matrix44
 
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Keys whose values do not fit together or make no sense, and why."""
+        n, m = len(self.screws), len(self.markers_tool)
+        if len(self.q_reference) != n:
+            yield "q_reference", f"{len(self.q_reference)} values for {n} screws"
+        if self.marker_numbers and not len(self.marker_numbers) == len(set(self.marker_numbers)) == m:
+            yield "marker_numbers", f"give each of the {m} markers its own number"
+        for name in ("camera_left", "camera_right"):
+            if np.linalg.matrix_rank(np.array(getattr(self, name))) < 3:
+                yield name, "a camera matrix has three independent rows"
+        if what := _not_rigid(self.T_base_tool_at_reference):
+            yield "T_base_tool_at_reference", what
+
 
 def read_nominal(path: Path | str) -> dict[str, Any]:
     """Read what is believed of a robot, its rig and its markers: the fields of ``calibration.Nominal``.
@@ -370,28 +383,17 @@ def read_nominal(path: Path | str) -> dict[str, Any]:
     Raises InputError ``file: key: what`` when it cannot be read or makes no sense.
     """
     found = _believed(path)
-    n, pose = len(found.screws), found.T_base_tool_at_reference
-    if len(found.q_reference) != n:
-        raise InputError(f"{path}: q_reference: {len(found.q_reference)} values for {n} screws")
-    numbers = found.marker_numbers or list(range(len(found.markers_tool)))
-    if len(numbers) != len(found.markers_tool) or len(set(numbers)) < len(numbers):
-        raise InputError(
-            f"{path}: marker_numbers: give each of the {len(found.markers_tool)} markers its own number"
-        )
-    cameras = np.array([found.camera_left, found.camera_right])
-    for name, P in zip(("camera_left", "camera_right"), cameras, strict=True):
-        if np.linalg.matrix_rank(P) < 3:
-            raise InputError(f"{path}: {name}: a camera matrix has three independent rows")
-    if what := _not_rigid(pose):
-        raise InputError(f"{path}: T_base_tool_at_reference: {what}")
+    for key, what in found.contradictions():
+        raise InputError(f"{path}: {key}: {what}")
+    numbers = found.marker_numbers or range(len(found.markers_tool))
     body = np.c_[np.array(found.markers_tool), np.ones(len(numbers))]
     return {
         "where": str(path),
-        "P": cameras,
+        "P": np.array([found.camera_left, found.camera_right]),
         "H_hat": np.array([_twist(f"{path}: screws.{i}", screw) for i, screw in enumerate(found.screws)]),
         "q_reference": np.array(found.q_reference, dtype=np.float64),
         "marker": np.array(numbers, dtype=np.int64),
-        "M": body @ np.array(pose).T,
+        "M": body @ np.array(found.T_base_tool_at_reference).T,
     }
 
 

@@ -16,8 +16,6 @@ from threadpoolctl import threadpool_limits
 from projservo_cli.config import Config
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Law, State, new_state
-from projservo_cli.geometry.kinematics import operators_at
-from projservo_cli.geometry.mechanisms import workspace
 from projservo_cli.loop.compiled import Course, many_steps, run_compiled
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.step import Log, new_log
@@ -73,51 +71,30 @@ class Case:
         job = self.whole if body else self.points
         return many_steps(job.law._replace(code=CODES[law]), job.course, job.state, job.log)
 
-    def one_step(self) -> tuple[int, FloatArray]:
-        """One step of direct_three, called from Python."""
-        log = self.points.log
-        return self.law(log.s[0], log.q[0])
-
     def whole_run(self) -> _Job:
         """A run of 150 steps, traced."""
         log = new_log(len(self.q_start), self.m, STEPS, len(ERRORS))
         course = self.points.course._replace(limits=self.limits._replace(max_steps=STEPS))
         return self.points._replace(course=course, log=log)
 
-    def matrices(self) -> FloatArray:
-        """The 8×6 matrices of [RH00] eq. (9) at each state, for the SVD."""
-        Q = self.points.log.q
-        work = workspace(len(self.q_start), 8)
-        found = np.empty((STATES, 8, len(self.q_start)))
-        for k in range(STATES):
-            operators_at(self.model, Q[k], work.H_hat)
-            A = self.points.law.task.A_star
-            found[k] = np.concatenate([(work.H_hat @ A[0]).T, (work.H_hat @ A[1]).T])
-        return found
-
 
 def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
     """Time everything so many rounds; see the schema of ``projservo bench --json``."""
-    matrices = itertools.cycle(case.matrices())
-    whole = case.whole_run()
+    matrices = itertools.cycle(np.random.default_rng(0).standard_normal((STATES, 8, 6)))
+    whole, log = case.whole_run(), case.points.log
     timed: dict[str, tuple[Callable[[], object], int]] = {
         "numpy.linalg.svd": (lambda: [np.linalg.svd(next(matrices)) for _ in range(PIECE)], PIECE),
         **{law: (partial(case.steps, law), STATES) for law in LAWS},
         BODY: (lambda: case.steps("exact", body=True), STATES),
-        "one call from Python": (lambda: [case.one_step() for _ in range(PIECE)], PIECE),
+        "one call from Python": (lambda: [case.law(log.s[0], log.q[0]) for _ in range(PIECE)], PIECE),
         "run of 150 steps": (lambda: run_compiled(*whole), 1),
     }
     with threadpool_limits(1):
         for function, _ in timed.values():
             function()
-        table = 1e6 * np.array(
-            [
-                [timeit(function, number=1) / count for function, count in timed.values()]
-                for _ in range(rounds)
-            ]
-        )
-    svd = float(table[:, 0].min())
-    times = {name: _times(table[:, i], svd) for i, name in enumerate(timed)}
+        rows = [[timeit(call, number=1) / count for call, count in timed.values()] for _ in range(rounds)]
+    table = 1e6 * np.array(rows).T
+    times = {name: _times(row, float(table[0].min())) for name, row in zip(timed, table, strict=True)}
     return {
         "step_over_svd": max(times["direct_three"]["over_svd"], times["direct_two"]["over_svd"]),
         "exact_over_svd": times[BODY]["over_svd"],

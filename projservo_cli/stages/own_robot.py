@@ -18,11 +18,7 @@ SETTLE = 10  # further commands for what rounding or a controller left at the en
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
-    """Make the robot of ``plant.use``.
-
-    Raises InputError if there is no such class, or a joint has no speed limit; WorkFailed if it cannot be
-    made.
-    """
+    """Make the robot of ``plant.use``; an InputError where a joint has no speed limit."""
     target = config.plant.use
     assert target is not None
     for kind, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
@@ -37,8 +33,7 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
 def drive_to(robot: Robot, target: FloatArray, config: Config, joints: Joints, what: str) -> int:
     """Move to joints (n,) along a straight line, each command within the speed limit; how many there were.
 
-    what : the command it is for, in messages.
-    Raises WorkFailed if the robot is farther than ``ARRIVED`` from the target in the end.
+    what : the command it is for, in messages. Raises WorkFailed if the robot does not arrive.
     """
     period = config.control.period_s
     limit = joints.speed * period * config.plant.speed_scale  # (n,) rad or m a period; infinite for none
@@ -46,7 +41,7 @@ def drive_to(robot: Robot, target: FloatArray, config: Config, joints: Joints, w
     most = math.ceil(float(np.max(np.abs(gap) / limit))) + SETTLE
     count = 0
     while gap.any() and count < most:
-        robot.command(gap / max(1.0, float(np.max(np.abs(gap) / limit))), period)
+        robot.command(gap / np.max(np.abs(gap) / limit, initial=1.0), period)
         count += 1
         gap = target - robot.joints()
     i = int(np.argmax(np.abs(gap)))

@@ -76,9 +76,8 @@ class _Recording:
         """Write all poses that are done, in their order; the file appears whole or not at all."""
         pose = sorted(self.q)
         q, images = (np.array([done[k] for k in pose]) for done in (self.q, self.images))
-        write_table(
-            Observation(np.array(pose, dtype=np.int64), self.marker, q, images), self.path, recording=self.key
-        )
+        observation = Observation(np.array(pose, dtype=np.int64), self.marker, q, images)
+        write_table(observation, self.path, recording=self.key)
 
 
 def new_recording(
@@ -87,9 +86,7 @@ def new_recording(
     """What there is to record, and what of it the table holds already.
 
     motions : further poses after the trial motions, numbered on.
-    force : begin anew, whatever stands at ``path``.
-    Raises InputError if the configuration does not describe a robot and its trial motions, a pose lies beyond
-    the joint limits, or the table at ``path`` was not recorded with this configuration.
+    force : begin anew, whatever stands at ``path``; else a table of another configuration is refused.
     """
     if config.plant.use is None:
         truth_of(config)  # refuses what lacks a part of the simulation
@@ -129,43 +126,30 @@ def _resume(recording: _Recording) -> None:
 
 
 def record(
-    config: Config,
-    recording: _Recording,
-    robot: Robot | None = None,
-    *,
-    progress: Progress = silent,
+    config: Config, recording: _Recording, robot: Robot | None = None, *, progress: Progress = silent
 ) -> None:
     """Record the pending poses, and keep those that are done however it ends.
 
-    recording : what is to be done; on return, or on an interruption, what was done.
     robot : what is driven; None takes that of ``plant.use``, or simulates the robot of the configuration.
-    Raises InputError if the table cannot be written; WorkFailed if the robot fails or does not arrive where
-    it was sent.
     """
     joints = joints_of(config)
     if robot is None and config.plant.use is not None:
         robot = foreign_robot(config, joints, len(recording.marker))
-    driven = robot or _simulated(config, recording)
-    total, saved, took, unsaved = len(recording.targets), time.monotonic(), 0.0, False
+    if robot is None:
+        noise = trial_noise(config, len(recording.targets), len(recording.marker))  # as calibrate adds it
+        robot = SimulatedRobot(truth_of(config), recording.targets[0], noise[recording.pending])
+    kept, due = len(recording.q), time.monotonic() + SAVE_EVERY
     try:
-        with at_rest_after(driven):
+        with at_rest_after(robot):
             for pose in recording.pending:
-                recording.commands += drive_to(driven, recording.targets[pose], config, joints, "record")
-                recording.q[pose], recording.images[pose] = driven.joints(), driven.observe()
-                unsaved = True
-                progress("record", len(recording.q), total)
-                # A long table takes long to write: most of the time must stay for recording.
-                if time.monotonic() - saved >= max(SAVE_EVERY, 10.0 * took):
-                    start = time.monotonic()
+                recording.commands += drive_to(robot, recording.targets[pose], config, joints, "record")
+                recording.q[pose], recording.images[pose] = robot.joints(), robot.observe()
+                progress("record", len(recording.q), len(recording.targets))
+                if (start := time.monotonic()) >= due:
                     recording.save()
-                    saved, unsaved = time.monotonic(), False
-                    took = saved - start
+                    kept, now = len(recording.q), time.monotonic()
+                    # A long table takes long to write: most of the time must stay for recording.
+                    due = now + max(SAVE_EVERY, 10.0 * (now - start))
     finally:
-        if unsaved:
+        if len(recording.q) > kept:
             recording.save()
-
-
-def _simulated(config: Config, recording: _Recording) -> SimulatedRobot:
-    """The robot of a configuration at its reference, with the noise that ``calibrate`` would add."""
-    noise = trial_noise(config, len(recording.targets), len(recording.marker))
-    return SimulatedRobot(truth_of(config), recording.targets[0], noise[recording.pending])

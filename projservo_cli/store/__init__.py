@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 
@@ -39,6 +39,7 @@ from projservo_cli.store.hdf5 import (
     save_record,
 )
 
+_Record = TypeVar("_Record", Observation, Calibration, Plan)
 _SCHEMA = "projservo run"
 SERVO = "servo/"
 # What results hold, by the name of the record; with a calibration, the others may be absent.
@@ -82,14 +83,12 @@ class Run:
     @property
     def observation(self) -> Observation:
         """What the calibration was made from."""
-        found: Observation = self._record("calibrate", "observation")
-        return found
+        return self._record("calibrate", "observation", Observation)
 
     @property
     def calibration(self) -> Calibration:
         """The calibration."""
-        found: Calibration = self._record("calibrate", "calibration")
-        return found
+        return self._record("calibrate", "calibration", Calibration)
 
     @property
     def cross_validation(self) -> CrossValidation | None:
@@ -100,8 +99,7 @@ class Run:
     @property
     def plan(self) -> Plan:
         """The plan."""
-        found: Plan = self._record("plan", "")
-        return found
+        return self._record("plan", "", Plan)
 
     @property
     def traces(self) -> dict[str, Trace]:
@@ -109,12 +107,13 @@ class Run:
         found = {name: result for name, result in self.results.items() if name.startswith(SERVO)}
         return {name.removeprefix(SERVO): result.records[""] for name, result in found.items()}
 
-    def _record(self, result: str, name: str) -> Any:
-        if result not in self.results or name not in self.results[result].records:
-            raise InputError(
-                f"{self.path}: holds no {name or result}; make it first: projservo {result} -o {self.path}"
-            )
-        return self.results[result].records[name]
+    def _record(self, result: str, name: str, kind: type[_Record]) -> _Record:
+        found = self.results[result].records.get(name) if result in self.results else None
+        if isinstance(found, kind):
+            return found
+        raise InputError(
+            f"{self.path}: holds no {name or result}; make it first: projservo {result} -o {self.path}"
+        )
 
 
 def run_path(target: Path | str) -> Path:
@@ -127,10 +126,8 @@ def save(run: Run) -> Run:
     """Write a run file in place of the one at ``run.path``, as a whole or not at all.
 
     Results are added to those that were last written, where none of these went, in 0.1 s each: a chain of
-    eight results spends a quarter of the time on it that writing all of them each time takes.
-
-    Returns the run as it is written, to be added to. Raises InputError when it cannot be written; the file
-    that stood there stays.
+    eight results spends a quarter of the time on it that writing all of them each time takes. Returns the run
+    as it is written, to be added to. Raises InputError when it cannot be written.
     """
     image, held = run.written
     if not all(run.results.get(name) is result for name, result in held.items()):
@@ -143,10 +140,9 @@ def save(run: Run) -> Run:
             if name in held:
                 continue
             group = file.create_group(name)
-            group.attrs["key"] = result.key
-            group.attrs["configuration"] = result.configuration
-            group.attrs["provenance"] = json.dumps(result.provenance, sort_keys=True)
-            group.attrs["inputs"] = json.dumps(result.inputs, sort_keys=True)
+            group.attrs.update({"key": result.key, "configuration": result.configuration})
+            for part in ("provenance", "inputs"):
+                group.attrs[part] = json.dumps(getattr(result, part), sort_keys=True)
             group.attrs["records"] = json.dumps(list(result.records))
             for label, record in result.records.items():
                 save_record(group.create_group(label) if label else group, record)
@@ -173,16 +169,10 @@ def _require_version(path: Path, file: h5py.File) -> None:
     """Refuse what is no run file, or one of another schema, with what to do."""
     if "schema" not in file.attrs or attribute(file, "schema", str) != _SCHEMA:
         raise InputError(f"{path}: an HDF5 file, but not a run file of projservo; name another")
-    version = attribute(file, "schema_version", int)
-    if version > SCHEMA_VERSION:
+    if (version := attribute(file, "schema_version", int)) != SCHEMA_VERSION:
         raise InputError(
-            f"{path}: run file of schema {version}, this projservo reads up to {SCHEMA_VERSION}: it was made "
-            "by a newer one; upgrade: pip install --upgrade projservo"
-        )
-    if version < SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: run file of schema {version}, which this projservo does not read any more; make it "
-            "again: projservo calibrate plan servo report -c FILE -o DIR"
+            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}: upgrade, pip "
+            "install --upgrade projservo, or make it again: projservo calibrate plan servo report -c FILE"
         )
 
 
@@ -191,15 +181,12 @@ def _load_result(group: h5py.Group, sizes: dict[str, int]) -> Result:
     labels = attribute(group, "records", list)
     if not {"", "calibration"} & set(labels) or not set(labels) <= set(known):
         raise ValueError(f"{group.name} holds the records {labels}")
-    records = {}
-    for label in labels:
-        records[label] = load_record(member(group, label) if label else group, known[label], sizes)
+    groups = {label: member(group, label) if label else group for label in labels}
+    records = {label: load_record(inner, known[label], sizes) for label, inner in groups.items()}
     if "" not in labels:
         require_names(group, set(labels))
     inputs = attribute(group, "inputs", dict)
     if not all(isinstance(value, str) for value in inputs.values()):
         raise ValueError(f"inputs of {group.name} are not texts")
-    provenance = attribute(group, "provenance", dict)
-    return Result(
-        attribute(group, "key", str), attribute(group, "configuration", str), provenance, inputs, records
-    )
+    key, configuration = attribute(group, "key", str), attribute(group, "configuration", str)
+    return Result(key, configuration, attribute(group, "provenance", dict), inputs, records)

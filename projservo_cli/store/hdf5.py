@@ -90,8 +90,7 @@ def _require_unchanged(path: Path, remedy: str) -> None:
     if size and head != _SIGNATURE[:size]:
         raise InputError(f"{path}: no HDF5 file, so not a run file or sweep of projservo; name another")
     if last != _SEAL % _digest(path, size - _SEAL_SIZE).encode():
-        what = "its checksum is not that of its data" if last[:18] == _SEAL[:18] else "its checksum is gone"
-        raise InputError(f"{path}: cut short or changed since it was written ({what}); {remedy}")
+        raise InputError(f"{path}: cut short or changed since it was written; {remedy}")
 
 
 @contextmanager
@@ -149,8 +148,7 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             _require_sizes(field.name, field.metadata["dims"], arrays[field].shape, sizes)
         elif value is not None:
             group.attrs[field.name] = encoded(value)
-    used = {dim: sizes[dim] for field in arrays for dim in field.metadata["dims"]}
-    group.dimensions.update(used)
+    group.dimensions.update({dim: sizes[dim] for field in arrays for dim in field.metadata["dims"]})
     for field, value in arrays.items():
         boolean = value.dtype == np.bool_
         data = group.create_variable(
@@ -159,9 +157,9 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             data=value.astype(np.int8) if boolean else value,
             **({"chunks": value.shape, "fletcher32": True} if value.size else {}),
         )
-        told = {"units": field.metadata["units"], "long_name": field.metadata["about"]}
-        # netCDF has no booleans; this is how xarray marks them.
-        data.attrs.update(({"dtype": "bool"} if boolean else {}) | told)
+        data.attrs.update({"units": field.metadata["units"], "long_name": field.metadata["about"]})
+        if boolean:  # netCDF has none; this is how xarray marks them
+            data.attrs["dtype"] = "bool"
 
 
 def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], sizes: dict[str, int]) -> None:

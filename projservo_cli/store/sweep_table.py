@@ -50,12 +50,8 @@ def write_part(path: Path, columns: Mapping[str, Array], traces: Mapping[int, Tr
 
 def assemble(
     path: Path, parts: Sequence[Path], headings: Sequence[Heading], attributes: Mapping[str, Any]
-) -> int:
-    """Put parts together, in the order given, a few at a time; the number of rows.
-
-    attributes : of the file: numbers and texts, everything else as JSON.
-    Raises InputError if a part is damaged or the file cannot be written; the table that stood there stays.
-    """
+) -> None:
+    """Put parts together, in the order given, a few at a time, with attributes of the file."""
     rows = sum(_rows(part) for part in parts)
     size = rows * sum(np.dtype(dtype).itemsize for _, dtype, _, _ in headings)
     size += sum(part.stat().st_size for part in parts)  # their traces
@@ -73,7 +69,6 @@ def assemble(
             for name, dtype, _, _ in headings:
                 file[name][first:last] = _cells(block[name].astype(dtype, copy=False))
             first = last
-    return rows
 
 
 def _new_column(
@@ -128,12 +123,7 @@ def _rows(part: Path) -> int:
 
 
 class SweepTable:
-    """A table read from its file, a column at a time.
-
-    path : the file.
-    ``names``: of the columns. ``attributes``: of the file; JSON as its values. Raises InputError if there is
-    none or it is no table of a sweep.
-    """
+    """A table read from its file, a column at a time: ``names`` of columns, ``attributes`` of the file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -144,11 +134,9 @@ class SweepTable:
                 raise InputError(f"{path}: not the table of a sweep")
             if attribute(file, "schema_version") != SCHEMA_VERSION:
                 raise InputError(f"{path}: written by another version of projservo; use another sweep")
-            found = {name: attribute(file, name) for name in file.attrs}
-            self.attributes = {
-                name: json.loads(value) if str(value)[:1] in ("{", "[") else value
-                for name, value in found.items()
-            }
+            found = ((name, attribute(file, name)) for name in file.attrs)
+            is_json = ("{", "[")
+            self.attributes = {k: json.loads(v) if str(v).startswith(is_json) else v for k, v in found}
             self.names = tuple(self.attributes["columns"])
             self.rows = len(file["run"])
 
@@ -163,5 +151,4 @@ class SweepTable:
         with opened(self.path, _AGAIN) as file:
             if f"{_TRACES}/{run}" not in file:
                 raise InputError(f"{self.path}: the trace of run {run} was not kept; list it under traces")
-            found: Trace = load_record(file[f"{_TRACES}/{run}"], Trace, dict(SIZES))
-            return found
+            return typing.cast("Trace", load_record(file[f"{_TRACES}/{run}"], Trace, dict(SIZES)))

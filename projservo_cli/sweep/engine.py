@@ -213,5 +213,5 @@ class Cluster(Engine):
 
 def versions() -> dict[str, Any]:
     """Versions that decide the bits of a result."""
-    found = provenance.collect(seed=0, argv=[])
+    found = provenance.collect(seed=0)
     return {name: found[name] for name in DECISIVE}

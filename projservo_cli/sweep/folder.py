@@ -186,12 +186,11 @@ class Folder:
 
     def calibrations(self, design: Design) -> dict[str, Calibration | None]:
         """Calibrations by their key, None where one was refused; without covariance, which no run needs."""
-        none = np.zeros((0, 0))
-        paths = {key: self.calibration(key) for key, _ in design.calibrations()}
-        return {
-            key: replace(load(path).calibration, covariance=none) if path.exists() else None
-            for key, path in paths.items()
-        }
+        found: dict[str, Calibration | None] = {}
+        for key, _ in design.calibrations():
+            made = load(path).calibration if (path := self.calibration(key)).exists() else None
+            found[key] = made and replace(made, covariance=np.zeros((0, 0)))
+        return found
 
 
 def run_of(target: str) -> tuple[Config, Result | None]:

@@ -204,9 +204,9 @@ INSTANTS, FURTHER = 192, 4
 TOGETHER = 16
 
 
-def _setting_of(scenario: Scenario, law: str) -> Setting:
-    """All that compiled runs of a law share whose seeds differ."""
-    return Setting(
+def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
+    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
+    setting = Setting(
         CODES[law],
         scenario.model,
         scenario.believed_by(law),
@@ -217,11 +217,6 @@ def _setting_of(scenario: Scenario, law: str) -> Setting:
         Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
         scenario.true_ends,
     )
-
-
-def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArray:
-    """Numbers (k, ``NUMBERS``) of the runs of seeds (k), each a function of its own seed alone."""
-    setting = _setting_of(scenario, law)
     trials = Trials(setting, len(scenario.numbers))
     found = np.empty((len(seeds), len(NUMBERS)))
     for first in range(0, len(seeds), TOGETHER):

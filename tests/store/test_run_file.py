@@ -161,8 +161,7 @@ def test_a_change_anywhere_is_noticed_before_it_is_read(path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema_version": 2}, "pip install --upgrade projservo"),
-        ({"schema_version": 0}, "make it again: projservo calibrate"),
+        ({"schema_version": 2}, "upgrade, pip install --upgrade projservo, or make it again: projservo cal"),
         ({"schema": "something else"}, "not a run file of projservo"),
     ],
 )

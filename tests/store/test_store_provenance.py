@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_it_names_versions_machine_command_and_seed():
-    found = provenance.collect(seed=7, argv=["projservo", "servo"])
+    found = provenance.collect(seed=7)
     assert json.loads(json.dumps(found)) == found
     assert (found["projservo"], found["python"]) == (__version__, platform.python_version())
     assert found["numpy"] == np.__version__
