@@ -108,6 +108,13 @@ def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
                 folder.rmdir()
 
 
+def tidy(folder: Path, *parts: str) -> None:
+    """Remove what a killed process left in a folder, where no other works there and nothing is to be done."""
+    if (folder / _LOCK).exists():
+        with suppress(InputError), working_in(folder, *parts):
+            pass
+
+
 def lies_inside(path: Path, folder: Path) -> bool:
     """Whether a path lies in a folder when all symbolic links are followed."""
     try:

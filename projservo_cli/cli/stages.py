@@ -14,7 +14,6 @@ from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, words_of, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
-_EXTRAS = ("view", "animation")
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
 
@@ -159,15 +158,17 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
     from projservo_cli.config import to_yaml
-    from projservo_cli.files import working_in
+    from projservo_cli.files import tidy, working_in
 
     chain = _asked(console, names, options)
     if options["dry_run"]:
         return _tell_dry(chain)
+    folder = chain.run.path.parent
     up_to_date = chain.run.configuration == to_yaml(chain.config) and not any(s.why for s in chain.steps)
     if up_to_date and not _extras(options):
+        tidy(folder, _FIGURES)
         return _work(chain)
-    with working_in(chain.run.path.parent, _FIGURES):
+    with working_in(folder, _FIGURES):
         # Anew, since another process may have written the run until now.
         return _work(_asked(console, names, options))
 
@@ -196,7 +197,7 @@ def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -
 
 def _extras(options: Mapping[str, Any]) -> list[str]:
     """What a report is to have beside its page."""
-    return [name for name in _EXTRAS if options.get(name)]
+    return [name for name in ("view", "animation") if options.get(name)]
 
 
 def _law_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -204,12 +205,13 @@ def _law_names(names: Sequence[str]) -> tuple[str, ...]:
     from projservo_cli.records import LAWS
     from projservo_cli.robots import plugins
 
-    found = {name: name if name in LAWS else plugins.target_of("law", name) for name in names}
-    for name, target in found.items():
-        if target is None:
+    found = []
+    for name in names:
+        if (target := name if name in LAWS else plugins.target_of("law", name)) is None:
             valid = ", ".join((*LAWS, *plugins.registered("law")))
             raise click.UsageError(f"--law {name}: no such law; laws: {valid}, or module:Class")
-    return tuple(dict.fromkeys(target for target in found.values() if target is not None))
+        found.append(target)
+    return tuple(dict.fromkeys(found))
 
 
 def _require_named(chain: _Chain) -> None:

@@ -141,8 +141,14 @@ class _Document:
             return self._mapping(node, path)
         if isinstance(node, yaml.SequenceNode):
             return [self._value(item, (*path, i)) for i, item in enumerate(node.value)]
-        assert isinstance(node, yaml.ScalarNode)
-        return self._scalar(node, path)
+        if getattr(node, "style", None):  # in quotes, or a block of text
+            return node.value
+        meaning = next((meaning for pattern, meaning in _CORE if pattern.fullmatch(node.value)), str)
+        try:
+            return meaning(node.value)
+        except ValueError:  # of more digits than Python converts
+            self.wrong(path, "cannot be read as a number", self._place(node.start_mark))
+            return None
 
     def _mapping(self, node: yaml.MappingNode, path: _Path) -> dict[str, Any]:
         values: dict[str, Any] = {}
@@ -160,16 +166,6 @@ class _Document:
                 self.places[(*path, key)] = place
                 values[key] = self._value(value_node, (*path, key))
         return values
-
-    def _scalar(self, node: yaml.ScalarNode, path: _Path) -> Any:
-        if node.style:  # in quotes, or a block of text
-            return node.value
-        meaning = next((meaning for pattern, meaning in _CORE if pattern.fullmatch(node.value)), str)
-        try:
-            return meaning(node.value)
-        except ValueError:  # of more digits than Python converts
-            self.wrong(path, "cannot be read as a number", self._place(node.start_mark))
-            return None
 
     def override(self, change: "Override") -> None:
         """Set a value that comes from elsewhere, making the mappings on the way to it."""
@@ -351,7 +347,10 @@ def digest(
     values = config.model_dump(mode="json")
     for section, key in (dotted.split(".") for dotted in without):
         (values[section] or {}).pop(key, None)
-    parts = {dotted: _part(values, dotted.split(".")) for dotted in keys}
+    parts = {}
+    for dotted in keys:
+        section, _, key = dotted.partition(".")
+        parts[dotted] = values[section][key] if key and values[section] is not None else values[section]
     text = json.dumps([parts, extra or {}], sort_keys=True, allow_nan=False, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -373,8 +372,7 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
         if isinstance(part, dict) and isinstance(part.get(key), str) and part[key]:
             part[key] = str((base / part[key]).resolve())
     data = values.get("data")
-    table = data.get("table") if isinstance(data, dict) else None
-    for file in (table, path):
+    for file in (data.get("table") if isinstance(data, dict) else None, path):
         if isinstance(file, (str, pathlib.Path)) and str(file):
             values.setdefault("name", pathlib.Path(file).stem)
 
@@ -434,13 +432,6 @@ def _models(annotation: Any) -> Iterator[type[BaseModel]]:
         yield annotation
     for part in typing.get_args(annotation):
         yield from _models(part)
-
-
-def _part(values: Any, path: Sequence[str]) -> Any:
-    """The value at a path; None in a section that is absent."""
-    for key in path:
-        values = None if values is None else values[key]
-    return values
 
 
 def _without_unset(value: Any) -> Any:

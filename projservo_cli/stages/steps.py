@@ -63,20 +63,21 @@ def steps_for(
 
     run : what is stored so far; possibly nothing.
     laws : instead of ``control.laws``.
-    force : make the named stages even where they are up to date.
-    Raises InputError when a file cannot be read, a law has none of the modes of ``control.mode``, or a
-    recorded calibration would be replaced by a simulated one without ``force``.
+    force : make the named stages even where they are up to date, and replace a recorded calibration.
     """
-    last = max(named, key=STAGES.index)
-    stages = STAGES[: STAGES.index(last) + 1]
+    stages = STAGES[: max(map(STAGES.index, named)) + 1]
     if not has_task(config) and set(named) <= {"calibrate", "report"}:
         stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
     steps: list[Step] = []
     for step in _needed(config, run, laws or config.control.laws, stages):
         remade = any(before.why for before in steps if before.stage != step.stage)
         steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
-    if steps[0].why and not force:
-        _keep_recorded(config, run)
+    stored = run.calibration.source if "calibrate" in run.results else ""
+    if steps[0].why and not force and stored == "recorded" and not config.recorded:
+        raise InputError(
+            f"{run.path}: its calibration comes from recorded data and would be replaced by a simulated one; "
+            "choose another folder with -o, give the table with --data, or use --force"
+        )
     return steps
 
 
@@ -110,17 +111,16 @@ def _file_hashes(config: Config, run: Run) -> dict[str, str]:
     for name, given in files.items():
         if given is None:
             continue
-        path, digested = Path(given), f"{name}_sha256"
-        if not path.exists() and stored.get(name) == given:
+        digested = f"{name}_sha256"
+        if stored.get(name) == given and not Path(given).exists():
             found |= {name: given, digested: stored[digested]}
             continue
         try:
-            found |= {name: given, digested: hashlib.sha256(path.read_bytes()).hexdigest()}
+            found |= {name: given, digested: hashlib.sha256(Path(given).read_bytes()).hexdigest()}
         except OSError as error:
             expected = "a table" if name == "table" else "JSON with screws, cameras and markers"
-            raise InputError(
-                f"{path}: cannot be read: {error.strerror or error}; expected {expected}"
-            ) from error
+            what = f"cannot be read: {error.strerror or error}; expected {expected}"
+            raise InputError(f"{given}: {what}") from error
     return found
 
 
@@ -143,15 +143,6 @@ def missing(run: Run) -> bool:
     """Whether a file that the stored report wrote is not there any more."""
     figures = run.results["report"].records[""].figures
     return not all((run.path.parent / name).is_file() for name in (*figures, CLAIMS_FILE, PAGE_FILE))
-
-
-def _keep_recorded(config: Config, run: Run) -> None:
-    if config.recorded or "calibrate" not in run.results or run.calibration.source != "recorded":
-        return
-    raise InputError(
-        f"{run.path}: its calibration comes from recorded data and would be replaced by a simulated one; "
-        "choose another folder with -o, give the table with --data, or use --force"
-    )
 
 
 def result_of(step: Step, config: Config, *made: Any) -> Result:

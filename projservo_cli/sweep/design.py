@@ -273,8 +273,7 @@ class Design:
     def calibrated(self, cell: int, calibration: int) -> Config:
         """Configuration of a cell with the seed of a calibration and what is drawn for it."""
         config = self.cell(cell)
-        drawn = self._drawn(CALIBRATION_VALUES, calibration)
-        if drawn:
+        if drawn := self._drawn(CALIBRATION_VALUES, calibration):
             config = _changed(config, drawn, f"calibration {calibration}")
         seed = self.seed(CALIBRATIONS, calibration)
         update = {"calibration": config.calibration.model_copy(update={"seed": seed})}
@@ -301,17 +300,15 @@ class Design:
         assert config.task is not None
         assert config.robot is not None
         assert self.sweep.tasks is not None
-        count = self.sweep.tasks.random
         q_front = np.array(config.task.start.values(config.robot.joint_types))
         rng = np.random.default_rng(np.random.SeedSequence(self.sweep.seed, spawn_key=(TASKS,)))
-        return random_tasks(truth_of(config), q_front, count, rng)
+        return random_tasks(truth_of(config), q_front, self.sweep.tasks.random, rng)
 
     def config(self, run: int) -> Config:
         """Configuration of a run."""
         cell, draw, calibration, task = self.numbers(run)
         config = self.calibrated(cell, calibration)
-        drawn = self._drawn(VALUES, draw)
-        if drawn:
+        if drawn := self._drawn(VALUES, draw):
             config = _changed(config, drawn, f"run {run}")
         update: dict[str, Any] = {"seed": self.seed(RUNS, draw)}
         if task >= 0:
