@@ -1,6 +1,8 @@
 """The run file: everything an experiment made, one group a result, with the records in it or in subgroups.
 
 Nothing but this package opens HDF5. The groups are ``calibrate``, ``plan``, ``servo/<law>`` and ``report``.
+Arrays are netCDF-4 variables, by h5netcdf; scalars and texts are attributes of their group. Files are written
+as a whole and read only as they were written: a line behind the HDF5 data tells their checksum.
 
 A field may be added to a record where it may be absent or has a default. Whatever else changes the
 file raises ``SCHEMA_VERSION``; files of the version before are then read as well, or refused with
@@ -8,15 +10,26 @@ what to do.
 """
 
 import dataclasses
+import errno
+import hashlib
 import io
 import json
+import os
 import re
-from collections.abc import Mapping
+import shutil
+import typing
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import h5py
+import numpy as np
+import numpy.typing as npt
+from pydantic import TypeAdapter, ValidationError
 
+from projservo_cli.files import replacing
 from projservo_cli.records import (
     SIZES,
     Calibration,
@@ -27,18 +40,18 @@ from projservo_cli.records import (
     Report,
     Trace,
 )
-from projservo_cli.store.hdf5 import (
-    SCHEMA_VERSION,
-    attribute,
-    labelled,
-    load_record,
-    member,
-    new_file,
-    opened,
-    require_names,
-    save_record,
-)
 
+if typing.TYPE_CHECKING:
+    import h5netcdf
+
+SCHEMA_VERSION = 1
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_SEAL = b"\nprojservo sha256 %s\n"
+_SEAL_SIZE = len(_SEAL % bytes(64))
+_FORMAT = ("v110", "v110")  # that of HDF5 from 2016, with checksums in its structures
+_ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
+# Kind and size in bytes of the numbers of each type of array, as they are stored.
+_STORED = {"float64": ("f", 8), "int64": ("i", 8), "bool": ("i", 1)}
 _Record = TypeVar("_Record", Observation, Calibration, Plan)
 _SCHEMA = "projservo run"
 SERVO = "servo/"
@@ -159,9 +172,9 @@ def load(target: Path | str) -> Run:
         names = list(dict.fromkeys(attribute(file, "order", list)))
         if unknown := [name for name in names if not _NAME.fullmatch(name)]:
             raise ValueError(f"there is no result {unknown[0]!r}")
-        require_names(file, {name.split("/")[0] for name in names})
+        _require_names(file, {name.split("/")[0] for name in names})
         sizes = dict(SIZES)
-        results = {name: _load_result(member(file, name), sizes) for name in names}
+        results = {name: _load_result(_member(file, name), sizes) for name in names}
         return Run(path, attribute(file, "configuration", str), results)
 
 
@@ -181,12 +194,206 @@ def _load_result(group: h5py.Group, sizes: dict[str, int]) -> Result:
     labels = attribute(group, "records", list)
     if not {"", "calibration"} & set(labels) or not set(labels) <= set(known):
         raise ValueError(f"{group.name} holds the records {labels}")
-    groups = {label: member(group, label) if label else group for label in labels}
+    groups = {label: _member(group, label) if label else group for label in labels}
     records = {label: load_record(inner, known[label], sizes) for label, inner in groups.items()}
     if "" not in labels:
-        require_names(group, set(labels))
+        _require_names(group, set(labels))
     inputs = attribute(group, "inputs", dict)
     if not all(isinstance(value, str) for value in inputs.values()):
         raise ValueError(f"inputs of {group.name} are not texts")
     key, configuration = attribute(group, "key", str), attribute(group, "configuration", str)
     return Result(key, configuration, attribute(group, "provenance", dict), inputs, records)
+
+
+@contextmanager
+def new_file(path: Path, size: int | None = None, image: io.BytesIO | None = None) -> Iterator[h5py.File]:
+    """A file to be filled, that takes the place of the one at ``path`` when the block succeeds.
+
+    It is made in memory, from an ``image`` that is added to or from nothing, since HDF5 neither survives a
+    full disk nor tells of it in one line; or, where it may have ``size`` bytes and is too large for that, on
+    a disk that has them to begin with.
+    """
+    with replacing(path) as temporary:
+        if size is not None and shutil.disk_usage(temporary.parent).free < size:
+            raise InputError(f"{path}: cannot be written: {os.strerror(errno.ENOSPC)}")
+        image = image or io.BytesIO()
+        mode = "r+" if image.getbuffer().nbytes else "w"
+        target = image if size is None else temporary
+        with h5py.File(target, mode, libver=_FORMAT, track_order=True) as file:  # order as netCDF has it
+            yield file
+        if size is None:
+            temporary.write_bytes(image.getbuffer())
+        digest = _digest(temporary, temporary.stat().st_size)
+        with temporary.open("ab") as stream:
+            stream.write(_SEAL % digest.encode())
+
+
+def labelled(file: h5py.File) -> "h5netcdf.File":
+    """A new file as netCDF-4, to be closed before it: variables with dimensions take 1.5 ms each, not 0.1."""
+    import h5netcdf  # what only reads does not need it
+
+    return h5netcdf.File(file, "a" if len(file) else "w")
+
+
+def _digest(path: Path, size: int) -> str:
+    """SHA-256 of the first ``size`` bytes of a file, in hexadecimal."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while size > 0 and (block := stream.read(min(size, 1 << 20))):
+            digest.update(block)
+            size -= len(block)
+    return digest.hexdigest()
+
+
+def _require_unchanged(path: Path, remedy: str) -> None:
+    """Refuse a file whose last line is not the checksum of what is before it; nothing else of it is read."""
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        head = stream.read(len(_SIGNATURE))
+        stream.seek(max(0, size - _SEAL_SIZE))
+        last = stream.read()
+    if size and head != _SIGNATURE[:size]:
+        raise InputError(f"{path}: no HDF5 file, so not a run file or sweep of projservo; name another")
+    if last != _SEAL % _digest(path, size - _SEAL_SIZE).encode():
+        raise InputError(f"{path}: cut short or changed since it was written; {remedy}")
+
+
+@contextmanager
+def opened(path: Path, remedy: str, *, unchanged: bool = False) -> Iterator[h5py.File]:
+    """A file to read, ``unchanged`` first made sure of; everything wrong with it is an ``InputError``."""
+    try:
+        if unchanged:
+            _require_unchanged(path, remedy)
+        with h5py.File(path, "r", locking=False) as file:
+            yield file
+    except InputError:
+        raise
+    except _ERRORS as error:
+        what = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise InputError(f"{path}: cannot be read, or another version made it ({what}); {remedy}") from error
+
+
+def _member(group: h5py.Group, name: str) -> Any:
+    """A group or an array that lies in the file itself; a link to elsewhere is refused."""
+    for part in name.split("/"):
+        if not isinstance(group.get(part, getlink=True), h5py.HardLink):
+            raise ValueError(f"{group.name} lacks {part}")
+        group = group[part]
+    return group
+
+
+def _require_names(group: h5py.Group, known: set[str]) -> None:
+    """Refuse a group that holds anything else than is known."""
+    if unknown := sorted(set(group) - known):
+        raise ValueError(f"{group.name} holds an unknown {unknown[0]}")
+
+
+def attribute(group: h5py.Group, name: str, kind: type = object) -> Any:
+    """A text or a number among the attributes of a group; a list or a dictionary is stored as JSON."""
+    if name not in group.attrs:
+        raise ValueError(f"{group.name} lacks {name}")
+    value = group.attrs[name]
+    if isinstance(value, (np.generic, np.ndarray)):
+        value = value.item()  # netCDF makes numbers arrays of one entry
+    if kind in (list, dict):
+        value = json.loads(value)
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} of {group.name} is no {kind.__name__}")
+    return value
+
+
+def save_record(group: "h5netcdf.Group", record: Any) -> None:
+    """Store each field of a record; None is stored as nothing."""
+    group.attrs["record"] = type(record).__name__
+    sizes, arrays = dict(SIZES), {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if value is not None and "dims" in field.metadata:
+            arrays[field] = np.asarray(value)
+            _require_sizes(field.name, field.metadata["dims"], arrays[field].shape, sizes)
+        elif value is not None:
+            group.attrs[field.name] = encoded(value)
+    group.dimensions.update({dim: sizes[dim] for field in arrays for dim in field.metadata["dims"]})
+    for field, value in arrays.items():
+        boolean = value.dtype == np.bool_
+        data = group.create_variable(
+            field.name,
+            field.metadata["dims"],
+            data=value.astype(np.int8) if boolean else value,
+            **({"chunks": value.shape, "fletcher32": True} if value.size else {}),
+        )
+        data.attrs.update({"units": field.metadata["units"], "long_name": field.metadata["about"]})
+        if boolean:  # netCDF has none; this is how xarray marks them
+            data.attrs["dtype"] = "bool"
+
+
+def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], sizes: dict[str, int]) -> None:
+    """Refuse an array over other dimensions than declared, or of other sizes than those known so far."""
+    if len(shape) != len(dims):
+        raise ValueError(f"{name} of shape {shape} is no array over {', '.join(dims)}")
+    for dim, size in zip(dims, shape, strict=True):
+        if sizes.setdefault(dim, size) != size:
+            raise ValueError(f"{name} has {size} entries along {dim}, not {sizes[dim]}")
+
+
+def encoded(value: Any) -> Any:
+    """An attribute of HDF5 and netCDF: number or text; everything else as JSON text."""
+    if isinstance(value, (bool, np.bool_)):
+        return np.int8(value)
+    return value if isinstance(value, (str, int, float, np.number)) else json.dumps(value)
+
+
+def load_record(group: h5py.Group, kind: Any, sizes: dict[str, int]) -> Any:
+    """Read a record; ``sizes`` has the dimensions of equal size in all, and gets the number of joints."""
+    if attribute(group, "record", str) != kind.__name__:
+        raise ValueError(f"{group.name} is no {kind.__name__}")
+    hints, own = typing.get_type_hints(kind), dict(sizes)
+    values: dict[str, Any] = {}
+    for field in dataclasses.fields(kind):
+        name, dims, hint = field.name, field.metadata.get("dims"), hints[field.name]
+        optional = type(None) in typing.get_args(hint)
+        inner = typing.get_args(hint)[0] if optional else hint
+        if name not in (group.attrs if dims is None else group) and (optional or _has_default(field)):
+            values[name] = field.default if _has_default(field) else None
+        elif dims is None:
+            values[name] = _value(name, attribute(group, name), inner)
+        else:
+            values[name] = _array(_member(group, name), dims, inner, own)
+    _require_names(group, {*values, *own})
+    if "joint" in own:
+        sizes["joint"] = own["joint"]
+    if "joint_types" in values and not re.fullmatch(f"[RP]{{{own['joint']}}}", values["joint_types"]):
+        raise ValueError(f"joint_types are not {own['joint']} letters R and P")
+    return kind(**values)
+
+
+def _has_default(field: "dataclasses.Field[Any]") -> bool:
+    return field.default is not dataclasses.MISSING
+
+
+def _array(data: Any, dims: tuple[str, ...], hint: Any, sizes: dict[str, int]) -> npt.NDArray[Any]:
+    """An array of numbers of the declared type and dimensions, all of it stored in the file itself."""
+    if not isinstance(data, h5py.Dataset):
+        raise ValueError(f"{data.name} is no array")
+    _require_sizes(data.name, dims, data.shape, sizes)
+    wanted = np.dtype(typing.get_args(typing.get_args(hint)[1])[0])
+    if (data.dtype.kind, data.dtype.itemsize) != _STORED[wanted.name]:
+        raise ValueError(f"{data.name} holds {data.dtype}, not {wanted.name}")
+    if data.external or data.nbytes > data.id.get_storage_size():
+        raise ValueError(f"{data.name} claims data that are not stored in it")
+    return np.asarray(data[()], dtype=wanted)
+
+
+def _value(name: str, value: Any, hint: Any) -> Any:
+    """A number, a text, or texts and mappings in JSON, as the field declares it."""
+    adapter = _adapter(hint)
+    validate = adapter.validate_json if typing.get_origin(hint) is tuple else adapter.validate_python
+    try:
+        return validate(value)
+    except ValidationError as error:
+        raise ValueError(f"{name} is not of type {getattr(hint, '__name__', hint)}") from error
+
+
+@cache
+def _adapter(hint: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(hint)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.records import SIZES, InputError, Trace
-from projservo_cli.store.hdf5 import (
+from projservo_cli.store import (
     SCHEMA_VERSION,
     attribute,
     encoded,

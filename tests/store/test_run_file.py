@@ -12,7 +12,7 @@ import pytest
 
 from projservo_cli import store
 from projservo_cli.records import InputError, Plan, Trace
-from projservo_cli.store.hdf5 import save_record
+from projservo_cli.store import save_record
 from tests.fake_records import fake
 from tests.store.deceit import EDITS, HEADS, edited, head, resealed
 from tests.store.sound import result, sound_file, sound_run
