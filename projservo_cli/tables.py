@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.files import replacing, text_of
+from projservo_cli.files import text_of, write_whole
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 
 _MAX_JOINTS = 64  # as many as a configuration may have
@@ -28,7 +28,6 @@ _MAX_CELLS = 5_000_000  # poses × markers: mistyped numbers of poses must not f
 _TWO_TURNS = 4.0 * math.pi  # rad; no arm with stops turns a joint that far from its zero
 _PIXELS = ("u_left", "v_left", "u_right", "v_right")
 _RECORDING = "recording"  # column that says which recording a row belongs to
-_HEADER = "pose,marker,q1…qN,u_left,…"
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -57,7 +56,7 @@ def read_table(
     Returns poses in the order of their first row, markers by number; NaN where unseen; readings in rad and m.
     Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
     """
-    sheet = _Sheet(path, _HEADER, ["pose", "marker", *_PIXELS], joint_types)
+    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types)
     readings: dict[int, tuple[int, list[float]]] = {}
     seen: dict[tuple[int, int], tuple[int, list[float]]] = {}
     for row in sheet.rows():
@@ -100,7 +99,7 @@ def read_joint_list(
     joint_unit : ``deg`` or ``rad`` as for an observation table; with ``rad`` readings stay as they are.
     Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
     """
-    sheet = _Sheet(path, "q1…qN", [], joint_types, optional=["pose", "left", "right"])
+    sheet = _Sheet(path, [], joint_types, optional=["pose", "left", "right"])
     if ("left" in sheet.columns) != ("right" in sheet.columns):
         raise InputError(f"{sheet.file}:1: give the columns left and right both, or neither")
     lines: dict[int, int] = {}
@@ -123,7 +122,7 @@ def read_joint_list(
 
 def recording_of(path: Path | str) -> str | None:
     """The recording that all rows of a table belong to; None where they name none or several."""
-    sheet = _Sheet(path, _HEADER, [], optional=[_RECORDING])
+    sheet = _Sheet(path, [], optional=[_RECORDING])
     found = {row[_RECORDING] for row in sheet.rows() if _RECORDING in row}
     return found.pop() if len(found) == 1 else None
 
@@ -134,17 +133,15 @@ def write_table(observation: Observation, path: Path | str, *, recording: str = 
     Every marker of every pose has a row, with empty cells where unseen. ``recording``, if given, stands in a
     further column of every row.
     """
-    joints = [f"q{i}" for i in range(1, observation.q.shape[1] + 1)]
-    heading, mark = ([_RECORDING], [recording]) if recording else ([], [])
-    with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["pose", "marker", *joints, *_PIXELS, *heading])
-        for k, pose in enumerate(observation.pose.tolist()):
-            q = [repr(value) for value in observation.q[k].tolist()]
-            for j, marker in enumerate(observation.marker.tolist()):
-                pixels = observation.images[k, :, j].ravel().tolist()
-                cells = ["" if math.isnan(value) else repr(value) for value in pixels]
-                writer.writerow([pose, marker, *q, *cells, *mark])
+    K, m = len(observation.pose), len(observation.marker)
+    columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
+    columns |= {f"q{i}": np.repeat(values, m) for i, values in enumerate(observation.q.T, 1)}
+    pixels = np.moveaxis(observation.images, 1, 2).reshape(K * m, 4).T
+    seen = np.where(np.isnan(pixels), "", pixels.astype(object))
+    columns |= dict(zip(_PIXELS, seen, strict=True))
+    if recording:
+        columns[_RECORDING] = np.full(K * m, recording)
+    write_whole(Path(path), to_csv(columns))
 
 
 def to_csv(arrays: Mapping[str, npt.NDArray[Any]], down: int | None = None) -> str:
@@ -201,16 +198,11 @@ class _Row(dict[str, str]):
 
 
 class _Sheet:
-    """A table: the columns that are read (those needed, q1 … qN, optional ones if present), and its rows.
-
-    ``example`` is the header a reader hopes for, for the message about an empty file. ``joint_types`` has
-    one letter a joint column.
-    """
+    """A table: the columns that are read (those needed, q1 … qN, optional ones if present), and its rows."""
 
     def __init__(
         self,
         path: Path | str,
-        example: str,
         needed: Sequence[str],
         joint_types: str | None = None,
         *,
@@ -222,9 +214,9 @@ class _Sheet:
             line = text.split("\0", 1)[0].count("\n") + 1
             raise InputError(f"{path}:{line}: not a text file (it has a NUL byte)")
         self._reader = csv.reader(io.StringIO(text, newline=""), strict=True)
-        header = self._next()
-        if header is None:
-            raise InputError(f"{self.file}: the table is empty; expected a header {example}")
+        if (header := self._next()) is None:
+            expected = [*needed[:2], "q1…qN", *needed[2:]]
+            raise InputError(f"{self.file}: the table is empty; expected a header {','.join(expected)}")
         names = [name.strip().lower() for name in header]
         self.joints = sorted(filter(_JOINT.fullmatch, set(names)), key=lambda name: int(name[1:]))
         wanted = [*needed, *self.joints, *(name for name in optional if name in names)]

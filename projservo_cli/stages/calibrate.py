@@ -1,6 +1,5 @@
 """Stage calibrate: trial motions or a recorded table in, projective kinematics out."""
 
-import csv
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from projservo_cli.calibration import (
     suggest,
 )
 from projservo_cli.config import Config
-from projservo_cli.files import replacing
+from projservo_cli.files import write_whole
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, generator
@@ -28,7 +27,7 @@ from projservo_cli.stages.world import (
     reference_of,
     truth_of,
 )
-from projservo_cli.tables import read_table
+from projservo_cli.tables import read_table, to_csv
 
 
 def trial_motions(config: Config) -> FloatArray:
@@ -86,9 +85,7 @@ def run(
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
     """Calibrate from simulated trial motions, or from the recorded table of the configuration.
 
-    Returns what was seen, the calibration, and its held-out errors if the configuration asks for them. Raises
-    InputError if the table or the configuration cannot be used; WorkFailed if the data do not support a
-    calibration.
+    Returns what was seen, the calibration, and its held-out errors if the configuration asks for them.
     """
     from projservo_cli.config.robot import read_nominal
 
@@ -143,9 +140,6 @@ def suggest_motions(
     Predictions are judged over the range of the recorded readings, a little widened. Candidates lie in
     the same range, or for a simulated robot in one three times as wide. ``path`` becomes a list of motions, a
     row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
-
-    Raises InputError if the method of the calibration has no covariance, or the list cannot be written;
-    WorkFailed if no pose shows the markers to both views.
     """
     image = _image(config, observation)
     targets = _region(config, observation.q, WIDER, image)
@@ -155,12 +149,10 @@ def suggest_motions(
     turn = np.degrees(1.0) if config.data is not None and config.data.joint_unit == "deg" else 1.0
     scale = np.array([turn if kind == "R" else 1.0 for kind in calibration.joint_types])
     joints = [f"q{i}" for i in range(1, len(scale) + 1)]
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*joints, "from_pose", *(f"delta_{name}" for name in joints)])
-        for one in found:
-            q, delta = (map(repr, (scale * values).tolist()) for values in (one.q, one.delta))
-            writer.writerow([*q, one.from_pose, *delta])
+    q, delta = (scale * [getattr(one, name) for one in found] for name in ("q", "delta"))
+    columns = dict(zip(joints, q.T, strict=True)) | {"from_pose": np.array([one.from_pose for one in found])}
+    columns |= {f"delta_{name}": values for name, values in zip(joints, delta.T, strict=True)}
+    write_whole(path, to_csv(columns))
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from projservo_cli import provenance
 from projservo_cli.config import load_config
-from projservo_cli.files import replacing, require_inside
+from projservo_cli.files import replacing, require_inside, write_whole
 from projservo_cli.records import InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
 from projservo_cli.report.claims import claims_of
@@ -78,8 +78,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     )
     content = {"claims": report.claims, "drift": drift_rows(report), "left_out": report.left_out}
     text = json.dumps(content, ensure_ascii=False, allow_nan=False, indent=2)
-    with replacing(directory / CLAIMS_FILE) as temporary:
-        temporary.write_text(f"{text}\n", encoding="utf-8")
+    write_whole(directory / CLAIMS_FILE, f"{text}\n")
     for name in (VIEW_FILE, ANIMATION_FILE):  # of other runs than those that are reported on now
         (directory / name).unlink(missing_ok=True)
     made = Result("", run.configuration, provenance.collect(seed=config.seed), {}, {"": report})

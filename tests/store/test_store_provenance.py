@@ -13,7 +13,8 @@ from projservo_cli import __version__, provenance
 ROOT = Path(__file__).parents[2]
 
 
-def test_it_names_versions_machine_command_and_seed():
+def test_it_names_versions_machine_command_and_seed(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["projservo", "servo"])
     found = provenance.collect(seed=7)
     assert json.loads(json.dumps(found)) == found
     assert (found["projservo"], found["python"]) == (__version__, platform.python_version())
