@@ -9,6 +9,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NoReturn
 
 import click
@@ -214,14 +215,8 @@ def _interrupt_anew(lost: "sys.UnraisableHookArgs") -> None:
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
         return
-    timer = threading.Timer(0.01, _interrupt)
+    # Wherever there are signals, one to the process also interrupts what its main thread waits for.
+    send = partial(os.kill, os.getpid()) if os.name == "posix" else signal.raise_signal
+    timer = threading.Timer(0.01, send, (signal.SIGINT,))
     timer.daemon = True
     timer.start()
-
-
-def _interrupt() -> None:
-    """Interrupt the main thread, from another one, and wherever there are signals also what it waits for."""
-    if os.name == "posix":
-        os.kill(os.getpid(), signal.SIGINT)
-    else:
-        signal.raise_signal(signal.SIGINT)

@@ -162,7 +162,10 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
     chain = _asked(console, names, options)
     if options["dry_run"]:
-        return _tell_dry(chain)
+        words = (f"{s.name}: {f'would be made ({s.why})' if s.why else 'up to date'}" for s in chain.steps)
+        steps = [{"stage": s.stage, "law": s.law or None, "why": s.why or None} for s in chain.steps]
+        console.tell({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
+        return 0
     folder = chain.run.path.parent
     up_to_date = chain.run.configuration == to_yaml(chain.config) and not any(s.why for s in chain.steps)
     if up_to_date and not _extras(options):
@@ -247,13 +250,6 @@ def _require_named(chain: _Chain) -> None:
             )
     for kind, target in wanted:
         plugins.find(kind, target)
-
-
-def _tell_dry(chain: _Chain) -> int:
-    steps = [{"stage": step.stage, "law": step.law or None, "why": step.why or None} for step in chain.steps]
-    words = (f"{s.name}: {f'would be made ({s.why})' if s.why else 'up to date'}" for s in chain.steps)
-    chain.console.tell({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
-    return 0
 
 
 def _work(chain: _Chain) -> int:

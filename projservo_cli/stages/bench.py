@@ -92,9 +92,12 @@ def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
     with threadpool_limits(1):
         for function, _ in timed.values():
             function()
-        rows = [[timeit(call, number=1) / count for call, count in timed.values()] for _ in range(rounds)]
-    table = 1e6 * np.array(rows).T
-    times = {name: _times(row, float(table[0].min())) for name, row in zip(timed, table, strict=True)}
+        found = [[timeit(call, number=1) / count for call, count in timed.values()] for _ in range(rounds)]
+    table = 1e6 * np.array(found).T
+    quartiles = np.percentile(table, [0, 25, 50, 75], axis=1)
+    rows = np.vstack([quartiles, quartiles[0] / quartiles[0, 0]]).T.tolist()
+    keys = ("least", "lower", "median", "upper", "over_svd")  # µs, and the least over that of one SVD
+    times = {name: dict(zip(keys, row, strict=True)) for name, row in zip(timed, rows, strict=True)}
     return {
         "step_over_svd": max(times["direct_three"]["over_svd"], times["direct_two"]["over_svd"]),
         "exact_over_svd": times[BODY]["over_svd"],
@@ -102,9 +105,3 @@ def timings(case: Case, rounds: int = ROUNDS) -> dict[str, Any]:
         "python_call_us": times["one call from Python"]["least"],
         "times_us": times,
     }
-
-
-def _times(values: FloatArray, svd: float) -> dict[str, float]:
-    """Least, median and both quartiles of what one call takes, µs, and the least over that of one SVD."""
-    least, lower, median, upper = (float(x) for x in np.percentile(values, [0, 25, 50, 75]))
-    return {"least": least, "median": median, "lower": lower, "upper": upper, "over_svd": least / svd}

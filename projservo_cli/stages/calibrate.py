@@ -141,7 +141,10 @@ def suggest_motions(
     the same range, or for a simulated robot in one three times as wide. ``path`` becomes a list of motions, a
     row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
     """
-    image = _image(config, observation)
+    pixels, size = observation.images, image_size_of(config)
+    image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
+    if size is not None:
+        image = np.array([[[-0.5, -0.5], np.array(size) - 0.5]] * 2)
     targets = _region(config, observation.q, WIDER, image)
     candidates = targets if config.recorded else _region(config, observation.q, FARTHER, image)
     rng = generator(config.seed, SUGGESTIONS)
@@ -154,15 +157,6 @@ def suggest_motions(
     columns |= {f"delta_{name}": values for name, values in zip(joints, delta.T, strict=True)}
     write_whole(path, to_csv(columns))
     return found
-
-
-def _image(config: Config, observation: Observation) -> FloatArray:
-    """Corners (2, 2, 2) of both images, px; where their size is not known, of where markers were seen."""
-    size = image_size_of(config)
-    if size is not None:
-        return np.array([[[-0.5, -0.5], np.array(size) - 0.5]] * 2)
-    pixels = observation.images
-    return np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)
 
 
 def _region(config: Config, q: FloatArray, share: float, image: FloatArray) -> Region:

@@ -389,6 +389,4 @@ def _value(name: str, value: Any, hint: Any) -> Any:
         raise ValueError(f"{name} is not of type {getattr(hint, '__name__', hint)}") from error
 
 
-@cache
-def _adapter(hint: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(hint)
+_adapter = cache(TypeAdapter)

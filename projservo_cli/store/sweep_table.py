@@ -67,7 +67,9 @@ def assemble(
         for block in _blocks(file, parts, [heading[0] for heading in headings]):
             last = first + len(block["run"])
             for name, dtype, _, _ in headings:
-                file[name][first:last] = _cells(block[name].astype(dtype, copy=False))
+                values = np.ascontiguousarray(block[name], dtype=dtype)
+                cells = values.view("S1").reshape(len(values), -1) if dtype.startswith("S") else values
+                file[name][first:last] = cells
             first = last
 
 
@@ -88,13 +90,6 @@ def _new_column(
     if width:
         data.attrs["_Encoding"] = "utf-8"
     return data
-
-
-def _cells(values: Array) -> Array:
-    """Values of a column as they are stored, texts (k,) as characters (k, width)."""
-    if values.dtype.kind != "S":
-        return values
-    return np.ascontiguousarray(values).view("S1").reshape(len(values), values.dtype.itemsize)
 
 
 def _values(data: h5py.Dataset) -> Array:

@@ -232,7 +232,12 @@ def run_sweep(
         for base in range(len(design.bases) if design.sweep.tasks else 0):
             design.tasks(base)  # or say that there are none, before anything else is made
         _compile_once(design, engine, say)
-        _make_calibrations(design, folder, engine, progress)
+        wanted = folder.missing_calibrations(design)
+        most = 1 + len(wanted) // CALIBRATIONS
+        with closing(engine.completed(_calibrate, wanted, most=most)) as calibrated:
+            for count, one in enumerate(calibrated, 1):
+                folder.keep_calibration(one)
+                progress("calibrations", count, len(wanted))
         if status.done:
             say(f"{status.done} of {status.total} runs are stored already")
         _make_parts(design, folder, engine, status, progress)
@@ -245,16 +250,6 @@ def run_sweep(
     folder.assemble(design)
     shutil.rmtree(folder.parts)
     return _Status(design.total, design.total, status.chunk, complete=True)
-
-
-def _make_calibrations(design: Design, folder: Folder, engine: Engine, progress: Progress) -> None:
-    """Make the calibrations that are missing."""
-    wanted = folder.missing_calibrations(design)
-    most = 1 + len(wanted) // CALIBRATIONS
-    with closing(engine.completed(_calibrate, wanted, most=most)) as calibrated:
-        for count, one in enumerate(calibrated):
-            folder.keep_calibration(one)
-            progress("calibrations", count + 1, len(wanted))
 
 
 def _make_parts(design: Design, folder: Folder, engine: Engine, status: _Status, progress: Progress) -> None:

@@ -74,16 +74,6 @@ class _Rows:
             yield int(cell), self["cell"] == cell
 
 
-def _statistics(rows: _Rows) -> dict[str, Any]:
-    """Statistics of every cell, and laws against each other, as JSON values."""
-    return {
-        "cells": [
-            {"cell": cell, **rows.values(cell), **_of_runs(rows, these)} for cell, these in rows.cells()
-        ],
-        "paired": list(_paired(rows)),
-    }
-
-
 def _of_runs(rows: _Rows, these: BoolArray) -> dict[str, Any]:
     """Statistics of some runs; quantiles of those that converged."""
     count, good = int(these.sum()), these & rows["success"]
@@ -175,7 +165,9 @@ def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict
     """Write statistics and figures of the table of a sweep beside it; the statistics and the files."""
     table, folder = SweepTable(path), path.parent
     rows = _Rows(table)
-    found = {"runs": table.rows, "total": table.attributes["total"], **_statistics(rows)}
+    cells = [{"cell": cell, **rows.values(cell), **_of_runs(rows, these)} for cell, these in rows.cells()]
+    found = {"runs": table.rows, "total": table.attributes["total"], "cells": cells}
+    found["paired"] = list(_paired(rows))
     text = json.dumps(found, indent=1, allow_nan=False) + "\n"
     files = [write_whole(folder / STATISTICS, text)]
     pictures = list(_pictures(rows))
