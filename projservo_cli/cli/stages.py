@@ -293,7 +293,6 @@ def _make_steps(chain: _Chain) -> None:
     """Make what has to be made, stop at the first failure, keep what was made until then."""
     from projservo_cli.config import to_yaml
     from projservo_cli.records import WorkFailed
-    from projservo_cli.stages.steps import make_result
     from projservo_cli.store import save
 
     console = chain.console
@@ -305,7 +304,7 @@ def _make_steps(chain: _Chain) -> None:
         if step.why:
             console.detail(f"{step.name}: making it")
             try:
-                chain.run, dropped = make_result(step, chain.config, chain.run, chain.laws, console.progress)
+                dropped = _make_result(chain, step)
             except WorkFailed as error:
                 chain.failed, chain.reason = step.name, " ".join(str(error).split())
                 return
@@ -330,6 +329,53 @@ def _compiling(chain: _Chain) -> AbstractContextManager[None]:
     from projservo_cli.loop.beside import compiling_beside
 
     return compiling_beside()
+
+
+def _make_result(chain: _Chain, step: Any) -> list[str]:
+    """Make one result from those before it, and put it into the run file, which stays where a stage raises.
+
+    Returns names of results that were dropped, because they were made from older ones.
+    """
+    from projservo_cli.config import to_yaml
+    from projservo_cli.stages.steps import STAGES, result_of
+    from projservo_cli.store import save
+
+    run = replace(chain.run, configuration=to_yaml(chain.config))
+    result = result_of(step, chain.config, *_made(chain, step, run))
+    place = STAGES.index(step.stage)
+    after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
+    results = {name: stored for name, stored in run.results.items() if name not in after}
+    chain.run = save(replace(run, results={**results, step.name: result}))
+    return after
+
+
+def _made(chain: _Chain, step: Any, run: Any) -> tuple[Any, ...]:
+    """What a stage makes; its module is imported when it is needed."""
+    config, progress = chain.config, chain.console.progress
+    if step.stage == "calibrate":
+        from projservo_cli.stages import calibrate
+
+        return calibrate.run(config, progress=progress)
+    if step.stage == "plan":
+        from projservo_cli.stages import plan
+
+        return (plan.run(config, run.calibration),)
+    if step.stage == "servo":
+        from projservo_cli.stages import servo
+
+        return (servo.run(config, run.calibration, run.plan, step.law),)
+    from projservo_cli.stages import report
+
+    return (report.run(_reported(chain, run), run.path.parent, progress=progress),)
+
+
+def _reported(chain: _Chain, run: Any) -> Any:
+    """What a report is about: of the results before it those that the named runs of laws rest on."""
+    from projservo_cli.stages.world import has_task
+    from projservo_cli.store import SERVO
+
+    made = ["plan", *(SERVO + law for law in chain.laws)] if has_task(chain.config) else []
+    return replace(run, results={name: run.results[name] for name in ["calibrate", *made]})
 
 
 def _say_compilation(chain: _Chain) -> None:
@@ -369,9 +415,8 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
     """Write what is wanted, and the page anew, which links to it; the paths by name."""
     from projservo_cli.report.page import write_page
     from projservo_cli.stages import report as reporting
-    from projservo_cli.stages.steps import reported
 
-    told = reported(chain.config, chain.run, chain.laws)
+    told = _reported(chain, chain.run)
     makers = {"view": reporting.view, "animation": reporting.animation}
     made = {}
     for name in wanted:

@@ -1,4 +1,4 @@
-"""What is up to date, what has to be made first, and making it.
+"""What is up to date, and what has to be made first.
 
 Every result carries a key: a hash of the configuration its stage depends on and of the key of the
 stage before it. Keys follow from the configuration alone, so what is to be done is known before
@@ -15,9 +15,8 @@ from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.records import InputError, names_of
 from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
-from projservo_cli.stages import Progress
 from projservo_cli.stages.world import has_task
-from projservo_cli.store import SERVO, Result, Run, save
+from projservo_cli.store import SERVO, Result, Run
 
 STAGES = ("calibrate", "plan", "servo", "report")
 # What of the configuration each stage depends on, beside the stage before it.
@@ -150,44 +149,3 @@ def result_of(step: Step, config: Config, *made: Any) -> Result:
     labels = ("observation", "calibration", "cross_validation") if step.stage == "calibrate" else ("",)
     records = {label: record for label, record in zip(labels, made, strict=True) if record is not None}
     return Result(step.key, to_yaml(config), provenance.collect(seed=config.seed), step.inputs, records)
-
-
-def make_result(
-    step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress
-) -> tuple[Run, list[str]]:
-    """Make one result from those before it, and put it into the run file, which stays where a stage raises.
-
-    laws : names of the runs a report is about; others may be stored, of other settings perhaps.
-    Returns the run with it, and the names of results dropped because they were made from older ones.
-    """
-    run = replace(run, configuration=to_yaml(config))
-    result = result_of(step, config, *_made(step, config, run, laws, progress))
-    place = STAGES.index(step.stage)
-    after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
-    results = {name: stored for name, stored in run.results.items() if name not in after}
-    return save(replace(run, results={**results, step.name: result})), after
-
-
-def _made(step: Step, config: Config, run: Run, laws: Sequence[str], progress: Progress) -> tuple[Any, ...]:
-    """What a stage makes; its module is imported when it is needed."""
-    if step.stage == "calibrate":
-        from projservo_cli.stages import calibrate
-
-        return calibrate.run(config, progress=progress)
-    if step.stage == "plan":
-        from projservo_cli.stages import plan
-
-        return (plan.run(config, run.calibration),)
-    if step.stage == "servo":
-        from projservo_cli.stages import servo
-
-        return (servo.run(config, run.calibration, run.plan, step.law),)
-    from projservo_cli.stages import report
-
-    return (report.run(reported(config, run, laws), run.path.parent, progress=progress),)
-
-
-def reported(config: Config, run: Run, laws: Sequence[str]) -> Run:
-    """What a report is about: of the results before it those that the named runs of laws rest on."""
-    names = ["calibrate", *(["plan", *(SERVO + law for law in laws)] if has_task(config) else [])]
-    return replace(run, results={name: run.results[name] for name in names})
