@@ -18,9 +18,8 @@ _TEMPORARY = re.compile(r"\..+\.([0-9]+)\.[0-9a-f]{8}\.part")  # with the number
 def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
     """Yield a temporary neighbour of ``path`` that takes its place when the block succeeds.
 
-    The new content is on the disk before the old name points to it, unless it need not be ``lasting``: what
-    can be made again at any time need not wait for the disk. When the block raises, whatever stood at
-    ``path`` before stays. Raises InputError when it cannot be written, or the disk is full.
+    The new content is on the disk before the old name points to it, unless it need not be ``lasting`` since
+    it can be made again at any time. Raises InputError when it cannot be written, or the disk is full.
     """
     with _told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,10 +45,9 @@ def write_whole(path: Path, content: str | bytes) -> Path:
 
 
 def text_of(path: Path | str, expected: str, most: int) -> str:
-    """The text of a file in UTF-8, with or without byte-order mark.
+    """The text of a file of at most so many bytes in UTF-8, with or without byte-order mark.
 
-    Raises InputError, with what was ``expected``, when it cannot be read, is no such text or has more than
-    ``most`` bytes.
+    Raises InputError, with what was ``expected``, when there is none.
     """
     try:
         with Path(path).open("rb") as file:
@@ -69,8 +67,7 @@ def text_of(path: Path | str, expected: str, most: int) -> str:
 def working_in(folder: Path, *parts: str, name: str = _LOCK) -> Iterator[None]:
     """Keep other processes from working in a folder, and remove what killed ones left there.
 
-    The lock is the system's: it ends with the process, however that ends. Readers need none, since
-    files are put in place as a whole.
+    The lock is the system's: it ends with the process, however that ends.
 
     folder : is made where there is none, and removed where nothing was written into it.
     parts : folders in it, from which leftovers are removed as well.

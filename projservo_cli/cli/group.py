@@ -98,10 +98,7 @@ class Projservo(click.Group):
         return name, command, rest
 
     def _sorted(self, ctx: click.Context, args: list[str]) -> tuple[list[str], list[str], list[str]]:
-        """Words; options with their values; and the flags of these options.
-
-        The parser of click, stopping at each word, tells them apart.
-        """
+        """Words, options with their values, and their flags, told apart by click's parser word by word."""
         params = [*self.params, *(param for command in self.commands.values() for param in command.params)]
         options = {param.name: param for param in params if isinstance(param, click.Option)}
         every = click.Command(None, params=[*options.values()])
@@ -163,10 +160,7 @@ def _flag(option: click.Parameter) -> str:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command line.
-
-    Returns the exit code: 0 done, 1 the work failed, 2 what was given makes no sense, 130 interrupted.
-    """
+    """Run the command line; 0 done, 1 the work failed, 2 what was given makes no sense, 130 interrupted."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal without Greek letters is no reason to fail
             stream.reconfigure(errors="replace")

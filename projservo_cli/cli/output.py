@@ -137,10 +137,7 @@ class Console:
 
 
 def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:
-    """Lines on the object of a stage, or of the report of a ``sweep``, at most 80 columns wide.
-
-    ``detailed`` tells every claim and margin.
-    """
+    """Lines on the object of a stage or the report of a ``sweep``; ``detailed`` with claims and margins."""
     if "failed" in value:  # the reason is told with the exit code
         yield f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
     elif stage == "calibrate":

@@ -332,10 +332,7 @@ def _compiling(chain: _Chain) -> AbstractContextManager[None]:
 
 
 def _make_result(chain: _Chain, step: Any) -> list[str]:
-    """Make one result from those before it, and put it into the run file, which stays where a stage raises.
-
-    Returns names of results that were dropped, because they were made from older ones.
-    """
+    """Make one result from those before it into the run file; which others that made outdated and dropped."""
     from projservo_cli.config import to_yaml
     from projservo_cli.stages.steps import STAGES, result_of
     from projservo_cli.store import save

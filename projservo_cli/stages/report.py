@@ -50,8 +50,6 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
 
     run : with calibration, plan and traces; where there is no task, with the calibration.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
-    progress : told how far it is.
-    Raises InputError if the run lacks what the stage needs, or a file cannot be written.
     """
     config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
@@ -125,9 +123,8 @@ def draw_all(
 ) -> list[str]:
     """Draw every figure that the material supports, in all formats; the others are named with the reason.
 
-    Files that an earlier report left of them, and formats that are not asked for now, are removed.
-
-    Returns files written, relative to the folder. Raises InputError if a file cannot be written.
+    Files that an earlier report left of them, and formats that are not asked for now, are removed. Returns
+    files written, relative to the folder.
     """
     folder = directory / FOLDER
     require_inside(folder, directory)
@@ -165,10 +162,7 @@ def _without_collector() -> Iterator[None]:
 
 
 def require(config: "Config", wanted: Sequence[str]) -> None:
-    """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted.
-
-    Raises InputError if plotly is not installed, the robot is not known in metres, or there is no task.
-    """
+    """Make sure, before any work, that ``view`` and ``animation`` can be made where they are wanted."""
     if config.task is None:
         text = "shows runs of laws, which need a task: set task.start and task.goal"
         raise InputError(f"--{wanted[0]}: {text}")

@@ -52,10 +52,7 @@ class Comparison:
         return self.scenario.truth
 
     def run(self, law: str, operators: str, gains: Gains, *, limited: bool) -> Trace:
-        """Drive a direct law, with 5° per step as limit or with none.
-
-        Where there is a limit, the speed of prismatic joints is limited as configured.
-        """
+        """Drive a direct law without limit, or with 5° a step and that of prismatic joints as configured."""
         limits = self.scenario.limits
         speed = np.full(len(self.scenario.ends.q_start), math.inf)
         if limited:
@@ -105,8 +102,7 @@ def run_studies(
 ) -> Studies:
     """Make all extra runs, over gains per step, and over periods, s, at the configured gains.
 
-    Periods with a gain of 1 a step or more, which no loop survives, are left out. Raises WorkFailed if the
-    task cannot be partitioned with one of the models.
+    Periods with a gain of 1 a step or more, which no loop survives, are left out.
     """
     own, limits = bench.scenario.gains, (False, True)
     most = max(own.gain_t, own.gain_r, own.gain_p, own.gain_s)

@@ -146,10 +146,7 @@ def center_index(markers: Markers) -> int:
 
 
 def truth_of(config: Config) -> Truth:
-    """Build the truth, or find it again where it was built for another seed or task.
-
-    Raises InputError if the configuration lacks a part of it, naming the key to set.
-    """
+    """Build the truth, or find it again where it was built; an InputError where a part of it is missing."""
     if config.robot is None:
         raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
     if config.rig is None:
@@ -247,10 +244,7 @@ def _inverse_kinematics(robot: Arm, goal: FloatArray, q_start: FloatArray) -> Fl
     """Joints within the limits that put the tool at a pose, as near to the start as found.
 
     Damped Newton steps on the pose from the start and from 30 seeded places within the limits; the
-    solution with the least joint motion wins.
-
-    goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
-    Raises WorkFailed if none of the starts reaches the goal within the limits.
+    solution with the least joint motion wins. goal : (4, 4) pose of the tool, m; q_start : (n,) rad or m.
     """
     rng = np.random.default_rng(0)
     span_lower = np.maximum(robot.lower, q_start - 2 * math.pi)

@@ -136,11 +136,10 @@ def run_path(target: Path | str) -> Path:
 
 
 def save(run: Run) -> Run:
-    """Write a run file in place of the one at ``run.path``, as a whole or not at all.
+    """Write a run file in place of the one at ``run.path``; the run as it is written, to be added to.
 
     Results are added to those that were last written, where none of these went, in 0.1 s each: a chain of
-    eight results spends a quarter of the time on it that writing all of them each time takes. Returns the run
-    as it is written, to be added to. Raises InputError when it cannot be written.
+    eight results spends a quarter of the time on it that writing all of them each time takes.
     """
     image, held = run.written
     if not all(run.results.get(name) is result for name, result in held.items()):

@@ -297,10 +297,7 @@ def _calibrate(wanted: tuple[str, Config]) -> _Calibrated:
 
 
 def _compile_once(design: Design, engine: Engine, say: Callable[[str], None]) -> None:
-    """Fill an empty cache by one process, where several would each compile the same.
-
-    That process ends here: the compiler keeps hundreds of megabytes.
-    """
+    """Fill an empty cache by one process, which ends here: the compiler keeps hundreds of megabytes."""
     loop = LOOPS[is_compiled(design, design.cell(0))]
     if not engine.here or engine.workers == 1 or CACHE_FOLDER is None or any(CACHE_FOLDER.rglob(loop)):
         return
