@@ -61,9 +61,8 @@ def _record(
     if motions is not None:
         types = settings.robot.joint_types if settings.robot is not None else None
         poses = read_joint_list(motions, types, joint_unit)
-    recording = new_recording(settings, output, motions=poses, force=force)
     if dry_run:
-        _tell_recording(console, recording)
+        _tell_recording(console, new_recording(settings, output, motions=poses, force=force))
         return
     with working_in(output.parent, name=f".{output.name}.lock"):
         recording = new_recording(settings, output, motions=poses, force=force)

@@ -271,7 +271,9 @@ def _work(chain: _Chain) -> int:
         else:
             values[name] = stage_object(name, chain.run, chain.config, chain.laws)
             values[name] |= chain.beside.get(name, {})
-    chain.console.tell(values if len(values) > 1 else values[chain.names[0]], _words(chain, values))
+    words = [line for name in values for line in words_of(name, values[name], detailed=chain.console.verbose)]
+    words += [f"run: {chain.run.path}"] if chain.run.results else []
+    chain.console.tell(values if len(values) > 1 else values[chain.names[0]], words)
     findings = list(_findings(chain))
     for text, _ in findings:
         click.echo(f"projservo: {text}", err=True)
@@ -421,13 +423,6 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
         made[name] = makers[name](told, chain.console.progress).resolve()
     write_page(replace(told, results={**told.results, "report": chain.run.results["report"]}))
     return made
-
-
-def _words(chain: _Chain, values: Mapping[str, dict[str, Any]]) -> Iterator[str]:
-    for name, value in values.items():
-        yield from words_of(name, value, detailed=chain.console.verbose)
-    if chain.run.results:
-        yield f"run: {chain.run.path}"
 
 
 def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:

@@ -167,7 +167,13 @@ def load(target: Path | str) -> Run:
     if not path.is_file():
         raise InputError(f"{path}: there is no run file; make one with: projservo calibrate -o {path.parent}")
     with opened(path, _ANEW, unchanged=True) as file:
-        _require_version(path, file)
+        if "schema" not in file.attrs or attribute(file, "schema", str) != _SCHEMA:
+            raise InputError(f"{path}: an HDF5 file, but not a run file of projservo; name another")
+        if (version := attribute(file, "schema_version", int)) != SCHEMA_VERSION:
+            raise InputError(
+                f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}: upgrade, pip "
+                "install --upgrade projservo, or make it again: projservo calibrate plan servo report -c FILE"
+            )
         names = list(dict.fromkeys(attribute(file, "order", list)))
         if unknown := [name for name in names if not _NAME.fullmatch(name)]:
             raise ValueError(f"there is no result {unknown[0]!r}")
@@ -175,17 +181,6 @@ def load(target: Path | str) -> Run:
         sizes = dict(SIZES)
         results = {name: _load_result(_member(file, name), sizes) for name in names}
         return Run(path, attribute(file, "configuration", str), results)
-
-
-def _require_version(path: Path, file: h5py.File) -> None:
-    """Refuse what is no run file, or one of another schema, with what to do."""
-    if "schema" not in file.attrs or attribute(file, "schema", str) != _SCHEMA:
-        raise InputError(f"{path}: an HDF5 file, but not a run file of projservo; name another")
-    if (version := attribute(file, "schema_version", int)) != SCHEMA_VERSION:
-        raise InputError(
-            f"{path}: run file of schema {version}, this projservo reads {SCHEMA_VERSION}: upgrade, pip "
-            "install --upgrade projservo, or make it again: projservo calibrate plan servo report -c FILE"
-        )
 
 
 def _load_result(group: h5py.Group, sizes: dict[str, int]) -> Result:
