@@ -92,9 +92,14 @@ def doctor(console: Console) -> int:
         "packages": packages,
         "missing": missing,
         "extras": {name: sorted(lacking) for name, lacking in extras.items()},
-        "kernels": None if missing else _kernels(),
+        "kernels": None,
         "results": {"folder": folder, "writable": writable},
     }
+    if not missing:
+        from projservo_cli.geometry.jit import CACHE_FOLDER, COMPILED
+
+        count = 0 if CACHE_FOLDER is None else sum(1 for _ in CACHE_FOLDER.rglob("*.nbi"))
+        value["kernels"] = {"jit": COMPILED, "cache": CACHE_FOLDER, "compiled": count}
     console.tell(value, map(wrapped, _found(value)))
     return FAILED if missing or not writable else 0
 
@@ -119,13 +124,6 @@ def _requirements() -> tuple[dict[str, str | None], dict[str, list[str]]]:
         else:
             extras.setdefault(extra[1], []).extend([name] if version is None else [])
     return packages, extras
-
-
-def _kernels() -> dict[str, Any]:
-    from projservo_cli.geometry.jit import CACHE_FOLDER, COMPILED
-
-    count = 0 if CACHE_FOLDER is None else sum(1 for _ in CACHE_FOLDER.rglob("*.nbi"))
-    return {"jit": COMPILED, "cache": CACHE_FOLDER, "compiled": count}
 
 
 def _found(value: dict[str, Any]) -> Iterator[str]:

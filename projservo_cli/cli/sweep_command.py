@@ -79,8 +79,7 @@ def sweep(
         "cells": design.cells,
         "axes": {axis.name: list(axis.values) for axis in design.axes},
     }
-    left = (
-        f"{status.total - status.done} runs are left" if status.done < status.total else "all runs are done"
-    )
-    words = [f"sweep: {status.total} runs in {design.cells} cells, {left}"]
+    left = status.total - status.done
+    state = f"{left} runs are left" if left else "all runs are done"
+    words = [f"sweep: {status.total} runs in {design.cells} cells, {state}"]
     console.tell(value, [*words, *([f"table: {folder.table}"] if table else [])])

@@ -91,7 +91,12 @@ def run(
 
     settings, seed = config.calibration, _seed(config)
     init = Nominal(**read_nominal(settings.init)) if settings.init is not None else None
-    observation, types, sigma_px = _observed(config)
+    if config.data is not None:
+        observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
+        sigma_px = config.data.noise_px
+    else:
+        observation = simulate(config, truth_of(config))
+        sigma_px = config.noise.calibration_px or None
     held_out: list[CrossValidation] = []
 
     def hold_out(solution: Solution, noise_px: float) -> None:
@@ -102,7 +107,7 @@ def run(
 
     calibration = calibrate(
         observation,
-        types,
+        config.joint_types or "R" * observation.q.shape[1],
         method=settings.method,
         sigma_px=sigma_px,
         source="recorded" if config.recorded else "simulated",
@@ -114,17 +119,6 @@ def run(
         tell=progress,
     )
     return observation, calibration, held_out[0] if held_out else None
-
-
-def _observed(config: Config) -> tuple[Observation, str, float | None]:
-    """What is to be explained, the types of the joints, and the noise if it is known, px."""
-    if config.data is not None:
-        observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
-        types = config.joint_types or "R" * observation.q.shape[1]
-        return observation, types, config.data.noise_px
-    observation = simulate(config, truth_of(config))
-    assert config.robot is not None
-    return observation, config.robot.joint_types, config.noise.calibration_px or None
 
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

@@ -183,7 +183,7 @@ def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict
 
 def _pictures(rows: _Rows) -> Iterator[tuple[str, Data, Any]]:
     """Every figure that the columns of a sweep allow: the name of its files, its numbers, how it is drawn."""
-    axes = {name: values for name, values in rows.axes if len(values) > 1 and _numeric(values)}
+    axes = [name for name, values in rows.axes if len(values) > 1 and {*map(type, values)} <= {int, float}]
     for name in axes:
         yield f"success_over_{name}", _success(rows, name, name, None), _draw_success
     drawn = [name for name in rows.table.names if name in rows.table.attributes["random"]]
@@ -198,10 +198,6 @@ def _pictures(rows: _Rows) -> Iterator[tuple[str, Data, Any]]:
         yield "basin", _basin(rows, offsets[0], offsets[1]), _draw_basin
     if errors := _final_errors(rows):
         yield "final_error", errors, _draw_final_errors
-
-
-def _numeric(values: Sequence[Any]) -> bool:
-    return all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values)
 
 
 def _success(rows: _Rows, name: str, label: str, edges: Sequence[float] | None) -> Data:
