@@ -29,12 +29,12 @@ class _Stage(click.Command):
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
         """Further stages, and options."""
         named, group = ctx.obj, ctx.find_root().command
-        stages = group.stages if isinstance(group, Projservo) else []
+        stages = group.stages if isinstance(group, _Group) else []
         further = [name for name in stages if name.startswith(incomplete) and name not in named]
         return [*map(CompletionItem, further), *super().shell_complete(ctx, incomplete)]
 
 
-class Projservo(click.Group):
+class _Group(click.Group):
     """A group whose stages chain, and in which options stand anywhere and hold for the whole call.
 
     ``context.obj`` are the names of the commands that are called: of one, or of the stages of a chain,
@@ -145,7 +145,7 @@ class Projservo(click.Group):
         sys.exit(run(sys.argv[1:] if args is None else args))
 
 
-main = Projservo(
+main = _Group(
     "projservo",
     help="Uncalibrated stereo visual servoing in projective space. The stages calibrate, plan, servo and "
     "report chain in one call; each first makes what it lacks. Options may stand anywhere.",

@@ -28,7 +28,7 @@ ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)
 NONE = -1  # in columns of counts, where a run did not begin
 
 
-class Column(NamedTuple):
+class _Column(NamedTuple):
     """One column of the table: its name, NumPy type, unit and what it holds."""
 
     name: str
@@ -37,42 +37,42 @@ class Column(NamedTuple):
     about: str
 
 
-def _text(name: str, values: Sequence[str], about: str) -> Column:
+def _text(name: str, values: Sequence[str], about: str) -> _Column:
     """A column of texts, as wide as the longest of the possible ones."""
-    return Column(name, f"S{max(len(value.encode()) for value in values)}", "1", about)
+    return _Column(name, f"S{max(len(value.encode()) for value in values)}", "1", about)
 
 
 NUMBERED = (
-    Column("run", "i8", "1", "number of the run"),
-    Column("cell", "i8", "1", "number of its cell of the grid"),
-    Column("draw", "i8", "1", "number of the run in its cell; runs of one number share task and noise"),
-    Column("calibration", "i8", "1", "number of the calibration in the cell"),
-    Column("task", "i8", "1", "number of the random task, -1 for that of the base"),
-    Column("seed", "i8", "1", "seed of the run"),
+    _Column("run", "i8", "1", "number of the run"),
+    _Column("cell", "i8", "1", "number of its cell of the grid"),
+    _Column("draw", "i8", "1", "number of the run in its cell; runs of one number share task and noise"),
+    _Column("calibration", "i8", "1", "number of the calibration in the cell"),
+    _Column("task", "i8", "1", "number of the random task, -1 for that of the base"),
+    _Column("seed", "i8", "1", "seed of the run"),
 )
 MEASURED = (
     _text("verdict", ALL_VERDICTS, "how the run ended"),
-    Column("usable", "i1", "1", "whether its calibration is usable"),
-    Column("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
-    Column("rotation_deg", "f8", "deg", "true rotation from start to goal"),
-    Column("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
-    Column("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
-    Column("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
-    Column("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
-    Column("self_occluded_steps_left", "i8", "1", "instants at which the left camera is behind the face"),
-    Column("self_occluded_steps_right", "i8", "1", "instants at which the right camera is behind the face"),
-    Column("first_outside_image", "i8", "1", "first instant with a marker outside an image, -1 for never"),
-    Column("first_beyond_limit", "i8", "1", "first instant beyond a joint limit, -1 for never"),
-    Column("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
-    Column("visibility_limited_steps", "i8", "1", "commands whose translation was kept within delta·tau_0"),
-    Column("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
-    Column("center_deviation_at_samples_mm", "f8", "mm", "largest distance of the centre from the line"),
-    Column("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
+    _Column("usable", "i1", "1", "whether its calibration is usable"),
+    _Column("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
+    _Column("rotation_deg", "f8", "deg", "true rotation from start to goal"),
+    _Column("distance_mm", "f8", "mm", "true distance of the centre from start to goal"),
+    _Column("position_error_mm", "f8", "mm", "true centre to true goal at the end"),
+    _Column("rotation_error_deg", "f8", "deg", "true rotation to the goal at the end"),
+    _Column("image_error_px", "f8", "px", "image error at the end, rms over markers and views"),
+    _Column("self_occluded_steps_left", "i8", "1", "instants at which the left camera is behind the face"),
+    _Column("self_occluded_steps_right", "i8", "1", "instants at which the right camera is behind the face"),
+    _Column("first_outside_image", "i8", "1", "first instant with a marker outside an image, -1 for never"),
+    _Column("first_beyond_limit", "i8", "1", "first instant beyond a joint limit, -1 for never"),
+    _Column("speed_limited_steps", "i8", "1", "commands scaled to the joint-speed limit"),
+    _Column("visibility_limited_steps", "i8", "1", "commands whose translation was kept within delta·tau_0"),
+    _Column("path_length_mm", "f8", "mm", "length of the path of the centre, from sample to sample"),
+    _Column("center_deviation_at_samples_mm", "f8", "mm", "largest distance of the centre from the line"),
+    _Column("effort", "f8", "rad²/s or m²/s", "integral of the squared joint velocities"),
 )
-BETWEEN = Column("center_deviation_mm", "f8", "mm", "largest distance of the centre, between samples too")
+BETWEEN = _Column("center_deviation_mm", "f8", "mm", "largest distance of the centre, between samples too")
 
 
-def columns_of(design: Design) -> tuple[Column, ...]:
+def columns_of(design: Design) -> tuple[_Column, ...]:
     """All columns of the table of a sweep: numbers, inputs, what was measured."""
     axes = [_input(axis.name, axis.values, "value of the grid") for axis in design.axes]
     random = design.sweep.random.items()
@@ -81,12 +81,12 @@ def columns_of(design: Design) -> tuple[Column, ...]:
     return (*NUMBERED, *axes, *drawn, *MEASURED, *between)
 
 
-def _input(name: str, values: Sequence[Any], about: str) -> Column:
+def _input(name: str, values: Sequence[Any], about: str) -> _Column:
     """A column of values that are given: of numbers where all are, else of texts."""
     shown = [_shown(value) for value in values]
     if any(isinstance(value, str) for value in shown):
         return _text(name, [str(value) for value in shown], about)
-    return Column(name, "f8", "1", about)
+    return _Column(name, "f8", "1", about)
 
 
 def _shown(value: Any) -> Any:
