@@ -49,7 +49,7 @@ def image_points(P: FloatArray, points: FloatArray) -> FloatArray:
     return np.asarray(points[..., None, :, :] @ np.swapaxes(P, 1, 2))
 
 
-def _projection_derivative(
+def projection_derivative(
     P: FloatArray, lens: FloatArray | None, points: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     """Pixels (2, N, 2) of points (N, 4), and derivatives by image points (2, N, 2, 3) and k1, k2 of a lens.
@@ -107,7 +107,7 @@ class Scene:
         From images to the point behind each joint by [RH00] eq. (6).
         """
         E, Y = self.carried(q, pose_of, marker_of)
-        pixels, G, by_lens = _projection_derivative(self.P, self.lens, Y[0])
+        pixels, G, by_lens = projection_derivative(self.P, self.lens, Y[0])
         D = np.empty((len(Y), *pixels.shape, 4))
         D[0] = G @ self.P[:, None]
         for i, by_joint in enumerate(E):
