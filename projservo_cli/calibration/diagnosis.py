@@ -106,18 +106,15 @@ def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma:
 
     def residual(x: FloatArray) -> FloatArray:
         q = pose.q + x @ np.eye(pose.q.shape[1])[joints]
-        return dataclasses.replace(pose, q=q).residual(scene)[seen]
+        return dataclasses.replace(pose, q=q).residual(scene)[seen].ravel()
 
-    found = least_squares(lambda x: residual(x).ravel(), np.zeros(len(joints)), loss="soft_l1", f_scale=sigma)
-    return float(np.median(np.linalg.norm(residual(found.x), axis=1)))
+    found = least_squares(residual, np.zeros(len(joints)), loss="soft_l1", f_scale=sigma)
+    return float(np.median(np.linalg.norm(found.fun.reshape(-1, 2), axis=1)))
 
 
 def _require_explained(readings: Readings, used: BoolArray, found: Outliers, epipolar: Epipolar) -> None:
-    """Refuse a fit that leaves out too many sightings both views agree on, or poses for their joint readings.
-
-    Errors of detection break the epipolar geometry; what obeys it and still does not fit speaks
-    against the model of the robot.
-    """
+    """Refuse a fit that leaves out too many sightings both views agree on, or poses for their readings."""
+    # Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
     both = readings.both
     out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
     agree = epipolar.within(readings.pixels[0][both], readings.pixels[1][both], _CONSISTENT)
@@ -195,10 +192,7 @@ def blamed_joint(search: Search, most_px: float) -> str:
 
 
 def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
-    """Every joint of the other type, and every joint standing still.
-
-    In words, with the problem as it then is, and by what share an equal one must leave less.
-    """
+    """Every joint of the other type, every joint standing still: in words, as it then is, its handicap."""
     found = []
     for i, slides in enumerate(readings.prismatic):
         flipped = readings.prismatic.copy()
@@ -237,7 +231,6 @@ def _describes(problem: LeastSquares, scene: Scene, epipolar: Epipolar, most_px:
     return True
 
 
-_COEFFICIENTS = 2 * LENS
 # A lens is suspected where it explains this share of the squared residuals and chance, with its tail
 # probability, would not.
 _LEAST_SHARE, _TAIL = 0.02, 1e-3
@@ -256,7 +249,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
         return 0.0
     readings = solution.problem.readings
     poses = np.unique(readings.pose_of[solution.used.any(axis=0)])
-    K, d = poses.size, _COEFFICIENTS
+    K, d = poses.size, 2 * LENS
     if d + 1 >= K:
         return 0.0
     columns = _cleared_columns(solution, frame)

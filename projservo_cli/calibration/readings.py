@@ -245,10 +245,7 @@ _OFF_LINE_TAIL = 0.1
 
 
 def require_images(readings: Readings, sigma_px: float | None) -> None:
-    """Refuse images that show one place, one line, or no motion, at a noise known or not, px.
-
-    Raises WorkFailed naming the view, or the joint whose trials show no motion.
-    """
+    """Refuse images that show one place, one line, or no motion: WorkFailed names the view or the joint."""
     sigma = max(sigma_px or 0.0, LEAST_SIGMA)
     _require_spread(readings, sigma)
     _require_moving(readings, sigma)

@@ -3,7 +3,7 @@
 Or from what is known of a robot and its rig beforehand, which is tried and never trusted.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,8 +76,10 @@ def _merged(reconstructed: FloatArray, readings: Readings) -> _Alignment:
             grown = bool((rows & ~found).any())
             found |= rows
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
-            hidden = np.broadcast_to(~(seen & found[:, None])[..., None], local.shape)
-            body = np.ma.median(np.ma.masked_array(local, hidden), axis=0).filled(np.nan)
+            here = seen & found[:, None]
+            body = np.full_like(body, np.nan)
+            for j in np.flatnonzero(here.any(axis=0)):
+                body[j] = np.median(local[here[:, j], j], axis=0)
             grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
     return _Alignment(body, R, found)
 
@@ -123,7 +125,7 @@ def _seed(points: FloatArray, seen: BoolArray) -> int:
     return int(full[np.argmin(deviation)])
 
 
-_STARTS, _TURNS, _FOCAL_MINIMA, _AXIS_MINIMA = 20, 60, 3, 3
+_STARTS, _TURNS, _MOST_SETS = 20, 60, 3
 # Minima with so many times the least loss are not worth a try: they do not explain the rotations.
 _UNLIKELY = 4.0
 # Sets that differ less, rad, lie in one valley: along it the rotations hardly determine the axes, and
@@ -160,7 +162,7 @@ def _rotation_axes(
     for s in order[loss[order] <= enough]:
         if not any(np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < _DISTINCT for other in kept):
             kept.append(w[s])
-        if len(kept) == _AXIS_MINIMA:
+        if len(kept) == _MOST_SETS:
             break
     return kept
 
@@ -324,7 +326,7 @@ def starts(search: Search, readings: Readings, factors: tuple[float, ...] = (1.0
     The readings are those of the problem, perhaps at some of its poses.
     """
     for factor in factors:
-        for guess in metric_guesses(search.epipolar, readings, search.frame, _FOCAL_MINIMA, factor):
+        for guess in metric_guesses(search.epipolar, readings, search.frame, factor):
             alignment = _merged(guess[1], readings)
             if int(np.isfinite(alignment.body[:, 0]).sum()) < _LEAST:
                 raise WorkFailed(
