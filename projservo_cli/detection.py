@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import map_coordinates
+from scipy.optimize import least_squares
 from scipy.special import ndtr
 
 from projservo_cli.records import FloatArray, InputError, Observation, WorkFailed
@@ -85,9 +86,9 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
 
 
 _ROUNDS = 3  # samples are taken anew around the sides that were found
-_ITERATIONS = 20
 _LEAST_REACH = 1.5  # px on either side of an edge: less is no profile
 _MOST_REACH = 6.0
+_LEAST_BLUR = 0.2  # px: a sharper edge cannot be told
 _SPOILT = 0.2  # of the contrast: rms residual of a profile that something covers
 _BORDER = 2  # cells of border along a side of a tag, besides those of its code
 _SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
@@ -171,28 +172,25 @@ def _fit_edge(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> t
 def _least_squares(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> FloatArray | None:
     """Edge (b, a, n_0, k, σ) through all profiles; None where it is not one from dark to bright."""
     low, high = float(grey[:, : len(n) // 4].mean()), float(grey[:, -(len(n) // 4) :].mean())
-    x = np.array([low, high - low, 0.0, 0.0, 1.0])
-    scale = np.array([1.0, 1.0, reach, reach, reach])
-    if not x[1] > 0.0:
+    if not high > low:
         return None
-    for _ in range(_ITERATIONS):
-        residual, J = _edge_model(x, grey, t, n)
-        step = np.linalg.lstsq(J, -residual.ravel(), rcond=None)[0]
-        # A start two pixels off is far outside a sharp edge: no step may leap over the profile.
-        step *= min(1.0, 0.3 * reach / max(float(np.abs(step[2:]).max()), 1e-12))
-        x = x + step
-        x[4] = min(max(x[4], 0.2), reach)
-        if float(np.abs(step[2:] / scale[2:]).max()) < 1e-6:
-            break
-    found = np.isfinite(x).all() and x[1] > 0.0 and abs(x[2]) + 0.5 * abs(x[3]) < reach
-    return x if found else None
+    found = least_squares(
+        lambda x, *profiles: _edge_model(x, *profiles)[0].ravel(),
+        [low, high - low, 0.0, 0.0, 1.0],
+        lambda x, *profiles: _edge_model(x, *profiles)[1],
+        method="lm",
+        x_scale=[1.0, 1.0, reach, reach, reach],
+        args=(grey, t, n),
+    )
+    x = found.x
+    return x if x[1] > 0.0 and abs(x[2]) + 0.5 * abs(x[3]) < reach else None
 
 
 def _edge_model(
     x: FloatArray, grey: FloatArray, t: FloatArray, n: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Residual (T, N) of an edge x = (b, a, n_0, k, σ) and its derivative (T N, 5)."""
-    b, a, n_0, k, sigma = x
+    b, a, n_0, k, sigma = *x[:4], max(x[4], _LEAST_BLUR)
     z = (n - n_0 - k * t[:, None]) / sigma
     phi = ndtr(z)
     bell = -a * np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * sigma)

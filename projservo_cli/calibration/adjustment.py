@@ -32,10 +32,7 @@ def _axis_of(H_hat: FloatArray) -> FloatArray:
 
 
 def _generators(scene: Scene) -> list[FloatArray]:
-    """Rigid motions (b, 4, 4) that move each joint's screw: four for an axis, two for a direction.
-
-    An axis turns about its point nearest to the markers and shifts across itself; a direction turns.
-    """
+    """Rigid motions (b, 4, 4) that move each joint's screw: two turns and two shifts, a slide two turns."""
     H_hat, prismatic = scene.H_hat, scene.prismatic
     center = scene.M[:, :3].mean(axis=0)
     size = float(np.linalg.norm(scene.M[:, :3] - center, axis=1).mean()) or 1.0

@@ -3,9 +3,11 @@
 import dataclasses
 import itertools
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.special import fdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares, minimize
@@ -13,13 +15,12 @@ from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
 from projservo_cli.calibration.fit import Misfit, Solution, fit_from
 from projservo_cli.calibration.forward import LENS, Scene
 from projservo_cli.calibration.readings import RAYLEIGH, Readings
-from projservo_cli.calibration.start import Search, starts_of_changed
+from projservo_cli.calibration.start import Search, starts
 from projservo_cli.geometry.lens import straight_views, within
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, WorkFailed
 
 # A pose is explained by a corrected joint reading when its median residual falls below so many σ.
 _CORRECTED = 3.0
-_STEPS = 12
 # Sightings both views agree on, in units of the epipolar noise, are no errors of detection.
 _CONSISTENT = 3.0
 # Shares of sightings both views agree on, and of poses, that may be left out of a fit.
@@ -93,38 +94,27 @@ def _wrong_joints(pose: LeastSquares, scene: Scene, sigma: float) -> tuple[int, 
     """The joint, or else the pair of joints, whose correction explains the images of a pose; or none."""
     for size in (1, 2):
         pairs = list(itertools.combinations(range(pose.q.shape[1]), size))
-        levels = [_corrected_level(pose, scene, list(joints)) for joints in pairs]
+        levels = [_corrected_level(pose, scene, list(joints), sigma) for joints in pairs]
         if min(levels, default=np.inf) <= _CORRECTED * RAYLEIGH * sigma:
             return pairs[int(np.argmin(levels))]
     return ()
 
 
-def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int]) -> float:
-    """Median residual after some joints of a pose are fitted to its images under a Cauchy loss, px."""
+def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma: float) -> float:
+    """Median residual after some joints of a pose are fitted to its images, nearly by least distances, px."""
     seen = pose.readings.seen
-    best = np.inf
-    for _ in range(_STEPS):
-        pixels, J = pose.joint_derivative(scene)
-        residual = np.where(seen[..., None], pixels - pose.readings.pixels, 0.0)
-        level = float(np.median(np.linalg.norm(residual[seen], axis=1)))
-        if not np.isfinite(level) or level > 0.999 * best:
-            break
-        best = level
-        distance = np.linalg.norm(residual, axis=2)
-        root = np.where(seen, 1.0 / np.sqrt(1.0 + (distance / max(2.0 * level, 1e-9)) ** 2), 0.0)
-        rows = (J[..., joints] * root[..., None, None]).reshape(-1, len(joints))
-        q = pose.q.copy()  # all rows alike: the readings are of one
-        q[:, joints] -= np.linalg.lstsq(rows, (residual * root[..., None]).ravel(), rcond=None)[0]
-        pose = dataclasses.replace(pose, q=q)
-    return best
+
+    def residual(x: FloatArray) -> FloatArray:
+        q = pose.q + x @ np.eye(pose.q.shape[1])[joints]
+        return dataclasses.replace(pose, q=q).residual(scene)[seen].ravel()
+
+    found = least_squares(residual, np.zeros(len(joints)), loss="soft_l1", f_scale=sigma)
+    return float(np.median(np.linalg.norm(found.fun.reshape(-1, 2), axis=1)))
 
 
 def _require_explained(readings: Readings, used: BoolArray, found: Outliers, epipolar: Epipolar) -> None:
-    """Refuse a fit that leaves out too many sightings both views agree on, or poses for their joint readings.
-
-    Errors of detection break the epipolar geometry; what obeys it and still does not fit speaks
-    against the model of the robot.
-    """
+    """Refuse a fit that leaves out too many sightings both views agree on, or poses for their readings."""
+    # Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
     both = readings.both
     out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
     agree = epipolar.within(readings.pixels[0][both], readings.pixels[1][both], _CONSISTENT)
@@ -170,9 +160,8 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-# Hypotheses that are followed to the end, and steps of the axes and of the screws by which they are
-# compared before.
-_FOLLOWED, _TURNS, _SCREW_STEPS = 2, 25, 8
+# Hypotheses that are followed to the end, and steps of the screws by which they are compared before.
+_FOLLOWED, _SCREW_STEPS = 2, 8
 # A joint that stands still is a prismatic one of no speed: it is preferred unless the residuals with the
 # other are smaller by more than this share.
 _SIMPLER = 0.1
@@ -181,17 +170,16 @@ _SIMPLER = 0.1
 def blamed_joint(search: Search, most_px: float) -> str:
     """The one change of one joint with which the model does describe the data, in words; empty if none.
 
-    All changes are compared from one guessed metric frame; the best are followed to the maximum of the
-    likelihood and believed only where that passes as a calibration would and leaves no more than a noise, px.
+    All changes are compared first; the best are followed to the maximum of the likelihood and believed only
+    where that passes as a calibration would and leaves no more than a noise, px.
     """
     changes = _hypotheses(search.problem.readings, search.problem.q_reference)
     candidates = []
-    starts = starts_of_changed(search, (changed for _, changed, _ in changes), _TURNS)
     try:
-        for done, ((words, changed, handicap), start) in enumerate(zip(changes, starts, strict=True)):
+        for done, (words, changed, handicap) in enumerate(changes):
             search.tell("calibration, joint at fault", done, len(changes))
-            if start is not None:
-                seen = changed.readings.seen
+            seen = changed.readings.seen
+            for start in islice(starts(dataclasses.replace(search, problem=changed), changed.readings), 1):
                 scene = minimize(changed, start, seen, robust=True, cameras=False, most=_SCREW_STEPS).scene
                 candidates.append((_level(changed, scene) + handicap, words, changed, scene))
     except WorkFailed:
@@ -204,10 +192,7 @@ def blamed_joint(search: Search, most_px: float) -> str:
 
 
 def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, LeastSquares, float]]:
-    """Every joint of the other type, and every joint standing still.
-
-    In words, with the problem as it then is, and by what share an equal one must leave less.
-    """
+    """Every joint of the other type, every joint standing still: in words, as it then is, its handicap."""
     found = []
     for i, slides in enumerate(readings.prismatic):
         flipped = readings.prismatic.copy()
@@ -246,7 +231,6 @@ def _describes(problem: LeastSquares, scene: Scene, epipolar: Epipolar, most_px:
     return True
 
 
-_COEFFICIENTS = 2 * LENS
 # A lens is suspected where it explains this share of the squared residuals and chance, with its tail
 # probability, would not.
 _LEAST_SHARE, _TAIL = 0.02, 1e-3
@@ -265,7 +249,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
         return 0.0
     readings = solution.problem.readings
     poses = np.unique(readings.pose_of[solution.used.any(axis=0)])
-    K, d = poses.size, _COEFFICIENTS
+    K, d = poses.size, 2 * LENS
     if d + 1 >= K:
         return 0.0
     columns = _cleared_columns(solution, frame)

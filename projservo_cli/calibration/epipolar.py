@@ -6,7 +6,6 @@ from, never a result. All of it is free in the adjustment, whose result is proje
 [HZ04] is R. Hartley, A. Zisserman, "Multiple View Geometry in Computer Vision", 2nd ed., 2004.
 """
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -215,7 +214,7 @@ def _isotropic_frame(points: FloatArray) -> FloatArray:
 _WHITENINGS = 30
 # Focal lengths tried, in units of the image size: from a fisheye's centre to a long lens. Without an
 # image size the extent of the data stands in for it, which may be several times smaller.
-_SHORTEST, _LONGEST, _TRIALS = 0.4, 24.0, 28
+_SHORTEST, _LONGEST, _TRIALS, _MOST_GUESSES = 0.4, 24.0, 28, 3
 _FINE = 0.01  # of the steps of the scan, to which minima are refined
 
 
@@ -241,58 +240,47 @@ class ImageFrame:
         return cls(0.5 * (low + high), np.where(size > 0.0, size, 1.0), False)
 
 
-@dataclass(frozen=True, eq=False)
-class _Guess:
-    """Cameras and points in a guessed metric frame."""
-
-    P: FloatArray  # (2, 3, 4) cameras to pixels
-    points: FloatArray  # (N, 3) reconstructed points, in units of their median distance from the left camera
-    spread: float  # how much marker distances vary over the poses, median of |log ratio|
-    focal: float  # guessed focal length over image size
-
-
 def metric_guesses(
-    epipolar: Epipolar, readings: Readings, frame: ImageFrame, keep: int, factor: float = 1.0
+    epipolar: Epipolar, readings: Readings, frame: ImageFrame, factor: float
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Cameras (2, 3, 4) and points (N, 3) seen by both, in so many guessed metric frames at most, best first.
+    """Cameras (2, 3, 4) and points (N, 3) seen by both, in some guessed metric frames, best first.
 
     The focal length is a factor of the one that keeps the distances between markers most constant over the
     poses, each local minimum of a scan refined within its neighbours.
 
     Raises WorkFailed if no two markers were seen together at two poses.
     """
-    F = epipolar.F
     both = readings.both
     pairs = _marker_pairs(readings.pose_of[both], readings.marker_of[both])
 
-    def guess(log_focal: float) -> _Guess:
-        found = _guess_at(F, readings, frame, float(np.exp(log_focal)))
-        return dataclasses.replace(found, spread=_distance_spread(found.points, pairs))
+    def guess(log_focal: float, factor: float) -> tuple[FloatArray, FloatArray]:
+        return _guess_at(epipolar.F, readings, frame, factor * float(np.exp(log_focal)))
+
+    def spread_at(log_focal: float) -> float:
+        return _distance_spread(guess(log_focal, 1.0)[1], pairs)
 
     grid = np.linspace(np.log(_SHORTEST), np.log(_LONGEST), _TRIALS)
-    scan = [guess(x) for x in grid]
-    spread = np.array([g.spread for g in scan])
+    spread = np.array([spread_at(x) for x in grid])
     if not np.isfinite(spread).any():
         raise WorkFailed("no two markers are seen together at two poses: more markers must be seen at once")
     padded = np.concatenate([[np.inf], spread, [np.inf]])
     minima = np.flatnonzero((spread <= padded[:-2]) & (spread < padded[2:]))
-    minima = minima[np.argsort(spread[minima])][:keep]
+    minima = minima[np.argsort(spread[minima])][:_MOST_GUESSES]
     # A minimum at which the body changes its shape a lot more than at the best is none to start from.
     minima = minima[spread[minima] <= max(4.0 * spread[minima[0]], 0.05)]
     step = float(grid[1] - grid[0])
     found = []
     for i in minima:
         bounds = float(grid[i]) - step, float(grid[i]) + step
-        fine = minimize_scalar(
-            lambda x: guess(x).spread, bounds=bounds, method="bounded", options={"xatol": _FINE * step}
-        )
-        best = min(scan[i], guess(fine.x), key=lambda g: g.spread)
-        found.append(best if factor == 1.0 else _guess_at(F, readings, frame, factor * best.focal))
-    return [(one.P, one.points) for one in found]
+        fine = minimize_scalar(spread_at, bounds=bounds, method="bounded", options={"xatol": _FINE * step})
+        found.append(guess(fine.x if fine.fun < spread[i] else grid[i], factor))
+    return found
 
 
-def _guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float) -> _Guess:
-    """Reconstruction of the pairs seen by both cameras from a focal length in units of the image size.
+def _guess_at(
+    F: FloatArray, readings: Readings, frame: ImageFrame, focal: float
+) -> tuple[FloatArray, FloatArray]:
+    """Cameras (2, 3, 4), and points (N, 3) at median distance one, by a focal length over image size.
 
     [HZ04] result 9.19, the solution of the four that has most points in front of both cameras.
     """
@@ -312,7 +300,7 @@ def _guess_at(F: FloatArray, readings: Readings, frame: ImageFrame, focal: float
     # A ray nearly parallel to its partner meets it anywhere: the median ignores the few.
     scale = float(np.median(np.abs(depth))) or 1.0
     P = K @ np.stack([np.eye(3, 4), np.hstack([R, t[:, None] / scale])])
-    return _Guess(P, x * (depth / scale)[:, None], np.inf, focal)
+    return P, x * (depth / scale)[:, None]
 
 
 def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -58,12 +58,9 @@ class Solution:
         return _median_px(self.residual, self.problem.readings.seen)
 
     def determined(self) -> tuple["Solution", BoolArray]:
-        """The solution without markers of which hardly any reading counts, and which markers (m,) stay.
-
-        One reading is less than the three coordinates of a marker, and a few among many wrong ones agree by
-        chance; either would spoil what is said about the body as a whole.
-        """
+        """The solution without markers of which hardly any reading counts, and which markers (m,) stay."""
         problem, scene, readings = self.problem, self.scene, self.problem.readings
+        # One reading is less than a marker's three coordinates; a few among many wrong ones agree by chance.
         keep = readings.count_of(self.used) >= np.maximum(2, _LEAST_SHARE * readings.count_of(readings.seen))
         if keep.all():
             return self, keep
@@ -189,10 +186,7 @@ def fit_from(problem: LeastSquares, scene: Scene, epipolar: Epipolar) -> Solutio
 def _robust_search(
     problem: LeastSquares, scene: Scene, rows: BoolArray, epipolar: Epipolar
 ) -> tuple[Scene, float]:
-    """Screws alone, then everything, under a Cauchy loss over some readings (2, N): scene, median px.
-
-    Given up where the fit would be refused and hardly proceeds.
-    """
+    """Screws alone, then everything, under a Cauchy loss over some readings (2, N): scene, median px."""
     scene = minimize(problem, scene, rows, robust=True, cameras=False, most=20).scene
     stalled = _crawling(rows, REFUSE_RATIO * epipolar.noise_px)
     fit = minimize(problem, scene, rows, robust=True, most=100, stalled=stalled)
@@ -298,8 +292,6 @@ def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[
 
 def _solve_from_images(search: Search, expected: Expected) -> Solution:
     """Best fit over the starts; the first that leaves nothing but the expected noise ends the search.
-
-    Before each start it tells how many were tried, of at most how many.
 
     Raises Misfit if no start leads anywhere; WorkFailed if too little was seen to start from.
     """

@@ -92,10 +92,7 @@ def _isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective
 
 
 def _output_derivative(solution: Solution, result: Projective) -> FloatArray:
-    """Derivative of P, H_hat_0, M and the lenses (ravelled, in this order) by the adjusted parameters.
-
-    The frame and the camera scales are held: they are part of the gauge.
-    """
+    """Derivative of P, H_hat_0, M and the lenses (ravelled) by the adjusted parameters, the frame held."""
     problem, scene = solution.problem, solution.scene
     back = np.linalg.inv(result.W)
     cameras = [scale * np.kron(np.eye(3), back.T) for scale in result.camera_scale]

@@ -84,11 +84,7 @@ class _Uncertainty:
 
 
 def _needed_spans(sure: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
-    """Range (n,) of a trial motion that would mend each joint of too much noise at its reach, rad or m.
-
-    The trial is of eight frames about the reference, of this joint alone, beside the data there are;
-    information adds up. NaN for joints that are not weak or that no trial of sensible range mends.
-    """
+    """Range (n,) of a trial about the reference that would mend each weak joint, rad or m; NaN where none."""
     needed = np.full(len(spreads), np.nan)
     for i, T in enumerate(spreads):
         low, high = _LEAST_REACHES * sure.reach(i), MOST_REACHES * sure.reach(i)

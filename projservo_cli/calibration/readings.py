@@ -191,20 +191,18 @@ def require_motion(readings: Readings) -> FloatArray:
     return span
 
 
-def describe_joint(i: int, span: float, prismatic: bool, needed: float | None = None) -> str:
+def describe_joint(i: int, span: float, prismatic: bool, needed: float) -> str:
     """Advice for joint i that moved too little, or never apart from the others, over its range, rad or m.
 
-    ``needed`` is the range of a trial motion that determines it; NaN where none does, None where unknown.
+    ``needed`` is the range of a trial motion that determines it; NaN where none does.
     """
     reach = REACH_M if prismatic else REACH_RAD
     moved = _amount(span, prismatic)
-    if needed is not None and not needed <= MOST_REACHES * reach:
+    if not needed <= MOST_REACHES * reach:
         return f"joint {i + 1} moved {moved}; no motion of it alone would do: record trials of every joint"
     if span >= reach:
-        far = "" if needed is None else f", by {_amount(needed, prismatic)} or more"
-        return f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone{far}"
-    if needed is None:
-        needed = min(2.0 * reach, max(4.0 * span, 0.5 * reach))
+        apart = f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone"
+        return f"{apart}, by {_amount(needed, prismatic)} or more"
     if needed <= span:
         return (
             f"joint {i + 1} moved {moved}, in too few poses: record further ones in which it moves alone, by "
@@ -220,11 +218,10 @@ def require_moved(i: int, span: float, prismatic: bool, motion_px: float, sigma_
     seen = (
         f"the images by {motion_px:.3g} px, less than {LEAST_MOTION:g} times their noise of {sigma_px:.3g} px"
     )
-    if span < _STANDING * (REACH_M if prismatic else REACH_RAD):
-        raise WorkFailed(
-            f"too little excitation: the range of joint {i + 1} moves {seen}; "
-            f"{describe_joint(i, span, prismatic)}"
-        )
+    reach = REACH_M if prismatic else REACH_RAD
+    if span < _STANDING * reach:
+        advice = describe_joint(i, span, prismatic, 0.5 * reach)
+        raise WorkFailed(f"too little excitation: the range of joint {i + 1} moves {seen}; {advice}")
     raise WorkFailed(
         f"joint {i + 1} stands still: its readings range over {_amount(span, prismatic)} but move {seen}; "
         "check that it moved and that its readings are its own, or move a marker off its axis"
@@ -248,10 +245,7 @@ _OFF_LINE_TAIL = 0.1
 
 
 def require_images(readings: Readings, sigma_px: float | None) -> None:
-    """Refuse images that show one place, one line, or no motion, at a noise known or not, px.
-
-    Raises WorkFailed naming the view, or the joint whose trials show no motion.
-    """
+    """Refuse images that show one place, one line, or no motion: WorkFailed names the view or the joint."""
     sigma = max(sigma_px or 0.0, LEAST_SIGMA)
     _require_spread(readings, sigma)
     _require_moving(readings, sigma)

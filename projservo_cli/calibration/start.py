@@ -3,7 +3,7 @@
 Or from what is known of a robot and its rig beforehand, which is tried and never trusted.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +76,10 @@ def _merged(reconstructed: FloatArray, readings: Readings) -> _Alignment:
             grown = bool((rows & ~found).any())
             found |= rows
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
-            body = _median_body(local, seen & found[:, None])
+            here = seen & found[:, None]
+            body = np.full_like(body, np.nan)
+            for j in np.flatnonzero(here.any(axis=0)):
+                body[j] = np.median(local[here[:, j], j], axis=0)
             grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
     return _Alignment(body, R, found)
 
@@ -122,15 +125,7 @@ def _seed(points: FloatArray, seen: BoolArray) -> int:
     return int(full[np.argmin(deviation)])
 
 
-def _median_body(local: FloatArray, seen: BoolArray) -> FloatArray:
-    """Median over the poses of each marker's place in the body, NaN where never seen."""
-    body = np.full(local.shape[1:], np.nan)
-    for j in np.flatnonzero(seen.any(axis=0)):
-        body[j] = np.median(local[seen[:, j], j], axis=0)
-    return body
-
-
-_STARTS, _TURNS = 20, 60
+_STARTS, _TURNS, _MOST_SETS = 20, 60, 3
 # Minima with so many times the least loss are not worth a try: they do not explain the rotations.
 _UNLIKELY = 4.0
 # Sets that differ less, rad, lie in one valley: along it the rotations hardly determine the axes, and
@@ -148,8 +143,6 @@ def _rotation_axes(
     q: FloatArray,
     prismatic: BoolArray,
     rng: np.random.Generator,
-    keep: int,
-    steps: int,
 ) -> list[FloatArray]:
     """Sets of axes (n, 3) that explain the rotations at joint values (K, n), distinct minima, best first.
 
@@ -162,14 +155,14 @@ def _rotation_axes(
     direct = _isolated_axes(R, q, prismatic)
     if direct is not None:
         w[0] = direct
-    w, loss = _fit_axes(w, R, q, prismatic, steps)
+    w, loss = _fit_axes(w, R, q, prismatic)
     order = np.argsort(loss)
     kept: list[FloatArray] = []
     enough = min(_UNLIKELY * loss[order[0]] + 1e-9, _CONTRADICTION * len(R))
     for s in order[loss[order] <= enough]:
         if not any(np.abs((w[s] - other)[~prismatic]).max(initial=0.0) < _DISTINCT for other in kept):
             kept.append(w[s])
-        if len(kept) == keep:
+        if len(kept) == _MOST_SETS:
             break
     return kept
 
@@ -216,7 +209,7 @@ def _isolated_axes(R: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatA
 
 
 def _fit_axes(
-    w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray, steps: int
+    w: FloatArray, R: FloatArray, q: FloatArray, prismatic: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Axes (S, n, 3) and losses (S,): Levenberg–Marquardt for all at once, Cauchy loss on log(R R_predᵀ)."""
     S, n = w.shape[:2]
@@ -225,7 +218,7 @@ def _fit_axes(
     damping = np.full(S, 1e-2)
     residual, J = _axis_residuals(w, base, R, q, prismatic)
     loss, weight = _cauchy(residual)
-    for _ in range(steps):
+    for _ in range(_TURNS):
         size = J.shape[-1]
         rows = J.reshape(S, -1, size)
         weighted = np.swapaxes(rows * np.repeat(weight, 3, axis=1)[..., None], 1, 2)
@@ -327,44 +320,23 @@ def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> Fl
     return np.asarray(x)
 
 
-_FOCAL_MINIMA, _AXIS_MINIMA = 3, 3
-
-
-def starts(search: Search, readings: Readings, factors: tuple[float, ...]) -> Iterator[Scene]:
+def starts(search: Search, readings: Readings, factors: tuple[float, ...] = (1.0,)) -> Iterator[Scene]:
     """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each.
 
     The readings are those of the problem, perhaps at some of its poses.
     """
     for factor in factors:
-        for guess in metric_guesses(search.epipolar, readings, search.frame, _FOCAL_MINIMA, factor):
+        for guess in metric_guesses(search.epipolar, readings, search.frame, factor):
             alignment = _merged(guess[1], readings)
             if int(np.isfinite(alignment.body[:, 0]).sum()) < _LEAST:
                 raise WorkFailed(
                     "no three markers are seen together by both cameras: more must be seen at once"
                 )
             q = search.problem.q
-            axes = _rotation_axes(alignment, q, readings.prismatic, search.rng, _AXIS_MINIMA, _TURNS)
-            yield from filter(_finite, (_place(w, guess, readings, q) for w in axes))
-
-
-def starts_of_changed(search: Search, changes: Iterable[LeastSquares], steps: int) -> Iterator[Scene | None]:
-    """A start for each of some problems that differ from the one searched in their joints; None without one.
-
-    All in one guessed metric frame, which owes nothing to the joints, after some steps of the axes.
-
-    Raises WorkFailed if no two markers were seen together at two poses.
-    """
-    readings = search.problem.readings
-    guess = metric_guesses(search.epipolar, readings, search.frame, keep=1)[0]
-    alignment = _merged(guess[1], readings)
-    for changed in changes:
-        axes = _rotation_axes(alignment, changed.q, changed.readings.prismatic, search.rng, 1, steps)
-        yield next(filter(_finite, (_place(w, guess, changed.readings, changed.q) for w in axes)), None)
-
-
-def _finite(scene: Scene) -> bool:
-    """Whether the axes had places."""
-    return bool(np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all())
+            for w in _rotation_axes(alignment, q, readings.prismatic, search.rng):
+                scene = _place(w, guess, readings, q)
+                if np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all():
+                    yield scene
 
 
 @dataclass(frozen=True, eq=False)
