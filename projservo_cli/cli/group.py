@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -20,6 +21,7 @@ from projservo_cli.provenance import __version__
 
 DONE, FAILED, MALFORMED, INTERRUPTED = 0, 1, 2, 130
 _COMPLETE = "_PROJSERVO_COMPLETE"
+_COMING = threading.Event()  # an interrupt that was lost and comes anew
 _LEFT_OUT = {"--suggest": "5"}  # what an option means whose number is left out
 
 
@@ -165,8 +167,7 @@ def run(arguments: Sequence[str]) -> int:
         if isinstance(stream, io.TextIOWrapper):  # a terminal without Greek letters is no reason to fail
             stream.reconfigure(errors="replace")
     try:
-        with main.make_context("projservo", list(arguments)) as context:
-            code: int | None = main.invoke(context)
+        code = _invoked(arguments)
         sys.stdout.flush()
         return code or DONE
     except click.exceptions.Exit as end:  # after help and version
@@ -174,12 +175,25 @@ def run(arguments: Sequence[str]) -> int:
     except click.UsageError as error:
         return _complain(error.format_message(), MALFORMED)
     except KeyboardInterrupt:
+        _COMING.clear()
         return _complain("interrupted", INTERRUPTED)
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return DONE
     except Exception as error:
         return _failure(error, verbose="-v" in arguments or "--verbose" in arguments)
+
+
+def _invoked(arguments: Sequence[str]) -> int | None:
+    """What the command that is asked for returns."""
+    try:
+        with main.make_context("projservo", list(arguments)) as context:
+            code: int | None = main.invoke(context)
+            return code
+    except Exception:
+        if _COMING.is_set():  # what was broken off there, such as a compilation, fails before it comes
+            time.sleep(1.0)
+        raise
 
 
 def _failure(error: Exception, *, verbose: bool) -> int:
@@ -209,6 +223,7 @@ def _interrupt_anew(lost: "sys.UnraisableHookArgs") -> None:
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
         return
+    _COMING.set()
     # Wherever there are signals, one to the process also interrupts what its main thread waits for.
     send = partial(os.kill, os.getpid()) if os.name == "posix" else signal.raise_signal
     timer = threading.Timer(0.01, send, (signal.SIGINT,))

@@ -18,18 +18,20 @@ class Ended:
 
 def work(arguments):
     Ended()
-    time.sleep({seconds})
+    {then}
 
 cli.main.invoke = work
 cli.main(["doctor"])
 """
-INTERRUPT = ("os.kill(os.getpid(), signal.SIGINT)", 60, 130, "projservo: interrupted\n")
-ELSE = ("raise ValueError('odd')", 0, 0, "ValueError: odd")
+INTERRUPT = ("os.kill(os.getpid(), signal.SIGINT)", "time.sleep(60)", 130, "projservo: interrupted\n")
+# As a compilation ends that was broken off where C called Python.
+BROKEN_OFF = (INTERRUPT[0], "raise RuntimeError('no compiled object')", *INTERRUPT[2:])
+ELSE = ("raise ValueError('odd')", "pass", 0, "ValueError: odd")
 
 
-@pytest.mark.parametrize(("at_the_end", "seconds", "code", "told"), [INTERRUPT, ELSE])
-def test_what_comes_at_the_end_of_an_object_is_not_lost(at_the_end, seconds, code, told):
-    command = COMMAND.format(at_the_end=at_the_end, seconds=seconds)
+@pytest.mark.parametrize(("at_the_end", "then", "code", "told"), [INTERRUPT, BROKEN_OFF, ELSE])
+def test_what_comes_at_the_end_of_an_object_is_not_lost(at_the_end, then, code, told):
+    command = COMMAND.format(at_the_end=at_the_end, then=then)
     done = subprocess.run(
         [sys.executable, "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=50, check=False
     )
