@@ -1,0 +1,1 @@
+"""Ways through joint space that keep the face in sight: goals, validity, search, timing."""

@@ -1,0 +1,349 @@
+"""All joint vectors that show the goal: Newton's method from random joints, and whole turns of what it finds.
+
+The points of the face are first brought to where they are at the goal, in the coordinates of the calibrated
+frame scaled to a_inf·A = 1, which is well behaved from everywhere; then its images, which have the last word.
+For an arm of more joints than the face has freedoms what is found is a sample of a continuum.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import apply, mat, put_vec, sub, vec
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kinematics import operators_at, row
+from projservo_cli.guidance.validity import (
+    BORDER,
+    DEVIATIONS,
+    MARGINS,
+    Constraints,
+    off,
+    put_margins,
+    put_row,
+    time_between,
+)
+from projservo_cli.records import PRISMATIC, FloatArray, IntArray
+
+# Newton steps from one start; one that is not near after half of them is given up.
+STEPS = 40
+# Share of the first squares that is left to one that is given up.
+GIVEN_UP = 0.25
+DAMPED = 1e6
+# A Newton step below this, rad or m, is the last: of points, which are near then, and of images.
+NEAR, SETTLED = 1e-3, 1e-7
+# Longest Newton step of a joint, rad or m.
+STRIDE = 0.7
+# Noise that is allowed for where none is known, px.
+LEAST_SIGMA = 0.2
+# What a solution may leave of the images, px, as a multiple of the least.
+MUCH = 2.0
+DISTINCT = math.radians(1.0)
+ROUND_OFF = 1e-9
+# Starts; the search for further goals ends early once so many times the starts until the last new one, and
+# ``AT_LEAST``, have found none.
+STARTS, PATIENCE, AT_LEAST = 400, 3, 40
+# Solutions of an arm of more joints than six.
+SAMPLED = 96
+
+
+class Aim(NamedTuple):
+    """What the goal shows."""
+
+    A_star: FloatArray  # (m, 4) face at the goal, a_inf·A = 1
+    s_star: FloatArray  # (2, m, 2) its images as projective cameras see them, px
+    sigma: float  # standard deviation of a coordinate of them, px
+
+
+class Bench(NamedTuple):
+    """Workspace of the solver."""
+
+    H_hat: FloatArray  # (n, 4, 4) operators at the joints
+    N: FloatArray  # (n, n + 1) normal equations, right-hand side in the last column
+    J: FloatArray  # (n + 1, 4) derivatives of a point, or its images, by the joints; last what is left
+    L: FloatArray  # (n, n + 1) damped and factored
+    q: FloatArray  # (n,) trial
+    base: FloatArray  # (k, n) solutions that are no turns of each other
+    left: FloatArray  # (k,) their sums of squares, px²
+    choice: IntArray  # (n,)
+    lowest: FloatArray  # (n,) least of the joints that are whole turns of a solution
+    s: FloatArray
+    margins: FloatArray  # s, margins: of ``put_margins``
+
+
+def new_bench(n: int, b: int) -> Bench:
+    """Workspace for n joints and b markers; of a redundant arm fewer solutions are looked for."""
+    most = STARTS if n <= 6 else SAMPLED
+    return Bench(
+        np.zeros((n, 4, 4)),
+        np.zeros((n, n + 1)),
+        np.zeros((n + 1, 4)),
+        np.zeros((n, n + 1)),
+        np.zeros(n),
+        np.zeros((most, n)),
+        np.zeros(most),
+        np.zeros(n, dtype=np.int64),
+        np.zeros(n),
+        np.zeros((2, b, 2)),
+        np.zeros(MARGINS),
+    )
+
+
+@internal
+def _put_equations(c: Constraints, aim: Aim, q: FloatArray, images: bool, bench: Bench) -> float:
+    """Write the normal equations of points, or images, at joints; returns the sum of squares left.
+
+    [RH00] eq. (19) for points; eq. (7), second row corrected, for images.
+    """
+    n = q.shape[0]
+    P, N, J = c.model.P, bench.N, bench.J
+    H = operators_at(c.model, q, bench.H_hat)
+    for i in range(n):
+        for j in range(n + 1):
+            N[i, j] = 0.0
+    total = 0.0
+    for k in range(c.face):
+        A = apply(H, vec(c.M[k]))
+        if images:
+            for view in range(2):
+                depth = row(P[view], 2, A)
+                for axis in range(2):
+                    J[n, 2 * view + axis] = float(aim.s_star[view, k, axis]) - row(P[view], axis, A) / depth
+            for i in range(n):
+                D = apply(mat(bench.H_hat[i]), A)
+                for view in range(2):
+                    depth, away = row(P[view], 2, A), row(P[view], 2, D)
+                    for axis in range(2):
+                        pixel = row(P[view], axis, A) / depth
+                        J[i, 2 * view + axis] = (row(P[view], axis, D) - pixel * away) / depth
+        else:
+            put_vec(J[n], sub(vec(aim.A_star[k]), A))
+            for i in range(n):
+                put_vec(J[i], apply(mat(bench.H_hat[i]), A))
+        for i in range(n):
+            for j in range(i, n + 1):
+                N[i, j] += (J[i, 0] * J[j, 0] + J[i, 1] * J[j, 1]) + (J[i, 2] * J[j, 2] + J[i, 3] * J[j, 3])
+        e = J[n]
+        total += (e[0] * e[0] + e[1] * e[1]) + (e[2] * e[2] + e[3] * e[3])
+    return total
+
+
+@internal
+def _put_step(N: FloatArray, damping: float, L: FloatArray) -> bool:
+    """Solve (N + damping diag N) x = b by Cholesky's factorisation; x is left in the last column of L."""
+    n = L.shape[0]
+    most = 0.0
+    for i in range(n):
+        most = max(most, N[i, i])
+    for j in range(n):
+        pivot = N[j, j] * (1.0 + damping) + 1e-14 * most
+        for k in range(j):
+            pivot -= L[k, j] * L[k, j]
+        if not pivot > 1e-16 * most:
+            return False
+        L[j, j] = math.sqrt(pivot)
+        for i in range(j + 1, n + 1):
+            total = N[j, i]
+            for k in range(j):
+                total -= L[k, j] * L[k, i]
+            L[j, i] = total / L[j, j]
+    for j in range(n - 1, -1, -1):
+        total = L[j, n]
+        for i in range(j + 1, n):
+            total -= L[j, i] * L[i, n]
+        L[j, n] = total / L[j, j]
+    return True
+
+
+@internal
+def _settled(c: Constraints, aim: Aim, images: bool, settled: float, q: FloatArray, bench: Bench) -> float:
+    """Bring the joints to the least squares of points or images by damped Newton steps; what is left.
+
+    K. Levenberg, Quarterly of Applied Mathematics 2, 1944, with D. Marquardt's scaling, SIAM Journal 11, 1963.
+    """
+    n = q.shape[0]
+    damping = 1e-3
+    left = first = _put_equations(c, aim, q, images, bench)
+    for step in range(STEPS):
+        if (step == STEPS // 2 and left > GIVEN_UP * first) or not _put_step(bench.N, damping, bench.L):
+            break
+        longest = 0.0
+        for i in range(n):
+            longest = max(longest, abs(bench.L[i, n]))
+        share = min(1.0, STRIDE / longest) if longest > 0.0 else 1.0
+        for i in range(n):
+            bench.q[i] = q[i] + share * bench.L[i, n]
+        trial = _put_equations(c, aim, bench.q, images, bench)
+        if trial < left:
+            left = trial
+            put_row(q, bench.q)
+            damping *= 0.1
+        elif longest >= settled and damping <= DAMPED:
+            damping *= 10.0
+            _put_equations(c, aim, q, images, bench)
+            continue
+        if longest < settled:
+            break
+    return left
+
+
+@internal
+def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench) -> float:
+    """Sum of squares, px², that noise and calibration explain of what is left at joints that show the goal.
+
+    Of each way in which the calibration may be off, what no motion of the joints makes up for. The normal
+    equations of the images at these joints are in the bench.
+    """
+    n = q.shape[0]
+    P, L = c.model.P, bench.L
+    total = (4.0 * c.face - min(n, 6)) * (
+        aim.sigma * aim.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
+    )
+    _put_equations(c, aim, q, True, bench)
+    H = operators_at(c.model, q, bench.H_hat)
+    for j in range(1, c.spread.P.shape[0]):
+        away = 0.0
+        for i in range(n):
+            bench.N[i, n] = 0.0
+        for k in range(c.face):
+            A = apply(H, vec(c.M[k]))
+            for view in range(2):
+                du, dv = off(c, q, view, k, j)
+                away += du * du + dv * dv
+                depth = row(P[view], 2, A)
+                u, v = row(P[view], 0, A) / depth, row(P[view], 1, A) / depth
+                for i in range(n):
+                    D = apply(mat(bench.H_hat[i]), A)
+                    far = row(P[view], 2, D)
+                    bench.N[i, n] += (row(P[view], 0, D) - u * far) / depth * du
+                    bench.N[i, n] += (row(P[view], 1, D) - v * far) / depth * dv
+        if _put_step(bench.N, 0.0, L):
+            for i in range(n):
+                away -= L[i, n] * bench.N[i, n]
+        total += max(away, 0.0)
+    return DEVIATIONS * DEVIATIONS * total
+
+
+@merged
+def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bool:
+    """Whether joints are a solution that was found before, or whole turns of it."""
+    for g in range(count):
+        most = 0.0
+        for i in range(q.shape[0]):
+            off = q[i] - base[g, i]
+            if c.model.joint_types[i] != PRISMATIC:
+                off -= 2.0 * math.pi * math.floor(off / (2.0 * math.pi) + 0.5)
+            most = max(most, abs(off))
+        if most <= DISTINCT:
+            return True
+    return False
+
+
+@internal
+def _keep_turns(
+    c: Constraints,
+    start: FloatArray,
+    solution: FloatArray,
+    goals: FloatArray,
+    times: FloatArray,
+    bench: Bench,
+) -> int:
+    """Put the whole turns of a solution within the limits among the goals nearest in time; how many there are."""
+    n, most = solution.shape[0], goals.shape[0]
+    q, choice, lowest = bench.q, bench.choice, bench.lowest
+    turn = 2.0 * math.pi
+    for i in range(n):
+        lowest[i] = solution[i]
+        if c.model.joint_types[i] != PRISMATIC:
+            low = c.lower[i] if math.isfinite(c.lower[i]) else start[i] - math.pi
+            lowest[i] += turn * math.ceil((low - ROUND_OFF - solution[i]) / turn)
+        if lowest[i] < c.lower[i] - ROUND_OFF or lowest[i] > c.upper[i] + ROUND_OFF:
+            return 0
+        choice[i] = 0
+        q[i] = lowest[i]
+    found = 0
+    while True:
+        if found == 0:
+            # All turns show the same: one test serves them, but for the limits.
+            put_margins(c, q, bench.s, bench.margins)
+            for j in range(1, BORDER):
+                if not bench.margins[j] > 0.0:
+                    return 0
+        found += 1
+        time = time_between(c, start, q)
+        if time < times[most - 1]:
+            place = most - 1
+            while place > 0 and times[place - 1] > time:
+                times[place] = times[place - 1]
+                put_row(goals[place], goals[place - 1])
+                place -= 1
+            times[place] = time
+            for i in range(n):
+                goals[place, i] = min(max(q[i], c.lower[i]), c.upper[i])
+        i = 0
+        while i < n:
+            high = c.upper[i] if math.isfinite(c.upper[i]) else start[i] + math.pi
+            choice[i] += 1
+            q[i] = lowest[i] + choice[i] * turn
+            if c.model.joint_types[i] != PRISMATIC and q[i] <= high + ROUND_OFF:
+                break
+            choice[i] = 0
+            q[i] = lowest[i]
+            i += 1
+        if i == n:
+            return found
+
+
+@internal
+def _solutions(c: Constraints, aim: Aim, starts: FloatArray, bench: Bench) -> int:
+    """Write solutions that are no turns of each other, and what is left of each; how many."""
+    count, last, most = 0, 0, bench.base.shape[0]
+    for k in range(starts.shape[0]):
+        if count == most or k > AT_LEAST + PATIENCE * last:
+            break
+        q = starts[k]
+        _settled(c, aim, False, NEAR, q, bench)
+        if _is_known(c, q, bench.base, count):
+            continue
+        left = _settled(c, aim, True, SETTLED, q, bench)
+        if left <= _explained(c, aim, q, bench) and not _is_known(c, q, bench.base, count):
+            put_row(bench.base[count], q)
+            bench.left[count] = left
+            count += 1
+            last = k
+    return count
+
+
+@njit
+def put_goals(
+    c: Constraints,
+    aim: Aim,
+    start: FloatArray,
+    starts: FloatArray,
+    goals: FloatArray,
+    times: FloatArray,
+    bench: Bench,
+) -> tuple[int, int, int]:
+    """Write the joints (g, n) that show the goal, and their times (g,) from the start, nearest first.
+
+    A solution that leaves much more than the best is a local minimum beside it.
+
+    start : (n,) joints at the start; starts : (k, n) from which solutions are sought, overwritten.
+    Returns how many there are, of which the first g are written; how many solutions, apart from whole turns; how
+    many of those do not show the face or lie beyond the limits.
+    """
+    for g in range(times.shape[0]):
+        times[g] = math.inf
+    count = _solutions(c, aim, starts, bench)
+    most = math.inf
+    for k in range(count):
+        most = min(most, bench.left[k])
+    most = MUCH * MUCH * max(most, 4.0 * c.face * LEAST_SIGMA * LEAST_SIGMA)
+    solutions, total, hidden = 0, 0, 0
+    for k in range(count):
+        if bench.left[k] <= most:
+            turns = _keep_turns(c, start, bench.base[k], goals, times, bench)
+            solutions += 1
+            total += turns
+            hidden += turns == 0
+    return total, solutions, hidden

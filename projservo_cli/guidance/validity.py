@@ -1,0 +1,495 @@
+"""Whether joints keep what must hold, as numbers with a sign, from the calibrated model alone.
+
+Each margin is positive where its constraint holds:
+
+- limits: the least distance of a joint from its limits over the margin asked for;
+- front: the least third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
+  the sign, which nothing else fixes in projective space;
+- side: a·O of the face and a camera over its value at the start, carried by the dual motion H⁻ᵀ;
+- width: the least width of the image of the face, px, for an angle means nothing in projective space;
+- border: the least distance of a marker of the face from the border of an image, px, less what its prediction
+  may be off;
+- clear: the least distance from a region that is kept out of, px, less what a prediction may be off and what a
+  marker moves between two checks: of all markers, and of points between those of the face.
+
+Joints are valid where each margin is above what is asked for, and that is no more than a share of what start
+and goal have themselves, rising to its full value within ``RISE`` of them.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.prediction import predict, prediction_derivative
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
+from projservo_cli.geometry.lens import bend, bends
+from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance
+from projservo_cli.records import PRISMATIC, Calibration, FloatArray, IntArray, Model
+from projservo_cli.task.face import Task, center_of, face_plane
+
+LIMITS, FRONT, SIDE, WIDTH, BORDER, CLEAR = 0, 1, 3, 5, 7, 9
+MARGINS = 10  # all but the limits and clear by view
+# Of what start and goal have themselves, so much is asked for there.
+SHARE = 0.5
+# Motion, s at the speed limits, from start or goal within which demands rise to their full value.
+RISE = 0.5
+# Between two checks no marker moves more than this in an image, px, and no joint more than that, rad or m.
+FINE_PX = 4.0
+FINE_STEP = 0.2
+
+
+class Spread(NamedTuple):
+    """How far predictions err: models off the calibrated one by a deviation, each in a direction of its own.
+
+    The directions are those in which the covariance of the calibration moves images most.
+    """
+
+    P: FloatArray  # (k, 2, 3, 4)
+    H_hat: FloatArray  # (k, n, 4, 4)
+    M: FloatArray  # P, H_hat, M: (k, b, 4) cameras, operators, markers; first as calibrated; none for no spread
+    rest: float  # standard deviation that is left to all other directions, px
+    most: float  # largest standard deviation of a coordinate that was met with, px
+
+
+NO_SPREAD = Spread(np.zeros((0, 2, 3, 4)), np.zeros((0, 0, 4, 4)), np.zeros((0, 0, 4)), 0.0, 0.0)
+# So many standard deviations a prediction may be off.
+DEVIATIONS = 3.0
+
+
+class Constraints(NamedTuple):
+    """What joints are held against, in the frame of the calibrated model."""
+
+    model: Model  # its cameras scaled so that markers in front have a positive third coordinate
+    M: FloatArray  # (b, 4) markers of the body at the reference, those of the face first
+    face: int  # how many are of the face
+    a: FloatArray  # (4,) plane of the face at the reference
+    O: FloatArray  # (2, 4) optical centres, a·O = 1 at the start
+    depth: FloatArray  # (2,) least third coordinate of a marker at the start
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    speed: FloatArray  # (n,) most motion per second; all one where nothing limits it
+    image_size: FloatArray  # (2,) px; infinite where an image has no border
+    keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
+    full: FloatArray  # (10,) margins asked for
+    ends: FloatArray  # (k, n) start and goals, near which less is asked for
+    had: FloatArray  # (k, 10) what is asked for there
+    spread: Spread = NO_SPREAD
+    keep_out: KeepOut = NO_KEEP_OUT
+
+
+def constraints_of(
+    model: Model, A: FloatArray, task: Task, q_start: FloatArray, asked: "Asked"
+) -> Constraints:
+    """What joints are held against, of a task whose points (b, 4) are at the start where they are, face first.
+
+    Signs are those at the start: [RH00] section 4.2 carries them along.
+    """
+    m = len(task.order)
+    a = np.array(face_plane(A[:m], task.order, center_of(A[:m], task.center)))
+    H = forward_kinematics(model, q_start)
+    sides = np.sign((A @ model.P[:, 2].T)[0])
+    model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
+    n = len(q_start)
+    keep = np.where(model.joint_types == PRISMATIC, asked.joint_margin_m, asked.joint_margin)
+    steep, border = asked.least_face_px, asked.border_px
+    return Constraints(
+        model,
+        np.ascontiguousarray(A @ np.linalg.inv(H).T),
+        m,
+        H.T @ a,
+        np.ascontiguousarray(task.O / (task.O @ a)[:, None]),
+        (A @ model.P[:, 2].T).min(axis=0),
+        asked.lower,
+        asked.upper,
+        np.where(np.isfinite(asked.speed), asked.speed, 1.0),
+        asked.image_size,
+        np.asarray(np.maximum(keep, 1e-9), dtype=np.float64),
+        np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, 0.0]),
+        np.zeros((0, n)),
+        np.zeros((0, MARGINS)),
+    )
+
+
+class Asked(NamedTuple):
+    """What a way is to keep to."""
+
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
+    image_size: FloatArray  # (2,) px; infinite where an image has no border
+    border_px: float = 5.0
+    least_face_px: float = 8.0
+    joint_margin: float = math.radians(1.0)
+    joint_margin_m: float = 0.002
+
+
+# Directions of the covariance that are told apart, and joints at which they are looked for.
+DIRECTIONS, LOOKED_AT = 8, 150
+BATCH, BATCHES = 1_500, 40
+
+
+def spread_of(calibration: Calibration, indices: IntArray, face: int, asked: Asked, seed: int) -> Spread:
+    """How far predictions err within the joint limits, of markers (b,) by their index, the first of them a face.
+
+    The directions are those that move the images of the face most, among joints drawn at random that show it;
+    what they leave is taken to be the same everywhere. None without a covariance.
+    """
+    if not np.isfinite(calibration.covariance).all():
+        return NO_SPREAD
+    q = _showing(calibration, indices[:face], asked, seed)
+    if len(q) == 0:
+        return NO_SPREAD
+    size, basis = np.linalg.eigh(calibration.covariance)
+    known = size > len(size) * np.finfo(np.float64).eps * size[-1]
+    factor = basis[:, known] * np.sqrt(size[known])
+    J = prediction_derivative(calibration.model(), calibration.M, q)[:, :, indices[:face]] @ factor
+    variance = (J**2).sum(axis=-1)
+    rows = J.reshape(-1, J.shape[-1]) / np.maximum(np.sqrt(variance).reshape(-1, 1), 1e-9)
+    main = np.linalg.svd(rows, full_matrices=False)[2][:DIRECTIONS].T
+    rest = float(np.sqrt(np.median(np.maximum(variance - ((J @ main) ** 2).sum(axis=-1), 0.0))))
+    moved = (factor @ main).T
+    n, b = calibration.H_hat_0.shape[0], calibration.M.shape[0]
+    P, H_hat, M = np.split(moved[:, : 24 + 16 * n + 4 * b], [24, 24 + 16 * n], axis=1)
+    return Spread(
+        np.concatenate([calibration.P[None], calibration.P + P.reshape(-1, 2, 3, 4)]),
+        np.concatenate([calibration.H_hat_0[None], calibration.H_hat_0 + H_hat.reshape(-1, n, 4, 4)]),
+        np.ascontiguousarray(
+            np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)])[:, indices]
+        ),
+        rest,
+        float(np.sqrt(variance.max())),
+    )
+
+
+def _showing(calibration: Calibration, indices: IntArray, asked: Asked, seed: int) -> FloatArray:
+    """Joints (k, n) within the limits at which both images hold the markers."""
+    rng = np.random.default_rng(seed)
+    low = np.where(np.isfinite(asked.lower), asked.lower, calibration.q_reference - np.pi)
+    high = np.where(np.isfinite(asked.upper), asked.upper, calibration.q_reference + np.pi)
+    found: list[FloatArray] = []
+    for _ in range(BATCHES):
+        q = rng.uniform(low, high, (BATCH, len(low)))
+        s = predict(calibration, q)[:, :, indices]
+        found += list(q[((s >= -0.5) & (s <= asked.image_size - 0.5)).all(axis=(1, 2, 3))])
+        if len(found) >= LOOKED_AT:
+            break
+    return np.array(found[:LOOKED_AT]).reshape(-1, len(low))
+
+
+@merged
+def _put_limits(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
+    least = math.inf
+    for i in range(q.shape[0]):
+        least = min(least, min(q[i] - c.lower[i], c.upper[i] - q[i]) / c.keep[i])
+    margins[LIMITS] = least
+
+
+@merged
+def _put_sides(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
+    back = backward(c.model, q)
+    for view in range(2):
+        margins[SIDE + view] = dot(vec(c.a), apply(back, vec(c.O[view])))
+
+
+@internal
+def width(s: FloatArray, m: int) -> float:
+    """Least width of m image points (≥ m, 2), px: between the two nearest parallel lines that hold them.
+
+    One of them goes through two of the points.
+    """
+    least = math.inf
+    for i in range(m):
+        for j in range(i):
+            dx, dy = s[i, 0] - s[j, 0], s[i, 1] - s[j, 1]
+            length = math.sqrt(dx * dx + dy * dy)
+            if length > 0.0:
+                low, high = 0.0, 0.0
+                for k in range(m):
+                    off = (dx * (s[k, 1] - s[j, 1]) - dy * (s[k, 0] - s[j, 0])) / length
+                    low, high = min(low, off), max(high, off)
+                least = min(least, high - low)
+    return least if math.isfinite(least) else 0.0
+
+
+@merged
+def _inside(c: Constraints, u: float, v: float) -> float:
+    """Distance of a pixel from the border of the image, px; negative outside."""
+    return min(u + 0.5, v + 0.5, c.image_size[0] - 0.5 - u, c.image_size[1] - 0.5 - v)
+
+
+@internal
+def off(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float, float]:
+    """How far a marker of the face would be off, px, if the calibration were by the deviation j."""
+    u, v = _predicted(c, q, view, k, j)
+    u_0, v_0 = _predicted(c, q, view, k, 0)
+    return u - u_0, v - v_0
+
+
+@merged
+def _predicted(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float, float]:
+    m = c.model
+    twin = Model(c.spread.P[j], c.spread.H_hat[j], m.joint_types, m.q_reference, m.a_inf, m.lens)
+    A = apply(forward(twin, q), vec(c.spread.M[j, k]))
+    depth = row(twin.P[view], 2, A)
+    return row(twin.P[view], 0, A) / depth, row(twin.P[view], 1, A) / depth
+
+
+@merged
+def _variance(c: Constraints, q: FloatArray, view: int, k: int) -> float:
+    """Variance of a coordinate of a predicted marker, px², the mean of both coordinates."""
+    total = 0.0
+    for j in range(1, c.spread.P.shape[0]):
+        du, dv = off(c, q, view, k, j)
+        total += 0.5 * (du * du + dv * dv)
+    return total + c.spread.rest * c.spread.rest
+
+
+@merged
+def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray) -> bool:
+    """Write the images (2, b, 2) and what they tell; False where a marker is behind a camera."""
+    H = forward(c.model, q)
+    P = c.model.P
+    for view in range(2):
+        nearest, border = math.inf, math.inf
+        for k in range(c.M.shape[0]):
+            A = apply(H, vec(c.M[k]))
+            depth = row(P[view], 2, A)
+            nearest = min(nearest, depth)
+            if not depth > 0.0:
+                continue
+            u, v = _image(c, view, A)
+            s[view, k, 0], s[view, k, 1] = u, v
+            if k < c.face:
+                border = min(border, _inside(c, u, v))
+        margins[FRONT + view] = nearest / c.depth[view]
+        if not nearest > 0.0:
+            return False
+        margins[WIDTH + view] = width(s[view], c.face)
+        deviation = c.spread.most
+        if border < c.full[BORDER + view] + DEVIATIONS * deviation and deviation > 0.0:
+            # Near enough for the deviation there to tell.
+            border = math.inf
+            for k in range(c.face):
+                deviation = math.sqrt(_variance(c, q, view, k))
+                border = min(border, _inside(c, s[view, k, 0], s[view, k, 1]) - DEVIATIONS * deviation)
+        else:
+            border -= DEVIATIONS * deviation
+        margins[BORDER + view] = border
+    margins[CLEAR] = _clear(c, q, H, s) if c.keep_out.image.shape[0] > 0 else math.inf
+    return True
+
+
+# Parts of a segment between two markers of the face, at whose ends it is looked at.
+BETWEEN = 8
+
+
+@internal
+def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray) -> float:
+    """Margin of the regions that are kept out of."""
+    least = math.inf
+    for k in range(c.M.shape[0]):
+        for r in range(c.keep_out.hides.shape[0]):
+            margin = _clear_of(c, q, r, (k, k), (s[0, k, 0], s[0, k, 1]), (s[1, k, 0], s[1, k, 1]))
+            least = min(least, margin)
+        for l in range(k if k < c.face else 0):
+            A, B = apply(H, vec(c.M[k])), apply(H, vec(c.M[l]))
+            for part in range(1, BETWEEN):
+                D = combined(part / BETWEEN, A, B)
+                left, right = _image(c, 0, D), _image(c, 1, D)
+                for r in range(c.keep_out.hides.shape[0]):
+                    if c.keep_out.views[r] == BOTH:
+                        least = min(least, _clear_of(c, q, r, (k, l), left, right))
+    return least
+
+
+@merged
+def _image(c: Constraints, view: int, A: Vec4) -> tuple[float, float]:
+    """Pixel of a point, as the camera reports it."""
+    P = c.model.P[view]
+    depth = row(P, 2, A)
+    u, v = row(P, 0, A) / depth, row(P, 1, A) / depth
+    return bend(c.model.lens[view], u, v) if bends(c.model.lens) else (u, v)
+
+
+@merged
+def combined(x: float, A: Vec4, B: Vec4) -> Vec4:
+    """Point (1 − x) A + x B."""
+    return axpy(x, sub(B, A), A)
+
+
+@internal
+def _clear_of(
+    c: Constraints,
+    q: FloatArray,
+    region: int,
+    ends: tuple[int, int],
+    left: tuple[float, float],
+    right: tuple[float, float],
+) -> float:
+    """Margin of one region at a point between two markers, or at one, by its pixels in both images.
+
+    Of a region of both images one camera must see the point beside it; markers of a face that it may hide
+    both, and of a region of one image that camera.
+    """
+    views = c.keep_out.views[region]
+    all_views = views != BOTH or (c.keep_out.hides[region] == 1 and ends[0] == ends[1] and ends[0] < c.face)
+    margin = math.inf if all_views else -math.inf
+    for view in range(2):
+        if views not in (view, BOTH):
+            continue
+        u, v = left if view == 0 else right
+        far = clearance(c.keep_out, region, view, u, v) - FINE_PX
+        if far < DEVIATIONS * c.spread.most:
+            spread = max(_variance(c, q, view, ends[0]), _variance(c, q, view, ends[1]))
+            far -= DEVIATIONS * math.sqrt(spread)
+        else:
+            far -= DEVIATIONS * c.spread.most
+        if not all_views:
+            far = min(far, _inside(c, u, v))
+        margin = min(margin, far) if all_views else max(margin, far)
+    return margin
+
+
+@njit
+def put_margins(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray) -> None:
+    """Write all margins (10,) at joints (n,), rad or m, and the images (2, b, 2), px."""
+    for i in range(MARGINS):
+        margins[i] = -math.inf
+    _put_limits(c, q, margins)
+    _put_sides(c, q, margins)
+    _put_views(c, q, s, margins)
+
+
+@njit
+def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
+    """Write what is asked for (10,) at joints (n,): the full margins, or less near start and goals."""
+    for i in range(MARGINS):
+        demands[i] = c.full[i]
+    for e in range(c.ends.shape[0]):
+        rise = time_between(c, q, c.ends[e]) / RISE
+        if rise < 1.0:
+            for i in range(MARGINS):
+                demands[i] = min(demands[i], c.had[e, i] + rise * (c.full[i] - c.had[e, i]))
+
+
+@merged
+def time_between(c: Constraints, q: FloatArray, r: FloatArray) -> float:
+    """Time, s, of the straight way between joints at the speed limits."""
+    most = 0.0
+    for i in range(q.shape[0]):
+        most = max(most, abs(q[i] - r[i]) / c.speed[i])
+    return most
+
+
+@merged
+def put_row(target: FloatArray, source: FloatArray) -> None:
+    """Copy a row; a slice would be copied by way of memory that compiled code has none of."""
+    for i in range(target.shape[0]):
+        target[i] = source[i]
+
+
+@merged
+def _moved(s: FloatArray, before: FloatArray) -> float:
+    """Longest way of an image point between two views (2, b, 2), px."""
+    most = 0.0
+    for view in range(2):
+        for k in range(s.shape[1]):
+            du, dv = s[view, k, 0] - before[view, k, 0], s[view, k, 1] - before[view, k, 1]
+            most = max(most, du * du + dv * dv)
+    return math.sqrt(most)
+
+
+@merged
+def _keep_images(trial: "Trial") -> None:
+    for view in range(2):
+        for k in range(trial.s.shape[1]):
+            trial.s_before[view, k, 0], trial.s_before[view, k, 1] = trial.s[view, k, 0], trial.s[view, k, 1]
+
+
+class Trial(NamedTuple):
+    """Workspace of one test of joints, or of the way between two."""
+
+    margins: FloatArray
+    demands: FloatArray  # margins, demands: (10,)
+    s: FloatArray
+    s_before: FloatArray  # s, s_before: (2, b, 2) px
+    q: FloatArray  # (n,)
+    failures: IntArray  # (10 + n,) how often each margin failed; of the limits, how often each joint
+
+
+def new_trial(n: int, b: int) -> Trial:
+    """Workspace for n joints and b markers."""
+    pixels = np.zeros((2, b, 2))
+    return Trial(
+        np.zeros(MARGINS),
+        np.zeros(MARGINS),
+        pixels,
+        pixels.copy(),
+        np.zeros(n),
+        np.zeros(MARGINS + n, np.int64),
+    )
+
+
+@internal
+def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
+    """Whether joints keep all that is asked for; what fails is counted, the images are written."""
+    margins, demands = trial.margins, trial.demands
+    put_demands(c, q, demands)
+    _put_limits(c, q, margins)
+    if not margins[LIMITS] >= demands[LIMITS]:
+        trial.failures[LIMITS] += 1
+        for i in range(q.shape[0]):
+            if not min(q[i] - c.lower[i], c.upper[i] - q[i]) / c.keep[i] >= demands[LIMITS]:
+                trial.failures[MARGINS + i] += 1
+        return False
+    _put_sides(c, q, margins)
+    for view in range(2):
+        if not margins[SIDE + view] > demands[SIDE + view]:
+            trial.failures[SIDE + view] += 1
+            return False
+    if not _put_views(c, q, trial.s, margins):
+        trial.failures[FRONT if not margins[FRONT] > 0.0 else FRONT + 1] += 1
+        return False
+    for i in (FRONT, FRONT + 1, WIDTH, WIDTH + 1, BORDER, BORDER + 1, CLEAR):
+        if not margins[i] >= demands[i]:
+            trial.failures[i] += 1
+            return False
+    return True
+
+
+@internal
+def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) -> float:
+    """Share of the straight way from valid joints that is valid: 1 for all of it.
+
+    Checks are so dense that between two of them no marker moves more than ``FINE_PX`` and no joint more
+    than ``FINE_STEP``: a step that did is halved, and the next one made to do so by its speed.
+    """
+    n = start.shape[0]
+    stride = 0.0
+    for i in range(n):
+        stride = max(stride, abs(end[i] - start[i]))
+    if stride == 0.0:
+        return 1.0
+    least = min(1.0, 1e-6 / stride)
+    most = FINE_STEP / stride
+    valid(c, start, trial)
+    _keep_images(trial)
+    done, step = 0.0, 0.25 * most
+    while done < 1.0:
+        step = min(step, most, 1.0 - done)
+        share = 1.0 if done + step >= 1.0 - 1e-12 else done + step
+        for i in range(n):
+            trial.q[i] = end[i] if share == 1.0 else start[i] + share * (end[i] - start[i])
+        if not valid(c, trial.q, trial):
+            return done
+        moved = _moved(trial.s, trial.s_before)
+        if moved > FINE_PX and step > least:
+            step *= max(0.25, 0.9 * FINE_PX / moved)
+            continue
+        _keep_images(trial)
+        done = share
+        step *= min(2.0, 0.9 * FINE_PX / moved) if moved > 0.0 else 2.0
+    return 1.0

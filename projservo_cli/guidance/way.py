@@ -1,0 +1,182 @@
+"""A way to the goal through joint space: goals, a search, shortened, rounded and timed; or why there is none."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.guidance.goals import STARTS, Aim, new_bench, put_goals
+from projservo_cli.guidance.search import Tree, drop_corners, first_straight, grow, new_tree, shorten
+from projservo_cli.guidance.timing import Pace, new_pace, put_corners, put_pace, put_path
+from projservo_cli.guidance.validity import (
+    MARGINS,
+    NO_SPREAD,
+    SHARE,
+    Constraints,
+    Trial,
+    new_trial,
+    put_margins,
+)
+from projservo_cli.records import FloatArray, IntArray
+
+# Draws that the trees are given at a time.
+CHUNK = 250
+# Ways that are looked for by trees, and draws after which no further one is begun.
+WAYS, FURTHER = 6, 300
+# A straight line that takes so much longer than to the nearest goal is held against what trees find.
+LONGER = 1.2
+SHORTENINGS = 150
+ROUND_OFF = 1e-9
+# Share of the limits of speed and acceleration that is planned with, so that feedback has room.
+ROOM = 0.9
+
+
+class Search(NamedTuple):
+    """How long is searched, and with which random numbers."""
+
+    samples: int = 20_000
+    seed: int = 0
+    goals: int = 64
+
+
+class Way(NamedTuple):
+    """What a search came to."""
+
+    goals: FloatArray  # (g, n) joints that show the goal, nearest in time first
+    shown: int  # how many there are, kept or not
+    solutions: int  # how many apart from whole turns
+    hidden: int  # how many of those lie beyond the limits or do not show the face
+    corners: FloatArray  # (k, n) of the way; none where none was found
+    straight: bool  # whether it is a straight line
+    pace: Pace | None  # in time; None where there is no way or nothing limits its speed
+    draws: int  # by the trees
+    trees: tuple[Tree, Tree] | None  # from the start and from the goals, where they were grown
+    failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
+    had: FloatArray  # (10,) margins of the start
+
+
+def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
+    """Constraints that ask of joints (k, n), and near them, for no more than a share of what those have.
+
+    What they show was seen there, so that a deviation of the prediction takes nothing from it.
+    """
+    had = np.array([margins_at(c, q)[0] for q in ends])
+    seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
+    seen = np.where(np.isfinite(seen), seen, 0.0)
+    had = np.minimum(c.full, np.where(seen > 0.0, had - (1.0 - SHARE) * seen, had - ROUND_OFF))
+    poor = (had < c.full).any(axis=1)
+    return c._replace(ends=np.ascontiguousarray(ends[poor]), had=np.ascontiguousarray(had[poor]))
+
+
+def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Margins (10,) and images (2, b, 2), px, at joints (n,)."""
+    s, margins = np.full((2, len(c.M), 2), np.nan), np.zeros(MARGINS)
+    put_margins(c, q, s, margins)
+    return margins, s
+
+
+def find_way(
+    c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, search: Search, acceleration: FloatArray
+) -> Way:
+    """Find a way from the start to joints that show the goal.
+
+    start : (n,) joints, rad or m.
+    known : (k, n) joints known to show the goal, k ≥ 0.
+    acceleration : (n,) rad/s² or m/s².
+    """
+    n = len(start)
+    rng = np.random.default_rng(search.seed)
+    low = np.where(np.isfinite(c.lower), c.lower, start - np.pi)
+    high = np.where(np.isfinite(c.upper), c.upper, start + np.pi)
+
+    def draw(count: int) -> FloatArray:
+        return np.asarray(low + (high - low) * rng.random((count, n)))
+
+    starts = np.vstack([known, start[None], draw(STARTS)])
+    goals, times = np.empty((search.goals, n)), np.empty(search.goals)
+    shown, solutions, hidden = put_goals(c, aim, start, starts, goals, times, new_bench(n, len(c.M)))
+    goals, times = goals[: min(shown, search.goals)], times[: min(shown, search.goals)]
+    had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
+    trial = new_trial(n, len(c.M))
+    way = Way(goals, shown, solutions, hidden, np.empty((0, n)), False, None, 0, None, trial.failures, had)
+    if len(goals) == 0 or not (had > 0.0).all():
+        return way
+    c = with_ends(c, np.vstack([start[None], goals]))
+    best, shortest = np.empty((0, n)), math.inf
+    straight = first_straight(c, start, goals, trial)
+    if straight >= 0:
+        best, shortest = np.stack([start, goals[straight]]), float(times[straight])
+    draws, trees = 0, None
+    if not shortest <= LONGER * times[0]:
+        for _ in range(WAYS):
+            most = search.samples if math.isinf(shortest) else FURTHER
+            if draws >= most:
+                break
+            found, used, trees = _by_trees(c, start, goals, most - draws, draw, trial)
+            draws += used
+            if found is not None:
+                found = _shortened(c, found, rng, trial)
+                time = length(c, found)
+                if time < shortest:
+                    best, shortest = found, time
+    pace = None if len(best) == 0 else timed(c, best, acceleration, trial)
+    return way._replace(corners=best, straight=len(best) == 2, pace=pace, draws=draws, trees=trees)
+
+
+def length(c: Constraints, path: FloatArray) -> float:
+    """Time of a path (k, n) at the speed limits, s."""
+    return float((np.abs(np.diff(path, axis=0)) / c.speed).max(axis=1).sum())
+
+
+def _by_trees(
+    c: Constraints,
+    start: FloatArray,
+    goals: FloatArray,
+    most: int,
+    draw: Callable[[int], FloatArray],
+    trial: Trial,
+) -> tuple[FloatArray | None, int, tuple[Tree, Tree]]:
+    """A path of corners (k, n), None where none was found; how many draws it took; the trees."""
+    nodes = min(most, 100_000) * 4 + len(goals)
+    trees = new_tree(nodes, start[None]), new_tree(nodes, goals)
+    scratch, draws = np.empty(len(start)), 0
+    while draws < most:
+        chunk = draw(min(CHUNK, most - draws))
+        first, last, used = grow(c, trees, chunk, scratch, trial)
+        draws += used
+        if first >= 0:
+            return np.vstack([_branch(trees[0], first)[::-1], _branch(trees[1], last)[1:]]), draws, trees
+        if used < len(chunk):
+            break
+    return None, draws, trees
+
+
+def _branch(tree: Tree, node: int) -> FloatArray:
+    """Joints (k, n) from a node to its root."""
+    nodes = [node]
+    while tree.parent[nodes[-1]] >= 0:
+        nodes.append(int(tree.parent[nodes[-1]]))
+    return tree.q[nodes]
+
+
+def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
+    """The corners that are left of a path when straight ways cut them short."""
+    room = np.empty((len(path) + 2 * SHORTENINGS, path.shape[1]))
+    room[: len(path)] = path
+    scratch = np.empty((2, path.shape[1]))
+    count = shorten(c, room, len(path), rng.random((SHORTENINGS, 2)), scratch, trial)
+    return room[: drop_corners(c, room, count, trial)].copy()
+
+
+def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
+    """The pace of a path of corners, from rest to rest at ``ROOM`` of the limits of speed and acceleration."""
+    keep = np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > 1e-12]
+    path = np.ascontiguousarray(path[keep])
+    if len(path) == 1:
+        path = np.vstack([path, path])
+    sizes, pace = np.zeros(len(path)), new_pace(len(path), path.shape[1])
+    put_corners(c, path, len(path), sizes, np.empty((2, path.shape[1])), trial)
+    count = put_path(c, path, len(path), sizes, pace)
+    put_pace(pace, count, ROOM * c.speed, ROOM * acceleration)
+    return Pace(*(column[: count - (name == "ddq")] for name, column in zip(Pace._fields, pace, strict=True)))
