@@ -26,7 +26,7 @@ from projservo_cli.guidance.validity import (
 from projservo_cli.records import PRISMATIC, FloatArray, IntArray
 
 # Newton steps from one start; one that is not near after half of them is given up.
-STEPS = 40
+STEPS = 400
 # Share of the first squares that is left to one that is given up.
 GIVEN_UP = 0.25
 DAMPED = 1e6
@@ -165,7 +165,7 @@ def _settled(c: Constraints, aim: Aim, images: bool, settled: float, q: FloatArr
     damping = 1e-3
     left = first = _put_equations(c, aim, q, images, bench)
     for step in range(STEPS):
-        if (step == STEPS // 2 and left > GIVEN_UP * first) or not _put_step(bench.N, damping, bench.L):
+        if (step == 20 and left > GIVEN_UP * first and not images) or not _put_step(bench.N, damping, bench.L):
             break
         longest = 0.0
         for i in range(n):

@@ -39,7 +39,7 @@ def keep_out_of(regions: list[tuple[FloatArray | None, FloatArray | None, bool]]
     ]
     if not polygons:
         return NO_KEEP_OUT
-    views = [BOTH if None not in r[:2] else int(r[0] is None) for r in regions]
+    views = [int(left is None) if left is None or right is None else BOTH for left, right, _ in regions]
     return KeepOut(
         np.ascontiguousarray(np.vstack([corners for _, _, corners in polygons])),
         np.cumsum([0, *(len(corners) for _, _, corners in polygons)]),

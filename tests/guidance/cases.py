@@ -1,0 +1,47 @@
+"""Random tasks of shipped robots, with the true model in place of a calibrated one."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.guidance.goals import Aim
+from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
+from projservo_cli.stages.world import joints_of, truth_of
+from projservo_cli.sweep.tasks import random_tasks
+from projservo_cli.task.face import task_from_images
+from tests.known import configured
+
+COUNT = 12
+
+
+class Case(NamedTuple):
+    """One task."""
+
+    truth: object
+    q_start: object
+    q_goal: object
+    c: Constraints
+    aim: Aim
+    acceleration: object
+
+
+@lru_cache(maxsize=8)
+def _drawn(name):
+    config = configured(name)
+    truth, joints = truth_of(config), joints_of(config)
+    front = np.array(config.task.start.values(config.joint_types))
+    return truth, joints, random_tasks(truth, front, COUNT, np.random.default_rng(3))
+
+
+def case(name, k, **asked):
+    """Random task k of a configuration."""
+    truth, joints, tasks = _drawn(name)
+    q_start, q_goal = tasks.q_start[k], tasks.q_goal[k]
+    s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
+    task = task_from_images(truth.model, s_start, s_star, truth.center)
+    A = truth.M_face @ truth.displacement(q_start).T
+    limits = Asked(joints.lower, joints.upper, joints.speed, truth.image_size)._replace(**asked)
+    acceleration = np.array([2.0 if kind == "P" else np.radians(500.0) for kind in joints.types])
+    c = constraints_of(truth.model, A, task, q_start, limits)
+    return Case(truth, q_start, q_goal, c, Aim(task.A_star, s_star, 0.0), acceleration)

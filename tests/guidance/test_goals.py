@@ -1,0 +1,77 @@
+"""All joints that show a goal: each does, all that closed forms know of are found, nearest in time first."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.guidance.goals import new_bench, put_goals
+from projservo_cli.guidance.way import Search, find_way
+from tests.guidance.cases import case
+
+NONE = np.empty((0, 6))
+
+
+def goals_of(found, most=64, seed=0):
+    """Goals of a case, their times, and what was counted."""
+    c, n = found.c, len(found.q_start)
+    draws = np.random.default_rng(seed).random((400, n))
+    starts = np.vstack([found.q_start, c.lower + (c.upper - c.lower) * draws])
+    goals, times = np.empty((most, n)), np.empty(most)
+    counts = put_goals(c, found.aim, found.q_start, starts, goals, times, new_bench(n, len(c.M)))
+    return goals[: counts[0]], times[: counts[0]], counts
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5", "stanford", "seven"])
+@pytest.mark.parametrize("k", [0, 5, 11])
+def test_every_goal_shows_the_goal_within_the_limits(name, k):
+    found = case(name, k)
+    goals, times, (shown, solutions, hidden) = goals_of(found)
+    assert 0 < len(goals) <= 64
+    assert solutions >= hidden
+    truth = found.truth
+    for q in goals:
+        assert np.abs(truth.images(q, truth.M_face) - found.aim.s_star).max() < 1e-4
+        assert ((q >= found.c.lower) & (q <= found.c.upper)).all()
+    assert (np.diff(times) >= 0.0).all()
+    np.testing.assert_allclose(times, (np.abs(goals - found.q_start) / found.c.speed).max(axis=1))
+    apart = np.abs(goals[:, None] - goals[None]).max(axis=2) + 9.0 * np.eye(len(goals))
+    assert apart.min() > np.radians(1.0)
+    assert shown >= len(goals)
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5", "stanford"])
+def test_the_joints_at_which_the_goal_was_drawn_are_among_them(name):
+    for k in range(6):
+        found = case(name, k)
+        goals, *_ = goals_of(found, most=4096)
+        assert np.abs(goals - found.q_goal).max(axis=1).min() < 1e-6
+
+
+def test_an_arm_with_a_spherical_wrist_has_eight_solutions():
+    # D. Pieper, "The kinematics of manipulators under computer control", 1968: four places of the wrist, and
+    # two turns of it each, wherever limits let them.
+    counts = [goals_of(case("paper", k))[2][1] for k in range(6)]
+    assert max(counts) == 8
+    assert all(count % 2 == 0 for count in counts)
+
+
+def test_turns_are_goals_of_their_own():
+    # The UR5 turns five of its joints twice around: 2⁵ goals of each solution.
+    _, _, (shown, solutions, hidden) = goals_of(case("ur5", 1), most=4096)
+    assert shown == 32 * (solutions - hidden)
+
+
+def test_few_are_the_nearest_of_many():
+    found = case("ur5", 2)
+    many, times, _ = goals_of(found, most=4096)
+    few, _, counts = goals_of(found, most=5)
+    assert counts[0] == len(many)
+    np.testing.assert_allclose(times[:5], (np.abs(few[:5] - found.q_start) / found.c.speed).max(axis=1))
+
+
+def test_a_goal_beyond_the_limits_is_told():
+    found = case("paper", 0)
+    # Limits around the start that none of the solutions lies within.
+    c = found.c._replace(lower=found.q_start - 1e-3, upper=found.q_start + 1e-3)
+    way = find_way(c, found.aim, found.q_start, NONE, Search(), found.acceleration)
+    assert len(way.goals) == len(way.corners) == way.shown == 0
+    assert way.solutions == way.hidden > 0
