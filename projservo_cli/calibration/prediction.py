@@ -88,13 +88,18 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     Returns (K, 2, m, 2) variances of u and v, px². Raises InputError if the readings have another number of
     joints or are not finite.
     """
-    scene, q = _scene(calibration, q)
-    J = scene.derivative(q)
+    J = prediction_derivative(calibration, q)
     variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
     return np.asarray(np.maximum(variance, 0.0))
 
 
-def _root(covariance: FloatArray) -> FloatArray:
+def prediction_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
+    """Derivative (K, 2, m, 2, parameters) of predicted pixels by the parameters of the covariance."""
+    scene, q = _scene(calibration, q)
+    return scene.derivative(q)
+
+
+def covariance_root(covariance: FloatArray) -> FloatArray:
     """Λ (d, r) with Λ Λᵀ the covariance (d, d); the gauge, and what no robot can do, have no spread."""
     spread, basis = np.linalg.eigh(covariance)
     known = spread > len(spread) * np.finfo(np.float64).eps * spread[-1]
@@ -131,7 +136,7 @@ class Innovation:
     _beyond: list[BoolArray] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._factor = _root(self.calibration.covariance)
+        self._factor = covariance_root(self.calibration.covariance)
         self._scene = _scene(self.calibration, self.calibration.q_reference[None])[0]
         r = self._factor.shape[1]
         self._mean, self._C = np.zeros(r), np.eye(r)
@@ -261,7 +266,7 @@ def suggest(
             f"suggestions need a covariance, which the method {calibration.method} has not: "
             "use --set calibration.method=refined"
         )
-    factor = _root(calibration.covariance)
+    factor = covariance_root(calibration.covariance)
     sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
     _, T = _shown(calibration, targets, _TARGETS, factor, rng)
     q, C = _shown(calibration, candidates, _CANDIDATES, factor, rng)

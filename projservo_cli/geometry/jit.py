@@ -21,7 +21,7 @@ from numba.extending import register_jitable
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
-COMPILED_PARTS = ("records.py", "geometry", "task", "control", "loop", "robots")
+COMPILED_PARTS = ("records.py", "geometry", "task", "guidance", "control", "loop", "robots")
 
 
 def _source_hash(root: Path) -> str:

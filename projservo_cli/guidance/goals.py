@@ -159,13 +159,15 @@ def _put_step(N: FloatArray, damping: float, L: FloatArray) -> bool:
 def _settled(c: Constraints, aim: Aim, images: bool, settled: float, q: FloatArray, bench: Bench) -> float:
     """Bring the joints to the least squares of points or images by damped Newton steps; what is left.
 
-    K. Levenberg, Quarterly of Applied Mathematics 2, 1944, with D. Marquardt's scaling, SIAM Journal 11, 1963.
+    K. Levenberg, Quarterly of Applied Mathematics 2, 1944; scaled as by D. Marquardt, SIAM Journal 11, 1963.
     """
     n = q.shape[0]
     damping = 1e-3
     left = first = _put_equations(c, aim, q, images, bench)
     for step in range(STEPS):
-        if (step == 20 and left > GIVEN_UP * first and not images) or not _put_step(bench.N, damping, bench.L):
+        if (step == 20 and left > GIVEN_UP * first and not images) or not _put_step(
+            bench.N, damping, bench.L
+        ):
             break
         longest = 0.0
         for i in range(n):
@@ -196,7 +198,7 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench) -> float:
     """
     n = q.shape[0]
     P, L = c.model.P, bench.L
-    total = (4.0 * c.face - min(n, 6)) * (
+    total: float = (4.0 * c.face - min(n, 6)) * (
         aim.sigma * aim.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
     )
     _put_equations(c, aim, q, True, bench)
@@ -248,7 +250,7 @@ def _keep_turns(
     times: FloatArray,
     bench: Bench,
 ) -> int:
-    """Put the whole turns of a solution within the limits among the goals nearest in time; how many there are."""
+    """Put the whole turns of a solution within the limits among the goals nearest in time; how many."""
     n, most = solution.shape[0], goals.shape[0]
     q, choice, lowest = bench.q, bench.choice, bench.lowest
     turn = 2.0 * math.pi
@@ -329,8 +331,8 @@ def put_goals(
     A solution that leaves much more than the best is a local minimum beside it.
 
     start : (n,) joints at the start; starts : (k, n) from which solutions are sought, overwritten.
-    Returns how many there are, of which the first g are written; how many solutions, apart from whole turns; how
-    many of those do not show the face or lie beyond the limits.
+    Returns how many there are, of which the first g are written; how many solutions, apart from whole turns;
+    how many of those do not show the face or lie beyond the limits.
     """
     for g in range(times.shape[0]):
         times[g] = math.inf

@@ -1,7 +1,7 @@
 """Regions of both images that the body keeps out of: polygons that somebody drew around an obstacle.
 
-A point in space lies in front of, behind or in an obstacle where both cameras show it within the outline; where
-one camera sees it beside the outline, it is beside the obstacle. No metre is needed for that.
+A point in space lies in front of, behind or in an obstacle where both cameras show it within the outline;
+where one camera sees it beside the outline, it is beside the obstacle. No metre is needed for that.
 """
 
 import math
@@ -30,7 +30,7 @@ NO_KEEP_OUT = KeepOut(np.zeros((0, 2)), np.zeros(1, np.int64), *(np.zeros(0, np.
 
 
 def keep_out_of(regions: list[tuple[FloatArray | None, FloatArray | None, bool]]) -> KeepOut:
-    """Regions: polygons (k, 2) in the left and the right image, None where there is none, and whether they hide."""
+    """Regions, each of polygons (k, 2) in the left and the right image, None for none, and if it hides."""
     polygons = [
         (r, view, np.asarray(drawn, dtype=np.float64))
         for r, region in enumerate(regions)
@@ -72,7 +72,7 @@ def outside_polygon(corners: FloatArray, first: int, last: int, u: float, v: flo
 
 @merged
 def clearance(keep: KeepOut, region: int, view: int, u: float, v: float) -> float:
-    """Distance of a pixel of one image from the polygon of a region there, px; infinite where none is drawn."""
+    """Distance of a pixel of one image from the polygon of a region, px; infinite where none is drawn."""
     for p in range(keep.image.shape[0]):
         if keep.region[p] == region and keep.image[p] == view:
             return outside_polygon(keep.corners, keep.first[p], keep.first[p + 1], u, v)

@@ -24,7 +24,7 @@ class Tree(NamedTuple):
 
     q: FloatArray  # (k, n)
     parent: IntArray  # (k,) −1 at a root
-    count: IntArray  # (1,)
+    size: IntArray  # (1,) how many nodes there are
 
 
 def new_tree(most: int, roots: FloatArray) -> Tree:
@@ -38,7 +38,7 @@ def new_tree(most: int, roots: FloatArray) -> Tree:
 def _nearest(c: Constraints, tree: Tree, q: FloatArray) -> int:
     best, nearest = math.inf, 0
     n = q.shape[0]
-    for k in range(tree.count[0]):
+    for k in range(tree.size[0]):
         most = 0.0
         for i in range(n):
             most = max(most, abs(tree.q[k, i] - q[i]) / c.speed[i])
@@ -53,17 +53,17 @@ def _nearest(c: Constraints, tree: Tree, q: FloatArray) -> int:
 def _extended(
     c: Constraints, tree: Tree, q: FloatArray, target: FloatArray, trial: Trial
 ) -> tuple[int, bool]:
-    """Grow the tree from its nearest node towards joints q, as far as it gets; the last node, and if it is there."""
+    """Grow the tree from its nearest node towards joints q; the last node, and whether it is there."""
     node = _nearest(c, tree, q)
     n = q.shape[0]
     while True:
         time = time_between(c, tree.q[node], q)
         if time <= LEAST:
             return node, True
-        if tree.count[0] == tree.q.shape[0]:
+        if tree.size[0] == tree.q.shape[0]:
             return node, False
         share = min(1.0, REACH / time)
-        new = tree.count[0]
+        new = tree.size[0]
         for i in range(n):
             target[i] = q[i] if share == 1.0 else tree.q[node, i] + share * (q[i] - tree.q[node, i])
         got = reached(c, tree.q[node], target, trial)
@@ -75,7 +75,7 @@ def _extended(
         for i in range(n):
             tree.q[new, i] = tree.q[node, i] + got * (target[i] - tree.q[node, i]) if got < 1.0 else target[i]
         tree.parent[new] = node
-        tree.count[0] += 1
+        tree.size[0] += 1
         node = new
         if got < 1.0:
             return node, False
@@ -93,11 +93,11 @@ def grow(
     for k in range(draws.shape[0]):
         first = trees[0] if k % 2 == 0 else trees[1]
         second = trees[1] if k % 2 == 0 else trees[0]
-        if first.count[0] == first.q.shape[0] or second.count[0] == second.q.shape[0]:
+        if first.size[0] == first.q.shape[0] or second.size[0] == second.q.shape[0]:
             return -1, -1, k
-        before = first.count[0]
+        before = first.size[0]
         node, _ = _extended(c, first, draws[k], scratch, trial)
-        if first.count[0] == before:
+        if first.size[0] == before:
             continue
         other, there = _extended(c, second, first.q[node], scratch, trial)
         if there:

@@ -27,7 +27,7 @@ BISECTIONS = 48
 
 
 class Pace(NamedTuple):
-    """A path on a grid of its parameter, the time along its straight pieces at the speed limits, and its pace."""
+    """A path on a grid of its parameter, the time along straight pieces at the speed limits, and its pace."""
 
     s: FloatArray  # (k,) s
     q: FloatArray  # (k, n) joints, rad or m
@@ -128,7 +128,7 @@ def _narrowed(slope: float, offset: float, bound: float, low: float, high: float
 
 @internal
 def _accelerations(pace: Pace, i: int, x: float, ahead: float, most: FloatArray) -> tuple[float, float]:
-    """Accelerations d²s/dt² that interval i allows at a pace x, so that it ends at no more than that ahead."""
+    """Accelerations d²s/dt² that interval i allows at a pace x, to end at no more than that ahead."""
     step = pace.s[i + 1] - pace.s[i]
     low, high = -x / (2.0 * step), (ahead - x) / (2.0 * step)
     for j in range(most.shape[0]):

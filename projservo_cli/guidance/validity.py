@@ -9,8 +9,8 @@ Each margin is positive where its constraint holds:
 - width: the least width of the image of the face, px, for an angle means nothing in projective space;
 - border: the least distance of a marker of the face from the border of an image, px, less what its prediction
   may be off;
-- clear: the least distance from a region that is kept out of, px, less what a prediction may be off and what a
-  marker moves between two checks: of all markers, and of points between those of the face.
+- clear: the least distance from a region that is kept out of, px, less what a prediction may be off and what
+  a marker moves between two checks: of all markers, and of points between those of the face.
 
 Joints are valid where each margin is above what is asked for, and that is no more than a share of what start
 and goal have themselves, rising to its full value within ``RISE`` of them.
@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import predict, prediction_derivative
+from projservo_cli.calibration.prediction import covariance_root, predict, prediction_derivative
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
@@ -49,7 +49,7 @@ class Spread(NamedTuple):
 
     P: FloatArray  # (k, 2, 3, 4)
     H_hat: FloatArray  # (k, n, 4, 4)
-    M: FloatArray  # P, H_hat, M: (k, b, 4) cameras, operators, markers; first as calibrated; none for no spread
+    M: FloatArray  # P, H_hat, M: (k, b, 4) cameras, operators, markers; first as calibrated
     rest: float  # standard deviation that is left to all other directions, px
     most: float  # largest standard deviation of a coordinate that was met with, px
 
@@ -83,7 +83,7 @@ class Constraints(NamedTuple):
 def constraints_of(
     model: Model, A: FloatArray, task: Task, q_start: FloatArray, asked: "Asked"
 ) -> Constraints:
-    """What joints are held against, of a task whose points (b, 4) are at the start where they are, face first.
+    """What joints are held against, of a task whose points (b, 4) are given at the start, face first.
 
     Signs are those at the start: [RH00] section 4.2 carries them along.
     """
@@ -132,7 +132,7 @@ BATCH, BATCHES = 1_500, 40
 
 
 def spread_of(calibration: Calibration, indices: IntArray, face: int, asked: Asked, seed: int) -> Spread:
-    """How far predictions err within the joint limits, of markers (b,) by their index, the first of them a face.
+    """How far predictions err within the joint limits, of markers (b,) by index, those of the face first.
 
     The directions are those that move the images of the face most, among joints drawn at random that show it;
     what they leave is taken to be the same everywhere. None without a covariance.
@@ -142,10 +142,8 @@ def spread_of(calibration: Calibration, indices: IntArray, face: int, asked: Ask
     q = _showing(calibration, indices[:face], asked, seed)
     if len(q) == 0:
         return NO_SPREAD
-    size, basis = np.linalg.eigh(calibration.covariance)
-    known = size > len(size) * np.finfo(np.float64).eps * size[-1]
-    factor = basis[:, known] * np.sqrt(size[known])
-    J = prediction_derivative(calibration.model(), calibration.M, q)[:, :, indices[:face]] @ factor
+    factor = covariance_root(calibration.covariance)
+    J = prediction_derivative(calibration, q)[:, :, indices[:face]] @ factor
     variance = (J**2).sum(axis=-1)
     rows = J.reshape(-1, J.shape[-1]) / np.maximum(np.sqrt(variance).reshape(-1, 1), 1e-9)
     main = np.linalg.svd(rows, full_matrices=False)[2][:DIRECTIONS].T
@@ -217,7 +215,7 @@ def width(s: FloatArray, m: int) -> float:
 @merged
 def _inside(c: Constraints, u: float, v: float) -> float:
     """Distance of a pixel from the border of the image, px; negative outside."""
-    return min(u + 0.5, v + 0.5, c.image_size[0] - 0.5 - u, c.image_size[1] - 0.5 - v)
+    return min(u + 0.5, v + 0.5, float(c.image_size[0]) - 0.5 - u, float(c.image_size[1]) - 0.5 - v)
 
 
 @internal

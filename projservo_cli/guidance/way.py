@@ -1,4 +1,4 @@
-"""A way to the goal through joint space: goals, a search, shortened, rounded and timed; or why there is none."""
+"""A way to the goal through joint space: goals, a search, shortened, rounded and timed; or why none."""
 
 import math
 from collections.abc import Callable
@@ -170,7 +170,7 @@ def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial
 
 
 def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
-    """The pace of a path of corners, from rest to rest at ``ROOM`` of the limits of speed and acceleration."""
+    """The pace of a path of corners, from rest to rest at ``ROOM`` of the limits."""
     keep = np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > 1e-12]
     path = np.ascontiguousarray(path[keep])
     if len(path) == 1:

@@ -8,8 +8,8 @@ import numpy as np
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
 from projservo_cli.stages.world import joints_of, truth_of
-from projservo_cli.sweep.tasks import random_tasks
-from projservo_cli.task.face import task_from_images
+from projservo_cli.sweep.design import random_tasks
+from projservo_cli.task.target import Shown
 from tests.known import configured
 
 COUNT = 12
@@ -37,9 +37,9 @@ def _drawn(name):
 def case(name, k, **asked):
     """Random task k of a configuration."""
     truth, joints, tasks = _drawn(name)
-    q_start, q_goal = tasks.q_start[k], tasks.q_goal[k]
+    q_start, q_goal = tasks[0][k], tasks[1][k]
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
-    task = task_from_images(truth.model, s_start, s_star, truth.center)
+    task = Shown(q_start, s_start, s_star, truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
     limits = Asked(joints.lower, joints.upper, joints.speed, truth.image_size)._replace(**asked)
     acceleration = np.array([2.0 if kind == "P" else np.radians(500.0) for kind in joints.types])

@@ -19,7 +19,9 @@ def test_the_distance_from_a_polygon_is_that_to_its_outline(k, seed):
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, k))
     corners = 100.0 * rng.uniform(0.3, 1.0, k)[:, None] * np.c_[np.cos(angle), np.sin(angle)]
     x = np.linspace(0.0, 1.0, 4001)[:, None]
-    outline = np.vstack([(1 - x) * a + x * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    outline = np.vstack(
+        [(1 - x) * a + x * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    )
     for u, v in rng.uniform(-120.0, 120.0, (8, 2)):
         found = outside_polygon(corners, 0, len(corners), u, v)
         assert abs(found) == pytest.approx(np.hypot(*(outline - (u, v)).T).min(), abs=0.1)
@@ -43,10 +45,14 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
         found = case("paper", k)
         nothing = np.empty((0, 6))
         free = find_way(found.c, found.aim, found.q_start, nothing, Search(), found.acceleration)
-        middle, (left, right) = box_of(found, joints_at(free.pace, np.array([0.5 * free.pace.time[-1]]))[0], 0.02)
+        middle, (left, right) = box_of(
+            found, joints_at(free.pace, np.array([0.5 * free.pace.time[-1]]))[0], 0.02
+        )
         c = found.c._replace(keep_out=keep_out_of([(left, right, False)]))
         ends = [found.truth.images(q, found.truth.M_face) for q in (found.q_start, found.q_goal)]
-        if any(Outline(drawn).contains_points(s[v]).any() for s in ends for v, drawn in enumerate((left, right))):
+        if any(
+            Outline(drawn).contains_points(s[v]).any() for s in ends for v, drawn in enumerate((left, right))
+        ):
             continue
         tried += 1
         way = find_way(c, found.aim, found.q_start, nothing, Search(), found.acceleration)

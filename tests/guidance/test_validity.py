@@ -11,7 +11,6 @@ from projservo_cli.guidance.validity import (
     BORDER,
     FRONT,
     LIMITS,
-    MARGINS,
     SIDE,
     WIDTH,
     new_trial,

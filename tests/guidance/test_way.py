@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from projservo_cli.guidance.timing import joints_at
-from projservo_cli.guidance.validity import LIMITS, SIDE, WIDTH
+from projservo_cli.guidance.validity import LIMITS, SIDE, WIDTH, new_trial
 from projservo_cli.guidance.way import ROOM, Search, find_way, length, margins_at, timed
-from projservo_cli.guidance.validity import new_trial
 from tests.guidance.cases import COUNT, case
 
+SEARCH = Search()
 
-def way_of(found, search=Search()):
+
+def way_of(found, search=SEARCH):
     """The way of a case."""
     nothing = np.empty((0, len(found.q_start)))
     return find_way(found.c, found.aim, found.q_start, nothing, search, found.acceleration)
@@ -39,7 +40,7 @@ def test_every_task_has_a_valid_way_within_the_limits_of_the_joints(name):
         assert (np.abs(acceleration) / found.acceleration).max() <= ROOM * (1.0 + 1e-6)
         np.testing.assert_allclose(q[-1], way.corners[-1], atol=1e-12)
         assert np.isfinite(acceleration).all()
-    assert 0 < straight
+    assert straight > 0
 
 
 def test_a_straight_way_takes_the_time_of_its_slowest_joint():
@@ -94,4 +95,6 @@ def test_no_way_is_told_with_what_stands_in_it():
 def test_a_shortened_way_is_no_longer_than_what_the_trees_found():
     found = case("stanford", next(k for k in range(COUNT) if not way_of(case("stanford", k)).straight))
     way = way_of(found)
-    assert length(found.c, way.corners) >= (np.abs(way.goals[0] - found.q_start) / found.c.speed).max() - 1e-12
+    assert (
+        length(found.c, way.corners) >= (np.abs(way.goals[0] - found.q_start) / found.c.speed).max() - 1e-12
+    )
