@@ -225,7 +225,7 @@ class Plan:
     profile: str = _scalar(about="which part is driven when")
     feasible: bool = _scalar(
         about="whether both cameras see the face all along; in the profile constrained, whether all "
-        "constraints hold"
+        "constraints hold; in the profile joint, whether a way was found"
     )
     reason: str = _scalar(about="what makes the plan feasible or not, in words")
     tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
@@ -243,7 +243,9 @@ class Plan:
     tau_limit: float = _scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
     sigma: FloatArray = _array("sample", about="path parameter from 0 to 1")
     time: FloatArray = _array("sample", units="s", about="when that is reached; NaN where there is no time")
-    mu: FloatArray = _array("sample", "part", about="shares of t, r, p that are done")
+    mu: FloatArray = _array(
+        "sample", "part", about="shares of t, r, p that are done, NaN in the profile joint"
+    )
     H_d: FloatArray = _array("sample", "row", "coordinate", about="planned displacement of the face")
     s: FloatArray = _array("sample", "view", "marker", "xy", units="px", about="predicted images of the face")
     margin: FloatArray = _array("sample", "view", about="visibility margin a·O, 1 at the start")
@@ -282,6 +284,13 @@ class Plan:
     sense: FloatArray = _array("solution", units="rad", about="both senses of the rotation onto the plane")
     sense_margin: FloatArray = _array(
         "solution", "view", about="least margin along each sense, 1 at the start"
+    )
+    goals: int | None = _scalar(
+        about="joint vectors within the limits that show the goal; none but in the profile joint",
+        default=None,
+    )
+    samples: int | None = _scalar(
+        about="joint vectors that the search grew towards; none but in the profile joint", default=None
     )
 
     def rotation_sense(self) -> FloatArray:

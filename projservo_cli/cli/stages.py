@@ -446,7 +446,8 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
             but = " must converge, but" if trace.law in must else ""
             yield f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason}", True
     # Other profiles are those of the paper, of which the margins are only measured.
-    if "plan" in results and chain.run.plan.profile == "constrained" and not chain.run.plan.feasible:
+    searched = "plan" in results and chain.run.plan.profile in ("constrained", "joint")
+    if searched and not chain.run.plan.feasible:
         yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
 
 

@@ -241,12 +241,30 @@ class TaskSettings(Section):
     goal: Goal
 
 
+class _Search(Section):
+    """How long the profile ``joint`` searches, and with which random numbers."""
+
+    samples: Count = Field(20_000, description="joint vectors that two trees grow towards, at most")
+    seed: Whole = Field(0, description="of the random numbers; the same seed gives the same way")
+
+
 class Trajectory(Section):
-    """How the planned motion is spread over σ in [0, 1], and what the profile ``constrained`` keeps to."""
+    """How the planned motion is spread over σ in [0, 1], and what it keeps to where it is searched for.
+
+    ``joint`` leads through joint space to any joints that show the goal; ``auto`` is ``linear`` where that
+    keeps every constraint, else ``constrained``, else ``joint``.
+    """
 
     profile: Literal[
-        "linear", "exponential", "rotation_first", "translation_first", "planar_first", "constrained"
-    ] = Field("linear", description="which part is driven when")
+        "linear",
+        "exponential",
+        "rotation_first",
+        "translation_first",
+        "planar_first",
+        "constrained",
+        "joint",
+        "auto",
+    ] = Field("linear", description="which part is driven when, or a way through joint space")
     delta: Number = Field(
         0.9, gt=0, le=1, description="share of the translation at which visibility changes that is kept to"
     )
@@ -258,7 +276,8 @@ class Trajectory(Section):
         0.4, description="time in which a planned motion comes up to its pace, and to rest again at its end"
     )
     border_px: NotNegative = Field(
-        5.0, description="in the profile constrained: least distance of a marker from the border of an image"
+        5.0,
+        description="in the profiles constrained and joint: least distance of a marker from an image border",
     )
     least_condition: Number = Field(
         0.001,
@@ -266,6 +285,17 @@ class Trajectory(Section):
         lt=1,
         description="in the profile constrained: least reciprocal condition of the face's image Jacobian",
     )
+    goals: Count = Field(64, description="joints that show the goal, nearest in time, which joint tries")
+    joint_margin_deg: NotNegative = Field(
+        1.0, description="in the profile joint: least distance from a limit, revolute joints"
+    )
+    joint_margin_m: NotNegative = Field(
+        0.002, description="in the profile joint: least distance from a limit, prismatic joints"
+    )
+    least_face_px: NotNegative = Field(
+        8.0, description="in the profile joint: least width of the face in an image, seen ever more edge-on"
+    )
+    search: _Search = Field(_Search(), description="how long the profile joint searches, and from which seed")
 
 
 class _Control(Section):
@@ -296,6 +326,12 @@ class _Control(Section):
     gain: Positive = Field(2.5, description="gain of the classical laws, 1/s")
     joint_speed_limit_deg_s: Positive | None = Field(125.0, description="of revolute joints; null for none")
     prismatic_speed_limit_m_s: Positive | None = Field(None, description="of prismatic joints; null for none")
+    joint_acceleration_limit_deg_s2: Positive | None = Field(
+        None, description="of revolute joints in the profile joint; null for 500"
+    )
+    prismatic_acceleration_limit_m_s2: Positive | None = Field(
+        None, description="of prismatic joints in the profile joint; null for 2"
+    )
     substeps: Literal["none", "auto"] = Field(
         "auto", description="whether the law exact sends long steps in parts"
     )
@@ -468,11 +504,20 @@ def _plan_to_follow(control: _Control, trajectory: Trajectory) -> Iterator[Findi
         )
 
 
+def _speed_in_joint_space(
+    control: _Control, trajectory: Trajectory, robot: RobotSettings | None, data: _Data | None
+) -> Iterator[Finding]:
+    types = _joint_types(robot, data)
+    for letter, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
+        if trajectory.profile == "joint" and letter in types and getattr(control, key) is None:
+            yield ("control", key), "the profile joint goes as fast as joints can: give their limit"
+
+
 _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone),
-        *(_disturbed_joints, _lost_markers, _plan_to_follow),
+        *(_disturbed_joints, _lost_markers, _plan_to_follow, _speed_in_joint_space),
     )
 }
 

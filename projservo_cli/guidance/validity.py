@@ -27,8 +27,9 @@ from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
 from projservo_cli.geometry.lens import bend, bends
 from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance
-from projservo_cli.records import PRISMATIC, Calibration, FloatArray, IntArray, Model
+from projservo_cli.records import Calibration, FloatArray, IntArray, Model
 from projservo_cli.task.face import Task, center_of, face_plane
+from projservo_cli.task.margins import Demands
 
 LIMITS, FRONT, SIDE, WIDTH, BORDER, CLEAR = 0, 1, 3, 5, 7, 9
 MARGINS = 10  # all but the limits and clear by view
@@ -70,7 +71,7 @@ class Constraints(NamedTuple):
     depth: FloatArray  # (2,) least third coordinate of a marker at the start
     lower: FloatArray
     upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
-    speed: FloatArray  # (n,) most motion per second; all one where nothing limits it
+    speed: FloatArray  # (n,) most motion per second, rad/s or m/s
     image_size: FloatArray  # (2,) px; infinite where an image has no border
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
     full: FloatArray  # (10,) margins asked for
@@ -93,8 +94,8 @@ def constraints_of(
     sides = np.sign((A @ model.P[:, 2].T)[0])
     model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
     n = len(q_start)
-    keep = np.where(model.joint_types == PRISMATIC, asked.joint_margin_m, asked.joint_margin)
-    steep, border = asked.least_face_px, asked.border_px
+    demands, steep = asked.demands, asked.least_face_px
+    border = demands.border_px
     return Constraints(
         model,
         np.ascontiguousarray(A @ np.linalg.inv(H).T),
@@ -102,11 +103,11 @@ def constraints_of(
         H.T @ a,
         np.ascontiguousarray(task.O / (task.O @ a)[:, None]),
         (A @ model.P[:, 2].T).min(axis=0),
-        asked.lower,
-        asked.upper,
-        np.where(np.isfinite(asked.speed), asked.speed, 1.0),
-        asked.image_size,
-        np.asarray(np.maximum(keep, 1e-9), dtype=np.float64),
+        demands.lower,
+        demands.upper,
+        demands.speed,
+        demands.image_size,
+        np.maximum(asked.keep, 1e-9),
         np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, 0.0]),
         np.zeros((0, n)),
         np.zeros((0, MARGINS)),
@@ -116,14 +117,9 @@ def constraints_of(
 class Asked(NamedTuple):
     """What a way is to keep to."""
 
-    lower: FloatArray
-    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
-    speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
-    image_size: FloatArray  # (2,) px; infinite where an image has no border
-    border_px: float = 5.0
-    least_face_px: float = 8.0
-    joint_margin: float = math.radians(1.0)
-    joint_margin_m: float = 0.002
+    demands: Demands  # limits and speeds of the joints, of which each has one, images and their border
+    keep: FloatArray  # (n,) distance from the joint limits, rad or m
+    least_face_px: float  # width of the face in the images
 
 
 # Directions of the covariance that are told apart, and joints at which they are looked for.
@@ -131,7 +127,7 @@ DIRECTIONS, LOOKED_AT = 8, 150
 BATCH, BATCHES = 1_500, 40
 
 
-def spread_of(calibration: Calibration, indices: IntArray, face: int, asked: Asked, seed: int) -> Spread:
+def spread_of(calibration: Calibration, indices: IntArray, face: int, demands: Demands, seed: int) -> Spread:
     """How far predictions err within the joint limits, of markers (b,) by index, those of the face first.
 
     The directions are those that move the images of the face most, among joints drawn at random that show it;
@@ -139,7 +135,7 @@ def spread_of(calibration: Calibration, indices: IntArray, face: int, asked: Ask
     """
     if not np.isfinite(calibration.covariance).all():
         return NO_SPREAD
-    q = _showing(calibration, indices[:face], asked, seed)
+    q = _showing(calibration, indices[:face], demands, seed)
     if len(q) == 0:
         return NO_SPREAD
     factor = covariance_root(calibration.covariance)
@@ -162,16 +158,16 @@ def spread_of(calibration: Calibration, indices: IntArray, face: int, asked: Ask
     )
 
 
-def _showing(calibration: Calibration, indices: IntArray, asked: Asked, seed: int) -> FloatArray:
+def _showing(calibration: Calibration, indices: IntArray, demands: Demands, seed: int) -> FloatArray:
     """Joints (k, n) within the limits at which both images hold the markers."""
     rng = np.random.default_rng(seed)
-    low = np.where(np.isfinite(asked.lower), asked.lower, calibration.q_reference - np.pi)
-    high = np.where(np.isfinite(asked.upper), asked.upper, calibration.q_reference + np.pi)
+    low = np.where(np.isfinite(demands.lower), demands.lower, calibration.q_reference - np.pi)
+    high = np.where(np.isfinite(demands.upper), demands.upper, calibration.q_reference + np.pi)
     found: list[FloatArray] = []
     for _ in range(BATCHES):
         q = rng.uniform(low, high, (BATCH, len(low)))
         s = predict(calibration, q)[:, :, indices]
-        found += list(q[((s >= -0.5) & (s <= asked.image_size - 0.5)).all(axis=(1, 2, 3))])
+        found += list(q[((s >= -0.5) & (s <= demands.image_size - 0.5)).all(axis=(1, 2, 3))])
         if len(found) >= LOOKED_AT:
             break
     return np.array(found[:LOOKED_AT]).reshape(-1, len(low))

@@ -10,6 +10,9 @@ from projservo_cli.guidance.goals import STARTS, Aim, new_bench, put_goals
 from projservo_cli.guidance.search import Tree, drop_corners, first_straight, grow, new_tree, shorten
 from projservo_cli.guidance.timing import Pace, new_pace, put_corners, put_pace, put_path
 from projservo_cli.guidance.validity import (
+    CLEAR,
+    FRONT,
+    LIMITS,
     MARGINS,
     NO_SPREAD,
     SHARE,
@@ -54,6 +57,36 @@ class Way(NamedTuple):
     trees: tuple[Tree, Tree] | None  # from the start and from the goals, where they were grown
     failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
     had: FloatArray  # (10,) margins of the start
+
+    def why_none(self) -> str:
+        """Why no way was found, in words."""
+        if self.solutions == 0:
+            return "no joints were found that show the goal"
+        if len(self.goals) == 0:
+            return (
+                f"all {self.hidden} joint vectors that show the goal, whole turns apart, lie beyond the "
+                "joint limits or do not show the face to both cameras"
+            )
+        if not (self.had > 0.0).all():
+            return f"the start is already at or beyond {self._told(int(self.had.argmin()))}"
+        at = self._told(int(self.failures[:MARGINS].argmax()))
+        return (
+            f"no way was found to any of {len(self.goals)} joint vectors that show the goal, in {self.draws} "
+            f"samples; what stopped most was {at}"
+        )
+
+    def _told(self, margin: int) -> str:
+        if margin == LIMITS:
+            return f"the limits of joint {int(self.failures[MARGINS:].argmax()) + 1}"
+        if margin == CLEAR:
+            return "a region that is kept out of"
+        kind, view = (margin - FRONT) // 2, ("left", "right")[(margin - FRONT) % 2]
+        return (
+            f"a marker behind the {view} camera",
+            f"the face edge-on to the {view} camera",
+            f"the width of the face in the {view} image",
+            f"the border of the {view} image",
+        )[kind]
 
 
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
@@ -174,7 +207,8 @@ def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Tri
     keep = np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > 1e-12]
     path = np.ascontiguousarray(path[keep])
     if len(path) == 1:
-        path = np.vstack([path, path])
+        at, still = np.vstack([path, path]), np.zeros((2, path.shape[1]))
+        return Pace(np.array([0.0, 1.0]), at, still, still[:1], np.zeros(2), np.zeros(2))
     sizes, pace = np.zeros(len(path)), new_pace(len(path), path.shape[1])
     put_corners(c, path, len(path), sizes, np.empty((2, path.shape[1])), trial)
     count = put_path(c, path, len(path), sizes, pace)

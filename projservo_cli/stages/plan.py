@@ -1,7 +1,8 @@
 """Stage plan: the task's partition, where the face stays visible, and a motion that keeps it so."""
 
 import math
-from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +13,32 @@ from projservo_cli.config.models import Trajectory
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
-from projservo_cli.geometry.kinematics import forward_kinematics, project
+from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
+from projservo_cli.guidance.goals import Aim
+from projservo_cli.guidance.timing import Pace, joints_at
+from projservo_cli.guidance.validity import (
+    NO_SPREAD,
+    Asked,
+    Spread,
+    constraints_of,
+    spread_of,
+)
+from projservo_cli.guidance.way import Search, Way, find_way
 from projservo_cli.loop.trial import begin
-from projservo_cli.records import Calibration, FloatArray, Model, Plan, WorkFailed, in_sense
+from projservo_cli.records import (
+    PRISMATIC,
+    Calibration,
+    FloatArray,
+    InputError,
+    Model,
+    Plan,
+    WorkFailed,
+    in_sense,
+)
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.world import face_numbers
+from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.margins import (
     BEHIND,
@@ -29,7 +50,9 @@ from projservo_cli.task.margins import (
     Demands,
     Reaching,
     along,
+    along_joints,
     limit_margin,
+    within,
 )
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.planning import Path, least_time, plan_path
@@ -55,14 +78,18 @@ def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> F
     least = float(eased[-1])
     if duration is None:
         return eased
+    _require_time(duration, least)
+    if not least > 0.0:
+        eased = _from_rest(sigma * duration, ramp)
+    return np.asarray(eased * (duration / eased[-1]))
+
+
+def _require_time(duration: float, least: float) -> None:
     if least > duration:
         raise WorkFailed(
             f"trajectory.duration_s {duration:g}: the joint-speed limit lets the motion take {least:.4g} s "
             "or more: give it longer, or null for as short as that"
         )
-    if not least > 0.0:
-        eased = _from_rest(sigma * duration, ramp)
-    return np.asarray(eased * (duration / eased[-1]))
 
 
 def _from_rest(time: FloatArray, ramp: float) -> FloatArray:
@@ -94,7 +121,7 @@ def _verdict_of(path: Path) -> tuple[bool, str, str]:
     words = _words(path, nearest, int(np.argmin(shares[:, nearest]) if holds else np.argmax(margins <= 0.0)))
     if holds:
         return True, name, f"all constraints hold; nearest is {name}: {words}"
-    return False, name, f"no path was found that keeps all constraints; {name} fails first: {words}"
+    return False, name, f"{name} fails first: {words}"
 
 
 def _words(path: Path, constraint: int, instant: int) -> str:
@@ -145,29 +172,134 @@ class _Found(NamedTuple):
 
     judged: Path  # where the constraints were looked at
     motion: Path  # as it is stored, at the instants sigma
-    shortest: FloatArray  # (s,) times of the motion as fast as the joints can go, s; NaN where nothing limits
+    time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
+    feasible: bool
+    reason: str  # feasible, reason: whether it may be followed, in words
+    way: Way | None = None  # through joint space, where one was looked for
 
 
-def _coupled(reaching: Reaching, sigma: FloatArray) -> _Found:
+def _coupled(reaching: Reaching, trajectory: Trajectory) -> _Found:
     """Shares of translation and rotations that keep all constraints, [RH00] section 4.3."""
+    sigma = np.linspace(0.0, 1.0, trajectory.samples)
     judged = plan_path(reaching)
     mu = judged.at(sigma)
     motion = Path(judged.reaching, mu, along(judged.reaching, mu))
     if judged.holds() and not motion.holds():  # between the places that were looked at
         judged = motion
-    return _Found(judged, motion, sigma * judged.duration())
+    feasible, _, reason = _verdict_of(judged)
+    reason = reason if feasible else f"no path was found that keeps all constraints; {reason}"
+    return _Found(judged, motion, _timed(sigma * judged.duration(), sigma, trajectory), feasible, reason)
 
 
-# Ways to a motion that search for one; the other profiles are shares of the paper, taken as they are.
-_SEARCHED: dict[str, Callable[[Reaching, FloatArray], _Found]] = {"constrained": _coupled}
-
-
-def _given(profile: str, reaching: Reaching, sigma: FloatArray, pure_translation: float) -> _Found:
+def _given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> _Found:
     """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
+    sigma = np.linspace(0.0, 1.0, trajectory.samples)
     mu = profile_shares(profile, sigma, pure_translation)
     motion, speed = Path(reaching, mu, along(reaching, mu)), reaching.demands.speed
     shortest = least_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
-    return _Found(motion, motion, shortest)
+    time = _timed(shortest, sigma, trajectory)
+    return _Found(motion, motion, time, *_in_sight(profile, motion.along))
+
+
+class JointSearch(NamedTuple):
+    """What the profile ``joint`` takes beside model, images and demands."""
+
+    acceleration: FloatArray  # (n,) most joint acceleration, rad/s² or m/s²
+    q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
+    sigma: float  # standard deviation of a coordinate of the images of the goal, px
+    spread: Spread = NO_SPREAD  # how far predictions err
+
+
+def _search_of(scenario: Scenario) -> JointSearch:
+    """What a scenario tells of a search through joint space."""
+    calibration, spread = scenario.calibration, NO_SPREAD
+    if calibration is not None:
+        numbers = scenario.numbers if len(scenario.ends.body.M) else scenario.numbers[: scenario.m]
+        known, demands = calibration.marker.tolist(), scenario.demands
+        spread = _spread(
+            calibration,
+            tuple(known.index(number) for number in numbers),
+            scenario.m,
+            (tuple(demands.lower), tuple(demands.upper), tuple(demands.image_size)),
+            scenario.config.trajectory.search.seed,
+        )
+    sigma = scenario.noise_px / math.sqrt(scenario.config.noise.shown_frames)
+    return JointSearch(scenario.joints.acceleration, scenario.q_shown, sigma, spread)
+
+
+@lru_cache(maxsize=64)
+def _spread(
+    calibration: Calibration,
+    indices: tuple[int, ...],
+    m: int,
+    bounds: tuple[tuple[float, ...], ...],
+    seed: int,
+) -> Spread:
+    """How far predictions of a calibration err, the same for every task; it takes 20 ms."""
+    lower, upper, size = (np.array(bound) for bound in bounds)
+    demands = within(lower, upper)._replace(image_size=size)
+    return spread_of(calibration, np.array(indices), m, demands, seed)
+
+
+def _body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> FloatArray:
+    """Points (b, 4) of the body at the start, face first; the face A (m, 4) alone without a body."""
+    if len(task.body.M) == 0:
+        return A
+    seen = straight_views(model.lens, shown.s_start)
+    fit = fit_body(model.P, task.body, seen, forward(model, shown.q_start), SETTLED, np.zeros((6, 7)))
+    return np.asarray(task.body.M @ as_array(fit.H).T)
+
+
+# What is left of the images, px, where joints are interpolated between the places that are stored.
+_INTERPOLATED_PX = 0.05
+
+
+def _through_joints(
+    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, search: JointSearch
+) -> _Found:
+    """A way through joint space for a body at A (b, 4); the linear motion where there is none."""
+    model, demands = reaching.model, reaching.demands
+    margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
+    keep = np.where(model.joint_types == PRISMATIC, *margins).astype(np.float64)
+    c = constraints_of(model, A, task, reaching.q_start, Asked(demands, keep, trajectory.least_face_px))
+    aim = Aim(task.A_star, straight_views(model.lens, task.s_star), search.sigma)
+    how = Search(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
+    c = c._replace(spread=search.spread)
+    way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
+    if way.pace is None:
+        linear = _given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
+        q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
+        still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
+        motion = linear.motion._replace(along=still)
+        return _Found(linear.judged, motion, unknown, False, way.why_none(), way)
+    found = _sampled(reaching, way.pace, trajectory.samples)
+    least = float(way.pace.time[-1])
+    duration = least if trajectory.duration_s is None else trajectory.duration_s
+    _require_time(duration, least)
+    motion = Path(reaching, np.full((len(found.q), 3), np.nan), found)
+    time = np.linspace(0.0, duration, len(found.q))
+    return _Found(motion, motion, time, True, _found_words(way), way)
+
+
+def _sampled(reaching: Reaching, pace: Pace, samples: int) -> Along:
+    """The motion at so many places even in time, or more where joints between them were too far off."""
+    while True:
+        q = joints_at(pace, np.linspace(0.0, float(pace.time[-1]), 2 * samples - 1))
+        found, between = along_joints(reaching, q[::2]), 0.5 * (q[:-2:2] + q[2::2])
+        off = along_joints(reaching, q[1::2]).view.s - along_joints(reaching, between).view.s
+        if np.abs(off).max() <= _INTERPOLATED_PX:
+            return found
+        samples = 2 * samples - 1
+
+
+def _found_words(way: Way) -> str:
+    g = int(np.abs(way.goals - way.corners[-1]).max(axis=1).argmin())
+    how = "a straight way" if way.straight else f"a way through {len(way.corners) - 2} corners"
+    some = f"the {len(way.goals)} nearest of " if way.shown > len(way.goals) else ""
+    return (
+        f"{how} in joint space, after {way.draws} samples, leads to joints {g + 1} of {some}{way.shown} that "
+        "show the goal"
+    )
 
 
 def _partitioned(
@@ -185,8 +317,8 @@ def _partitioned(
 
 
 def rehearses(profile: str) -> bool:
-    """Whether half turns are rehearsed; a way that searches compares both senses by itself."""
-    return profile not in _SEARCHED
+    """Whether half turns are rehearsed; where shares are searched for both senses are compared."""
+    return profile not in ("constrained", "auto")
 
 
 def _joint_motions(state: State) -> FloatArray:
@@ -240,44 +372,88 @@ def run(config: Config, calibration: Calibration) -> Plan:
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    scenario = scenario_of(config, calibration)
-    return plan_task(scenario.model, scenario.ends, config.trajectory, scenario.demands)
+    return _plan_of(scenario_of(config, calibration))
 
 
-def plan_task(model: Model, shown: Shown, trajectory: Trajectory, demands: Demands) -> Plan:
+def _plan_of(scenario: Scenario) -> Plan:
+    trajectory = scenario.config.trajectory
+    search = _search_of(scenario) if trajectory.profile in ("joint", "auto") else None
+    return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
+
+
+def plan_task(
+    model: Model, shown: Shown, trajectory: Trajectory, demands: Demands, search: JointSearch | None = None
+) -> Plan:
     """Plan from the images of the face at the start and at the goal, [RH00] section 4.
 
     trajectory : the motion that is asked for.
     demands : what the motion must keep to; profiles of the paper are only measured against it.
+    search : what a search through joint space takes, for the profiles ``joint`` and ``auto``.
     Raises WorkFailed if a marker cannot be triangulated, a motion is not unique or the joints would be too
-    fast.
+    fast; InputError for the profile ``joint`` where a joint has no speed limit.
     """
-    profile, sigma, face = trajectory.profile, np.linspace(0.0, 1.0, trajectory.samples), shown.by_points()
+    if trajectory.profile != "auto":
+        return _planned(model, shown, trajectory, demands, search)[0]
+    before: list[str] = []
+    for profile in ("linear", "constrained", "joint"):
+        asked = trajectory.model_copy(update={"profile": profile})
+        last = profile == "joint" or (profile == "constrained" and bool(_closed(model, demands)))
+        try:
+            plan, fails = _planned(model, shown, asked, demands, search)
+        except WorkFailed as error:
+            if last:
+                raise
+            before.append(f"not {profile}: {error}")
+            continue
+        if not fails or last:
+            closed = [] if profile == "joint" or not fails else [f"not joint: {_closed(model, demands)}"]
+            return replace(plan, reason="; ".join([plan.reason, *before, *closed]))
+        before.append(f"not {profile}: {fails}")
+    raise AssertionError(before)
+
+
+def _closed(model: Model, demands: Demands) -> str:
+    """Why no way through joint space can be given a time; empty where it can."""
+    for i in np.flatnonzero(~np.isfinite(demands.speed)):
+        kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
+        unit = "m_s" if kind == "prismatic" else "deg_s"
+        return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
+    return ""
+
+
+def _planned(
+    model: Model, shown: Shown, trajectory: Trajectory, demands: Demands, search: JointSearch | None
+) -> tuple[Plan, str]:
+    """Plan of one profile, and what of its constraints fails, in words; empty where all hold."""
+    profile, face = trajectory.profile, shown.by_points()
     state, task, parts, note = _partitioned(model, shown, profile, demands.lower, demands.upper)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
     tau_limit = min((trajectory.delta * t for t in tau_0 if t > 0.0), default=math.inf)
     reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start)
-    if profile in _SEARCHED:
-        judged, motion, shortest = _SEARCHED[profile](reaching, sigma)
+    if profile == "joint":
+        if search is None or _closed(model, demands):
+            raise InputError(f"the profile joint: {_closed(model, demands) or 'no search was given'}")
+        A = _body_at_start(model, task, shown, state.A)
+        found = _through_joints(reaching, A, task, trajectory, search)
+    elif profile == "constrained":
+        found = _coupled(reaching, trajectory)
     else:
         share = tau_limit / parts.tau if parts.tau > 0.0 else 1.0
-        judged, motion, shortest = _given(profile, reaching, sigma, share)
-    time = _timed(shortest, sigma, trajectory)
+        found = _given(profile, reaching, trajectory, share)
+    motion, time, way = found.motion, found.time, found.way
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     view = motion.along.view
-    if len(shown.q_start) < COORDINATES:
+    if len(shown.q_start) < COORDINATES and way is None:
         _require_in_span(model, state.A, shown.q_start, view.s)
     sense, sense_margin = _senses(parts, task)
-    feasible, constraint, reason = _verdict_of(judged)
-    if profile not in _SEARCHED:
-        feasible, reason = _in_sight(profile, motion.along)
-    least, least_mu = _least(judged)
-    return Plan(
+    holds, constraint, words = _verdict_of(found.judged)
+    least, least_mu = _least(found.judged)
+    plan = Plan(
         profile=profile,
-        feasible=feasible,
-        reason=reason + note,
+        feasible=found.feasible,
+        reason=found.reason + ("" if way else note),
         tau=tau,
         theta_r=theta_r,
         theta_p=theta_p,
@@ -285,7 +461,7 @@ def plan_task(model: Model, shown: Shown, trajectory: Trajectory, demands: Deman
         constraint=constraint,
         duration=float(time[-1]) if math.isfinite(time[-1]) else None,
         tau_limit=tau_limit,
-        sigma=sigma,
+        sigma=np.linspace(0.0, 1.0, len(time)),
         time=time,
         mu=motion.mu,
         H_d=view.H_d,
@@ -316,7 +492,10 @@ def plan_task(model: Model, shown: Shown, trajectory: Trajectory, demands: Deman
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
+        goals=None if way is None else way.shown,
+        samples=None if way is None else way.draws,
     )
+    return plan, "" if holds or (way is not None and found.feasible) else words
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:
@@ -366,7 +545,7 @@ def rotation_sense(scenario: Scenario) -> FloatArray:
     """Joint motions (2, n) of both rotations in the sense of the plan; few profiles need all of that."""
     trajectory, joints = scenario.config.trajectory, scenario.joints
     if not rehearses(trajectory.profile):
-        return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands).rotation_sense()
+        return _plan_of(scenario).rotation_sense()
     ends = scenario.model, scenario.ends
     state, _, parts, _ = _partitioned(*ends, trajectory.profile, joints.lower, joints.upper)
     return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

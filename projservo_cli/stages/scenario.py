@@ -62,6 +62,7 @@ class Scenario:
     observed: tuple[int, ...]  # numbers of all markers that the robot observes, in its order
     exact: Shown  # start and goal without noise; predicted for a robot that is not simulated
     true_ends: Ends  # where the true robot holds the tool; NaN where nobody knows
+    q_shown: FloatArray  # (k, n) joints at which the goal was shown, rad or m; k is 0 where nobody knows
     noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
     gains: Gains
     limits: Limits  # gains, limits: of the laws, and when a run ends
@@ -96,7 +97,8 @@ class Scenario:
     def demands(self) -> Demands:
         """What the planned motion must keep to, as configured."""
         size = np.array(image_size_of(self.config) or (math.inf, math.inf), dtype=np.float64)
-        limits, trajectory = self.joints[1:], self.config.trajectory
+        joints, trajectory = self.joints, self.config.trajectory
+        limits = joints.lower, joints.upper, joints.speed
         return Demands(*limits, size, trajectory.border_px, trajectory.least_condition)
 
     def believed_by(self, law: str) -> Model:
@@ -180,10 +182,10 @@ def scenario_of(config: Config, calibration: Calibration | None = None) -> Scena
         pins = tuple(number for number in observed if number in known and number not in face)
         body = _body(calibration or truth, tuple(known.index(number) for number in (*face, *pins)))
     if truth is not None:
-        exact, ends = _simulated_ends(config.task, joints.types, truth, pins, center)
+        exact, ends, q_goal = _simulated_ends(config.task, joints.types, truth, pins, center)
     else:
         assert calibration is not None
-        exact, ends = _predicted_ends(config, calibration, joints, (*face, *pins), center)
+        exact, ends, q_goal = _predicted_ends(config, calibration, joints, (*face, *pins), center)
     return Scenario(
         config,
         calibration,
@@ -193,6 +195,7 @@ def scenario_of(config: Config, calibration: Calibration | None = None) -> Scena
         observed,
         exact._replace(body=body),
         ends,
+        np.empty((0, len(joints.types))) if q_goal is None else q_goal[None],
         sigma_px,
         _gains(config, joints),
         _limits(config, joints, sigma_px),
@@ -273,8 +276,8 @@ def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
 @lru_cache(maxsize=2048)
 def _simulated_ends(
     task: TaskSettings, types: str, truth: Truth, pins: tuple[int, ...], center: int
-) -> tuple[Shown, Ends]:
-    """What the ends of a task look like, for any seed and noise."""
+) -> tuple[Shown, Ends, FloatArray | None]:
+    """What the ends of a task look like, for any seed and noise, and the joints (n,) at the goal."""
     M_pins, robot = truth.of(pins), truth.robot
 
     def images(q: FloatArray, key: str) -> FloatArray:
@@ -284,7 +287,7 @@ def _simulated_ends(
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
     shown, q_goal = _shown(task, types, len(pins), center, images, lambda q: truth.turned(q, task.goal))
-    return shown, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal)
+    return shown, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
 def _shown(
@@ -320,8 +323,8 @@ def _unknown(base_tool: FloatArray) -> Ends:
 
 def _predicted_ends(
     config: Config, calibration: Calibration, joints: Joints, numbers: Sequence[int], center: int
-) -> tuple[Shown, Ends]:
-    """Start and goal of a robot that is not simulated, as the calibration predicts their images."""
+) -> tuple[Shown, Ends, FloatArray | None]:
+    """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
     task = config.task
     assert task is not None
     m, known = len(face_numbers(config)), calibration.marker.tolist()
@@ -343,8 +346,8 @@ def _predicted_ends(
             raise InputError("task.goal.turn_deg needs the model of the robot: give joints or images instead")
         return truth_of(config).turned(q, task.goal)
 
-    shown, _ = _shown(task, joints.types, len(numbers) - m, center, images, turn)
-    return shown, _unknown(np.full((4, 4), np.nan))
+    shown, q_goal = _shown(task, joints.types, len(numbers) - m, center, images, turn)
+    return shown, _unknown(np.full((4, 4), np.nan)), q_goal
 
 
 def plant_of(config: Config, truth: Truth, q_start: FloatArray) -> Plant:

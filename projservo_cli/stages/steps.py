@@ -22,10 +22,15 @@ STAGES = ("calibrate", "plan", "servo", "report")
 # What of the configuration each stage depends on, beside the stage before it.
 _WORLD = ("robot", "rig", "markers")
 _TASK = ("seed", *_WORLD, "noise.servo_px", "noise.shown_frames", "task")
-_SPEED = ("control.joint_speed_limit_deg_s", "control.prismatic_speed_limit_m_s")
+_PACE = (
+    "control.joint_speed_limit_deg_s",
+    "control.prismatic_speed_limit_m_s",
+    "control.joint_acceleration_limit_deg_s2",
+    "control.prismatic_acceleration_limit_m_s2",
+)
 _DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "calibrate": ("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start"),
-    "plan": (*_TASK, "trajectory", "control.observation", "plant.use", *_SPEED),
+    "plan": (*_TASK, "trajectory", "control.observation", "plant.use", *_PACE),
     "servo": (*_TASK, "trajectory.delta", "control", "plant", "disturbance", "stop"),
     "report": ("report", "control.must_converge"),
 }

@@ -23,6 +23,10 @@ def reference_of(config: Config) -> JointVector | None:
     return config.calibration.reference or (config.task.start if config.task is not None else None)
 
 
+# Accelerations that the profile joint takes where no limit is given, deg/s² and m/s².
+_ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
+
+
 class Joints(NamedTuple):
     """What a configuration says of the joints."""
 
@@ -30,6 +34,7 @@ class Joints(NamedTuple):
     lower: FloatArray
     upper: FloatArray  # lower, upper: (n,) limits, rad or m; infinite where none is set
     speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
+    acceleration: FloatArray  # (n,) most in the profile joint, rad/s² or m/s²
 
 
 def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
@@ -51,7 +56,10 @@ def joints_of(config: Config, default_types: str = "") -> Joints:
     prismatic = math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s
     lower, upper = np.array(bounds, dtype=np.float64).reshape(-1, 2).T.copy()
     speed = np.array([prismatic if kind == "P" else revolute for kind in types])
-    return Joints(types, lower, upper, speed)
+    turning = math.radians(c.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2)
+    sliding = c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2
+    acceleration = np.array([sliding if kind == "P" else turning for kind in types])
+    return Joints(types, lower, upper, speed, acceleration)
 
 
 def has_task(config: Config) -> bool:

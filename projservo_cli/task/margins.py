@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, apply, axpy, dot, mat, put_mat, put_vec, vec
+from projservo_cli.geometry.algebra import Mat4, apply, axpy, dot, mat, mul, put_mat, put_vec, vec
 from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize
-from projservo_cli.geometry.kinematics import backward, image_velocity, operators_at, project
+from projservo_cli.geometry.kinematics import backward, forward, image_velocity, operators_at, project
 from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, reach, span_of, workspace
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.trajectory import displaced
@@ -116,9 +116,14 @@ def _put_displaced(reaching: Reaching, mu: FloatArray, H_d: FloatArray, visibili
 
 def view_at(reaching: Reaching, mu: FloatArray) -> _Seen:
     """What both cameras have of the face at the shares mu (s, 3)."""
-    model = reaching.model
     H_d, visibility = np.empty((len(mu), 4, 4)), np.empty((len(mu), 2))
     _put_displaced(reaching, np.ascontiguousarray(mu), H_d, visibility)
+    return _seen(reaching, H_d, visibility)
+
+
+def _seen(reaching: Reaching, H_d: FloatArray, visibility: FloatArray) -> _Seen:
+    """What both cameras have of the face after displacements (s, 4, 4)."""
+    model = reaching.model
     M = reaching.A @ np.swapaxes(H_d, 1, 2)
     images = np.moveaxis(project(model.P, M, model.lens), 0, 1)
     depth, at_start = M @ model.P[:, 2].T, reaching.A @ model.P[:, 2].T
@@ -237,7 +242,36 @@ def along(reaching: Reaching, mu: FloatArray) -> Along:
                 break
         if math.isnan(condition[i]):
             break
-    view, demands = view_at(reaching, mu), reaching.demands
+    return _margins(view_at(reaching, mu), q, condition, reaching.demands)
+
+
+@njit
+def _put_moved(
+    carrier: _Carrier, q: FloatArray, H_d: FloatArray, visibility: FloatArray, condition: FloatArray
+) -> None:
+    """Write displacements (s, 4, 4), visibility (s, 2) and reciprocal conditions (s,) at joints (s, n)."""
+    reaching, model = carrier.reaching, carrier.reaching.model
+    a, start = vec(reaching.a), forward(model, reaching.q_start)
+    back = backward(model, reaching.q_start)
+    for i in range(q.shape[0]):
+        H = mul(operators_at(model, q[i], carrier.work.H_hat), back)
+        put_mat(H_d[i], H)
+        condition[i] = _reciprocal_condition(carrier, H)
+        H_back = mul(start, backward(model, q[i]))
+        for view in range(2):
+            O = vec(reaching.O[view])
+            visibility[i, view] = dot(a, apply(H_back, O)) / dot(a, O)
+
+
+def along_joints(reaching: Reaching, q: FloatArray) -> Along:
+    """Margins at joints (s, n), whose displacements are those of the forward kinematics, [RH00] eq. (6)."""
+    H_d, visibility, condition = np.empty((len(q), 4, 4)), np.empty((len(q), 2)), np.empty(len(q))
+    _put_moved(carrier_of(reaching), np.ascontiguousarray(q), H_d, visibility, condition)
+    return _margins(_seen(reaching, H_d, visibility), q, condition, reaching.demands)
+
+
+def _margins(view: _Seen, q: FloatArray, condition: FloatArray, demands: Demands) -> Along:
+    """All margins along a path of joints (s, n)."""
     limit = limit_margin(q, demands).min(axis=1)
     margins = np.stack(
         [

@@ -9,6 +9,7 @@ from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweep.design import random_tasks
+from projservo_cli.task.margins import Demands
 from projservo_cli.task.target import Shown
 from tests.known import configured
 
@@ -34,14 +35,15 @@ def _drawn(name):
     return truth, joints, random_tasks(truth, front, COUNT, np.random.default_rng(3))
 
 
-def case(name, k, **asked):
+def case(name, k):
     """Random task k of a configuration."""
     truth, joints, tasks = _drawn(name)
     q_start, q_goal = tasks[0][k], tasks[1][k]
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
     task = Shown(q_start, s_start, s_star, truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
-    limits = Asked(joints.lower, joints.upper, joints.speed, truth.image_size)._replace(**asked)
-    acceleration = np.array([2.0 if kind == "P" else np.radians(500.0) for kind in joints.types])
-    c = constraints_of(truth.model, A, task, q_start, limits)
-    return Case(truth, q_start, q_goal, c, Aim(task.A_star, s_star, 0.0), acceleration)
+    speed = np.where(np.isfinite(joints.speed), joints.speed, 1.0)
+    demands = Demands(joints.lower, joints.upper, speed, truth.image_size, 5.0, 0.0)
+    keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])
+    c = constraints_of(truth.model, A, task, q_start, Asked(demands, keep, 8.0))
+    return Case(truth, q_start, q_goal, c, Aim(task.A_star, s_star, 0.0), joints.acceleration)
