@@ -66,7 +66,7 @@ REGISTER = (
     _entry(
         "6",
         "Forward kinematics as a product of exponentials",
-        "geometry.kinematics.forward calibration.forward.moved_points",
+        "geometry.kinematics.forward geometry.kinematics.forward_between calibration.forward.moved_points",
         "geometry/test_kinematics.py::test_forward_kinematics_is_the_product_of_exponentials",
     ),
     _entry(

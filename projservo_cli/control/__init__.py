@@ -9,7 +9,7 @@ from projservo_cli.control.law import LOST, OK, Gains, Law, State, speed_share
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray
-from projservo_cli.task.trajectory import Reference, following, put_aim
+from projservo_cli.task.trajectory import Reference, following, near_way, put_aim, under_way
 
 _DIRECT_THREE, _DIRECT_TWO, _STACKED = direct_three.CODE, direct_two.CODE, stacked.CODE
 _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = blockwise.CODE, euclidean_points.CODE, exact.CODE
@@ -43,7 +43,7 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
         seen = state.straight
     if following(task.reference):
         lead = 1.0 / (gains.gain * gains.period)
-        put_aim(task.reference, float(state.clock[0]), lead, state.A_aim, state.s_aim, state.q_ahead)
+        put_aim(model, task.reference, float(state.clock[0]), lead, state.A_aim, state.s_aim, state.q_ahead)
     if code == _DIRECT_THREE:
         status = direct_three.direct_three(model, task, gains, seen, q, state)
     elif code == _DIRECT_TWO:
@@ -57,8 +57,25 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
     else:
         status = exact.exact(model, task, gains, seen, q, state)
     if following(task.reference):
-        _go_on(task.reference, gains, status, code == _EXACT, state)
+        limited = code == _EXACT
+        if status != LOST and under_way(task.reference, float(state.clock[0])):
+            _keep_near(task.reference, gains, q, status == OK, state)
+            status, limited = OK, False
+        _go_on(task.reference, gains, status, limited, state)
     return status
+
+
+@merged
+def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, state: State) -> None:
+    """Keep the joints near a way through joint space, and within their limits, whatever the images ask for.
+
+    unique : whether the law found a joint motion; else the joints follow the way alone.
+    """
+    for i in range(q.shape[0]):
+        step = gains.period * state.q_dot[i] if unique else state.q_ahead[i]
+        q_next = near_way(reference, float(state.clock[0]) + 1.0, i, q[i] + step)
+        state.q_dot[i] = (min(max(q_next, gains.lower[i]), gains.upper[i]) - q[i]) / gains.period
+    state.parts[0], state.blocked[0] = 0, -1
 
 
 @merged

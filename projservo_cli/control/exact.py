@@ -27,7 +27,7 @@ from projservo_cli.geometry.mechanisms import SETTLED, Seen, reach
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
-from projservo_cli.task.trajectory import following, planned_step
+from projservo_cli.task.trajectory import following, planned_step, through_joints, under_way
 
 CODE = 5
 
@@ -103,8 +103,9 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
             state.path[j, i] = state.path[j - 1, i] + part
             predicted += part * part
         goal = _desired(step, j / count)
-        if following(task.reference):
-            goal = mul(planned_step(task.reference, float(state.clock[0]), step.ahead * j / count), goal)
+        if following(task.reference) and not through_joints(task.reference):
+            ahead = planned_step(model, task.reference, float(state.clock[0]), step.ahead * j / count)
+            goal = mul(ahead, goal)
         if not reach(model, face, goal, state.path[j], state.work, SETTLED):
             return False
         taken = 0.0
@@ -163,7 +164,8 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     singularity, where none of them can be solved, the first-order step is taken.
 
     While a plan is followed, the displacement is that of the plan in the next period after the one that
-    takes back what the face is off.
+    takes back what the face is off. Along a way through joint space the joints of the plan lead, and to first
+    order what takes that back is added.
 
     Source: [RH00] eqs. (22), (23) as corrected, solved for the joint step through eq. (6).
     """
@@ -178,6 +180,10 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     whole = _Step(parts, H_s, tau, theta, sense, 1.0, 1)
     if not math.isfinite(_first_order(whole, state)):
         return SINGULAR
+    if under_way(task.reference, float(state.clock[0])):
+        for i in range(q.shape[0]):
+            state.q_dot[i] /= gains.period
+        return OK
     share = speed_share(state.q_dot, gains.speed, gains.period)
     step = _scaled(whole, share, 1)
     most = _first_order(step, state)

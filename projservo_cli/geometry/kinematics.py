@@ -49,6 +49,16 @@ def backward(model: Model, q: FloatArray) -> Mat4:
     return H
 
 
+@internal
+def forward_between(model: Model, q: FloatArray, i: int, x: float) -> Mat4:
+    """Forward kinematics, [RH00] eq. (6), at a share x of the way from row i of joints (k, n) to the next."""
+    H = IDENTITY
+    for l in range(q.shape[1]):
+        amount = (1.0 - x) * float(q[i, l]) + x * float(q[i + 1, l]) - float(model.q_reference[l])
+        H = mul(H, _joint_displacement(mat(model.H_hat_0[l]), model.joint_types[l], amount))
+    return H
+
+
 @njit
 def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     """Joint operators at q, [RH00] eq. (19) with the truncated product H̄_i of (6); returns the whole product.

@@ -8,10 +8,10 @@ import numpy as np
 from projservo_cli.geometry.algebra import mul, translation
 from projservo_cli.geometry.jit import composed
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.geometry.kinematics import forward, operators_at, project
+from projservo_cli.geometry.kinematics import forward, forward_kinematics, operators_at, project
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.geometry.mechanisms import span_of, workspace
-from projservo_cli.records import FloatArray, InputError, Model, Plan, WorkFailed
+from projservo_cli.records import PRISMATIC, FloatArray, InputError, Model, Plan, WorkFailed
 from projservo_cli.task.body import NO_BODY, SETTLED, Body, carry, fit_body
 from projservo_cli.task.face import (
     FOUND,
@@ -28,6 +28,9 @@ from projservo_cli.task.face import (
 from projservo_cli.task.partition import Split, partition
 from projservo_cli.task.trajectory import Reference, both_rotations, trajectory_displacement
 
+# How far images may take the joints from a way through joint space: near a singularity they would lead them
+# astray, and the way keeps as much from the joint limits.
+_ROOM_RAD, _ROOM_M = math.radians(1.0), 0.002
 # A last period that is shorter than this share of one is none.
 _ROUND_OFF = 1e-9
 # Share of a period over which image velocities are differences: what it leaves is the curvature of the
@@ -123,8 +126,9 @@ def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -
     until_next = np.append(np.diff(times), 0.0)
     _, _, _, s_next = _followed_at(model, task, plan, times + _DIFFERENCE * until_next)
     amplitudes = np.array([plan.tau, plan.theta_r, plan.theta_p])
+    room = np.zeros(0) if len(mu) else np.where(model.joint_types == PRISMATIC, _ROOM_M, _ROOM_RAD)
     A, s, ahead = (np.ascontiguousarray(x) for x in (A, s, (s_next - s) / _DIFFERENCE))
-    return task._replace(reference=Reference(plan.H_hat, amplitudes, mu, q, A, s, ahead, rate))
+    return task._replace(reference=Reference(plan.H_hat, amplitudes, mu, q, A, s, ahead, rate, room))
 
 
 def _instants(plan: Plan, period: float) -> FloatArray:
@@ -148,6 +152,8 @@ def _followed_at(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Shares (k, 3), joints (k, n), points (k, m, 4) and straight pixels (k, 2, m, 2) at times (k,), s.
 
+    Of a way through joint space there are no shares, and displacements are those of the joints.
+
     The points are those that the planned displacement carries to where the face should be. What the plan
     is off at the goal is taken back along the path: points where they were measured one by one, and
     images by what the calibration is off there, so that both arrive where the goal was shown.
@@ -156,8 +162,12 @@ def _followed_at(
     mu, q = (
         np.stack([np.interp(sigma, plan.sigma, row) for row in rows.T], axis=1) for rows in (plan.mu, plan.q)
     )
-    amplitudes = plan.tau, plan.theta_r, plan.theta_p
-    H_d = trajectory_displacement(plan.H_hat, amplitudes, np.append(mu, np.ones((1, 3)), axis=0))
+    if np.isnan(mu).any():
+        mu, back = np.empty((0, 3)), np.linalg.inv(forward_kinematics(model, plan.q[0]))
+        H_d = np.array([forward_kinematics(model, row) for row in (*q, plan.q[-1])]) @ back
+    else:
+        amplitudes = plan.tau, plan.theta_r, plan.theta_p
+        H_d = trajectory_displacement(plan.H_hat, amplitudes, np.append(mu, np.ones((1, 3)), axis=0))
     H_d, H_goal = np.swapaxes(H_d[:-1], 1, 2), H_d[-1].T
     A = plan.A @ H_d + sigma[:, None, None] * (task.A_star - plan.A @ H_goal)
     off = straight_views(model.lens, task.s_star) - project(model.P, task.A_star)

@@ -6,7 +6,8 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, apply, mat, mul, put_vec, rotation, translation, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.records import FloatArray
+from projservo_cli.geometry.kinematics import backward, forward_between
+from projservo_cli.records import FloatArray, Model
 
 # Share of the path that a part driven first, or last, has to itself.
 _PLATEAU = 0.5
@@ -74,8 +75,8 @@ class Reference(NamedTuple):
 
     H_hat: FloatArray  # (3, 4, 4) operators t, r, p of the plan
     amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
-    mu: FloatArray  # (k, 3) shares that are done; k is 0 where nothing is followed, else at least 2
-    q: FloatArray  # (k, n) joints that follow, rad or m
+    mu: FloatArray  # (k, 3) shares that are done; none of a way through joint space
+    q: FloatArray  # (k, n) joints, rad or m; k is 0 where nothing is followed, else at least 2
     # (k, m, 4) points of the face, a_inf·A = 1, before the displacement that is planned until then
     A: FloatArray
     s: FloatArray  # (k, 2, m, 2) its pixels as projective cameras see them
@@ -83,6 +84,8 @@ class Reference(NamedTuple):
     s_ahead: FloatArray
     # periods of the plan that a period of the loop is worth: less than 1 where commands are scaled
     rate: float
+    # (n,) how far images may take the joints from a way through joint space, rad or m; none for shares
+    room: FloatArray
 
 
 # Every step plans anew.
@@ -95,19 +98,26 @@ NO_REFERENCE = Reference(
     np.zeros((0, 2, 0, 2)),
     np.zeros((0, 2, 0, 2)),
     1.0,
+    np.zeros(0),
 )
 
 
 @merged
 def following(reference: Reference) -> bool:
     """Whether there is a plan to follow."""
-    return bool(reference.mu.shape[0] > 0)
+    return bool(reference.q.shape[0] > 0)
+
+
+@merged
+def through_joints(reference: Reference) -> bool:
+    """Whether what is followed is a way through joint space."""
+    return bool(reference.room.shape[0] > 0)
 
 
 @merged
 def _place(reference: Reference, clock: float) -> tuple[int, float]:
     """Row before a time in periods, and how far on towards the next; the plan stays where it arrived."""
-    last = reference.mu.shape[0] - 1
+    last = reference.q.shape[0] - 1
     i = min(int(clock), last - 1)
     return i, min(clock, float(last)) - i
 
@@ -119,9 +129,14 @@ def _between(column: FloatArray, i: int, x: float) -> float:
 
 
 @internal
-def planned(reference: Reference, clock: float) -> Mat4:
-    """Displacement from the start that is planned until a time in periods, [RH00] eqs. (17), (18)."""
+def planned(model: Model, reference: Reference, clock: float) -> Mat4:
+    """Displacement from the start that is planned until a time in periods, [RH00] eqs. (17), (18).
+
+    Of a way through joint space it is that of the joints, eq. (6).
+    """
     i, x = _place(reference, clock)
+    if through_joints(reference):
+        return mul(forward_between(model, reference.q, i, x), backward(model, reference.q[0]))
     mu_t = _between(reference.mu[:, 0], i, x)
     mu_r = _between(reference.mu[:, 1], i, x)
     mu_p = _between(reference.mu[:, 2], i, x)
@@ -129,8 +144,28 @@ def planned(reference: Reference, clock: float) -> Mat4:
 
 
 @merged
+def under_way(reference: Reference, clock: float) -> bool:
+    """Whether a way through joint space has not arrived yet."""
+    return through_joints(reference) and clock < reference.q.shape[0] - 1
+
+
+@merged
+def near_way(reference: Reference, clock: float, l: int, wanted: float) -> float:
+    """Where joint l may be at a time in periods: as wanted, but near the way."""
+    i, x = _place(reference, clock)
+    there, room = _between(reference.q[:, l], i, x), float(reference.room[l])
+    return min(max(wanted, there - room), there + room)
+
+
+@merged
 def put_aim(
-    reference: Reference, clock: float, lead: float, A: FloatArray, s: FloatArray, q_ahead: FloatArray
+    model: Model,
+    reference: Reference,
+    clock: float,
+    lead: float,
+    A: FloatArray,
+    s: FloatArray,
+    q_ahead: FloatArray,
 ) -> None:
     """Write where the face should be now, where its images should go, and how the joints lead there.
 
@@ -144,7 +179,7 @@ def put_aim(
     """
     i, x = _place(reference, clock)
     j, y = _place(reference, clock + 1.0)
-    H = planned(reference, clock)
+    H = planned(model, reference, clock)
     for k in range(A.shape[0]):
         for c in range(4):
             A[k, c] = _between(reference.A[:, k, c], i, x)
@@ -158,8 +193,8 @@ def put_aim(
 
 
 @merged
-def planned_step(reference: Reference, clock: float, share: float) -> Mat4:
-    """Displacement that the plan makes from a time on in a share of a period."""
+def planned_step(model: Model, reference: Reference, clock: float, share: float) -> Mat4:
+    """Displacement that a plan of shares makes from a time on in a share of a period."""
     mu = reference.mu
     i, x = _place(reference, clock)
     H_r, H_p = mat(reference.H_hat[1]), mat(reference.H_hat[2])
@@ -168,5 +203,5 @@ def planned_step(reference: Reference, clock: float, share: float) -> Mat4:
     tau = _between(mu[:, 0], i, x) * float(reference.amplitudes[0])
     turned_back = mul(rotation(H_p, -theta_p), rotation(H_r, -theta_r))
     return mul(
-        planned(reference, clock + share), mul(turned_back, translation(mat(reference.H_hat[0]), -tau))
+        planned(model, reference, clock + share), mul(turned_back, translation(mat(reference.H_hat[0]), -tau))
     )

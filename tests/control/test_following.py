@@ -55,7 +55,7 @@ def test_the_motion_of_a_period_is_the_quotient_of_planned_displacements():
         ]
         amplitudes = (plan.tau, plan.theta_r, plan.theta_p)
         before, after = (trajectory_displacement(plan.H_hat, amplitudes, np.array(row)) for row in mu)
-        found = np.array(planned_step(reference, clock, share)).reshape(4, 4)
+        found = np.array(planned_step(sc.seen(frame(1)), reference, clock, share)).reshape(4, 4)
         assert found == pytest.approx(after @ np.linalg.inv(before), abs=1e-12)
 
 
@@ -66,7 +66,7 @@ def test_the_reference_ends_at_the_goal_that_was_shown():
     assert following(reference)
     assert not following(NO_REFERENCE)
     assert reference.A[0] == pytest.approx(plan.A, abs=1e-12)
-    goal = np.array(planned_at(reference, 1e9)).reshape(4, 4)
+    goal = np.array(planned_at(sc.seen(frame(2)), reference, 1e9)).reshape(4, 4)
     assert reference.A[-1] @ goal.T == pytest.approx(task.A_star, abs=1e-12)
     assert reference.s[-1] == pytest.approx(sc.s_star, abs=1e-9)
     assert (reference.s_ahead[-1] == 0.0).all()
@@ -101,7 +101,7 @@ def test_the_speed_limit_slows_the_plan_and_never_bends_the_path():
     assert run.log.factor[: run.steps - 4] == pytest.approx(0.5, abs=0.04)
     reference = tracked(sc, plan=run.plan).reference
     clock = np.r_[0.0, np.cumsum(run.log.factor[: run.steps])]
-    goal = np.array([planned_at(reference, float(time)) for time in clock]).reshape(-1, 4, 4)
+    goal = np.array([planned_at(sc.model, reference, float(time)) for time in clock]).reshape(-1, 4, 4)
     assert run.log.H @ np.linalg.inv(run.log.H[0]) == pytest.approx(goal, abs=1e-9)
 
 

@@ -1,0 +1,165 @@
+"""Plans of the profiles joint and auto, and runs that follow them to the goal."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from projservo_cli.calibration import predict
+from projservo_cli.config.robot import JointVector
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages import calibrate, servo
+from projservo_cli.stages import plan as planning
+from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.stages.world import truth_of
+from projservo_cli.sweep.design import random_tasks
+from tests.known import asked, configured
+
+pytestmark = pytest.mark.volume
+COUNT = 6
+
+
+@lru_cache(maxsize=4)
+def calibrated(name):
+    """A configuration with joint limits that end a run, a calibration at 0.5 px, and random tasks."""
+    config = configured(name, "plant.joint_limits=stop", "trajectory.profile=joint", "noise.servo_px=0.5")
+    truth, front = truth_of(config), np.array(config.task.start.values(config.joint_types))
+    return config, calibrate.run(config)[1], random_tasks(truth, front, COUNT, np.random.default_rng(7))
+
+
+@lru_cache(maxsize=16)
+def guided(name, k, profile="joint"):
+    """Configuration, calibration and plan of a random task."""
+    config, calibration, tasks = calibrated(name)
+    start, goal = (JointVector(joints=tuple(q[k].tolist()), unit="rad") for q in tasks)
+    task = config.task.model_copy(update={"start": start, "goal": type(config.task.goal)(joints=goal)})
+    motion = config.trajectory.model_copy(update={"profile": profile})
+    config = config.model_copy(update={"task": task, "trajectory": motion})
+    return config, calibration, planning.run(config, calibration)
+
+
+@pytest.mark.parametrize("k", range(COUNT))
+@pytest.mark.parametrize("name", ["paper", "ur5"])
+def test_a_random_task_is_planned_and_followed_to_its_goal(name, k):
+    config, calibration, plan = guided(name, k)
+    assert plan.feasible
+    assert plan.profile == "joint"
+    assert "joints" in plan.reason
+    assert plan.goals >= 1
+    assert np.isnan(plan.mu).all()
+    assert (plan.margin > 0.0).all()
+    assert (plan.border_distance > 0.0).all()
+    assert (plan.joint_margin > 0.0).all()
+    assert plan.s[-1] == pytest.approx(plan.s_star, abs=6.0)
+    assert np.diff(plan.time) == pytest.approx(plan.duration / (len(plan.time) - 1))
+    # The face is where it was measured at the start, carried by the calibrated joints.
+    face = [calibration.marker.tolist().index(number) for number in config.markers.face]
+    assert predict(calibration, plan.q)[:, :, face] == pytest.approx(plan.s, abs=8.0)
+    for law in ("exact_track", "stacked_image_track"):
+        trace = servo.run(config, calibration, plan, law)
+        assert trace.verdict == "converged"
+        assert trace.planned_s == plan.duration
+        assert not trace.self_occluded.any()
+        assert trace.first_beyond_limit == trace.first_outside_image == -1
+
+
+@pytest.mark.parametrize("law", ["exact_track", "direct_three_track", "direct_two_track"])
+def test_a_way_is_followed_where_and_when_it_was_planned(law):
+    """By a law that is given what the plan was made with, without noise."""
+    config, calibration, _ = guided("ur5", 1)
+    quiet = config.model_copy(update={"noise": config.noise.model_copy(update={"servo_px": 0.0})})
+    plan = planning.run(quiet, calibration)
+    trace = servo.run(quiet, calibration, plan, law)
+    there = int(plan.duration / trace.period)
+    assert trace.speed_factor[:there] == pytest.approx(1.0, abs=0.01)
+    times = np.r_[0.0, np.cumsum(trace.speed_factor)] * trace.period
+    wanted = np.stack([np.interp(times, plan.time, column) for column in plan.q.T], axis=1)
+    assert trace.q[:there] == pytest.approx(wanted[:there], abs=np.radians(1.0) + 1e-9)
+
+
+def test_what_is_stored_tells_the_images_between_its_samples():
+    """Half a pixel's tenth, by the true model: of joints halfway between two that are stored."""
+    _, _, plan = guided("paper", 2)
+    finer = guided("paper", 2)[0].trajectory.model_copy(update={"samples": 4 * len(plan.time) - 3})
+    config = guided("paper", 2)[0].model_copy(update={"trajectory": finer})
+    dense = planning.run(config, guided("paper", 2)[1])
+    times = dense.time
+    q = np.stack([np.interp(times, plan.time, column) for column in plan.q.T], axis=1)
+    truth = truth_of(config)
+    off = [
+        truth.images(a, truth.M_face) - truth.images(b, truth.M_face) for a, b in zip(q, dense.q, strict=True)
+    ]
+    assert np.abs(off).max() < 0.1
+    assert dense.duration == plan.duration
+
+
+def test_auto_is_linear_to_the_bit_where_that_keeps_every_constraint():
+    plans = []
+    for profile in ("linear", "auto"):
+        config = configured("paper", f"trajectory.profile={profile}")
+        plans.append(planning.run(config, calibrated("paper")[1]))
+    for field in fields(plans[0]):
+        np.testing.assert_array_equal(*(getattr(plan, field.name) for plan in plans), err_msg=field.name)
+
+
+def test_auto_says_which_way_it_took_and_why_not_the_ones_before():
+    """On these tasks each of the three ways, and every plan keeps what it promises."""
+    taken = set()
+    for name in ("paper", "ur5"):
+        for k in range(COUNT):
+            _, _, plan = guided(name, k, "auto")
+            taken.add(plan.profile)
+            assert plan.feasible
+            assert ("not linear: " in plan.reason) == (plan.profile != "linear")
+            assert ("not constrained: " in plan.reason) == (plan.profile == "joint")
+            assert (plan.goals is None) == (plan.profile != "joint")
+    assert {"linear", "joint"} <= taken
+
+
+def test_the_duration_is_stretched_but_never_cut():
+    config, calibration, plan = guided("ur5", 0)
+    slow = config.trajectory.model_copy(update={"duration_s": 2.0 * plan.duration})
+    longer = planning.run(config.model_copy(update={"trajectory": slow}), calibration)
+    assert longer.duration == 2.0 * plan.duration
+    np.testing.assert_array_equal(longer.q, plan.q)
+    fast = config.trajectory.model_copy(update={"duration_s": 0.5 * plan.duration})
+    with pytest.raises(WorkFailed, match=r"trajectory\.duration_s.*lets the motion take"):
+        planning.run(config.model_copy(update={"trajectory": fast}), calibration)
+
+
+def test_a_joint_without_a_speed_limit_is_refused_by_its_key():
+    with pytest.raises(InputError, match=r"control\.prismatic_speed_limit_m_s.*as fast as joints can"):
+        configured("stanford", "trajectory.profile=joint", "control.prismatic_speed_limit_m_s=null")
+    scenario = scenario_of(configured("stanford", "control.prismatic_speed_limit_m_s=null"))
+    plan = planning.plan_task(
+        scenario.model, scenario.ends, asked("auto"), scenario.demands._replace(border_px=480.0)
+    )
+    assert not plan.feasible
+    assert "not joint: joint 3 has no speed limit: set control.prismatic_speed_limit_m_s" in plan.reason
+
+
+def test_no_way_is_told_and_the_law_goes_alone():
+    config, calibration, _ = guided("paper", 0)
+    scenario = scenario_of(config, calibration)
+    shut = scenario.ends.q_start - 1e-3, scenario.ends.q_start + 1e-3
+    demands = scenario.demands._replace(lower=shut[0], upper=shut[1])
+    search = planning.JointSearch(scenario.joints.acceleration, scenario.q_shown, 0.5)
+    plan = planning.plan_task(scenario.model, scenario.ends, config.trajectory, demands, search)
+    assert not plan.feasible
+    assert plan.profile == "joint"
+    assert plan.duration is None
+    assert "lie beyond the joint limits" in plan.reason
+    trace = servo.run(config, calibration, plan, "exact_track")
+    assert plan.reason in trace.unplanned
+
+
+def test_plans_in_threads_are_equal_to_the_bit():
+    names = [("paper", k) for k in range(COUNT)]
+    alone = [guided(*name)[2] for name in names]
+    with ThreadPoolExecutor(4) as pool:
+        made = list(pool.map(lambda name: planning.run(*guided(*name)[:2]), names * 2))
+    for here, there in zip(alone * 2, made, strict=True):
+        for field in fields(here):
+            np.testing.assert_array_equal(getattr(here, field.name), getattr(there, field.name))
