@@ -12,7 +12,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import apply, mat, put_vec, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kinematics import operators_at, row
+from projservo_cli.geometry.kinematics import image_velocity, operators_at
 from projservo_cli.guidance.validity import (
     BORDER,
     DEVIATIONS,
@@ -63,6 +63,7 @@ class Bench(NamedTuple):
     J: FloatArray  # (n + 1, 4) derivatives of a point, or its images, by the joints; last what is left
     L: FloatArray  # (n, n + 1) damped and factored
     q: FloatArray  # (n,) trial
+    M: FloatArray  # (2, 4) a point and its derivative
     base: FloatArray  # (k, n) solutions that are no turns of each other
     left: FloatArray  # (k,) their sums of squares, px²
     choice: IntArray  # (n,)
@@ -80,6 +81,7 @@ def new_bench(n: int, b: int) -> Bench:
         np.zeros((n + 1, 4)),
         np.zeros((n, n + 1)),
         np.zeros(n),
+        np.zeros((2, 4)),
         np.zeros((most, n)),
         np.zeros(most),
         np.zeros(n, dtype=np.int64),
@@ -96,30 +98,21 @@ def _put_equations(c: Constraints, aim: Aim, q: FloatArray, images: bool, bench:
     [RH00] eq. (19) for points; eq. (7), second row corrected, for images.
     """
     n = q.shape[0]
-    P, N, J = c.model.P, bench.N, bench.J
+    N, J, M = bench.N, bench.J, bench.M
     H = operators_at(c.model, q, bench.H_hat)
-    for i in range(n):
-        for j in range(n + 1):
-            N[i, j] = 0.0
+    N[:] = 0.0
     total = 0.0
     for k in range(c.face):
-        A = apply(H, vec(c.M[k]))
-        if images:
-            for view in range(2):
-                depth = row(P[view], 2, A)
-                for axis in range(2):
-                    J[n, 2 * view + axis] = float(aim.s_star[view, k, axis]) - row(P[view], axis, A) / depth
-            for i in range(n):
-                D = apply(mat(bench.H_hat[i]), A)
-                for view in range(2):
-                    depth, away = row(P[view], 2, A), row(P[view], 2, D)
-                    for axis in range(2):
-                        pixel = row(P[view], axis, A) / depth
-                        J[i, 2 * view + axis] = (row(P[view], axis, D) - pixel * away) / depth
-        else:
-            put_vec(J[n], sub(vec(aim.A_star[k]), A))
-            for i in range(n):
-                put_vec(J[i], apply(mat(bench.H_hat[i]), A))
+        put_vec(M[0], apply(H, vec(c.M[k])))
+        put_vec(J[n], sub(vec(aim.A_star[k]), vec(M[0])))
+        for i in range(n):
+            put_vec(M[1], apply(mat(bench.H_hat[i]), vec(M[0])))
+            put_vec(J[i], vec(M[1]))
+            for view in range(2 if images else 0):
+                u, v, du, dv = image_velocity(c.model.P[view], M[0], M[1])
+                J[i, 2 * view], J[i, 2 * view + 1] = du, dv
+                J[n, 2 * view] = float(aim.s_star[view, k, 0]) - u
+                J[n, 2 * view + 1] = float(aim.s_star[view, k, 1]) - v
         for i in range(n):
             for j in range(i, n + 1):
                 N[i, j] += (J[i, 0] * J[j, 0] + J[i, 1] * J[j, 1]) + (J[i, 2] * J[j, 2] + J[i, 3] * J[j, 3])
@@ -197,7 +190,7 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench) -> float:
     equations of the images at these joints are in the bench.
     """
     n = q.shape[0]
-    P, L = c.model.P, bench.L
+    L, M = bench.L, bench.M
     total: float = (4.0 * c.face - min(n, 6)) * (
         aim.sigma * aim.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
     )
@@ -208,17 +201,14 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench) -> float:
         for i in range(n):
             bench.N[i, n] = 0.0
         for k in range(c.face):
-            A = apply(H, vec(c.M[k]))
+            put_vec(M[0], apply(H, vec(c.M[k])))
             for view in range(2):
                 du, dv = off(c, q, view, k, j)
                 away += du * du + dv * dv
-                depth = row(P[view], 2, A)
-                u, v = row(P[view], 0, A) / depth, row(P[view], 1, A) / depth
                 for i in range(n):
-                    D = apply(mat(bench.H_hat[i]), A)
-                    far = row(P[view], 2, D)
-                    bench.N[i, n] += (row(P[view], 0, D) - u * far) / depth * du
-                    bench.N[i, n] += (row(P[view], 1, D) - v * far) / depth * dv
+                    put_vec(M[1], apply(mat(bench.H_hat[i]), vec(M[0])))
+                    _, _, u_dot, v_dot = image_velocity(c.model.P[view], M[0], M[1])
+                    bench.N[i, n] += u_dot * du + v_dot * dv
         if _put_step(bench.N, 0.0, L):
             for i in range(n):
                 away -= L[i, n] * bench.N[i, n]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.jit import internal, njit
-from projservo_cli.guidance.validity import Constraints, Trial, put_row, reached, time_between
+from projservo_cli.guidance.validity import Constraints, Trial, reached, time_between
 from projservo_cli.records import FloatArray, IntArray
 
 # Longest edge of a tree, s at the speed limits.
@@ -103,73 +103,6 @@ def grow(
         if there:
             return (node, other, k + 1) if k % 2 == 0 else (other, node, k + 1)
     return -1, -1, draws.shape[0]
-
-
-@njit
-def shorten(
-    c: Constraints, path: FloatArray, count: int, draws: FloatArray, scratch: FloatArray, trial: Trial
-) -> int:
-    """Shorten a path (k, n) of so many corners, in place, by straight ways between two drawn places on it.
-
-    draws : (d, 2) in [0, 1); scratch : (≥ k + 4, n).
-    Returns how many corners are left.
-    """
-    n = path.shape[1]
-    for d in range(draws.shape[0]):
-        if count <= 2:
-            break
-        length = 0.0
-        for k in range(count - 1):
-            length += time_between(c, path[k], path[k + 1])
-        low, high = min(draws[d, 0], draws[d, 1]) * length, max(draws[d, 0], draws[d, 1]) * length
-        done, i_low, i_high, x_low, x_high = 0.0, -1, -1, 0.0, 0.0
-        for k in range(count - 1):
-            time = time_between(c, path[k], path[k + 1])
-            if i_low < 0 and low <= done + time:
-                i_low, x_low = k, (low - done) / time if time > 0.0 else 0.0
-            if i_high < 0 and high <= done + time:
-                i_high, x_high = k, (high - done) / time if time > 0.0 else 0.0
-            done += time
-        if i_low < 0 or i_high <= i_low:
-            continue
-        q_low, q_high = scratch[0], scratch[1]
-        for i in range(n):
-            q_low[i] = path[i_low, i] + x_low * (path[i_low + 1, i] - path[i_low, i])
-            q_high[i] = path[i_high, i] + x_high * (path[i_high + 1, i] - path[i_high, i])
-        if time_between(c, q_low, q_high) > (high - low) * (1.0 + 1e-12):
-            continue
-        if reached(c, q_low, q_high, trial) < 1.0:
-            continue
-        # Corners i_low + 1 … i_high give way to the two new ones.
-        removed = i_high - i_low
-        shift = 2 - removed
-        if shift > 0 and count + shift > path.shape[0]:
-            continue
-        if shift > 0:
-            for k in range(count - 1, i_high, -1):
-                put_row(path[k + shift], path[k])
-        elif shift < 0:
-            for k in range(i_high + 1, count):
-                put_row(path[k + shift], path[k])
-        put_row(path[i_low + 1], q_low)
-        put_row(path[i_low + 2], q_high)
-        count += shift
-    return count
-
-
-@njit
-def drop_corners(c: Constraints, path: FloatArray, count: int, trial: Trial) -> int:
-    """Leave out corners of a path that a straight way passes as well; how many are left."""
-    k = 1
-    while k < count - 1:
-        if reached(c, path[k - 1], path[k + 1], trial) == 1.0:
-            for j in range(k, count - 1):
-                put_row(path[j], path[j + 1])
-            count -= 1
-            k = max(1, k - 1)
-        else:
-            k += 1
-    return count
 
 
 @njit

@@ -454,7 +454,7 @@ def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
     return True
 
 
-@internal
+@njit
 def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) -> float:
     """Share of the straight way from valid joints that is valid: 1 for all of it.
 

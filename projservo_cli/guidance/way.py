@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.guidance.goals import STARTS, Aim, new_bench, put_goals
-from projservo_cli.guidance.search import Tree, drop_corners, first_straight, grow, new_tree, shorten
+from projservo_cli.guidance.search import Tree, first_straight, grow, new_tree
 from projservo_cli.guidance.timing import Pace, new_pace, put_corners, put_pace, put_path
 from projservo_cli.guidance.validity import (
     CLEAR,
@@ -20,6 +20,7 @@ from projservo_cli.guidance.validity import (
     Trial,
     new_trial,
     put_margins,
+    reached,
 )
 from projservo_cli.records import FloatArray, IntArray
 
@@ -157,9 +158,14 @@ def find_way(
     return way._replace(corners=best, straight=len(best) == 2, pace=pace, draws=draws, trees=trees)
 
 
+def _times(c: Constraints, path: FloatArray) -> FloatArray:
+    """Time (k − 1,) of each straight piece of a path (k, n) at the speed limits, s."""
+    return np.asarray((np.abs(np.diff(path, axis=0)) / c.speed).max(axis=1))
+
+
 def length(c: Constraints, path: FloatArray) -> float:
     """Time of a path (k, n) at the speed limits, s."""
-    return float((np.abs(np.diff(path, axis=0)) / c.speed).max(axis=1).sum())
+    return float(_times(c, path).sum())
 
 
 def _by_trees(
@@ -194,12 +200,23 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 
 
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
-    """The corners that are left of a path when straight ways cut them short."""
-    room = np.empty((len(path) + 2 * SHORTENINGS, path.shape[1]))
-    room[: len(path)] = path
-    scratch = np.empty((2, path.shape[1]))
-    count = shorten(c, room, len(path), rng.random((SHORTENINGS, 2)), scratch, trial)
-    return room[: drop_corners(c, room, count, trial)].copy()
+    """What is left of a path (k, n) when straight ways cut it short: first between drawn places on it."""
+    for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
+        if len(path) <= 2:
+            return path
+        time = np.r_[0.0, np.cumsum(_times(c, path))]
+        low, high = ends * time[-1]
+        i, j = np.clip(np.searchsorted(time, (low, high)) - 1, 0, None)
+        new = np.stack([np.interp((low, high), time, column) for column in path.T], axis=1)
+        if i < j and _times(c, new)[0] < high - low and reached(c, new[0], new[1], trial) == 1.0:
+            path = np.vstack([path[: i + 1], new, path[j + 1 :]])
+    k = 1
+    while k < len(path) - 1:
+        if reached(c, path[k - 1], path[k + 1], trial) == 1.0:
+            path, k = np.delete(path, k, axis=0), max(1, k - 1)
+        else:
+            k += 1
+    return path
 
 
 def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
