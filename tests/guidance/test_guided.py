@@ -9,12 +9,15 @@ import pytest
 
 from projservo_cli.calibration import predict
 from projservo_cli.config.robot import JointVector
+from projservo_cli.geometry.kinematics import forward_kinematics
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.stages import calibrate, servo
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.design import random_tasks
+from projservo_cli.task.target import followed
+from projservo_cli.task.trajectory import planned
 from tests.known import asked, configured
 
 pytestmark = pytest.mark.volume
@@ -77,6 +80,22 @@ def test_a_way_is_followed_where_and_when_it_was_planned(law):
     times = np.r_[0.0, np.cumsum(trace.speed_factor)] * trace.period
     wanted = np.stack([np.interp(times, plan.time, column) for column in plan.q.T], axis=1)
     assert trace.q[:there] == pytest.approx(wanted[:there], abs=np.radians(1.0) + 1e-9)
+
+
+def test_the_displacement_planned_at_a_time_is_that_of_the_joints():
+    config, calibration, plan = guided("paper", 1)
+    model, period = calibration.model(), config.control.period_s
+    task = followed(model, scenario_of(config, calibration).ends.task(model), plan, period, 1.0)
+    assert task.reference.A[-1] @ (
+        forward_kinematics(model, plan.q[-1]) @ np.linalg.inv(forward_kinematics(model, plan.q[0]))
+    ).T == pytest.approx(task.A_star, abs=1e-9)
+    rows = task.reference.q
+    for clock in (0.0, 3.25, 1e6):
+        i = min(int(clock), len(rows) - 2)
+        q = rows[i] + min(clock - i, 1.0) * (rows[i + 1] - rows[i])
+        wanted = forward_kinematics(model, q) @ np.linalg.inv(forward_kinematics(model, rows[0]))
+        found = np.array(planned(model, task.reference, clock)).reshape(4, 4)
+        assert found == pytest.approx(wanted, abs=1e-9)
 
 
 def test_what_is_stored_tells_the_images_between_its_samples():
