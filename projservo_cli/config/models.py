@@ -17,6 +17,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from projservo_cli.config.regions import Region
 from projservo_cli.config.robot import (
     Count,
     Finding,
@@ -296,6 +297,11 @@ class Trajectory(Section):
         8.0, description="in the profile joint: least width of the face in an image, seen ever more edge-on"
     )
     search: _Search = Field(_Search(), description="how long the profile joint searches, and from which seed")
+    keep_out: Annotated[tuple[Region, ...], Field(max_length=100)] = Field(
+        (),
+        description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], hides: true}, "
+        "that no marker enters, nor what is between those of the face",
+    )
 
 
 class _Control(Section):
@@ -504,6 +510,14 @@ def _plan_to_follow(control: _Control, trajectory: Trajectory) -> Iterator[Findi
         )
 
 
+def _keeping_out(control: _Control, trajectory: Trajectory) -> Iterator[Finding]:
+    if trajectory.keep_out and REPLAN in control.mode:
+        yield (
+            ("control", "mode"),
+            "replan goes its own way, and trajectory.keep_out is kept by plans: set track or image_track",
+        )
+
+
 def _speed_in_joint_space(
     control: _Control, trajectory: Trajectory, robot: RobotSettings | None, data: _Data | None
 ) -> Iterator[Finding]:
@@ -517,7 +531,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone),
-        *(_disturbed_joints, _lost_markers, _plan_to_follow, _speed_in_joint_space),
+        *(_disturbed_joints, _lost_markers, _plan_to_follow, _keeping_out, _speed_in_joint_space),
     )
 }
 

@@ -5,9 +5,11 @@ where one camera sees it beside the outline, it is beside the obstacle. No metre
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.records import FloatArray, IntArray
@@ -29,7 +31,7 @@ class KeepOut(NamedTuple):
 NO_KEEP_OUT = KeepOut(np.zeros((0, 2)), np.zeros(1, np.int64), *(np.zeros(0, np.int64) for _ in range(4)))
 
 
-def keep_out_of(regions: list[tuple[FloatArray | None, FloatArray | None, bool]]) -> KeepOut:
+def keep_out_of(regions: Sequence[tuple[ArrayLike | None, ArrayLike | None, bool]]) -> KeepOut:
     """Regions, each of polygons (k, 2) in the left and the right image, None for none, and if it hides."""
     polygons = [
         (r, view, np.asarray(drawn, dtype=np.float64))

@@ -16,6 +16,7 @@ from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.goals import Aim
+from projservo_cli.guidance.keep_out import keep_out_of
 from projservo_cli.guidance.timing import Pace, joints_at
 from projservo_cli.guidance.validity import (
     NO_SPREAD,
@@ -264,7 +265,8 @@ def _through_joints(
     c = constraints_of(model, A, task, reaching.q_start, Asked(demands, keep, trajectory.least_face_px))
     aim = Aim(task.A_star, straight_views(model.lens, task.s_star), search.sigma)
     how = Search(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
-    c = c._replace(spread=search.spread)
+    drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
+    c = c._replace(spread=search.spread, keep_out=drawn)
     way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
     if way.pace is None:
         linear = _given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)

@@ -194,6 +194,8 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
     """
     law, mode = law_and_mode(name)
     unplanned, planned_s = "", None
+    if scenario.config.trajectory.keep_out and not (isinstance(plan, Plan) and plan.feasible):
+        raise WorkFailed("nothing is driven where trajectory.keep_out is set and the plan is not feasible")
     if mode != REPLAN and isinstance(plan, Plan):
         if not np.isfinite(plan.q).all() and scenario.config.control.without_plan != "refuse":
             unplanned = f"no joints can follow the plan: {plan.reason}"

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 from scipy.spatial import ConvexHull
@@ -13,6 +13,7 @@ from projservo_cli.guidance.way import Search, find_way
 from tests.guidance.cases import COUNT, case
 
 
+@settings(deadline=None)
 @given(st.integers(3, 9), st.integers(0, 10_000))
 def test_the_distance_from_a_polygon_is_that_to_its_outline(k, seed):
     rng = np.random.default_rng(seed)
