@@ -369,6 +369,11 @@ class Trace:
     pose: FloatArray = _array("instant", "row", "coordinate", units="m", about="true pose of the tool")
     goal_pose: FloatArray = _array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
     center: FloatArray = _array("instant", "axis", units="m", about="true centre of the face")
+    success: bool | None = _scalar(
+        about="whether it converged and at every instant, in truth, no joint was past a limit, no camera "
+        "behind the face and every marker of the face in both images; none where the truth is not known",
+        default=None,
+    )
     unplanned: str = _scalar(
         about="why a run that was to follow the plan went without it; empty where it followed", default=""
     )

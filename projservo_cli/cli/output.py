@@ -269,15 +269,15 @@ def _number(value: float | None) -> str:
 def _of_sweep(found: dict[str, Any]) -> Iterator[str]:
     """The table of cells, and that of pairs of laws on the same tasks."""
     yield (
-        f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; "
-        "medians of converged runs"
+        f"report: {found['runs']} of {found['total']} runs; shares in %, 95 % interval; medians of successes"
     )
     cells, pairs = found["cells"], found["paired"]
-    known = ("cell", "runs", "converged", "success_rate", "success_interval", "verdicts", "quantiles")
+    known = ("cell", "runs", "converged", "successes", "success_interval", "verdicts", "quantiles")
     axes = [name for name in cells[0] if name not in known and not name.endswith("_rate")]
     widths = [max(len(name), *(len(str(cell[name])) for cell in cells)) + 2 for name in axes]
     head = "".join(f"{name:<{width}}" for name, width in zip(axes, widths, strict=True))
-    yield f"  {head}{'converged %':>15}{'hidden':>7}{'outside':>8}{'steps':>6}{'mm':>8}{'path':>7}"
+    shares = f"{'success %':>15}{'converged':>10}{'hidden':>7}{'outside':>8}"
+    yield f"  {head}{shares}{'steps':>6}{'mm':>8}{'path':>7}"
     for cell in cells:
         low, high = (100.0 * value for value in cell["success_interval"])
         rate = f"{100.0 * cell['success_rate']:.1f} ({low:.0f}-{high:.0f})"
@@ -285,10 +285,11 @@ def _of_sweep(found: dict[str, Any]) -> Iterator[str]:
         medians = ((cell["quantiles"][name]["0.5"], width) for name, width in quantiles)
         numbers = "".join(f"{'-' if m is None else format(m, '.3g'):>{width}}" for m, width in medians)
         text = "".join(f"{cell[name]!s:<{width}}" for name, width in zip(axes, widths, strict=True))
+        converged = 100.0 * cell["converged"] / cell["runs"]
         hidden, outside = 100.0 * cell["self_occluded_rate"], 100.0 * cell["left_image_rate"]
-        yield f"  {text}{rate:>15}{hidden:>7.1f}{outside:>8.1f}{numbers}"
+        yield f"  {text}{rate:>15}{converged:>10.1f}{hidden:>7.1f}{outside:>8.1f}{numbers}"
     if pairs:
-        yield "paired on the same tasks: both converged, only the first, only the second,"
+        yield "paired on the same tasks: both succeed, only the first, only the second,"
         yield "neither; p: chance if alike"
     measured = ("laws", "pairs", "both", "only", "neither", "p_success", "median_difference", "p_difference")
     for pair in pairs:

@@ -14,7 +14,7 @@ from projservo_cli.geometry.algebra import IDENTITY
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.geometry.mechanisms import Seen, reach
 from projservo_cli.loop.step import new_log
-from projservo_cli.loop.summary import path_deviation, summarize
+from projservo_cli.loop.summary import Ended, path_deviation, summarize
 from projservo_cli.records import Model
 from projservo_cli.robots.simulated import Ends, Plant
 from projservo_cli.task.face import Task
@@ -55,5 +55,5 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     yield put_view, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)
     yield carry_joints, (carrier_of(reaching), O, 1, 1.0, 1.0, q)
-    yield summarize, (plant, log, 1, 0.0, 0.04, Ends(np.eye(4), np.eye(4), q))
+    yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))
     yield path_deviation, (plant, log, 1, 0.04, q, q)

@@ -5,18 +5,30 @@ from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
 from projservo_cli.geometry.jit import merged, njit
-from projservo_cli.loop.step import Log
+from projservo_cli.loop.step import CONVERGED, Log
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Ends, Plant, pose_after
+from projservo_cli.robots.simulated import Ends, Plant, pose_after, shows_face
 from projservo_cli.task.face import center_of
 
 MM = 1e3
+_ROUND_OFF = 1e-9  # rad or m, by which a joint at its limit may seem to be beyond
 SUBSAMPLES = 50  # points of a joint step at which the deviation between samples is measured
+
+
+class Ended(NamedTuple):
+    """How a run ended."""
+
+    verdict: int
+    steps: int  # commands sent
+    limited: float  # how often visibility limited the translation
 
 
 class Summary(NamedTuple):
     """Numbers of a run that ended; NaN where they need the true goal and that is not known."""
 
+    # 1 where it converged and, at every instant, both cameras truly saw the face whole and from its front and
+    # no joint was past a limit, 0 where not; what happens between the instants is not looked at
+    success: float
     image_error_px: float  # at the end, rms over markers and views
     # self_occluded_steps_left, self_occluded_steps_right: instants at which a camera is behind the face
     self_occluded_steps_left: int
@@ -36,8 +48,9 @@ class Summary(NamedTuple):
 
 
 @njit
-def summarize(plant: Plant, log: Log, steps: int, limited: float, period: float, ends: Ends) -> Summary:
-    """Numbers of a run of so many steps, whose translation visibility limited so often."""
+def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -> Summary:
+    """Numbers of a run."""
+    steps = ended.steps
     hidden_left, hidden_right, slowed = 0, 0, 0
     for k in range(steps + 1):
         if log.hidden[k, 0] > 0.5:
@@ -53,14 +66,16 @@ def summarize(plant: Plant, log: Log, steps: int, limited: float, period: float,
     if math.isfinite(goal[0]):
         length, at_samples = _path_along(plant, log, steps, start, goal)
     base_tool, goal_pose = mat(ends.base_tool), mat(ends.goal_pose)
+    kept = hidden_left == 0 and hidden_right == 0 and _keeps_within(plant, log, steps)
     return Summary(
+        1.0 if kept and ended.verdict == CONVERGED else 0.0,
         float(log.error[steps]),
         hidden_left,
         hidden_right,
         int(log.events[0]),
         int(log.events[1]),
         slowed,
-        int(limited),
+        int(ended.limited),
         _effort(log, steps, period),
         math.degrees(_angle_between(mul(first, base_tool), goal_pose)),
         MM * _distance(start, goal),
@@ -69,6 +84,19 @@ def summarize(plant: Plant, log: Log, steps: int, limited: float, period: float,
         MM * length,
         MM * at_samples,
     )
+
+
+@merged
+def _keeps_within(plant: Plant, log: Log, steps: int) -> bool:
+    """Whether at each instant all joints are within their limits and the face within both true images."""
+    for k in range(steps + 1):
+        for i in range(log.q.shape[1]):
+            q = log.q[k, i]
+            if not plant.lower[i] - _ROUND_OFF <= q <= plant.upper[i] + _ROUND_OFF:
+                return False
+        if not shows_face(plant, mat(log.H[k]), log.scratch[0]):
+            return False
+    return True
 
 
 @merged

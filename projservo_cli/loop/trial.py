@@ -25,7 +25,7 @@ from projservo_cli.geometry.lens import straight
 from projservo_cli.geometry.mechanisms import OWN, Span, span_of
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
-from projservo_cli.loop.summary import Summary, summarize
+from projservo_cli.loop.summary import Ended, Summary, summarize
 from projservo_cli.records import FloatArray, Model
 from projservo_cli.robots.simulated import Ends, Plant
 from projservo_cli.task.body import NO_BODY, Body
@@ -279,8 +279,8 @@ def _drive(setting: Setting, status: int, noise: FloatArray, desk: _Desk, number
     numbers[VERDICT] = verdict
     numbers[STEPS] = steps
     if verdict != RUNNING:
-        limited, period = state.limited[0], setting.gains.period
-        found = summarize(setting.course.plant, desk.log, steps, limited, period, setting.ends)
+        ended, period = Ended(verdict, steps, state.limited[0]), setting.gains.period
+        found = summarize(setting.course.plant, desk.log, ended, period, setting.ends)
         column = 2
         for value in literal_unroll(found):
             numbers[column] = value

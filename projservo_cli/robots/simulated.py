@@ -167,6 +167,22 @@ def inside(pixel: FloatArray, image_size: FloatArray) -> bool:
 
 
 @merged
+def shows_face(plant: Plant, H: Mat4, pixel: FloatArray) -> bool:
+    """Whether both images truly show every marker of the face after the displacement H.
+
+    pixel : (2 or more,) workspace.
+    """
+    for k in range(plant.M.shape[0]):
+        A = apply(H, vec(plant.M[k]))
+        for view in range(2):
+            if not _put_pixel(plant.model.P[view], plant.model.lens[view], A, pixel):
+                return False
+            if not inside(pixel, plant.image_size):
+                return False
+    return True
+
+
+@merged
 def rig_distance(plant: Plant, M: FloatArray) -> float:
     """Distance of the centre of the face M (m, 4) from the middle of the optical centres, m."""
     middle = axpy(1.0, vec(plant.O[0]), vec(plant.O[1]))

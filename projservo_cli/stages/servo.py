@@ -17,7 +17,7 @@ from projservo_cli.geometry.mechanisms import in_span, span_of
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.loop.summary import MM, Summary, path_deviation, summarize
+from projservo_cli.loop.summary import MM, Ended, Summary, path_deviation, summarize
 from projservo_cli.records import (
     REPLAN,
     Calibration,
@@ -61,7 +61,9 @@ class Outcome:
     def summary(self) -> Summary:
         """Numbers of the run; NaN where they need a truth that nobody knows."""
         period, ends = self.scenario.gains.period, self.scenario.true_ends
-        return summarize(self.plant, self.log, self.steps, self.limited, period, ends)
+        ended = Ended(VERDICTS.index(self.verdict), self.steps, self.limited)
+        found = summarize(self.plant, self.log, ended, period, ends)
+        return found if self.scenario.truth is not None else found._replace(success=math.nan)
 
     def deviation_mm(self) -> float:
         """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
@@ -87,6 +89,8 @@ class Outcome:
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         told = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
         numbers: dict[str, Any] = {n: None if math.isnan(told[n]) else told[n] for n in _TOLD}
+        if simulated:
+            numbers["success"] = told["success"] == 1.0
         return Trace(
             **numbers,
             law=self.law,

@@ -52,6 +52,13 @@ NUMBERED = (
 )
 MEASURED = (
     _text("verdict", ALL_VERDICTS, "how the run ended"),
+    _Column(
+        "success",
+        "u1",
+        "1",
+        "1 where it converged and at every instant, in truth, no joint was past a limit, no camera behind "
+        "the face and every marker of the face in both images",
+    ),
     _Column("usable", "i1", "1", "whether its calibration is usable"),
     _Column("steps", "i8", "1", "commands sent, -1 where the run did not begin"),
     _Column("rotation_deg", "f8", "deg", "true rotation from start to goal"),
@@ -167,7 +174,7 @@ def is_compiled(design: Design, config: Config) -> bool:
 
 def _numbered(design: Design, runs: IntArray) -> _Columns:
     """Rows of runs that are not made yet, with their numbers and seeds."""
-    missing = {"f8": math.nan, "i8": NONE, "i1": NONE}
+    missing = {"f8": math.nan, "i8": NONE, "i1": NONE, "u1": 0}
     table = {
         column.name: np.full(len(runs), missing.get(column.dtype, b""), dtype=column.dtype)
         for column in columns_of(design)
@@ -194,6 +201,7 @@ def _measured(config: Config, calibration: Calibration, seeds: IntArray) -> dict
     found: dict[str, Any] = {name: numbers[:, i] for i, name in enumerate(NUMBERS)}
     for name in _COUNTS:
         found[name] = np.where(numbers[:, VERDICT] < 0, NONE, found[name])
+    found["success"] = found["success"] == 1.0
     found["verdict"] = [_SAID.get(int(code), NOT_STARTED.encode()) for code in numbers[:, VERDICT]]
     return found
 

@@ -1,4 +1,4 @@
-"""Statistics of a sweep: how often runs arrive, how they end, and laws compared on the same tasks."""
+"""Statistics of a sweep: how often runs succeed, how they end, and laws compared on the same tasks."""
 
 import json
 import math
@@ -20,7 +20,6 @@ from projservo_cli.stages import Progress
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.tables import to_csv
 
-SUCCESS = "converged"
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 MEASURES = (
     "steps",
@@ -49,7 +48,9 @@ class _Rows:
 
     def _derived(self, name: str) -> npt.NDArray[Any]:
         if name == "success":
-            return np.asarray(self.table.column("verdict") == SUCCESS)
+            return np.asarray(self.table.column(name) == 1)
+        if name == "converged":
+            return np.asarray(self["verdict"] == name)
         if name == LAW and LAW not in self.table.names:  # where an axis of another name sets it
             return np.full(self.table.rows, "all")
         if name == "self_occluded":
@@ -75,13 +76,14 @@ class _Rows:
 
 
 def _of_runs(rows: _Rows, these: BoolArray) -> dict[str, Any]:
-    """Statistics of some runs; quantiles of those that converged."""
+    """Statistics of some runs; quantiles of those that succeeded."""
     count, good = int(these.sum()), these & rows["success"]
     successes = int(good.sum())
     verdicts, counts = np.unique(rows["verdict"][these], return_counts=True)
     return {
         "runs": count,
-        "converged": successes,
+        "converged": int(rows["converged"][these].sum()),
+        "successes": successes,
         "success_rate": successes / count,
         "success_interval": _interval(successes, count),
         "self_occluded_rate": float(rows["self_occluded"][these].mean()),
@@ -125,7 +127,7 @@ def _paired(rows: _Rows) -> Iterator[dict[str, Any]]:
 
 
 def _compared(rows: _Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
-    """Runs of two laws that share their draws: how often which arrives, and differences where both do.
+    """Runs of two laws that share their draws: how often which succeeds, and differences where both do.
 
     The probabilities are of the exact test of McNemar and of the sign test: how often a difference as
     large or larger would come about between laws that are alike.
@@ -259,7 +261,7 @@ def _draw_success(data: Data, figure: "style.Figure") -> None:
         beside = 0.006 * span * (i - 0.5 * (len(laws) - 1))  # so that bars of laws do not hide each other
         reach = np.maximum(0.0, [rate - data[f"{law}.low"], data[f"{law}.high"] - rate])
         axes.errorbar(x + beside, 100.0 * rate, 100.0 * reach, capsize=2, elinewidth=0.7, **looks[law])
-    axes.set(xlabel=str(data["label"]), ylabel="converged (%), bars: 95 %", ylim=(-3, 103))
+    axes.set(xlabel=str(data["label"]), ylabel="success (%), bars: 95 %", ylim=(-3, 103))
     style.legend_below(figure, looks, min(3, len(laws)))
 
 
@@ -286,7 +288,7 @@ def _draw_basin(data: Data, figure: "style.Figure") -> None:
         axes.set_visible(False)
     figure.supxlabel(str(data["label_x"]), fontsize=8)
     figure.supylabel(str(data["label_y"]), fontsize=8)
-    figure.colorbar(mesh, ax=panels.tolist(), label="converged (%)")
+    figure.colorbar(mesh, ax=panels.tolist(), label="success (%)")
 
 
 def _draw_final_errors(data: Data, figure: "style.Figure") -> None:

@@ -8,8 +8,8 @@ import pytest
 from projservo_cli.control import CODES
 from projservo_cli.control.law import Law, reset
 from projservo_cli.loop.compiled import Course, run_compiled
-from projservo_cli.loop.step import RUNNING
-from projservo_cli.loop.summary import SUBSAMPLES, path_deviation, summarize
+from projservo_cli.loop.step import CONVERGED, MAX_STEPS, RUNNING
+from projservo_cli.loop.summary import SUBSAMPLES, Ended, path_deviation, summarize
 from projservo_cli.records import LAWS
 from projservo_cli.robots.simulated import Ends
 from tests.samples import displacement, pixels, poe
@@ -222,7 +222,8 @@ def test_deviation_from_the_line():
     A_c = sc.plant.M.mean(axis=0)
     start, goal = (poe(sc.model, q) @ A_c for q in (sc.q_start, sc.q_goal))
     between = path_deviation(sc.plant, run.log, run.steps, GAINS.period, start, goal)
-    told = summarize(sc.plant, run.log, run.steps, 0.0, GAINS.period, Ends(np.eye(4), np.eye(4), goal))
+    ends = Ends(np.eye(4), np.eye(4), goal)
+    told = summarize(sc.plant, run.log, Ended(run.code, run.steps, 0.0), GAINS.period, ends)
     length, at_samples = 1e-3 * told.path_length_mm, 1e-3 * told.center_deviation_at_samples_mm
     way = (goal - start)[:3] / np.linalg.norm((goal - start)[:3])
 
@@ -241,6 +242,37 @@ def test_deviation_from_the_line():
     assert length == pytest.approx(np.linalg.norm(np.diff(run.center, axis=0), axis=1).sum(), rel=1e-12)
 
 
+def test_success_is_told_of_the_truth(rng):
+    """At every instant: what is measured may lie outside, true images and joints may not."""
+    sc = scene()
+    run = Run(sc, "direct_three")
+    ends = Ends(np.eye(4), np.eye(4), np.full(4, np.nan))
+
+    def success(verdict=CONVERGED, log=run.log, **plant):
+        ended = Ended(verdict, run.steps, 0.0)
+        return summarize(sc.plant._replace(**plant), log, ended, GAINS.period, ends).success
+
+    assert run.code == CONVERGED
+    assert success() == 1.0
+    assert success(MAX_STEPS) == 0.0
+    seen = np.array([sc.images(q) for q in run.log.q])
+    noisy = run.log._replace(s=run.log.s + 3.0 * rng.normal(size=run.log.s.shape))
+    for axis in range(2):
+        size, border = sc.plant.image_size.copy(), seen[..., axis].max() + 0.5
+        for beside, wanted in ((1e-6, 1.0), (-1e-6, 0.0)):
+            size[axis] = border + beside
+            assert success(image_size=size, log=noisy) == wanted
+    q = run.log.q[:, 3]
+    for limit, least, sign in (("lower", q.min(), 1.0), ("upper", -q.max(), -1.0)):
+        for beside, wanted in ((0.0, 1.0), (1e-6, 0.0)):
+            bound = getattr(sc.plant, limit).copy()
+            bound[3] = sign * (least + beside)
+            assert success(**{limit: bound}) == wanted
+    hidden = run.log.hidden.copy()
+    hidden[run.steps // 2, 1] = 1.0
+    assert success(log=run.log._replace(hidden=hidden)) == 0.0
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 0.5, math.pi - 1e-7, math.pi])
 def test_rotation_that_is_left(angle):
     """Accurate at both ends, where an arc cosine would lose half its digits."""
@@ -248,7 +280,7 @@ def test_rotation_that_is_left(angle):
     log = Run(sc, "stacked", bounds=limits(max_steps=0)).log
     log.H[0] = np.eye(4)
     ends = Ends(tool, displacement([0, angle, 0], [1, 2, 3]) @ tool, np.full(4, np.nan))
-    told = summarize(sc.plant, log, 0, 0.0, GAINS.period, ends)
+    told = summarize(sc.plant, log, Ended(MAX_STEPS, 0, 0.0), GAINS.period, ends)
     assert math.radians(told.rotation_error_deg) == pytest.approx(angle, abs=1e-14)
     assert math.isnan(told.position_error_mm)
 

@@ -9,6 +9,7 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.plan import rotation_sense as sense_of
 from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep import runs
 from projservo_cli.sweep.design import name_of_run
 from projservo_cli.sweep.runs import Part, is_compiled, run_part
@@ -47,6 +48,7 @@ SAME = (
     "center_deviation_mm",
     "effort",
     "steps",
+    "success",
 )
 
 
@@ -78,6 +80,12 @@ def test_every_run_redone_by_the_stages_is_its_row(name):
         assert row["image_error_px"] == trace.image_error[-1]
         for column in row.keys() & set(SAME):
             assert row[column] == getattr(trace, column), column
+        truth = truth_of(config)
+        seen = np.array([truth.images(q, truth.M_face) for q in trace.q])
+        kept = (trace.q >= truth.robot.lower) & (trace.q <= truth.robot.upper)
+        inside = (seen >= -0.5) & (seen <= truth.image_size - 0.5)
+        good = kept.all() and inside.all() and not trace.self_occluded.any()
+        assert row["success"] == (trace.verdict == "converged" and good)
         R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
         angle = math.degrees(math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
         assert row["rotation_deg"] == pytest.approx(angle, abs=1e-4)
@@ -111,6 +119,7 @@ def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
     assert made.columns["verdict"].tolist() == [b"not started"] * 2
     assert np.isnan(made.columns["position_error_mm"]).all()
     assert made.columns["steps"].tolist() == [-1, -1]
+    assert made.columns["success"].tolist() == [0, 0]
 
 
 @pytest.mark.volume
