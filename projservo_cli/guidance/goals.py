@@ -12,12 +12,13 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import apply, mat, put_vec, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kinematics import image_velocity, operators_at
+from projservo_cli.geometry.kinematics import forward, image_velocity, operators_at
 from projservo_cli.guidance.validity import (
     BORDER,
     DEVIATIONS,
     MARGINS,
     Constraints,
+    clear_by,
     off,
     put_margins,
     put_row,
@@ -45,6 +46,7 @@ ROUND_OFF = 1e-9
 STARTS, PATIENCE, AT_LEAST = 400, 3, 40
 # Solutions of an arm of more joints than six.
 SAMPLED = 96
+BARRED = -1
 
 
 class Aim(NamedTuple):
@@ -240,7 +242,10 @@ def _keep_turns(
     times: FloatArray,
     bench: Bench,
 ) -> int:
-    """Put the whole turns of a solution within the limits among the goals nearest in time; how many."""
+    """Put the whole turns of a solution within the limits among the goals nearest in time; how many.
+
+    ``BARRED`` where it lies within a region that is kept out of.
+    """
     n, most = solution.shape[0], goals.shape[0]
     q, choice, lowest = bench.q, bench.choice, bench.lowest
     turn = 2.0 * math.pi
@@ -261,6 +266,8 @@ def _keep_turns(
             for j in range(1, BORDER):
                 if not bench.margins[j] > 0.0:
                     return 0
+            if not clear_by(c, forward(c.model, q), bench.s, 0.0, 0.0) > 0.0:
+                return BARRED
         found += 1
         time = time_between(c, start, q)
         if time < times[most - 1]:
@@ -315,14 +322,14 @@ def put_goals(
     goals: FloatArray,
     times: FloatArray,
     bench: Bench,
-) -> tuple[int, int, int]:
+) -> tuple[int, int, int, int]:
     """Write the joints (g, n) that show the goal, and their times (g,) from the start, nearest first.
 
     A solution that leaves much more than the best is a local minimum beside it.
 
     start : (n,) joints at the start; starts : (k, n) from which solutions are sought, overwritten.
     Returns how many there are, of which the first g are written; how many solutions, apart from whole turns;
-    how many of those do not show the face or lie beyond the limits.
+    how many of those do not show the face or lie beyond the limits; how many within a region kept out of.
     """
     for g in range(times.shape[0]):
         times[g] = math.inf
@@ -331,11 +338,12 @@ def put_goals(
     for k in range(count):
         most = min(most, bench.left[k])
     most = MUCH * MUCH * max(most, 4.0 * c.face * LEAST_SIGMA * LEAST_SIGMA)
-    solutions, total, hidden = 0, 0, 0
+    solutions, total, hidden, barred = 0, 0, 0, 0
     for k in range(count):
         if bench.left[k] <= most:
             turns = _keep_turns(c, start, bench.base[k], goals, times, bench)
             solutions += 1
-            total += turns
+            total += max(turns, 0)
             hidden += turns == 0
-    return total, solutions, hidden
+            barred += turns == BARRED
+    return total, solutions, hidden, barred

@@ -52,6 +52,13 @@ def keep_out_of(regions: Sequence[tuple[ArrayLike | None, ArrayLike | None, bool
     )
 
 
+def only(keep: KeepOut, region: int) -> KeepOut:
+    """The polygons of one region alone."""
+    drawn = np.where(keep.region == region, 0, -1)
+    here = slice(region, region + 1)
+    return keep._replace(region=drawn, hides=keep.hides[here], views=keep.views[here])
+
+
 @internal
 def outside_polygon(corners: FloatArray, first: int, last: int, u: float, v: float) -> float:
     """Distance of a pixel from a polygon of corners first … last − 1, px; negative within."""

@@ -9,8 +9,8 @@ Each margin is positive where its constraint holds:
 - width: the least width of the image of the face, px, for an angle means nothing in projective space;
 - border: the least distance of a marker of the face from the border of an image, px, less what its prediction
   may be off;
-- clear: the least distance from a region that is kept out of, px, less what a prediction may be off and what
-  a marker moves between two checks: of all markers, and of points between those of the face.
+- clear: the least distance from a region that is kept out of, px, less what a prediction may be off: of all
+  markers, and of all points between those of the face.
 
 Joints are valid where each margin is above what is asked for, and that is no more than a share of what start
 and goal have themselves, rising to its full value within ``RISE`` of them.
@@ -108,7 +108,7 @@ def constraints_of(
         demands.speed,
         demands.image_size,
         np.maximum(asked.keep, 1e-9),
-        np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, 0.0]),
+        np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
         np.zeros((0, n)),
         np.zeros((0, MARGINS)),
     )
@@ -224,11 +224,15 @@ def off(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float
 
 @merged
 def _predicted(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float, float]:
+    twin = _twin(c, j)
+    return _pixel(twin.P[view], apply(forward(twin, q), vec(c.spread.M[j, k])))
+
+
+@merged
+def _twin(c: Constraints, j: int) -> Model:
+    """The calibrated model, off by the deviation j."""
     m = c.model
-    twin = Model(c.spread.P[j], c.spread.H_hat[j], m.joint_types, m.q_reference, m.a_inf, m.lens)
-    A = apply(forward(twin, q), vec(c.spread.M[j, k]))
-    depth = row(twin.P[view], 2, A)
-    return row(twin.P[view], 0, A) / depth, row(twin.P[view], 1, A) / depth
+    return Model(c.spread.P[j], c.spread.H_hat[j], m.joint_types, m.q_reference, m.a_inf, m.lens)
 
 
 @merged
@@ -276,75 +280,119 @@ def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray
     return True
 
 
-# Parts of a segment between two markers of the face, at whose ends it is looked at.
-BETWEEN = 8
+@internal
+def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray) -> float:
+    """Margin of the regions that are kept out of; near them what a prediction may be off there tells."""
+    most = DEVIATIONS * c.spread.most
+    least = clear_by(c, H, s, most, most)
+    if most > 0.0 and least < c.full[CLEAR]:
+        left, right = _most_off(c, q, H)
+        least = clear_by(c, H, s, DEVIATIONS * left, DEVIATIONS * right)
+    return least
 
 
 @internal
-def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray) -> float:
-    """Margin of the regions that are kept out of."""
-    least = math.inf
-    for k in range(c.M.shape[0]):
-        for r in range(c.keep_out.hides.shape[0]):
-            margin = _clear_of(c, q, r, (k, k), (s[0, k, 0], s[0, k, 1]), (s[1, k, 0], s[1, k, 1]))
-            least = min(least, margin)
-        for l in range(k if k < c.face else 0):
-            A, B = apply(H, vec(c.M[k])), apply(H, vec(c.M[l]))
-            for part in range(1, BETWEEN):
-                D = combined(part / BETWEEN, A, B)
-                left, right = _image(c, 0, D), _image(c, 1, D)
-                for r in range(c.keep_out.hides.shape[0]):
-                    if c.keep_out.views[r] == BOTH:
-                        least = min(least, _clear_of(c, q, r, (k, l), left, right))
+def _most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
+    """Standard deviation of a coordinate in each image, px, no less than that of any marker."""
+    left = right = c.spread.rest * c.spread.rest
+    for j in range(1, c.spread.P.shape[0]):
+        twin = _twin(c, j)
+        H_j = forward(twin, q)
+        worst_left, worst_right = 0.0, 0.0
+        for k in range(c.M.shape[0]):
+            A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
+            worst_left = max(worst_left, _squared(_pixel(c.model.P[0], A), _pixel(twin.P[0], A_j)))
+            worst_right = max(worst_right, _squared(_pixel(c.model.P[1], A), _pixel(twin.P[1], A_j)))
+        left, right = left + 0.5 * worst_left, right + 0.5 * worst_right
+    return math.sqrt(left), math.sqrt(right)
+
+
+@internal
+def clear_by(c: Constraints, H: Mat4, s: FloatArray, left: float, right: float) -> float:
+    """Least distance, px, of the displaced body with images s (2, b, 2) from regions that are kept out of.
+
+    left, right : how far off predictions may be in each image, px.
+    A point is clear where one camera sees it beside a region. Markers of a face that the obstacle may hide
+    are so in both images, and all markers in the only image in which a region is drawn.
+    """
+    keep, least = c.keep_out, math.inf
+    for region in range(keep.hides.shape[0]):
+        for k in range(c.M.shape[0]):
+            u, v, x, y = s[0, k, 0], s[0, k, 1], s[1, k, 0], s[1, k, 1]
+            first = clearance(keep, region, 0, u, v) - left
+            second = clearance(keep, region, 1, x, y) - right
+            if keep.views[region] != BOTH or (keep.hides[region] == 1 and k < c.face):
+                least = min(least, first, second)
+            else:
+                first, second = min(first, _inside(c, u, v) - left), min(second, _inside(c, x, y) - right)
+                least = min(least, max(first, second))
+        for k in range(c.face if keep.views[region] == BOTH else 0):
+            for l in range(k):
+                A, B = apply(H, vec(c.M[k])), apply(H, vec(c.M[l]))
+                least = min(least, _clear_between(c, region, A, B, (left, right)))
+    return least
+
+
+# Half the length, px, of the pieces of a segment that are told apart at a region.
+PIECE = 0.5
+
+
+@internal
+def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4, off: tuple[float, float]) -> float:
+    """Least distance, px, of a segment from a region of both images, as above; never too large.
+
+    A distance changes by no more than the way in an image, so that what holds in the middle of a piece less
+    its half length holds all along it. Pieces are of the segment in space, the same in both images; they
+    are halved until they are clear, or short.
+    """
+    least, done, step = math.inf, 0.0, 1.0
+    while done < 1.0:
+        step = min(step, 1.0 - done)
+        first, middle, last = (
+            combined(done, A, B),
+            combined(done + 0.5 * step, A, B),
+            combined(done + step, A, B),
+        )
+        here, all_along, half = -math.inf, -math.inf, 0.0
+        for view in range(2):
+            at = _image(c, view, middle)
+            longest = max(_squared(at, _image(c, view, first)), _squared(at, _image(c, view, last)))
+            radius = math.sqrt(longest)
+            clear = min(clearance(c.keep_out, region, view, at[0], at[1]), _inside(c, at[0], at[1]))
+            clear -= off[0] if view == 0 else off[1]
+            here, all_along, half = max(here, clear), max(all_along, clear - radius), max(half, radius)
+        if all_along >= c.full[CLEAR] or half <= max(PIECE, 0.25 * abs(here)):
+            least = min(least, all_along)
+            done += step
+            step *= 2.0
+        else:
+            step *= 0.5
     return least
 
 
 @merged
 def _image(c: Constraints, view: int, A: Vec4) -> tuple[float, float]:
     """Pixel of a point, as the camera reports it."""
-    P = c.model.P[view]
-    depth = row(P, 2, A)
-    u, v = row(P, 0, A) / depth, row(P, 1, A) / depth
+    u, v = _pixel(c.model.P[view], A)
     return bend(c.model.lens[view], u, v) if bends(c.model.lens) else (u, v)
+
+
+@merged
+def _pixel(P: FloatArray, A: Vec4) -> tuple[float, float]:
+    depth = row(P, 2, A)
+    return row(P, 0, A) / depth, row(P, 1, A) / depth
+
+
+@merged
+def _squared(s: tuple[float, float], t: tuple[float, float]) -> float:
+    du, dv = s[0] - t[0], s[1] - t[1]
+    return du * du + dv * dv
 
 
 @merged
 def combined(x: float, A: Vec4, B: Vec4) -> Vec4:
     """Point (1 − x) A + x B."""
     return axpy(x, sub(B, A), A)
-
-
-@internal
-def _clear_of(
-    c: Constraints,
-    q: FloatArray,
-    region: int,
-    ends: tuple[int, int],
-    left: tuple[float, float],
-    right: tuple[float, float],
-) -> float:
-    """Margin of one region at a point between two markers, or at one, by its pixels in both images.
-
-    Of a region of both images one camera must see the point beside it; markers of a face that it may hide
-    both, and of a region of one image that camera.
-    """
-    views = c.keep_out.views[region]
-    all_views = views != BOTH or (c.keep_out.hides[region] == 1 and ends[0] == ends[1] and ends[0] < c.face)
-    margin = math.inf if all_views else -math.inf
-    for view in range(2):
-        if views not in (view, BOTH):
-            continue
-        u, v = left if view == 0 else right
-        far = clearance(c.keep_out, region, view, u, v) - FINE_PX
-        if far < DEVIATIONS * c.spread.most:
-            spread = max(_variance(c, q, view, ends[0]), _variance(c, q, view, ends[1]))
-            far -= DEVIATIONS * math.sqrt(spread)
-        else:
-            far -= DEVIATIONS * c.spread.most
-        if not all_views:
-            far = min(far, _inside(c, u, v))
-        margin = min(margin, far) if all_views else max(margin, far)
-    return margin
 
 
 @njit

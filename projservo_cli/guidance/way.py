@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.guidance.goals import STARTS, Aim, new_bench, put_goals
+from projservo_cli.guidance.keep_out import only
 from projservo_cli.guidance.search import Tree, first_straight, grow, new_tree
 from projservo_cli.guidance.timing import Pace, new_pace, put_corners, put_pace, put_path
 from projservo_cli.guidance.validity import (
@@ -32,6 +33,8 @@ WAYS, FURTHER = 6, 300
 LONGER = 1.2
 SHORTENINGS = 150
 ROUND_OFF = 1e-9
+# A margin that is not asked for.
+_NOTHING = 1e12
 # Share of the limits of speed and acceleration that is planned with, so that feedback has room.
 ROOM = 0.9
 
@@ -51,6 +54,7 @@ class Way(NamedTuple):
     shown: int  # how many there are, kept or not
     solutions: int  # how many apart from whole turns
     hidden: int  # how many of those lie beyond the limits or do not show the face
+    barred: int  # how many of those lie within a region that is kept out of
     corners: FloatArray  # (k, n) of the way; none where none was found
     straight: bool  # whether it is a straight line
     pace: Pace | None  # in time; None where there is no way or nothing limits its speed
@@ -58,15 +62,19 @@ class Way(NamedTuple):
     trees: tuple[Tree, Tree] | None  # from the start and from the goals, where they were grown
     failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
     had: FloatArray  # (10,) margins of the start
+    region: int  # the one that the start is within, counted from 1; 0 for none
 
     def why_none(self) -> str:
         """Why no way was found, in words."""
+        if self.region:
+            return f"the start is already within region {self.region}"
         if self.solutions == 0:
             return "no joints were found that show the goal"
         if len(self.goals) == 0:
+            barred = f" and {self.barred} within a region that is kept out of" if self.barred else ""
             return (
-                f"all {self.hidden} joint vectors that show the goal, whole turns apart, lie beyond the "
-                "joint limits or do not show the face to both cameras"
+                f"of {self.solutions} joint vectors that show the goal, whole turns apart, {self.hidden} lie "
+                f"beyond the joint limits or do not show the face to both cameras{barred}"
             )
         if not (self.had > 0.0).all():
             return f"the start is already at or beyond {self._told(int(self.had.argmin()))}"
@@ -110,6 +118,35 @@ def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     return margins, s
 
 
+def within_region(c: Constraints, q: FloatArray) -> int:
+    """Number, counted from 1, of the region that the body is in at joints (n,); 0 for none."""
+    c = c._replace(spread=NO_SPREAD)
+    return _nearest_region(c, q) if -math.inf < margins_at(c, q)[0][CLEAR] <= 0.0 else 0
+
+
+def _nearest_region(c: Constraints, q: FloatArray) -> int:
+    """Number, counted from 1, of the region that the body is deepest in, or nearest to, at joints (n,)."""
+    regions = [only(c.keep_out, r) for r in range(len(c.keep_out.hides))]
+    return 1 + int(np.argmin([margins_at(c._replace(keep_out=region), q)[0][CLEAR] for region in regions]))
+
+
+def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
+    """The last of joints (s, n) up to which a path keeps out of regions, and the number of the one it enters.
+
+    All but the regions is left aside. The last of all and 0 where it enters none.
+    """
+    n = q.shape[1]
+    endless = np.full(n, math.inf)
+    full = np.r_[np.full(CLEAR, -_NOTHING), c.full[CLEAR]]
+    speed = np.where(np.isfinite(c.speed), c.speed, 1.0)
+    c = with_ends(c._replace(lower=-endless, upper=endless, full=full, speed=speed), q[[0, -1]])
+    trial = new_trial(n, len(c.M))
+    for i in range(len(q) - 1):
+        if reached(c, q[i], q[i + 1], trial) < 1.0:
+            return i, _nearest_region(c, trial.q)
+    return len(q) - 1, 0
+
+
 def find_way(
     c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, search: Search, acceleration: FloatArray
 ) -> Way:
@@ -129,11 +166,13 @@ def find_way(
 
     starts = np.vstack([known, start[None], draw(STARTS)])
     goals, times = np.empty((search.goals, n)), np.empty(search.goals)
-    shown, solutions, hidden = put_goals(c, aim, start, starts, goals, times, new_bench(n, len(c.M)))
-    goals, times = goals[: min(shown, search.goals)], times[: min(shown, search.goals)]
+    counts = put_goals(c, aim, start, starts, goals, times, new_bench(n, len(c.M)))
+    goals, times = goals[: counts[0]], times[: counts[0]]
     had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
     trial = new_trial(n, len(c.M))
-    way = Way(goals, shown, solutions, hidden, np.empty((0, n)), False, None, 0, None, trial.failures, had)
+    way = Way(
+        goals, *counts, np.empty((0, n)), False, None, 0, None, trial.failures, had, within_region(c, start)
+    )
     if len(goals) == 0 or not (had > 0.0).all():
         return way
     c = with_ends(c, np.vstack([start[None], goals]))

@@ -21,11 +21,12 @@ from projservo_cli.guidance.timing import Pace, joints_at
 from projservo_cli.guidance.validity import (
     NO_SPREAD,
     Asked,
+    Constraints,
     Spread,
     constraints_of,
     spread_of,
 )
-from projservo_cli.guidance.way import Search, Way, find_way
+from projservo_cli.guidance.way import Search, Way, find_way, first_within, within_region
 from projservo_cli.loop.trial import begin
 from projservo_cli.records import (
     PRISMATIC,
@@ -255,18 +256,38 @@ def _body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> Flo
 _INTERPOLATED_PX = 0.05
 
 
+def _constraints(
+    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread
+) -> Constraints:
+    """What joints are held against, for a body at A (b, 4)."""
+    margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
+    keep = np.where(reaching.model.joint_types == PRISMATIC, *margins).astype(np.float64)
+    asked = Asked(reaching.demands, keep, trajectory.least_face_px)
+    drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
+    c = constraints_of(reaching.model, A, task, reaching.q_start, asked)
+    return c._replace(spread=spread, keep_out=drawn)
+
+
+def _entered(c: Constraints, q: FloatArray) -> str:
+    """Which region the body enters along joints (s, n), in words; empty where it keeps out of all."""
+    if not np.isfinite(q).all():
+        return "no joints can follow the motion, so that it cannot be kept out of regions"
+    for end, joints in (("start", q[0]), ("goal", q[-1])):
+        if region := within_region(c, joints):
+            return f"the {end} is within region {region} of trajectory.keep_out"
+    last, region = first_within(c, q)
+    at = f"at sigma {last / (len(q) - 1):.2f}"
+    return f"the body enters region {region} of trajectory.keep_out {at}" if region else ""
+
+
 def _through_joints(
     reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, search: JointSearch
 ) -> _Found:
     """A way through joint space for a body at A (b, 4); the linear motion where there is none."""
-    model, demands = reaching.model, reaching.demands
-    margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
-    keep = np.where(model.joint_types == PRISMATIC, *margins).astype(np.float64)
-    c = constraints_of(model, A, task, reaching.q_start, Asked(demands, keep, trajectory.least_face_px))
+    model = reaching.model
+    c = _constraints(reaching, A, task, trajectory, search.spread)
     aim = Aim(task.A_star, straight_views(model.lens, task.s_star), search.sigma)
     how = Search(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
-    drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
-    c = c._replace(spread=search.spread, keep_out=drawn)
     way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
     if way.pace is None:
         linear = _given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
@@ -300,7 +321,7 @@ def _found_words(way: Way) -> str:
     some = f"the {len(way.goals)} nearest of " if way.shown > len(way.goals) else ""
     return (
         f"{how} in joint space, after {way.draws} samples, leads to joints {g + 1} of {some}{way.shown} that "
-        "show the goal"
+        f"show the goal{f'; {way.barred} more are within a region' if way.barred else ''}"
     )
 
 
@@ -379,7 +400,8 @@ def run(config: Config, calibration: Calibration) -> Plan:
 
 def _plan_of(scenario: Scenario) -> Plan:
     trajectory = scenario.config.trajectory
-    search = _search_of(scenario) if trajectory.profile in ("joint", "auto") else None
+    searched = trajectory.profile in ("joint", "auto") or trajectory.keep_out
+    search = _search_of(scenario) if searched else None
     return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
 
 
@@ -444,6 +466,12 @@ def _planned(
     else:
         share = tau_limit / parts.tau if parts.tau > 0.0 else 1.0
         found = _given(profile, reaching, trajectory, share)
+    entered = ""
+    if profile != "joint" and trajectory.keep_out and found.feasible:
+        A = _body_at_start(model, task, shown, state.A)
+        spread = NO_SPREAD if search is None else search.spread
+        entered = _entered(_constraints(reaching, A, task, trajectory, spread), found.motion.along.q)
+        found = found._replace(feasible=not entered, reason=entered or found.reason)
     motion, time, way = found.motion, found.time, found.way
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     view = motion.along.view
@@ -497,7 +525,7 @@ def _planned(
         goals=None if way is None else way.shown,
         samples=None if way is None else way.draws,
     )
-    return plan, "" if holds or (way is not None and found.feasible) else words
+    return plan, entered or ("" if holds or (way is not None and found.feasible) else words)
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:

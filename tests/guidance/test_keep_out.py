@@ -9,7 +9,8 @@ from scipy.spatial import ConvexHull
 
 from projservo_cli.guidance.keep_out import keep_out_of, outside_polygon
 from projservo_cli.guidance.timing import joints_at
-from projservo_cli.guidance.way import Search, find_way
+from projservo_cli.guidance.validity import CLEAR, FINE_PX
+from projservo_cli.guidance.way import Search, find_way, margins_at
 from tests.guidance.cases import COUNT, case
 
 
@@ -28,6 +29,52 @@ def test_the_distance_from_a_polygon_is_that_to_its_outline(k, seed):
         assert abs(found) == pytest.approx(np.hypot(*(outline - (u, v)).T).min(), abs=0.1)
         if abs(found) > 1e-6:
             assert (found < 0.0) == Outline(corners).contains_point((u, v))
+
+
+def outside(s, corners):
+    """Distances (k,) of pixels (k, 2) from a polygon, negative within, by its edges one by one."""
+    ends = np.roll(corners, -1, axis=0) - corners
+    x = ((s[:, None] - corners) * ends).sum(axis=-1) / (ends**2).sum(axis=-1)
+    away = s[:, None] - corners - np.clip(x, 0.0, 1.0)[..., None] * ends
+    far = np.linalg.norm(away, axis=-1).min(axis=1)
+    return np.where(Outline(corners).contains_points(s), -far, far)
+
+
+@pytest.mark.parametrize("k", range(6))
+def test_the_margin_is_that_of_every_point_of_every_segment(k):
+    """Held against thousands of points, of thin regions too, which markers alone would not meet."""
+    found, rng = case("paper", k), np.random.default_rng(k)
+    truth, size = found.truth, np.asarray(found.c.image_size)
+    for _ in range(8):
+        q = found.q_start + rng.uniform(-0.05, 0.05, 6)
+        face = truth.M_face @ truth.displacement(q).T
+        x = np.linspace(0.0, 1.0, 3001)[:, None]
+        pairs = [(i, j) for i in range(len(face)) for j in range(i)]
+        points = np.vstack([(1 - x) * face[i] + x * face[j] for i, j in pairs])
+        s = truth.images(q, truth.M_face)
+        drawn = []
+        for view in range(2):
+            middle, far = s[view].mean(axis=0) + rng.normal(0.0, 40.0, 2), rng.uniform(2.0, 60.0)
+            turn = rng.uniform(0.0, np.pi)
+            along, across = (
+                far * np.array([np.cos(turn), np.sin(turn)]),
+                np.array([-np.sin(turn), np.cos(turn)]),
+            )
+            drawn.append(np.array([middle - along, middle + across, middle + along, middle - across]))
+        m = points @ np.swapaxes(truth.P, 1, 2)
+        pixels = m[..., :2] / m[..., 2:]
+        border = np.minimum(pixels + 0.5, size - 0.5 - pixels).min(axis=-1)
+        seen = np.array([outside(pixels[v], drawn[v]) for v in range(2)])
+        one = np.minimum(seen, border).max(axis=0).min()
+        margin = margins_at(found.c._replace(keep_out=keep_out_of([(*drawn, False)])), q)[0][CLEAR]
+        assert margin <= one + 1e-2
+        if one < FINE_PX:
+            assert margin >= one - max(1.0, 0.5 * abs(one))
+        else:
+            assert margin >= FINE_PX - 1.0
+        both = min(outside(s[v], drawn[v]).min() for v in range(2))
+        hides = margins_at(found.c._replace(keep_out=keep_out_of([(*drawn, True)])), q)[0][CLEAR]
+        assert hides == pytest.approx(min(both, margin))
 
 
 def box_of(found, q, half):
@@ -76,4 +123,9 @@ def test_a_region_of_one_image_bars_that_image():
     c = found.c._replace(keep_out=keep_out_of([(everywhere, None, True)]))
     way = find_way(c, found.aim, found.q_start, nothing, Search(samples=200), found.acceleration)
     assert len(way.corners) == 0
-    assert way.failures[9] == way.failures.max()
+    assert way.why_none() == "the start is already within region 1"
+    around = found.aim.s_star[0, 1] + [[-3.0, -3.0], [3.0, -3.0], [0.0, 5.0]]
+    c = found.c._replace(keep_out=keep_out_of([(around, None, True)]))
+    way = find_way(c, found.aim, found.q_start, nothing, Search(samples=200), found.acceleration)
+    assert way.solutions == way.hidden + way.barred
+    assert f"and {way.barred} within a region that is kept out of" in way.why_none()
