@@ -100,7 +100,7 @@ def equations() -> Iterator[str]:
 
 def sweep_columns() -> Iterator[str]:
     """The columns that the table of every sweep has, and the one that it may have."""
-    kinds = {"f": "number", "i": "whole number", "S": "text"}
+    kinds = {"f": "number", "i": "whole number", "u": "whole number", "S": "text"}
     yield from table(
         ("column", "value", "unit", "what it is"),
         (

@@ -14,21 +14,30 @@ BASE, LAW = "base", "law"  # names of axes with a meaning of their own
 
 
 class _Linked(Section):
-    """Several keys that take the same values together."""
+    """Several keys that take the same values together, and further keys that go with a value."""
 
     keys: tuple[str, ...] = Field(
         min_length=1, description="keys of the configuration, such as noise.servo_px"
     )
     values: tuple[Plain, ...] = Field(min_length=1, description="values that all of them take in turn")
+    also: dict[str, dict[str, Plain]] = Field({}, description="values of other keys that go with a value")
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Keys that go with nothing."""
+        for value in self.also.keys() - {*map(str, self.values)}:
+            yield ("also", value), "is none of the values"
 
 
 def _axis(value: Any) -> Any:
-    """A list of values stands for one key that bears the name of the axis."""
+    """Values are those of the key of the name of the axis; a mapping tells what goes with each."""
+    if isinstance(value, dict) and not {*_Linked.model_fields} & {*value}:
+        return {"keys": [""], "values": list(value), "also": value}
     return {"keys": [""], "values": value} if isinstance(value, list) else value
 
 
 _Values = Annotated[tuple[Plain, ...], Field(min_length=1)]
-_Axis = Annotated[_Linked, BeforeValidator(_axis, json_schema_input_type=_Linked | _Values)]
+_Given = _Linked | _Values | dict[str, dict[str, Plain]]
+_Axis = Annotated[_Linked, BeforeValidator(_axis, json_schema_input_type=_Given)]
 _Bases = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
@@ -74,7 +83,10 @@ class SweepConfig(Root):
     runs: Annotated[int, Field(ge=1, le=100_000_000, strict=True)] = Field(
         100, description="runs of each cell"
     )
-    grid: dict[str, _Axis] = Field({}, description="values of each key; law is short for control.laws")
+    grid: dict[str, _Axis] = Field(
+        {},
+        description="values of each key, or of each value what goes with it; law is short for control.laws",
+    )
     random: dict[str, Distribution] = Field(
         {}, description="what the value of a key is drawn from, for each run; for each calibration where "
         "that depends on the key"

@@ -398,10 +398,14 @@ def run(config: Config, calibration: Calibration) -> Plan:
     return _plan_of(scenario_of(config, calibration))
 
 
+def needs_covariance(trajectory: Trajectory) -> bool:
+    """Whether a plan takes the covariance of the calibration: a search through joint space and regions do."""
+    return trajectory.profile in ("joint", "auto") or bool(trajectory.keep_out)
+
+
 def _plan_of(scenario: Scenario) -> Plan:
     trajectory = scenario.config.trajectory
-    searched = trajectory.profile in ("joint", "auto") or trajectory.keep_out
-    search = _search_of(scenario) if searched else None
+    search = _search_of(scenario) if needs_covariance(trajectory) else None
     return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
 
 

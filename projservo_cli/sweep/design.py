@@ -28,6 +28,7 @@ from projservo_cli.records import (
     names_of,
 )
 from projservo_cli.robots.simulated import METRIC_A_INF
+from projservo_cli.stages.plan import needs_covariance
 from projservo_cli.stages.steps import affects, key_of
 from projservo_cli.stages.world import Truth, truth_of
 
@@ -158,11 +159,20 @@ def _sample(distribution: Distribution, rng: np.random.Generator) -> Any:
 
 
 class _Axis(NamedTuple):
-    """One dimension of the grid: its name, the keys it sets, its values."""
+    """One dimension of the grid: its name, the keys it sets, its values, and what goes with some of them."""
 
     name: str
     keys: tuple[str, ...]
     values: tuple[Any, ...]
+    also: Mapping[str, Mapping[str, Any]] = {}
+
+    def changes(self, value: Any) -> Iterator[Override]:
+        """What one of the values sets."""
+        what = f"grid.{self.name}"
+        for key in self.keys:
+            yield from _overrides(what, key, value)
+        for key, other in self.also.get(str(value), {}).items():
+            yield _override(what, key, other)
 
 
 class _Places(NamedTuple):
@@ -193,7 +203,7 @@ class Design:
         """Dimensions of the grid, the last one running fastest; there is always one of laws."""
         found = [_Axis(BASE, (), tuple(name for name, _ in self.bases))] if len(self.bases) > 1 else []
         for name, axis in self.sweep.grid.items():
-            found.append(_Axis(name, self.sweep.keys_of(name), axis.values))
+            found.append(_Axis(name, self.sweep.keys_of(name), axis.values, axis.also))
         if all(LAW not in axis.keys for axis in found):
             control = load_config("base", text=self.bases[0][1]).control
             found.append(_Axis(LAW, (LAW,), names_of(control.laws, control.mode)))
@@ -250,12 +260,7 @@ class Design:
         """Configuration of a cell before anything is drawn."""
         name, text = self.bases[self.base_of(cell)]
         values = self.values(cell)
-        changes = [
-            change
-            for axis in self.axes
-            for key in axis.keys
-            for change in _overrides(f"grid.{axis.name}", key, values[axis.name])
-        ]
+        changes = [change for axis in self.axes for change in axis.changes(values[axis.name])]
         config = load_config(name, changes, text=text)
         if config.recorded or None in (config.robot, config.rig, config.markers, config.task):
             raise InputError(f"base {name}: a sweep needs a simulated robot with a task, and no data")
@@ -287,11 +292,21 @@ class Design:
     def calibrations(self) -> Iterator[tuple[str, Config]]:
         """Key of each calibration that is needed, each once, and a configuration that needs it."""
         seen = set()
-        for place in product(range(self.cells), range(min(self.sweep.calibrations, self.sweep.runs))):
+        for place in product(range(self.cells), range(self._calibrations)):
             key = self.calibration_key(*place)
             if key not in seen:
                 seen.add(key)
                 yield key, self.calibrated(*place)
+
+    def with_covariance(self) -> set[str]:
+        """Keys of the calibrations of which a run needs the covariance, each 0.2 MB."""
+        cells = [c for c in range(self.cells) if needs_covariance(self.cell(c).trajectory)]
+        return {self.calibration_key(*place) for place in product(cells, range(self._calibrations))}
+
+    @property
+    def _calibrations(self) -> int:
+        """How many calibrations a cell has."""
+        return min(self.sweep.calibrations, self.sweep.runs)
 
     @lru_cache(maxsize=64)  # noqa: B019 - a process has one design
     def tasks(self, base: int) -> tuple[FloatArray, FloatArray]:

@@ -37,7 +37,7 @@ SHARED, OWN = 2_000, 100
 CALIBRATIONS = 8  # that one process makes in less time than it takes to start another
 SETTINGS = 64  # as many of a cell, and a part has many runs of each, nearly all of whose time is compiled
 # Indices of the machine code of the closed loop, by whether many runs are made in one call.
-LOOPS = ("compiled.run-*.nbi", "trial.without_rehearsal-*.nbi")
+LOOPS = ("compiled.run_compiled-*.nbi", "trial._until_rehearsal-*.nbi")
 
 
 class _Status(NamedTuple):
@@ -185,11 +185,12 @@ class Folder:
         save(Run(path, to_yaml(made.config), {"calibrate": result_of(step, made.config, *made.records)}))
 
     def calibrations(self, design: Design) -> dict[str, Calibration | None]:
-        """Calibrations by their key, None where one was refused; without covariance, which no run needs."""
+        """Calibrations by their key, None where one was refused; with covariance where a plan needs it."""
         found: dict[str, Calibration | None] = {}
+        whole = design.with_covariance()
         for key, _ in design.calibrations():
             made = load(path).calibration if (path := self.calibration(key)).exists() else None
-            found[key] = made and replace(made, covariance=np.zeros((0, 0)))
+            found[key] = made if made is None or key in whole else replace(made, covariance=np.zeros((0, 0)))
         return found
 
 

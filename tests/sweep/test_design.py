@@ -36,6 +36,13 @@ def test_the_grid_is_the_product_of_its_axes_and_the_last_runs_fastest():
         assert found.values(cell) == {"base": base, "noise": noise, "control.gain_t": gain, "law": law}
 
 
+def test_a_value_may_take_other_keys_with_it():
+    found = design(grid={"law": {"exact": {}, "exact_track": {"trajectory.profile": "auto"}}})
+    profiles = [(cell.control.mode, cell.trajectory.profile) for cell in map(found.cell, range(found.cells))]
+    assert profiles == [(("replan",), "linear"), (("track",), "auto")]
+    assert Design.made_of(found.recipe).cell(1) == found.cell(1)
+
+
 def test_a_run_depends_on_its_number_alone_and_cells_share_their_draws():
     values = {
         "runs": 6,
@@ -112,6 +119,7 @@ def test_random_tasks_come_one_of_each_stratum_in_turn():
         ({"set": {"plant.use": "my_robot:Robot"}}, r"leave plant\.use out"),
         ({"random": {"control.gain_t": {"uniform": [-2, -1]}}}, r"run 0: control\.gain_t.*greater than 0"),
         ({"traces": [8]}, "no run 8"),
+        ({"grid": {"law": {"exact": {"stop.steps": 5}}}}, r"grid\.law: stop\.steps=5.*did you mean"),
     ],
 )
 def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
@@ -133,6 +141,14 @@ def test_what_no_run_can_be_made_of_is_refused_before_any_is(given, message):
         ("base: paper.yaml\nrandom: {control.gain_t: {}}\n", "exactly one of uniform"),
         ("base: paper.yaml\ngrid: {law: []}\n", "grid.law"),
         ("base: paper.yaml\ngrid: {control.gain: [1, 1]}\n", "a value stands there twice"),
+        (
+            "base: paper.yaml\ngrid: {law: {exact: 5}}\n",
+            "grid.law.also.exact: must be a mapping",
+        ),
+        (
+            "base: paper.yaml\ngrid: {law: {keys: [law], values: [exact], also: {b: {}}}}\n",
+            "grid.law.also.b: is none of the values",
+        ),
         ("- 1\n", "expected keys and values"),
     ],
 )

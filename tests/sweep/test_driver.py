@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 
+import numpy as np
 import pytest
 
 from projservo_cli.cli import run
@@ -207,7 +208,7 @@ def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, mon
     cache = tmp_path / "cache" / "loop_0123"
     cache.mkdir(parents=True)
     monkeypatch.setattr(driver, "CACHE_FOLDER", cache.parent)
-    (cache / "compiled.run-108.py311.nbi").touch()
+    (cache / "compiled.run_compiled-108.py311.nbi").touch()
     said = []
     made = []
     monkeypatch.setattr(driver, "run_part", lambda part: made.append(part) or run_part(part))
@@ -224,8 +225,32 @@ def test_an_empty_cache_is_filled_by_one_job_before_there_are_more(tmp_path, mon
     assert not said
     assert given() == ([1, 1, 2], [(1, 2), (0, 1), *every])
     assert said == ["compiling kernels, once, before the processes start"]
-    (cache / "trial.without_rehearsal-108.py311.nbi").touch()
+    (cache / "trial._until_rehearsal-108.py311.nbi").touch()
     assert given() == ([1, 2], every)
+    monkeypatch.undo()
+    assert all(any(driver.CACHE_FOLDER.rglob(loop)) for loop in driver.LOOPS)
+
+
+def test_guided_runs_are_the_same_in_processes_and_made_anew(tmp_path):
+    """Their plans take the covariance of the calibration, which those of other sweeps go without."""
+    guided = {"exact": {}, "exact_track": {"trajectory.profile": "joint"}}
+    found = design(runs=3, chunk=1, calibrations=2, tasks={"random": 3}, grid={"law": guided})
+    make(found, tmp_path / "one")
+    make(found, tmp_path / "two", workers=2)
+    rows, others = columns(tmp_path / "one"), columns(tmp_path / "two")
+    for name, values in rows.items():
+        assert values.tobytes() == others[name].tobytes(), name
+    number = 3 + int(np.flatnonzero(rows["steps"][3:] > 0)[0])
+    assert run(["servo", "--from", f"{tmp_path / 'one'}:{number}", "-o", str(tmp_path / "run"), "-q"]) == 0
+    (trace,) = load(tmp_path / "run").traces.values()
+    for name in ("verdict", "steps", "success", "effort", "position_error_mm"):
+        assert getattr(trace, name) == rows[name][number]
+    assert {made.covariance.size > 0 for made in Folder(tmp_path / "one").calibrations(found).values()} == {
+        True
+    }
+    plain = design(runs=3, calibrations=2)
+    kept = Folder(tmp_path / "one").calibrations(plain).values()
+    assert {made.covariance.size for made in kept} == {0}
 
 
 def test_a_run_made_anew_has_the_numbers_of_its_row(whole, tmp_path):
