@@ -122,6 +122,7 @@ class Calibration:
         about="of P.ravel(), H_hat_0.ravel(), M.ravel(), gauge fixed, and k1, k2 of both lenses if any",
     )
     excitation: FloatArray = _array("joint", units="rad or m", about="range of joint motion in the data")
+    lowest: FloatArray = _array("joint", units="rad or m", about="lowest joint reading in the data")
     weak: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
     operator_defect: FloatArray = _array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
     trace_defect: FloatArray = _array("joint", about="absolute trace of Ĥ")

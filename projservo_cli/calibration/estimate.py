@@ -249,6 +249,7 @@ def _record(
         M=scene.M,
         covariance=covariance,
         excitation=verdict.span,
+        lowest=readings.q[np.unique(readings.pose_of)].min(axis=0),
         weak=verdict.noise > WEAK_NOISE,
         operator_defect=operator_defect,
         trace_defect=trace_defect,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BeforeValidator,
@@ -78,6 +79,10 @@ class _Disturbance(Section):
     bump: _Bump | None = None
     frozen_joint: _FrozenJoint | None = None
     delay_periods: StrictInt = Field(0, ge=0, le=1000, description="by how many periods images are late")
+
+
+# What to do where a robot of somebody's has no joint limits.
+LIMITS_MISSING = "set robot.limits, such as {from_data: 0.1}, or limits in robot.dh or robot.screws"
 
 
 def _law(name: str) -> str:
@@ -426,6 +431,14 @@ def _joint_types(robot: RobotSettings | None, data: _Data | None) -> str:
     return robot.joint_types if robot is not None else ""
 
 
+def _limits_in_joint_space(
+    plant: _PlantSettings, trajectory: Trajectory, robot: RobotSettings | None
+) -> Iterator[Finding]:
+    bounded = robot is not None and (robot.limits is not None or np.isfinite(robot.ranges).all())
+    if trajectory.profile == "joint" and plant.use is not None and not bounded:
+        yield ("robot",), f"the profile joint needs the limits of all joints: {LIMITS_MISSING}"
+
+
 def _same_joints(robot: RobotSettings | None, data: _Data | None) -> Iterator[Finding]:
     given = _joint_types(robot, data)
     if robot is not None and robot.joints and given != robot.joint_types:
@@ -441,6 +454,9 @@ def _joint_vectors(
     """Vectors that are not of the robot's joints, and poses beyond their limits."""
     types = _joint_types(robot, data)
     vectors: dict[tuple[str, ...], JointVector | None] = {("calibration", "reference"): calibration.reference}
+    pairs = robot.limits.joints if robot is not None and robot.limits is not None else None
+    if types and pairs is not None and len(pairs) != len(types):
+        yield ("robot", "limits", "joints"), f"{len(pairs)} pairs for {len(types)} joints ({types})"
     if task is not None:
         vectors["task", "start"] = task.start
         vectors["task", "start_offset"] = task.start_offset
@@ -531,7 +547,8 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone),
-        *(_disturbed_joints, _lost_markers, _plan_to_follow, _keeping_out, _speed_in_joint_space),
+        *(_disturbed_joints, _lost_markers, _plan_to_follow, _keeping_out),
+        *(_speed_in_joint_space, _limits_in_joint_space),
     )
 }
 
@@ -542,6 +559,9 @@ def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
     for key in ("robot", "rig"):
         if sections.get(key, "broken") is None:
             yield (key,), f"{reason} (a recorded one sets data.table)"
+    robot = sections.get("robot")
+    if robot is not None and robot.limits is not None and not robot.joints:
+        yield ("robot",), "a simulated run needs dh or screws (a recorded one sets data.table)"
     if "markers" in sections and getattr(sections["markers"], "positions_m", None) is None:
         yield ("markers", "positions_m"), f"{reason} (a recorded one sets data.table)"
     calibration = sections.get("calibration")
@@ -579,6 +599,11 @@ class Config(Root):
         for rule, wanted in _RULES.items():
             if wanted <= sound.keys():
                 yield from rule(**{name: sound[name] for name in wanted})
+
+    @property
+    def arm(self) -> RobotSettings | None:
+        """The robot where its kinematics are given."""
+        return self.robot if self.robot is not None and self.robot.joints else None
 
     @property
     def recorded(self) -> bool:

@@ -209,12 +209,45 @@ class _Screws(Section):
             yield ("base_tool",), what
 
 
+class _Limits(Section):
+    """Joint limits of a robot whose kinematics nobody gives: one of yours, seen in recorded data."""
+
+    joints: Annotated[tuple[Vector2, ...], Field(min_length=1, max_length=64)] | None = Field(
+        None, description="lowest and highest reading of each joint, base to tool"
+    )
+    unit: Literal["deg", "rad"] | None = Field(None, description="unit of the revolute joints")
+    from_data: NotNegative | None = Field(
+        None,
+        description="instead: what each joint covers in the data, widened at each end by this share of it",
+    )
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Two ways to say them or none, a unit too many or too few, or limits upside down."""
+        if (self.joints is None) == (self.from_data is None):
+            yield (), "give exactly one of joints and from_data"
+        if (self.joints is None) != (self.unit is None):
+            yield ("unit",), "is that of joints: give both or neither"
+        for i, (low, high) in enumerate(self.joints or ()):
+            if not low < high:
+                yield ("joints", i), f"the lower limit {low:g} must be below the upper limit {high:g}"
+
+    def values(self, joint_types: str) -> tuple[tuple[float, float], ...]:
+        """Those that are given, in rad (R) and m (P), one for each letter of ``joint_types``.
+
+        Raises ValueError when the numbers of joints differ.
+        """
+        turned = {"R": math.radians if self.unit == "deg" else float, "P": float}
+        pairs = zip(self.joints or (), joint_types, strict=True)
+        return tuple((turned[letter](low), turned[letter](high)) for (low, high), letter in pairs)
+
+
 class RobotSettings(Section):
-    """A serial arm, given by a DH table or by screws."""
+    """A serial arm, given by a DH table or by screws; of one of yours perhaps its limits alone."""
 
     name: str = Field("", description="for figures and reports")
     dh: _DH | None = Field(None, description="a Denavit-Hartenberg table")
     screws: _Screws | None = Field(None, description="joint screws at a reference, instead of dh")
+    limits: _Limits | None = Field(None, description="joint limits, where neither dh nor screws are given")
 
     @property
     def joints(self) -> tuple[_Joint, ...]:
@@ -228,14 +261,14 @@ class RobotSettings(Section):
         return "".join(joint.type for joint in self.joints)
 
     @property
-    def limits(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest reading of each joint, rad or m; infinite where none is set."""
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """Lowest and highest reading of each joint of dh or screws, rad or m; infinite where none is set."""
         return tuple(joint.limits for joint in self.joints)
 
     def contradictions(self) -> Iterator[Finding]:
-        """No kinematics, or two."""
-        if (self.dh is None) == (self.screws is None):
-            yield (), "give exactly one of dh and screws"
+        """Nothing, or more than one of what tells joints and limits."""
+        if (self.dh, self.screws, self.limits).count(None) != 2:
+            yield (), "give exactly one of dh, screws and, for a robot of yours, limits"
 
 
 class Camera(Section):

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.config import Config
-from projservo_cli.config.models import Trajectory
+from projservo_cli.config.models import LIMITS_MISSING, Trajectory
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -210,6 +210,7 @@ class JointSearch(NamedTuple):
     q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
     sigma: float  # standard deviation of a coordinate of the images of the goal, px
     spread: Spread = NO_SPREAD  # how far predictions err
+    closed: str = ""  # why no way can be looked for, in words
 
 
 def _search_of(scenario: Scenario) -> JointSearch:
@@ -226,7 +227,10 @@ def _search_of(scenario: Scenario) -> JointSearch:
             scenario.config.trajectory.search.seed,
         )
     sigma = scenario.noise_px / math.sqrt(scenario.config.noise.shown_frames)
-    return JointSearch(scenario.joints.acceleration, scenario.q_shown, sigma, spread)
+    joints, closed = scenario.joints, ""
+    if scenario.truth is None and not (np.isfinite(joints.lower) & np.isfinite(joints.upper)).all():
+        closed = f"nothing tells the limits of all joints: {LIMITS_MISSING}"
+    return JointSearch(joints.acceleration, scenario.q_shown, sigma, spread, closed)
 
 
 @lru_cache(maxsize=64)
@@ -423,9 +427,10 @@ def plan_task(
     if trajectory.profile != "auto":
         return _planned(model, shown, trajectory, demands, search)[0]
     before: list[str] = []
+    closed = _closed(model, demands, search)
     for profile in ("linear", "constrained", "joint"):
         asked = trajectory.model_copy(update={"profile": profile})
-        last = profile == "joint" or (profile == "constrained" and bool(_closed(model, demands)))
+        last = profile == "joint" or (profile == "constrained" and bool(closed))
         try:
             plan, fails = _planned(model, shown, asked, demands, search)
         except WorkFailed as error:
@@ -434,14 +439,16 @@ def plan_task(
             before.append(f"not {profile}: {error}")
             continue
         if not fails or last:
-            closed = [] if profile == "joint" or not fails else [f"not joint: {_closed(model, demands)}"]
-            return replace(plan, reason="; ".join([plan.reason, *before, *closed]))
+            after = [] if profile == "joint" or not fails else [f"not joint: {closed}"]
+            return replace(plan, reason="; ".join([plan.reason, *before, *after]))
         before.append(f"not {profile}: {fails}")
     raise AssertionError(before)
 
 
-def _closed(model: Model, demands: Demands) -> str:
-    """Why no way through joint space can be given a time; empty where it can."""
+def _closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
+    """Why no way through joint space can be looked for, or given a time; empty where it can."""
+    if search is None or search.closed:
+        return "no search was given" if search is None else search.closed
     for i in np.flatnonzero(~np.isfinite(demands.speed)):
         kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
         unit = "m_s" if kind == "prismatic" else "deg_s"
@@ -461,8 +468,9 @@ def _planned(
     tau_limit = min((trajectory.delta * t for t in tau_0 if t > 0.0), default=math.inf)
     reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start)
     if profile == "joint":
-        if search is None or _closed(model, demands):
-            raise InputError(f"the profile joint: {_closed(model, demands) or 'no search was given'}")
+        closed = _closed(model, demands, search)
+        if search is None or closed:
+            raise InputError(f"the profile joint: {closed}")
         A = _body_at_start(model, task, shown, state.A)
         found = _through_joints(reaching, A, task, trajectory, search)
     elif profile == "constrained":

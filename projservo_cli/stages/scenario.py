@@ -105,7 +105,7 @@ class Scenario:
         """The model that a law is given: the calibrated one, or for a metric law the true one."""
         if law not in METRIC_LAWS:
             return self.model
-        if None in (self.config.robot, self.config.rig):
+        if None in (self.config.arm, self.config.rig):
             raise InputError(
                 f"{law} is given the metric model of robot and rig: set robot and rig, or leave it out of "
                 "control.laws"
@@ -166,7 +166,7 @@ def scenario_of(config: Config, calibration: Calibration | None = None) -> Scena
     face = face_numbers(config)
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
-    joints = joints_of(config, "" if calibration is None else calibration.joint_types)
+    joints = joints_of(config, "" if calibration is None else calibration.joint_types, calibration)
     assert config.markers is not None
     center, sigma_px = center_index(config.markers), config.noise.servo_px
     if truth is not None:
@@ -342,7 +342,7 @@ def _predicted_ends(
         return np.ascontiguousarray(s)
 
     def turn(q: FloatArray) -> FloatArray:
-        if config.robot is None:
+        if config.arm is None:
             raise InputError("task.goal.turn_deg needs the model of the robot: give joints or images instead")
         return truth_of(config).turned(q, task.goal)
 

@@ -13,7 +13,7 @@ from projservo_cli.config import Config
 from projservo_cli.config.models import Goal
 from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, RobotSettings
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
-from projservo_cli.records import PRISMATIC, REVOLUTE, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.records import PRISMATIC, REVOLUTE, Calibration, FloatArray, InputError, Model, WorkFailed
 from projservo_cli.robots.simulated import Arm, Ends, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
 
@@ -45,16 +45,17 @@ def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
     return ""
 
 
-def joints_of(config: Config, default_types: str = "") -> Joints:
-    """Joints of the robot; of the calibration's ``default_types`` where the configuration does not tell."""
+def joints_of(config: Config, default_types: str = "", calibration: Calibration | None = None) -> Joints:
+    """Joints of the robot; of ``default_types`` where the configuration does not tell.
+
+    calibration : whose data tell limits, where ``robot.limits`` takes them from there; without, none are.
+    """
     vector = reference_of(config)
     types = config.joint_types or default_types or "R" * (len(vector.joints) if vector is not None else 0)
-    robot = config.robot
-    bounds = robot.limits if robot is not None else ((-math.inf, math.inf),) * len(types)
+    lower, upper = _limits_of(config.robot, types, calibration)
     c = config.control
     revolute = math.inf if c.joint_speed_limit_deg_s is None else math.radians(c.joint_speed_limit_deg_s)
     prismatic = math.inf if c.prismatic_speed_limit_m_s is None else c.prismatic_speed_limit_m_s
-    lower, upper = np.array(bounds, dtype=np.float64).reshape(-1, 2).T.copy()
     speed = np.array([prismatic if kind == "P" else revolute for kind in types])
     turning = math.radians(c.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2)
     sliding = c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2
@@ -62,9 +63,27 @@ def joints_of(config: Config, default_types: str = "") -> Joints:
     return Joints(types, lower, upper, speed, acceleration)
 
 
+def _limits_of(
+    robot: RobotSettings | None, types: str, calibration: Calibration | None
+) -> tuple[FloatArray, FloatArray]:
+    """Lower and upper limits (n,) of joints, rad or m; infinite where nothing tells them."""
+    share = robot.limits.from_data if robot is not None and robot.limits is not None else None
+    if share is not None and calibration is not None:
+        span = calibration.excitation
+        return calibration.lowest - share * span, calibration.lowest + (1.0 + share) * span
+    pairs: Sequence[tuple[float, float]] = ((-math.inf, math.inf),) * len(types)
+    if robot is not None and share is None:
+        try:
+            pairs = robot.ranges if robot.limits is None else robot.limits.values(types)
+        except ValueError as error:
+            raise InputError(f"robot.limits.joints: give a pair for each of {len(types)} joints") from error
+    lower, upper = np.array(pairs, dtype=np.float64).reshape(-1, 2).T.copy()
+    return lower, upper
+
+
 def has_task(config: Config) -> bool:
     """Whether there is a robot with a task; a recorded run may be reported on without."""
-    return not config.recorded or None not in (config.robot, config.rig, config.markers, config.task)
+    return not config.recorded or None not in (config.arm, config.rig, config.markers, config.task)
 
 
 def image_size_of(config: Config) -> tuple[int, int] | None:
@@ -155,13 +174,13 @@ def center_index(markers: Markers) -> int:
 
 def truth_of(config: Config) -> Truth:
     """Build the truth, or find it again where it was built; an InputError where a part of it is missing."""
-    if config.robot is None:
+    if config.arm is None:
         raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
     if config.rig is None:
         raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
     if config.markers is None or config.markers.positions_m is None:
         raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
-    return _built(config.robot, config.rig, config.markers)
+    return _built(config.arm, config.rig, config.markers)
 
 
 @lru_cache(maxsize=16)
@@ -208,7 +227,7 @@ def _robot_of(described: RobotSettings) -> Arm:
     """
     kinds = described.joint_types
     types = np.array([PRISMATIC if kind == "P" else REVOLUTE for kind in kinds], dtype=np.int64)
-    lower, upper = np.array(described.limits, dtype=np.float64).T.copy()
+    lower, upper = np.array(described.ranges, dtype=np.float64).T.copy()
     if described.screws is not None:
         screws = described.screws
         twists = np.array([_twist(joint.w, joint.v) for joint in screws.joints])

@@ -262,7 +262,7 @@ class Design:
         values = self.values(cell)
         changes = [change for axis in self.axes for change in axis.changes(values[axis.name])]
         config = load_config(name, changes, text=text)
-        if config.recorded or None in (config.robot, config.rig, config.markers, config.task):
+        if config.recorded or None in (config.arm, config.rig, config.markers, config.task):
             raise InputError(f"base {name}: a sweep needs a simulated robot with a task, and no data")
         if config.plant.use is not None:
             raise InputError(f"base {name}: a sweep drives the simulated robot; leave plant.use out")

@@ -49,7 +49,7 @@ def test_a_configuration_loads_with_defaults_and_units(good):
     assert config.name == "good"
     assert config.joint_types == "RP"
     assert config.task.start.values("RP") == (math.radians(10), 0.5)
-    assert config.robot.limits == ((-2 * math.pi, 2 * math.pi), (0.2, 0.9))
+    assert config.robot.ranges == ((-2 * math.pi, 2 * math.pi), (0.2, 0.9))
     assert config.noise.calibration_px == 0.1
     assert config.control.joint_speed_limit_deg_s is None
     assert config.control.laws == tuple(law for law in LAWS if law != "exact")  # those of the paper
@@ -133,7 +133,7 @@ INCONSISTENT = [
     ("robot.dh.joints.1={type: P, limits_deg: [0, 1]}", "robot.dh.joints.1.limits_deg", "takes limits_m"),
     ("robot.dh.joints.0.limits_rad=[0, 1]", "robot.dh.joints.0.limits_rad", "keep one"),
     (f"robot.screws={{reference: {{joints: [0, 0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}", "robot",
-     "exactly one of dh and screws"),
+     "exactly one of dh, screws and"),
     (f"robot={{screws: {{reference: {{joints: [0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}}}",
      "robot.screws.reference.joints", "1 values for 2 joints"),
     ("robot=null", "robot", "a simulated run needs it"),
@@ -246,7 +246,7 @@ def test_overrides_reach_lists_and_make_sections(good):
     reference = ["calibration.reference.unit=deg", "calibration.reference.joints=[1, 0.2]"]
     gains = ["control.gain=1", "control.gain=2"]
     config = load_config(good, ["robot.dh.joints.1.limits_m=[0.1, 0.6]", *reference, *gains])
-    assert config.robot.limits[1] == (0.1, 0.6)
+    assert config.robot.ranges[1] == (0.1, 0.6)
     assert config.calibration.reference.values("RP") == (math.radians(1), 0.2)
     assert config.control.gain == 2
 

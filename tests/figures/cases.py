@@ -75,6 +75,7 @@ def known(config, true, model, q):
         M=M,
         covariance=sigma**2 * factor.T @ factor,
         excitation=np.ptp(q, axis=0),
+        lowest=q.min(axis=0),
         weak=np.arange(len(q[0])) == 1,
         outlier=none,
         suspect=none[:, :2],
