@@ -208,9 +208,9 @@ REGISTER = (
     _entry(
         "§4.2",
         "Visibility and the motions that do not change it",
-        "task.margins.visibility_margin task.visibility.visibility_translation "
+        "guidance.margins.visibility_margin task.visibility.visibility_translation "
         "task.visibility.visibility_angles task.visibility.choose_sense "
-        "task.visibility.limited_translation task.planning.turning_sense",
+        "task.visibility.limited_translation guidance.lattice.turning_sense",
         "task/test_visibility.py::test_neutral_along_the_ray_of_a_point_of_the_face "
         "task/test_visibility.py::test_neutral_parallel_to_the_face_and_within_its_plane "
         "task/test_visibility.py::test_neutral_about_any_axis_through_the_optical_center "
@@ -223,7 +223,7 @@ REGISTER = (
     _entry(
         "§4.3",
         "Profiles of the trajectory, and the coupled constraint on translation and rotation",
-        "task.trajectory.profile_shares task.planning.plan_path",
+        "task.trajectory.profile_shares guidance.lattice.plan_path",
         "planning/test_planning.py::test_the_shipped_task_needs_coupled_parts "
         "task/test_trajectory.py::test_linear_and_exponential "
         "task/test_trajectory.py::test_what_comes_first_is_done_before_the_rest_begins",

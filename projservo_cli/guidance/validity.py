@@ -27,9 +27,9 @@ from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
 from projservo_cli.geometry.lens import bend, bends
 from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance
+from projservo_cli.guidance.margins import Demands
 from projservo_cli.records import Calibration, FloatArray, IntArray, Model
 from projservo_cli.task.face import Task, center_of, face_plane
-from projservo_cli.task.margins import Demands
 
 LIMITS, FRONT, SIDE, WIDTH, BORDER, CLEAR = 0, 1, 3, 5, 7, 9
 MARGINS = 10  # all but the limits and clear by view

@@ -13,12 +13,12 @@ from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, put_vie
 from projservo_cli.geometry.algebra import IDENTITY
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.geometry.mechanisms import Seen, reach
+from projservo_cli.guidance.margins import Reaching, carrier_of, put_carried, put_margins, room_along, within
 from projservo_cli.loop.step import new_log
 from projservo_cli.loop.summary import Ended, path_deviation, summarize
 from projservo_cli.records import Model
 from projservo_cli.robots.simulated import Ends, Plant
 from projservo_cli.task.face import Task
-from projservo_cli.task.margins import Reaching, carrier_of, carry_joints, within
 from projservo_cli.task.partition import NO_PARTS
 
 
@@ -50,10 +50,12 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     plant = Plant(model, matrices[0], order, 0, O, q, q, q, q, True)
     state, log = new_state(4, 4), new_log(4, 4, 1, len(ERRORS))
     reaching = Reaching(model, within(q, q), matrices, q, matrices[0], q, O, q)
+    along = room_along(reaching, 1)
     yield reach, (model, Seen(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
     yield pseudo_inverse, (state, 8, q)
     yield put_view, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)
-    yield carry_joints, (carrier_of(reaching), O, 1, 1.0, 1.0, q)
+    yield put_carried, (carrier_of(reaching), O, along)
+    yield put_margins, (reaching, along)
     yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))
     yield path_deviation, (plant, log, 1, 0.04, q, q)

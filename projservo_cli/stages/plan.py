@@ -2,31 +2,19 @@
 
 import math
 from dataclasses import replace
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.config import Config
-from projservo_cli.config.models import LIMITS_MISSING, Trajectory
+from projservo_cli.config.models import Trajectory
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
-from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
+from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.guidance.goals import Aim
-from projservo_cli.guidance.keep_out import keep_out_of
-from projservo_cli.guidance.timing import Pace, joints_at
-from projservo_cli.guidance.validity import (
-    NO_SPREAD,
-    Asked,
-    Constraints,
-    Spread,
-    constraints_of,
-    spread_of,
-)
-from projservo_cli.guidance.way import Search, Way, find_way, first_within, within_region
+from projservo_cli.guidance.margins import Demands, Reaching
+from projservo_cli.guidance.validity import NO_SPREAD
 from projservo_cli.loop.trial import begin
 from projservo_cli.records import (
     PRISMATIC,
@@ -38,295 +26,27 @@ from projservo_cli.records import (
     WorkFailed,
     in_sense,
 )
-from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.world import face_numbers
-from projservo_cli.task.body import SETTLED, fit_body
-from projservo_cli.task.face import Task, center_of, face_plane
-from projservo_cli.task.margins import (
-    BEHIND,
-    CONSTRAINTS,
-    IMAGE,
-    JOINTS,
-    VISIBILITY,
-    Along,
-    Demands,
-    Reaching,
-    along,
-    along_joints,
-    limit_margin,
-    within,
+from projservo_cli.stages.motions import (
+    JointSearch,
+    body_at_start,
+    coupled,
+    given,
+    kept_out,
+    search_of,
+    through_joints,
 )
+from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.verdicts import least_of, verdict_of
+from projservo_cli.stages.world import face_numbers
+from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
-from projservo_cli.task.planning import Path, least_time, plan_path
 from projservo_cli.task.target import Shown
-from projservo_cli.task.trajectory import profile_shares
 from projservo_cli.task.visibility import (
     arc_minimum,
     margin_coefficients,
     visibility_angles,
     visibility_translation,
 )
-
-VIEWS = ("left", "right")
-
-
-def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
-    """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
-
-    Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
-    """
-    duration, ramp = trajectory.duration_s, trajectory.ramp_s
-    eased = _from_rest(shortest, ramp)
-    least = float(eased[-1])
-    if duration is None:
-        return eased
-    _require_time(duration, least)
-    if not least > 0.0:
-        eased = _from_rest(sigma * duration, ramp)
-    return np.asarray(eased * (duration / eased[-1]))
-
-
-def _require_time(duration: float, least: float) -> None:
-    if least > duration:
-        raise WorkFailed(
-            f"trajectory.duration_s {duration:g}: the joint-speed limit lets the motion take {least:.4g} s "
-            "or more: give it longer, or null for as short as that"
-        )
-
-
-def _from_rest(time: FloatArray, ramp: float) -> FloatArray:
-    """Times (s,) of a motion that comes up to its pace evenly in so many s, and so to rest again at its end.
-
-    The pace, seconds of ``time`` a second, is a trapezoid, of a short motion a triangle of the same slope:
-    the motion never is faster, and takes longer by the ramp.
-    """
-    total = float(time[-1])
-    if not (ramp > 0.0 and total > 0.0):
-        return time
-    half = 0.5 * min(total, ramp)
-    end = total + ramp if total >= ramp else 2.0 * math.sqrt(total * ramp)
-    before = np.sqrt(2.0 * ramp * np.maximum(time, 0.0))
-    after = end - np.sqrt(2.0 * ramp * np.maximum(total - time, 0.0))
-    return np.select([time <= half, time >= total - half], [before, after], time + 0.5 * ramp)
-
-
-def _verdict_of(path: Path) -> tuple[bool, str, str]:
-    """Whether all constraints hold along a path, which is nearest to failing, and that in words.
-
-    Nearest is the smallest share of the margin at the worse of both ends; where a constraint fails, words
-    are of the first instant at which it does.
-    """
-    shares = path.shares()
-    nearest = int(np.argmin(shares.min(axis=0)))
-    margins = path.along.margins[:, nearest]
-    name, holds = CONSTRAINTS[nearest], bool(margins.min() > 0.0)
-    words = _words(path, nearest, int(np.argmin(shares[:, nearest]) if holds else np.argmax(margins <= 0.0)))
-    if holds:
-        return True, name, f"all constraints hold; nearest is {name}: {words}"
-    return False, name, f"{name} fails first: {words}"
-
-
-def _words(path: Path, constraint: int, instant: int) -> str:
-    """What one constraint says at one instant, and where that is."""
-    found, demands = path.along, path.reaching.demands
-    at = "at mu_t {:.2f}, mu_r {:.2f}, mu_p {:.2f}".format(*path.mu[instant])
-    if constraint == VISIBILITY:
-        view = int(np.argmin(found.view.visibility[instant]))
-        margin = found.view.visibility[instant, view]
-        return f"visibility from the {VIEWS[view]} camera is {margin:.3f} of the start's {at}"
-    if constraint == IMAGE:
-        view = int(np.argmin(found.view.distance[instant]))
-        return f"{_border_words(found.view.distance[instant, view], VIEWS[view], demands)} {at}"
-    if math.isnan(found.condition[instant]):
-        return f"the joints cannot follow: the operators become dependent {at}"
-    if constraint == JOINTS:
-        q = found.q[instant]
-        i = int(np.argmin(limit_margin(q, demands)))
-        limits = f"its limits are {demands.lower[i]:.4g} to {demands.upper[i]:.4g} (rad or m)"
-        return f"joint {i + 1} is at {q[i]:.4g}, {limits}, {at}"
-    return (
-        f"the reciprocal condition of the image Jacobian is {found.condition[instant]:.2g} "
-        f"({demands.conditioning:.2g} allowed) {at}"
-    )
-
-
-def _border_words(distance: float, view: str, demands: Demands) -> str:
-    if distance <= BEHIND:
-        return f"a marker of the face is behind the {view} camera"
-    if distance < 0.0:
-        return f"a marker of the face is {-distance:.1f} px outside the {view} image"
-    return (
-        f"a marker of the face is {distance:.1f} px from the border of the {view} image "
-        f"({demands.border_px:g} px asked for)"
-    )
-
-
-def _least(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Smallest value (4,) of each constraint in its own unit, and the shares (4, 3) where it is."""
-    found, view = path.along, path.along.view
-    values = [view.visibility.min(axis=1), view.distance.min(axis=1), found.limit, found.condition]
-    where = [0 if np.isnan(column).all() else int(np.nanargmin(column)) for column in values]
-    return np.array([column[i] for column, i in zip(values, where, strict=True)]), path.mu[where]
-
-
-class _Found(NamedTuple):
-    """A motion that was found for a task."""
-
-    judged: Path  # where the constraints were looked at
-    motion: Path  # as it is stored, at the instants sigma
-    time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
-    feasible: bool
-    reason: str  # feasible, reason: whether it may be followed, in words
-    way: Way | None = None  # through joint space, where one was looked for
-
-
-def _coupled(reaching: Reaching, trajectory: Trajectory) -> _Found:
-    """Shares of translation and rotations that keep all constraints, [RH00] section 4.3."""
-    sigma = np.linspace(0.0, 1.0, trajectory.samples)
-    judged = plan_path(reaching)
-    mu = judged.at(sigma)
-    motion = Path(judged.reaching, mu, along(judged.reaching, mu))
-    if judged.holds() and not motion.holds():  # between the places that were looked at
-        judged = motion
-    feasible, _, reason = _verdict_of(judged)
-    reason = reason if feasible else f"no path was found that keeps all constraints; {reason}"
-    return _Found(judged, motion, _timed(sigma * judged.duration(), sigma, trajectory), feasible, reason)
-
-
-def _given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> _Found:
-    """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
-    sigma = np.linspace(0.0, 1.0, trajectory.samples)
-    mu = profile_shares(profile, sigma, pure_translation)
-    motion, speed = Path(reaching, mu, along(reaching, mu)), reaching.demands.speed
-    shortest = least_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
-    time = _timed(shortest, sigma, trajectory)
-    return _Found(motion, motion, time, *_in_sight(profile, motion.along))
-
-
-class JointSearch(NamedTuple):
-    """What the profile ``joint`` takes beside model, images and demands."""
-
-    acceleration: FloatArray  # (n,) most joint acceleration, rad/s² or m/s²
-    q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
-    sigma: float  # standard deviation of a coordinate of the images of the goal, px
-    spread: Spread = NO_SPREAD  # how far predictions err
-    closed: str = ""  # why no way can be looked for, in words
-
-
-def _search_of(scenario: Scenario) -> JointSearch:
-    """What a scenario tells of a search through joint space."""
-    calibration, spread = scenario.calibration, NO_SPREAD
-    if calibration is not None:
-        numbers = scenario.numbers if len(scenario.ends.body.M) else scenario.numbers[: scenario.m]
-        known, demands = calibration.marker.tolist(), scenario.demands
-        spread = _spread(
-            calibration,
-            tuple(known.index(number) for number in numbers),
-            scenario.m,
-            (tuple(demands.lower), tuple(demands.upper), tuple(demands.image_size)),
-            scenario.config.trajectory.search.seed,
-        )
-    sigma = scenario.noise_px / math.sqrt(scenario.config.noise.shown_frames)
-    joints, closed = scenario.joints, ""
-    if scenario.truth is None and not (np.isfinite(joints.lower) & np.isfinite(joints.upper)).all():
-        closed = f"nothing tells the limits of all joints: {LIMITS_MISSING}"
-    return JointSearch(joints.acceleration, scenario.q_shown, sigma, spread, closed)
-
-
-@lru_cache(maxsize=64)
-def _spread(
-    calibration: Calibration,
-    indices: tuple[int, ...],
-    m: int,
-    bounds: tuple[tuple[float, ...], ...],
-    seed: int,
-) -> Spread:
-    """How far predictions of a calibration err, the same for every task; it takes 20 ms."""
-    lower, upper, size = (np.array(bound) for bound in bounds)
-    demands = within(lower, upper)._replace(image_size=size)
-    return spread_of(calibration, np.array(indices), m, demands, seed)
-
-
-def _body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> FloatArray:
-    """Points (b, 4) of the body at the start, face first; the face A (m, 4) alone without a body."""
-    if len(task.body.M) == 0:
-        return A
-    seen = straight_views(model.lens, shown.s_start)
-    fit = fit_body(model.P, task.body, seen, forward(model, shown.q_start), SETTLED, np.zeros((6, 7)))
-    return np.asarray(task.body.M @ as_array(fit.H).T)
-
-
-# What is left of the images, px, where joints are interpolated between the places that are stored.
-_INTERPOLATED_PX = 0.05
-
-
-def _constraints(
-    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread
-) -> Constraints:
-    """What joints are held against, for a body at A (b, 4)."""
-    margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
-    keep = np.where(reaching.model.joint_types == PRISMATIC, *margins).astype(np.float64)
-    asked = Asked(reaching.demands, keep, trajectory.least_face_px)
-    drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
-    c = constraints_of(reaching.model, A, task, reaching.q_start, asked)
-    return c._replace(spread=spread, keep_out=drawn)
-
-
-def _entered(c: Constraints, q: FloatArray) -> str:
-    """Which region the body enters along joints (s, n), in words; empty where it keeps out of all."""
-    if not np.isfinite(q).all():
-        return "no joints can follow the motion, so that it cannot be kept out of regions"
-    for end, joints in (("start", q[0]), ("goal", q[-1])):
-        if region := within_region(c, joints):
-            return f"the {end} is within region {region} of trajectory.keep_out"
-    last, region = first_within(c, q)
-    at = f"at sigma {last / (len(q) - 1):.2f}"
-    return f"the body enters region {region} of trajectory.keep_out {at}" if region else ""
-
-
-def _through_joints(
-    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, search: JointSearch
-) -> _Found:
-    """A way through joint space for a body at A (b, 4); the linear motion where there is none."""
-    model = reaching.model
-    c = _constraints(reaching, A, task, trajectory, search.spread)
-    aim = Aim(task.A_star, straight_views(model.lens, task.s_star), search.sigma)
-    how = Search(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
-    way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
-    if way.pace is None:
-        linear = _given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
-        q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
-        still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
-        motion = linear.motion._replace(along=still)
-        return _Found(linear.judged, motion, unknown, False, way.why_none(), way)
-    found = _sampled(reaching, way.pace, trajectory.samples)
-    least = float(way.pace.time[-1])
-    duration = least if trajectory.duration_s is None else trajectory.duration_s
-    _require_time(duration, least)
-    motion = Path(reaching, np.full((len(found.q), 3), np.nan), found)
-    time = np.linspace(0.0, duration, len(found.q))
-    return _Found(motion, motion, time, True, _found_words(way), way)
-
-
-def _sampled(reaching: Reaching, pace: Pace, samples: int) -> Along:
-    """The motion at so many places even in time, or more where joints between them were too far off."""
-    while True:
-        q = joints_at(pace, np.linspace(0.0, float(pace.time[-1]), 2 * samples - 1))
-        found, between = along_joints(reaching, q[::2]), 0.5 * (q[:-2:2] + q[2::2])
-        off = along_joints(reaching, q[1::2]).view.s - along_joints(reaching, between).view.s
-        if np.abs(off).max() <= _INTERPOLATED_PX:
-            return found
-        samples = 2 * samples - 1
-
-
-def _found_words(way: Way) -> str:
-    g = int(np.abs(way.goals - way.corners[-1]).max(axis=1).argmin())
-    how = "a straight way" if way.straight else f"a way through {len(way.corners) - 2} corners"
-    some = f"the {len(way.goals)} nearest of " if way.shown > len(way.goals) else ""
-    return (
-        f"{how} in joint space, after {way.draws} samples, leads to joints {g + 1} of {some}{way.shown} that "
-        f"show the goal{f'; {way.barred} more are within a region' if way.barred else ''}"
-    )
 
 
 def _partitioned(
@@ -409,7 +129,7 @@ def needs_covariance(trajectory: Trajectory) -> bool:
 
 def _plan_of(scenario: Scenario) -> Plan:
     trajectory = scenario.config.trajectory
-    search = _search_of(scenario) if needs_covariance(trajectory) else None
+    search = search_of(scenario) if needs_covariance(trajectory) else None
     return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
 
 
@@ -471,27 +191,24 @@ def _planned(
         closed = _closed(model, demands, search)
         if search is None or closed:
             raise InputError(f"the profile joint: {closed}")
-        A = _body_at_start(model, task, shown, state.A)
-        found = _through_joints(reaching, A, task, trajectory, search)
+        A = body_at_start(model, task, shown, state.A)
+        found = through_joints(reaching, A, task, trajectory, search)
     elif profile == "constrained":
-        found = _coupled(reaching, trajectory)
+        found = coupled(reaching, trajectory)
     else:
         share = tau_limit / parts.tau if parts.tau > 0.0 else 1.0
-        found = _given(profile, reaching, trajectory, share)
-    entered = ""
+        found = given(profile, reaching, trajectory, share)
     if profile != "joint" and trajectory.keep_out and found.feasible:
-        A = _body_at_start(model, task, shown, state.A)
-        spread = NO_SPREAD if search is None else search.spread
-        entered = _entered(_constraints(reaching, A, task, trajectory, spread), found.motion.along.q)
-        found = found._replace(feasible=not entered, reason=entered or found.reason)
+        A = body_at_start(model, task, shown, state.A)
+        found = kept_out(found, A, task, trajectory, NO_SPREAD if search is None else search.spread)
     motion, time, way = found.motion, found.time, found.way
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
-    view = motion.along.view
+    along = motion.along
     if len(shown.q_start) < COORDINATES and way is None:
-        _require_in_span(model, state.A, shown.q_start, view.s)
+        _require_in_span(model, state.A, shown.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
-    holds, constraint, words = _verdict_of(found.judged)
-    least, least_mu = _least(found.judged)
+    holds, constraint, words = verdict_of(found.judged)
+    least, least_mu = least_of(found.judged)
     plan = Plan(
         profile=profile,
         feasible=found.feasible,
@@ -506,13 +223,13 @@ def _planned(
         sigma=np.linspace(0.0, 1.0, len(time)),
         time=time,
         mu=motion.mu,
-        H_d=view.H_d,
-        s=view.s,
-        margin=view.visibility,
-        border_distance=view.distance,
-        q=motion.along.q,
-        joint_margin=motion.along.limit,
-        condition=motion.along.condition,
+        H_d=along.H_d,
+        s=along.s,
+        margin=along.visibility,
+        border_distance=along.distance,
+        q=along.q,
+        joint_margin=along.limit,
+        condition=along.condition,
         least=least,
         least_mu=least_mu,
         s_start=face.s_start,
@@ -537,7 +254,7 @@ def _planned(
         goals=None if way is None else way.shown,
         samples=None if way is None else way.draws,
     )
-    return plan, entered or ("" if holds or (way is not None and found.feasible) else words)
+    return plan, found.entered or ("" if holds or (way is not None and found.feasible) else words)
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:
@@ -560,27 +277,6 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
         c_0, c_s, c_c = (c * (task.visible[view] / abs(c[0] + c[2]))).tolist()
         margins[:, view] = [arc_minimum(c_0, c_s, c_c, sense) for sense in senses.tolist()]
     return senses, margins
-
-
-def _in_sight(profile: str, found: Along) -> tuple[bool, str]:
-    """Whether both cameras see the face all along, and what says so."""
-    margins = found.view.visibility
-    sigma = np.linspace(0.0, 1.0, len(margins))
-    worst = np.unravel_index(np.argmin(margins), margins.shape)
-    if margins.min() > 0.0:
-        return True, (
-            f"both cameras see the face all along; least margin {margins.min():.3f} of the start's, "
-            f"{VIEWS[worst[1]]} camera at sigma {sigma[worst[0]]:.2f}"
-        )
-    lost = [
-        f"{VIEWS[view]} from sigma {sigma[np.argmax(margins[:, view] <= 0)]:.2f}"
-        for view in range(2)
-        if margins[:, view].min() <= 0.0
-    ]
-    return False, (
-        f"the profile {profile} turns the face away from a camera ({', '.join(lost)}): "
-        "choose another trajectory.profile"
-    )
 
 
 def rotation_sense(scenario: Scenario) -> FloatArray:

@@ -15,6 +15,7 @@ from projservo_cli.config import Config
 from projservo_cli.config.models import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.guidance.margins import Demands
 from projservo_cli.loop.step import Limits
 from projservo_cli.records import (
     BODY_LAWS,
@@ -38,7 +39,6 @@ from projservo_cli.stages.world import (
 )
 from projservo_cli.task.body import NO_BODY, Body, body_of
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
-from projservo_cli.task.margins import Demands
 from projservo_cli.task.target import Shown
 
 # Independent streams of random numbers, each a child of a seed.

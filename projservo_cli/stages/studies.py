@@ -18,6 +18,7 @@ from projservo_cli.geometry.algebra import (
     exp_rotation,
     twist_exponential,
 )
+from projservo_cli.guidance.margins import within
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
@@ -25,7 +26,6 @@ from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.world import Truth, truth_of
-from projservo_cli.task.margins import within
 
 GAINS = (0.5, 0.3, 0.1, 0.05, 0.02)
 PERIODS_S = (0.16, 0.08, 0.04, 0.02, 0.01)

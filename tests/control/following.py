@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
+from projservo_cli.guidance.margins import within
 from projservo_cli.records import NO_LENS
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.task.margins import within
 from projservo_cli.task.target import Shown, followed
 from tests.known import asked
 from tests.scene import GAINS, Run, limits

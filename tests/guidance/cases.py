@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.guidance.goals import Aim
+from projservo_cli.guidance.margins import Demands
 from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweep.design import random_tasks
-from projservo_cli.task.margins import Demands
 from projservo_cli.task.target import Shown
 from tests.known import configured
 

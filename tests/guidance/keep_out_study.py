@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
+from projservo_cli.task.margins import within
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
@@ -31,7 +32,6 @@ from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.world import Truth, joints_of, truth_of
 from projservo_cli.sweep.design import random_tasks
-from projservo_cli.task.margins import within
 from projservo_cli.task.target import Shown
 from tests.known import configured
 

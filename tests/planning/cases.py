@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from projservo_cli.guidance.margins import Reaching
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.task.margins import Reaching
 from tests.known import asked
 from tests.stages.cases import case
 

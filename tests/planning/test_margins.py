@@ -6,8 +6,15 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.task.margins import BEHIND, Demands, along, image_margin, limit_margin, view_at
-from projservo_cli.task.planning import least_time, shortest, widest
+from projservo_cli.guidance.lattice import least_time, shortest, widest
+from projservo_cli.guidance.margins import (
+    BEHIND,
+    Demands,
+    along_shares,
+    image_margin,
+    joint_margin,
+    limit_margin,
+)
 from tests.planning.cases import reaching_of
 from tests.samples import frame, in_frame, pixels, poe
 from tests.stages.cases import case
@@ -28,7 +35,7 @@ def test_margins_of_the_views_are_those_of_the_displaced_face(name):
     example = case(name)
     plan, reaching = example.plan, reaching_of(name)
     size = example.truth.image_size
-    found = view_at(reaching, SHARES)
+    found = along_shares(reaching, SHARES).along
     for i, mu in enumerate(SHARES):
         H = displacement(plan, mu)
         s = pixels(reaching.model.P, plan.A @ H.T)
@@ -39,7 +46,8 @@ def test_margins_of_the_views_are_those_of_the_displaced_face(name):
         sight = plan.a @ np.linalg.inv(H) @ plan.optical_center.T / (plan.optical_center @ plan.a)
         np.testing.assert_allclose(found.visibility[i], sight, atol=1e-12)
         wanted = (border.min() - 20.0) / (0.5 * size.min() - 20.0)
-        assert image_margin(found.distance[i].min(), reaching.demands) == pytest.approx(wanted, abs=1e-9)
+        assert image_margin(reaching.demands, found.distance[i].min()) == pytest.approx(wanted, abs=1e-9)
+        assert found.margins[i, 1] == pytest.approx(wanted, abs=1e-9)
 
 
 def test_a_marker_behind_a_camera_is_as_far_outside_as_can_be():
@@ -50,15 +58,18 @@ def test_a_marker_behind_a_camera_is_as_far_outside_as_can_be():
     there = reaching._replace(H_hat=np.stack([X, *reaching.H_hat[1:]]), amplitudes=np.array([3.0, 0.0, 0.0]))
     for sign in (1.0, -1.0):
         model = there.model._replace(P=sign * there.model.P)
-        found = view_at(there._replace(model=model), np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]))
+        shares = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        found = along_shares(there._replace(model=model), shares).along
         assert found.distance[0].min() > 0.0
         assert found.distance[1, 0] == BEHIND
 
 
 def test_margin_of_joint_limits():
     demands = Demands(np.array([-1.0, -np.inf]), np.array([3.0, np.inf]), np.ones(2), np.ones(2), 0.0, 0.0)
-    q = np.array([[1.0, 99.0], [2.0, 99.0], [-1.5, 99.0]])
-    np.testing.assert_array_equal(limit_margin(q, demands), [[1.0, 1.0], [0.5, 1.0], [-0.25, 1.0]])
+    for q_0, wanted in ((1.0, 1.0), (2.0, 0.5), (-1.5, -0.25)):
+        q = np.array([q_0, 99.0])
+        assert [joint_margin(demands, q, i) for i in range(2)] == [wanted, 1.0]
+        assert limit_margin(demands, q) == wanted
 
 
 @pytest.mark.parametrize("name", ["paper", "ur5"])
@@ -67,13 +78,13 @@ def test_joints_follow_the_planned_displacement(name):
     example = case(name)
     reaching = reaching_of(name)
     mu = np.linspace(0.0, 1.0, 5)[:, None] * np.array([1.0, 1.0, 1.0])
-    found = along(reaching, mu)
+    found = along_shares(reaching, mu).along
     start = np.linalg.inv(poe(example.truth.model, reaching.q_start))
     plan = example.plan
     for q, share in zip(found.q, mu, strict=True):
         H = poe(example.truth.model, q) @ start
         np.testing.assert_allclose(plan.A @ H.T, plan.A @ displacement(plan, share).T, atol=1e-9)
-    there = along(reaching_of(name, in_frame(example.truth.model, frame(3))), mu)
+    there = along_shares(reaching_of(name, in_frame(example.truth.model, frame(3))), mu).along
     np.testing.assert_allclose(there.q, found.q, atol=1e-7)
     np.testing.assert_allclose(there.condition, found.condition, rtol=1e-6)
 
@@ -82,7 +93,7 @@ def test_joints_that_cannot_follow_are_none_from_there_on():
     """Twice the translation leads out of reach; the margin of conditioning says so."""
     reaching = reaching_of("ur5")
     far = reaching._replace(amplitudes=reaching.amplitudes * np.array([8.0, 0.0, 0.0]))
-    found = along(far, np.linspace(0.0, 1.0, 11)[:, None] * np.ones(3))
+    found = along_shares(far, np.linspace(0.0, 1.0, 11)[:, None] * np.ones(3)).along
     lost = np.isnan(found.q).any(axis=1)
     assert not lost[0]
     assert lost[-1]
@@ -111,14 +122,15 @@ def all_paths(shape):
 @pytest.mark.parametrize("seed", range(5))
 def test_widest_and_shortest_path_among_all(seed):
     rng = np.random.default_rng(seed)
-    shape = (3, 3, 2)
+    shape = (3, 3, 3)
     margins, joints = rng.uniform(-1, 1, shape), rng.normal(size=(*shape, 2))
     speed = np.array([1.0, 3.0])
     paths = list(all_paths(shape))
     best = max(min(margins[node] for node in path) for path in paths)
-    value = widest(margins)
-    assert value[-1, -1, -1] == best
-    taken = [tuple(int(x) for x in node) for node in shortest(value >= best, joints, speed)]
+    value = widest(margins.ravel())
+    assert value[-1] == best
+    nodes = shortest(value >= best, joints.reshape(-1, 2), speed)
+    taken = [tuple(int(x) for x in np.unravel_index(node, shape)) for node in nodes]
     assert taken in paths
     assert min(margins[node] for node in taken) == best
 

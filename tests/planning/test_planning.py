@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from projservo_cli.guidance.lattice import turning_sense
 from projservo_cli.records import InputError
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.design import STRATA, random_tasks
-from projservo_cli.task.planning import turning_sense
 from projservo_cli.task.target import Shown
 from tests.known import asked, configured, known_scenario
 from tests.planning.cases import constrained, reaching_of

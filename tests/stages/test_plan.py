@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from projservo_cli.guidance.margins import within
 from projservo_cli.stages import calibrate
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import plan_task, rotation_sense
 from projservo_cli.stages.scenario import scenario_of
-from projservo_cli.task.margins import within
 from projservo_cli.task.trajectory import PROFILES
 from tests.known import asked, configured
 from tests.samples import frame, in_frame, pixels

@@ -1,0 +1,365 @@
+"""How far a planned motion is from what must not happen: its joints and its margins.
+
+Each margin is a number, positive where its constraint holds:
+
+- visibility: a·O of the face and a camera over its value at the start, [RH00] section 4.2; 0 where the
+  camera looks along the face;
+- image: distance of a marker from the border of an image less ``border_px``, over half the shorter
+  side of the image less ``border_px``; 1 in the middle of a square image;
+- joints: distance of a joint from its nearer limit over half its range; 1 in the middle;
+- conditioning: reciprocal condition of the image Jacobian less ``conditioning``.
+
+No path betters the margins of its ends. A planner therefore counts in shares of them, one scale a
+constraint: the smallest share of an instant is 1 where nothing is nearer than at the worse of both
+ends, and 0 where a constraint is about to fail.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_mat, put_vec, vec
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kernels import COORDINATES, orthogonalize
+from projservo_cli.geometry.kinematics import backward, forward, image_velocity, operators_at, project, row
+from projservo_cli.geometry.lens import bend, bends
+from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, reach, span_of, workspace
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.trajectory import displaced
+from projservo_cli.task.visibility import margin_coefficients
+
+CONSTRAINTS = ("visibility", "image", "joints", "conditioning")
+VISIBILITY, IMAGE, JOINTS, CONDITIONING = range(4)
+# A margin this bad is as bad as it gets: joints out of reach.
+WORST = -10.0
+# Distance, px, from the border of an image of what no camera shows.
+BEHIND = -1e9
+# A joint that moves more than this between neighbours on a path, rad or m, asks for twice the parts between.
+MOST_PART = 0.2
+MOST_PARTS = 256
+
+
+class Demands(NamedTuple):
+    """What a planned motion must keep to."""
+
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    speed: FloatArray  # (n,) most joint motion per second, rad/s or m/s; infinite for none
+    image_size: FloatArray  # (2,) width and height of both images, px; infinite where an image has no border
+    border_px: float  # least distance of a marker from the border of an image, px
+    conditioning: float  # least reciprocal condition of the image Jacobian of the face
+
+
+def within(lower: FloatArray, upper: FloatArray) -> Demands:
+    """Demands of joint limits alone, (n,) rad or m."""
+    endless = np.full(len(lower), math.inf)
+    return Demands(lower, upper, endless, np.full(2, math.inf), 0.0, 0.0)
+
+
+class Reaching(NamedTuple):
+    """A partitioned task as the planner sees it."""
+
+    model: Model  # calibrated model; a_inf·M keeps its scale under all displacements
+    demands: Demands  # what the motion must keep to
+    H_hat: FloatArray  # (3, 4, 4) operators t, r, p
+    amplitudes: FloatArray  # (3,) τ in the unit of Ĥ_t, θ_r and θ_p in rad
+    A: FloatArray  # (m, 4) face at the start
+    a: FloatArray  # (4,) its plane
+    O: FloatArray  # (2, 4) optical centres
+    q_start: FloatArray  # (n,) joints at the start, rad or m
+
+
+class Along(NamedTuple):
+    """What is along a motion, at s instants."""
+
+    H_d: FloatArray  # (s, 4, 4) displacement of the face
+    s: FloatArray  # (s, 2, m, 2) its images, px
+    visibility: FloatArray  # (s, 2) margins a·O, 1 at the start
+    # (s, 2) least distance of a marker from the image border, px; ``BEHIND`` where none shows it
+    distance: FloatArray
+    q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
+    limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
+    condition: FloatArray  # (s,) reciprocal conditions of the image Jacobian, NaN likewise
+    # (s, 4) the smallest of each of ``CONSTRAINTS``; ``WORST`` where the joints cannot follow
+    margins: FloatArray
+
+
+def room_along(reaching: Reaching, count: int) -> Along:
+    """Room for what is along a motion, at so many instants."""
+    m, n = len(reaching.A), len(reaching.q_start)
+    shapes = (4, 4), (2, m, 2), (2,), (2,), (n,), (), (), (4,)
+    return Along(*(np.full((count, *shape), np.nan) for shape in shapes))
+
+
+class Motion(NamedTuple):
+    """A planned motion at s instants."""
+
+    reaching: Reaching  # the task, in the senses of both rotations that were chosen
+    mu: FloatArray  # (s, 3) shares; NaN of a way through joint space
+    along: Along  # what is along it
+
+    def shares(self) -> FloatArray:
+        """Each margin (s, 4) over that at the worse of both ends, or over 1 where that is not positive."""
+        margins = self.along.margins
+        return np.asarray(margins / scale_of(margins[0], margins[-1]))
+
+    def holds(self) -> bool:
+        """Whether all constraints hold."""
+        return bool(self.along.margins.min() > 0.0)
+
+
+def scale_of(first: FloatArray, last: FloatArray) -> FloatArray:
+    """What margins (...,) are shares of: those at the worse of both ends, 1 where that is not positive."""
+    worse = np.minimum(first, last)
+    return np.where(worse > 0.0, worse, 1.0)
+
+
+@merged
+def visibility_margin(reaching: Reaching, view: int, mu_t: float, mu_r: float) -> float:
+    """Margin of one camera: the dual motion of its optical centre against the plane, [RH00] section 4.2.
+
+    The translation carries the centre along a line, the rotation within the plane leaves the plane as
+    it is: for every share μ_t the margin is c_0 + c_s sin θ + c_c cos θ with coefficients affine in μ_t.
+    """
+    O = vec(reaching.O[view])
+    a = vec(reaching.a)
+    moved = axpy(-mu_t * float(reaching.amplitudes[0]), apply(mat(reaching.H_hat[0]), O), O)
+    c_0, c_s, c_c = margin_coefficients(a, mat(reaching.H_hat[1]), moved)
+    theta = mu_r * float(reaching.amplitudes[1])
+    return (c_0 + c_s * math.sin(theta) + c_c * math.cos(theta)) / dot(a, O)
+
+
+@merged
+def pixel(model: Model, view: int, A: Vec4) -> tuple[float, float]:
+    """Pixel of a point, as the camera reports it, [RH00] eq. (1)."""
+    P = model.P[view]
+    depth = row(P, 2, A)
+    u, v = row(P, 0, A) / depth, row(P, 1, A) / depth
+    return bend(model.lens[view], u, v) if bends(model.lens) else (u, v)
+
+
+@merged
+def in_front(P: FloatArray, A: Vec4, M: Vec4) -> bool:
+    """Whether a camera has a point M on the side on which it had it at A."""
+    depth = row(P, 2, A)
+    return row(P, 2, M) * depth > 1e-9 * (depth * depth)
+
+
+@merged
+def inside(image_size: FloatArray, u: float, v: float) -> float:
+    """Distance of a pixel from the border of the image, px; negative outside, ``BEHIND`` of none."""
+    if not math.isfinite(u + v):
+        return BEHIND
+    return min(u + 0.5, v + 0.5, float(image_size[0]) - 0.5 - u, float(image_size[1]) - 0.5 - v)
+
+
+@merged
+def image_margin(demands: Demands, distance: float) -> float:
+    """Margin of a distance from the border, px; 1 where images have no border."""
+    half = 0.5 * min(float(demands.image_size[0]), float(demands.image_size[1]))
+    if not math.isfinite(half):
+        return 1.0 if distance > 0.0 else WORST
+    return max(WORST, (distance - demands.border_px) / (half - demands.border_px))
+
+
+@merged
+def joint_margin(demands: Demands, q: FloatArray, i: int) -> float:
+    """Margin of the limits of joint i of q (n,); 1 for a joint without."""
+    lower, upper = float(demands.lower[i]), float(demands.upper[i])
+    if not math.isfinite(upper - lower):
+        return 1.0
+    return min(max(2.0 * min(float(q[i]) - lower, upper - float(q[i])) / (upper - lower), WORST), 1.0)
+
+
+@merged
+def limit_margin(demands: Demands, q: FloatArray) -> float:
+    """The least margin of the limits of joints q (n,)."""
+    least = 1.0
+    for i in range(q.shape[0]):
+        least = min(least, joint_margin(demands, q, i))
+    return least
+
+
+class Carrier(NamedTuple):
+    """What carries the joints along a path."""
+
+    reaching: Reaching  # the task
+    work: Work  # workspace of n joints and 4m rows
+    before: FloatArray
+    M: FloatArray
+    ends: FloatArray  # before, M, ends: (n,), (2, 4) and (2, 3) workspaces
+
+
+def carrier_of(reaching: Reaching) -> Carrier:
+    """Workspace in which the joints of a task are carried."""
+    n = len(reaching.q_start)
+    work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
+    return Carrier(reaching, work, np.empty(n), np.empty((2, 4)), np.empty((2, 3)))
+
+
+@internal
+def carry_joints(
+    carrier: Carrier, ends: FloatArray, parts: int, settled: float, stride: float, q: FloatArray
+) -> float:
+    """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
+
+    ends : (2, 3) shares at both ends.
+    parts : how many; of none the joints stay where they are.
+    settled : Newton step, rad or m, that is the last of a part.
+    stride : most that a part may move a joint, rad or m.
+    Returns reciprocal condition of the image Jacobian there; −1 where a part does not settle or moves too
+    far.
+    """
+    reaching, work, before = carrier.reaching, carrier.work, carrier.before
+    model = reaching.model
+    face = Seen(reaching.A, backward(model, reaching.q_start))
+    operators_at(model, q, work.H_hat)
+    goal = displaced(reaching.H_hat, reaching.amplitudes, ends[0, 0], ends[0, 1], ends[0, 2])
+    for part in range(1, parts + 1):
+        x = part / parts
+        for i in range(q.shape[0]):
+            before[i] = q[i]
+        mu_t = (1.0 - x) * ends[0, 0] + x * ends[1, 0]
+        mu_r = (1.0 - x) * ends[0, 1] + x * ends[1, 1]
+        mu_p = (1.0 - x) * ends[0, 2] + x * ends[1, 2]
+        goal = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
+        if not reach(model, face, goal, q, work, settled):
+            return -1.0
+        for i in range(q.shape[0]):
+            if not abs(q[i] - before[i]) <= stride:
+                return -1.0
+    return _reciprocal_condition(carrier, goal)
+
+
+@merged
+def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
+    """Reciprocal condition of the image Jacobian of the displaced face, [RH00] eq. (7).
+
+    The ratio of the last to the first pivot of an orthogonalisation, which no projective frame changes.
+    The operators at the joints are in the workspace.
+    """
+    work, M = carrier.work, carrier.M
+    A, P = carrier.reaching.A, carrier.reaching.model.P
+    n, m = work.H_hat.shape[0], A.shape[0]
+    for k in range(m):
+        put_vec(M[0], apply(H, vec(A[k])))
+        for i in range(n):
+            put_vec(M[1], apply(mat(work.H_hat[i]), vec(M[0])))
+            for view in range(2):
+                _, _, du, dv = image_velocity(P[view], M[0], M[1])
+                work.system.B[i, 4 * k + 2 * view] = du
+                work.system.B[i, 4 * k + 2 * view + 1] = dv
+    first, _, last = orthogonalize(work.system, 4 * m, n, False)
+    if n > COORDINATES:  # further joints add no motion of the face
+        sixth = work.system.B[COORDINATES - 1, COORDINATES - 1]
+        last = 1.0 / sixth if sixth > 0.0 else 0.0
+    return last / first if first > 0.0 else 0.0
+
+
+@merged
+def put_displaced(reaching: Reaching, mu_t: float, mu_r: float, mu_p: float, found: Along, i: int) -> None:
+    """Write displacement and visibility of one instant, at shares."""
+    put_mat(found.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p))
+    for view in range(2):
+        found.visibility[i, view] = visibility_margin(reaching, view, mu_t, mu_r)
+
+
+@njit
+def put_carried(carrier: Carrier, mu: FloatArray, found: Along) -> None:
+    """Write displacement, visibility, joints and condition at shares mu (s, 3), whose first row is zero.
+
+    Where the joints would move too far between two of them, the way is made in parts.
+    """
+    reaching = carrier.reaching
+    for i in range(mu.shape[0]):
+        put_displaced(reaching, mu[i, 0], mu[i, 1], mu[i, 2], found, i)
+    for i in range(mu.shape[0]):
+        parts = 0 if i == 0 else 1
+        condition = -1.0
+        while condition < 0.0 and parts <= MOST_PARTS:
+            for l in range(found.q.shape[1]):
+                found.q[i, l] = reaching.q_start[l] if i == 0 else found.q[i - 1, l]
+            ends = mu[max(0, i - 1) : i + 1]
+            condition = carry_joints(carrier, ends, parts, SETTLED, MOST_PART, found.q[i])
+            parts = 2 * parts if parts > 0 else MOST_PARTS + 1
+        if condition < 0.0:
+            for l in range(found.q.shape[1]):
+                found.q[i, l] = math.nan
+            return
+        found.condition[i] = condition
+
+
+@njit
+def _put_moved(carrier: Carrier, found: Along) -> None:
+    """Write displacement, visibility and condition at joints (s, n), by the forward kinematics."""
+    reaching, model = carrier.reaching, carrier.reaching.model
+    a, start = vec(reaching.a), forward(model, reaching.q_start)
+    back = backward(model, reaching.q_start)
+    for i in range(found.q.shape[0]):
+        H = mul(operators_at(model, found.q[i], carrier.work.H_hat), back)
+        put_mat(found.H_d[i], H)
+        found.condition[i] = _reciprocal_condition(carrier, H)
+        H_back = mul(start, backward(model, found.q[i]))
+        for view in range(2):
+            O = vec(reaching.O[view])
+            found.visibility[i, view] = dot(a, apply(H_back, O)) / dot(a, O)
+
+
+@merged
+def put_images(reaching: Reaching, found: Along) -> None:
+    """Write the images of displaced faces."""
+    for i in range(found.H_d.shape[0]):
+        for k in range(reaching.A.shape[0]):
+            A = vec(reaching.A[k])
+            M = apply(mat(found.H_d[i]), A)
+            for view in range(2):
+                if in_front(reaching.model.P[view], A, M):
+                    u, v = pixel(reaching.model, view, M)
+                    found.s[i, view, k, 0], found.s[i, view, k, 1] = u, v
+
+
+@njit
+def put_margins(reaching: Reaching, found: Along) -> None:
+    """Write distances and margins, where all else is known."""
+    demands, A, P = reaching.demands, reaching.A, reaching.model.P
+    for i in range(found.q.shape[0]):
+        H = mat(found.H_d[i])
+        for view in range(2):
+            least = math.inf
+            for k in range(A.shape[0]):
+                u, v = found.s[i, view, k, 0], found.s[i, view, k, 1]
+                shown = in_front(P[view], vec(A[k]), apply(H, vec(A[k])))
+                least = min(least, inside(demands.image_size, u, v) if shown else BEHIND)
+            found.distance[i, view] = least
+        margins = found.margins[i]
+        margins[VISIBILITY] = min(found.visibility[i, 0], found.visibility[i, 1])
+        margins[IMAGE] = image_margin(demands, min(found.distance[i, 0], found.distance[i, 1]))
+        margins[JOINTS], margins[CONDITIONING] = 1.0, WORST
+        if not math.isnan(found.condition[i]):
+            found.limit[i] = margins[JOINTS] = limit_margin(demands, found.q[i])
+            margins[CONDITIONING] = found.condition[i] - demands.conditioning
+
+
+def along_shares(reaching: Reaching, mu: FloatArray) -> Motion:
+    """The motion of shares mu (s, 3), whose first row is zero."""
+    found = room_along(reaching, len(mu))
+    put_carried(carrier_of(reaching), np.ascontiguousarray(mu), found)
+    return _measured(Motion(reaching, mu, found))
+
+
+def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
+    """The motion of joints (s, n), displaced as the forward kinematics tell, [RH00] eq. (6)."""
+    found = room_along(reaching, len(q))
+    found.q[:] = q
+    _put_moved(carrier_of(reaching), found)
+    return _measured(Motion(reaching, np.full((len(q), 3), np.nan), found))
+
+
+def _measured(motion: Motion) -> Motion:
+    """The motion with its images, distances and margins."""
+    model, found = motion.reaching.model, motion.along
+    M = motion.reaching.A @ np.swapaxes(found.H_d, 1, 2)
+    found.s[:] = np.moveaxis(project(model.P, M, model.lens), 0, 1)
+    put_margins(motion.reaching, found)
+    return motion

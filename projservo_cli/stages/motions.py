@@ -1,0 +1,221 @@
+"""The motion of a plan by its profile, and its time."""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.config.models import LIMITS_MISSING, Trajectory
+from projservo_cli.geometry.algebra import as_array
+from projservo_cli.geometry.kinematics import forward
+from projservo_cli.geometry.lens import straight_views
+from projservo_cli.guidance.goals import Aim
+from projservo_cli.guidance.keep_out import keep_out_of
+from projservo_cli.guidance.lattice import duration, evenly, least_time, plan_path
+from projservo_cli.guidance.margins import Motion, Reaching, along_joints, along_shares, within
+from projservo_cli.guidance.timing import Pace, joints_at
+from projservo_cli.guidance.validity import NO_SPREAD, Asked, Constraints, Spread, constraints_of, spread_of
+from projservo_cli.guidance.way import Search, Way, find_way, first_within, within_region
+from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, WorkFailed
+from projservo_cli.stages.scenario import Scenario
+from projservo_cli.stages.verdicts import sight_words, verdict_of, way_words
+from projservo_cli.task.body import SETTLED, fit_body
+from projservo_cli.task.face import Task
+from projservo_cli.task.target import Shown
+from projservo_cli.task.trajectory import profile_shares
+
+
+class Found(NamedTuple):
+    """A motion that was found for a task."""
+
+    judged: Motion  # where the constraints were looked at
+    motion: Motion  # as it is stored, at the instants sigma
+    time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
+    feasible: bool
+    reason: str  # feasible, reason: whether it may be followed, in words
+    way: Way | None = None  # through joint space, where one was looked for
+    entered: str = ""  # which region it enters that is kept out of, in words
+
+
+def coupled(reaching: Reaching, trajectory: Trajectory) -> Found:
+    """Shares of translation and rotations that keep all constraints, [RH00] section 4.3."""
+    sigma = np.linspace(0.0, 1.0, trajectory.samples)
+    judged = plan_path(reaching)
+    motion = along_shares(judged.reaching, evenly(judged, sigma))
+    if judged.holds() and not motion.holds():  # between the places that were looked at
+        judged = motion
+    feasible, _, reason = verdict_of(judged)
+    reason = reason if feasible else f"no path was found that keeps all constraints; {reason}"
+    return Found(judged, motion, _timed(sigma * duration(judged), sigma, trajectory), feasible, reason)
+
+
+def given(profile: str, reaching: Reaching, trajectory: Trajectory, pure_translation: float) -> Found:
+    """Shares of a profile of the paper; ``pure_translation`` of the translation at most before a rotation."""
+    sigma = np.linspace(0.0, 1.0, trajectory.samples)
+    motion = along_shares(reaching, profile_shares(profile, sigma, pure_translation))
+    speed = reaching.demands.speed
+    shortest = least_time(speed, motion.along.q) if np.isfinite(speed).any() else np.nan * sigma
+    time = _timed(shortest, sigma, trajectory)
+    return Found(motion, motion, time, *sight_words(profile, motion))
+
+
+class JointSearch(NamedTuple):
+    """What the profile ``joint`` takes beside model, images and demands."""
+
+    acceleration: FloatArray  # (n,) most joint acceleration, rad/s² or m/s²
+    q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
+    sigma: float  # standard deviation of a coordinate of the images of the goal, px
+    spread: Spread = NO_SPREAD  # how far predictions err
+    closed: str = ""  # why no way can be looked for, in words
+
+
+def search_of(scenario: Scenario) -> JointSearch:
+    """What a scenario tells of a search through joint space."""
+    calibration, spread = scenario.calibration, NO_SPREAD
+    if calibration is not None:
+        numbers = scenario.numbers if len(scenario.ends.body.M) else scenario.numbers[: scenario.m]
+        known, demands = calibration.marker.tolist(), scenario.demands
+        spread = _spread(
+            calibration,
+            tuple(known.index(number) for number in numbers),
+            scenario.m,
+            (tuple(demands.lower), tuple(demands.upper), tuple(demands.image_size)),
+            scenario.config.trajectory.search.seed,
+        )
+    sigma = scenario.noise_px / math.sqrt(scenario.config.noise.shown_frames)
+    joints, closed = scenario.joints, ""
+    if scenario.truth is None and not (np.isfinite(joints.lower) & np.isfinite(joints.upper)).all():
+        closed = f"nothing tells the limits of all joints: {LIMITS_MISSING}"
+    return JointSearch(joints.acceleration, scenario.q_shown, sigma, spread, closed)
+
+
+@lru_cache(maxsize=64)
+def _spread(
+    calibration: Calibration,
+    indices: tuple[int, ...],
+    m: int,
+    bounds: tuple[tuple[float, ...], ...],
+    seed: int,
+) -> Spread:
+    """How far predictions of a calibration err, the same for every task; it takes 20 ms."""
+    lower, upper, size = (np.array(bound) for bound in bounds)
+    demands = within(lower, upper)._replace(image_size=size)
+    return spread_of(calibration, np.array(indices), m, demands, seed)
+
+
+def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
+    """Time (s,) of a motion: its shortest time, from rest to rest, stretched to the duration it is given.
+
+    Where nothing limits the speed, the path parameter sigma (s,) passes evenly but for the ramps.
+    """
+    duration, ramp = trajectory.duration_s, trajectory.ramp_s
+    eased = _from_rest(shortest, ramp)
+    least = float(eased[-1])
+    if duration is None:
+        return eased
+    _require_time(duration, least)
+    if not least > 0.0:
+        eased = _from_rest(sigma * duration, ramp)
+    return np.asarray(eased * (duration / eased[-1]))
+
+
+def _require_time(duration: float, least: float) -> None:
+    if least > duration:
+        raise WorkFailed(
+            f"trajectory.duration_s {duration:g}: the joint-speed limit lets the motion take {least:.4g} s "
+            "or more: give it longer, or null for as short as that"
+        )
+
+
+def _from_rest(time: FloatArray, ramp: float) -> FloatArray:
+    """Times (s,) of a motion that comes up to its pace evenly in so many s, and so to rest again at its end.
+
+    The pace, seconds of ``time`` a second, is a trapezoid, of a short motion a triangle of the same slope:
+    the motion never is faster, and takes longer by the ramp.
+    """
+    total = float(time[-1])
+    if not (ramp > 0.0 and total > 0.0):
+        return time
+    half = 0.5 * min(total, ramp)
+    end = total + ramp if total >= ramp else 2.0 * math.sqrt(total * ramp)
+    before = np.sqrt(2.0 * ramp * np.maximum(time, 0.0))
+    after = end - np.sqrt(2.0 * ramp * np.maximum(total - time, 0.0))
+    return np.select([time <= half, time >= total - half], [before, after], time + 0.5 * ramp)
+
+
+def body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> FloatArray:
+    """Points (b, 4) of the body at the start, face first; the face A (m, 4) alone without a body."""
+    if len(task.body.M) == 0:
+        return A
+    seen = straight_views(model.lens, shown.s_start)
+    fit = fit_body(model.P, task.body, seen, forward(model, shown.q_start), SETTLED, np.zeros((6, 7)))
+    return np.asarray(task.body.M @ as_array(fit.H).T)
+
+
+# What is left of the images, px, where joints are interpolated between the places that are stored.
+_INTERPOLATED_PX = 0.05
+
+
+def _constraints(
+    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread
+) -> Constraints:
+    """What joints are held against, for a body at A (b, 4)."""
+    margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
+    keep = np.where(reaching.model.joint_types == PRISMATIC, *margins).astype(np.float64)
+    asked = Asked(reaching.demands, keep, trajectory.least_face_px)
+    drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
+    c = constraints_of(reaching.model, A, task, reaching.q_start, asked)
+    return c._replace(spread=spread, keep_out=drawn)
+
+
+def _entered(c: Constraints, q: FloatArray) -> str:
+    """Which region the body enters along joints (s, n), in words; empty where it keeps out of all."""
+    if not np.isfinite(q).all():
+        return "no joints can follow the motion, so that it cannot be kept out of regions"
+    for end, joints in (("start", q[0]), ("goal", q[-1])):
+        if region := within_region(c, joints):
+            return f"the {end} is within region {region} of trajectory.keep_out"
+    last, region = first_within(c, q)
+    at = f"at sigma {last / (len(q) - 1):.2f}"
+    return f"the body enters region {region} of trajectory.keep_out {at}" if region else ""
+
+
+def kept_out(found: Found, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
+    """What was found, infeasible where it enters a region that a body at A (b, 4) is kept out of."""
+    c = _constraints(found.motion.reaching, A, task, trajectory, spread)
+    entered = _entered(c, found.motion.along.q)
+    return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
+
+
+def through_joints(
+    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, search: JointSearch
+) -> Found:
+    """A way through joint space for a body at A (b, 4); the linear motion where there is none."""
+    c = _constraints(reaching, A, task, trajectory, search.spread)
+    aim = Aim(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
+    how = Search(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
+    way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
+    if way.pace is None:
+        linear = given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
+        q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
+        still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
+        motion = linear.motion._replace(along=still)
+        return Found(linear.judged, motion, unknown, False, way.why_none(), way)
+    motion = _sampled(reaching, way.pace, trajectory.samples)
+    least = float(way.pace.time[-1])
+    asked = least if trajectory.duration_s is None else trajectory.duration_s
+    _require_time(asked, least)
+    time = np.linspace(0.0, asked, len(motion.mu))
+    return Found(motion, motion, time, True, way_words(way), way)
+
+
+def _sampled(reaching: Reaching, pace: Pace, samples: int) -> Motion:
+    """The motion at so many places even in time, or more where joints between them were too far off."""
+    while True:
+        q = joints_at(pace, np.linspace(0.0, float(pace.time[-1]), 2 * samples - 1))
+        found, between = along_joints(reaching, q[::2]), 0.5 * (q[:-2:2] + q[2::2])
+        off = along_joints(reaching, q[1::2]).along.s - along_joints(reaching, between).along.s
+        if np.abs(off).max() <= _INTERPOLATED_PX:
+            return found
+        samples = 2 * samples - 1
