@@ -27,6 +27,7 @@ from projservo_cli.records import (
     in_sense,
 )
 from projservo_cli.stages.motions import (
+    Found,
     JointSearch,
     body_at_start,
     coupled,
@@ -176,41 +177,54 @@ def _closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
     return ""
 
 
+def _found(
+    reaching: Reaching,
+    task: Task,
+    shown: Shown,
+    trajectory: Trajectory,
+    search: JointSearch | None,
+    tau_limit: float,
+) -> Found:
+    """The motion of one profile; ``tau_limit`` of the translation at most before a rotation."""
+    profile = trajectory.profile
+    if profile == "joint":
+        closed = _closed(reaching.model, reaching.demands, search)
+        if search is None or closed:
+            raise InputError(f"the profile joint: {closed}")
+        A = body_at_start(reaching.model, task, shown, reaching.A)
+        return through_joints(reaching, A, task, trajectory, search)
+    if profile == "constrained":
+        found = coupled(reaching, trajectory)
+    else:
+        tau = float(reaching.amplitudes[0])
+        found = given(profile, reaching, trajectory, tau_limit / tau if tau > 0.0 else 1.0)
+    if trajectory.keep_out and found.feasible:
+        A = body_at_start(reaching.model, task, shown, reaching.A)
+        found = kept_out(found, A, task, trajectory, NO_SPREAD if search is None else search.spread)
+    return found
+
+
 def _planned(
     model: Model, shown: Shown, trajectory: Trajectory, demands: Demands, search: JointSearch | None
 ) -> tuple[Plan, str]:
     """Plan of one profile, and what of its constraints fails, in words; empty where all hold."""
-    profile, face = trajectory.profile, shown.by_points()
-    state, task, parts, note = _partitioned(model, shown, profile, demands.lower, demands.upper)
+    face = shown.by_points()
+    state, task, parts, note = _partitioned(model, shown, trajectory.profile, demands.lower, demands.upper)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
     tau_limit = min((trajectory.delta * t for t in tau_0 if t > 0.0), default=math.inf)
     reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start)
-    if profile == "joint":
-        closed = _closed(model, demands, search)
-        if search is None or closed:
-            raise InputError(f"the profile joint: {closed}")
-        A = body_at_start(model, task, shown, state.A)
-        found = through_joints(reaching, A, task, trajectory, search)
-    elif profile == "constrained":
-        found = coupled(reaching, trajectory)
-    else:
-        share = tau_limit / parts.tau if parts.tau > 0.0 else 1.0
-        found = given(profile, reaching, trajectory, share)
-    if profile != "joint" and trajectory.keep_out and found.feasible:
-        A = body_at_start(model, task, shown, state.A)
-        found = kept_out(found, A, task, trajectory, NO_SPREAD if search is None else search.spread)
-    motion, time, way = found.motion, found.time, found.way
+    found = _found(reaching, task, shown, trajectory, search, tau_limit)
+    motion, along, time, way = found.motion, found.motion.along, found.time, found.way
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
-    along = motion.along
     if len(shown.q_start) < COORDINATES and way is None:
         _require_in_span(model, state.A, shown.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
     holds, constraint, words = verdict_of(found.judged)
     least, least_mu = least_of(found.judged)
     plan = Plan(
-        profile=profile,
+        profile=trajectory.profile,
         feasible=found.feasible,
         reason=found.reason + ("" if way else note),
         tau=tau,

@@ -68,7 +68,9 @@ def test_an_end_too_near_to_the_border_of_an_image():
 
 
 def test_no_path_jumps_over_a_singular_configuration():
-    """The joints flip the wrist where it is all but singular: that is no path."""
+    """To flip the wrist where it is all but singular is no path; without a flip joint 4 passes its limit."""
     plan = planned("ur5", JUMP, ["trajectory.border_px=0.0"])
     assert not plan.feasible
-    assert plan.constraint == "conditioning"
+    assert plan.constraint in ("conditioning", "joints")
+    followed = plan.q[np.isfinite(plan.q).all(axis=1)]
+    assert np.abs(np.diff(followed, axis=0)).max() < 0.6
