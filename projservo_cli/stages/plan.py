@@ -168,13 +168,11 @@ def plan_task(
 
 def _closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
     """Why no way through joint space can be looked for, or given a time; empty where it can."""
-    if search is None or search.closed:
-        return "no search was given" if search is None else search.closed
     for i in np.flatnonzero(~np.isfinite(demands.speed)):
         kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
         unit = "m_s" if kind == "prismatic" else "deg_s"
         return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
-    return ""
+    return "no search was given" if search is None else search.closed
 
 
 def _found(
