@@ -19,6 +19,7 @@ from projservo_cli.guidance.validity import (
     MARGINS,
     Constraints,
     clear_by,
+    most_off,
     off,
     put_margins,
     put_row,
@@ -244,7 +245,7 @@ def _keep_turns(
 ) -> int:
     """Put the whole turns of a solution within the limits among the goals nearest in time; how many.
 
-    ``BARRED`` where it lies within a region that is kept out of.
+    ``BARRED`` where it lies within a region that is kept out of, whatever its prediction may be off.
     """
     n, most = solution.shape[0], goals.shape[0]
     q, choice, lowest = bench.q, bench.choice, bench.lowest
@@ -266,7 +267,10 @@ def _keep_turns(
             for j in range(1, BORDER):
                 if not bench.margins[j] > 0.0:
                     return 0
-            if not clear_by(c, forward(c.model, q), bench.s, 0.0, 0.0) > 0.0:
+            # What a prediction may be off speaks for a goal: it was chosen, and is seen on arrival.
+            H = forward(c.model, q)
+            left, right = most_off(c, q, H)
+            if not clear_by(c, H, bench.s, -DEVIATIONS * left, -DEVIATIONS * right) > 0.0:
                 return BARRED
         found += 1
         time = time_between(c, start, q)

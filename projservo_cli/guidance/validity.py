@@ -286,13 +286,13 @@ def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray) -> float:
     most = DEVIATIONS * c.spread.most
     least = clear_by(c, H, s, most, most)
     if most > 0.0 and least < c.full[CLEAR]:
-        left, right = _most_off(c, q, H)
+        left, right = most_off(c, q, H)
         least = clear_by(c, H, s, DEVIATIONS * left, DEVIATIONS * right)
     return least
 
 
 @internal
-def _most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
+def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
     """Standard deviation of a coordinate in each image, px, no less than that of any marker."""
     left = right = c.spread.rest * c.spread.rest
     for j in range(1, c.spread.P.shape[0]):

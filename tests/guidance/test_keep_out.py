@@ -1,7 +1,10 @@
 """Regions that are kept out of: distances by another library, and a box in space."""
 
+import json
+
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
@@ -11,7 +14,11 @@ from projservo_cli.guidance.keep_out import keep_out_of, outside_polygon
 from projservo_cli.guidance.timing import joints_at
 from projservo_cli.guidance.validity import CLEAR, FINE_PX
 from projservo_cli.guidance.way import Search, find_way, margins_at
+from projservo_cli.records import WorkFailed
+from projservo_cli.stages import calibrate, plan, servo
+from tests.conftest import ROOT
 from tests.guidance.cases import COUNT, case
+from tests.known import configured
 
 
 @settings(deadline=None)
@@ -129,3 +136,37 @@ def test_a_region_of_one_image_bars_that_image():
     way = find_way(c, found.aim, found.q_start, nothing, Search(samples=200), found.acceleration)
     assert way.solutions == way.hidden + way.barred
     assert f"and {way.barred} within a region that is kept out of" in way.why_none()
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """The paper's task with the region of the page Guidance, in a profile, and its plan."""
+    page = (ROOT / "docs" / "guidance.md").read_text(encoding="utf-8")
+    block = next(block for block in page.split("```text\n") if block.startswith("trajectory:"))
+    region = yaml.safe_load(block.split("```")[0])["trajectory"]["keep_out"]
+    calibration = calibrate.run(configured("paper"))[1]
+
+    def plan_of(profile):
+        keep_out = f"trajectory.keep_out={json.dumps(region)}"
+        config = configured("paper", f"trajectory.profile={profile}", keep_out, "control.mode=track")
+        return config, calibration, plan.run(config, calibration)
+
+    return plan_of
+
+
+@pytest.mark.volume
+def test_a_region_in_the_way_closes_the_motions_of_the_paper_and_leaves_a_way_around(drawn):
+    config, calibration, linear = drawn("linear")
+    assert not linear.feasible
+    assert "the body enters region 1 of trajectory.keep_out at sigma 0." in linear.reason
+    with pytest.raises(WorkFailed, match="nothing is driven"):
+        servo.run(config, calibration, linear, "exact_track")
+    config, calibration, found = drawn("auto")
+    assert (found.profile, found.feasible) == ("joint", True)
+    assert found.reason.count("enters region 1") == 2
+    trace = servo.run(config, calibration, found, "exact_track")
+    assert trace.verdict == "converged"
+    # The face is never within the outlines in either image, as the cameras see it.
+    region = config.trajectory.keep_out[0]
+    for view, corners in enumerate((region.left, region.right)):
+        assert not Outline(corners).contains_points(trace.s[:, view].reshape(-1, 2)).any()
