@@ -14,9 +14,11 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.guidance.validity import Constraints, Trial, put_row, reached, time_between
+from projservo_cli.guidance.validity import Constraints, Trial, reached
 from projservo_cli.records import FloatArray
 
+# Share of the limits of speed and acceleration that is planned with, so that feedback has room.
+ROOM = 0.9
 # Straight chords by which the validity of a rounded corner is checked.
 CHORDS = 8
 # Halvings of a rounded corner until it counts as sharp.
@@ -24,6 +26,8 @@ HALVINGS = 12
 # Intervals of the grid on each straight piece and on each rounded corner.
 STRAIGHT, ROUNDED = 64, 24
 BISECTIONS = 48
+# Motion between two corners, rad or m, or s, below which it is none.
+LEAST = 1e-12
 
 
 class Pace(NamedTuple):
@@ -37,84 +41,67 @@ class Pace(NamedTuple):
     time: FloatArray  # (k,) s
 
 
-def new_pace(corners: int, n: int) -> Pace:
-    """Room for the pace of a path of so many corners and n joints."""
-    k = (corners - 1) * (STRAIGHT + ROUNDED) + 1
-    return Pace(
-        np.zeros(k), np.zeros((k, n)), np.zeros((k, n)), np.zeros((k - 1, n)), np.zeros(k), np.zeros(k)
-    )
+def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
+    """The pace of a path of corners (k, n), from rest to rest at ``ROOM`` of the limits."""
+    path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > LEAST]]
+    if len(path) == 1:
+        still = np.zeros((2, path.shape[1]))
+        return Pace(np.array([0.0, 1.0]), path + still, still, still[:1], np.zeros(2), np.zeros(2))
+    times = (np.abs(np.diff(path, axis=0)) / c.speed).max(axis=1)
+    slopes = np.diff(path, axis=0) / times[:, None]
+    sizes = np.zeros(len(path))
+    for k in range(1, len(path) - 1):
+        sizes[k] = _rounding(c, path[k], slopes[k - 1 : k + 1], 0.5 * times[k - 1 : k + 1].min(), trial)
+    pace = _on_grid(path, times, slopes, sizes)
+    _put_pace(pace, ROOM * c.speed, ROOM * acceleration)
+    return pace
 
 
-@internal
-def _corner(
-    path: FloatArray, k: int, size: float, time_before: float, time_after: float, x: float, q: FloatArray
-) -> None:
-    """Write the joints at a share x of the parabola that rounds a corner from ``size`` s before it."""
-    before = size / time_before * (1.0 - x) * (1.0 - x)
-    after = size / time_after * x * x
-    for i in range(q.shape[0]):
-        q[i] = path[k, i] - before * (path[k, i] - path[k - 1, i]) + after * (path[k + 1, i] - path[k, i])
+def _parabola(corner: FloatArray, slopes: FloatArray, size: float, x: FloatArray) -> FloatArray:
+    """Joints (k, n) at shares x (k, 1) of the parabola that rounds a corner from ``size`` s before it."""
+    return np.asarray(corner + size * (x**2 * slopes[1] - (1.0 - x) ** 2 * slopes[0]))
 
 
-@njit
-def put_corners(
-    c: Constraints, path: FloatArray, count: int, sizes: FloatArray, scratch: FloatArray, trial: Trial
-) -> None:
-    """Write how far from each corner (k,) of a path, s, the largest valid rounding begins and ends."""
-    for k in range(count):
-        sizes[k] = 0.0
-    for k in range(1, count - 1):
-        before, after = time_between(c, path[k - 1], path[k]), time_between(c, path[k], path[k + 1])
-        size = 0.5 * min(before, after)
-        for _ in range(HALVINGS):
-            fits = True
-            _corner(path, k, size, before, after, 0.0, scratch[0])
-            for j in range(1, CHORDS + 1):
-                _corner(path, k, size, before, after, j / CHORDS, scratch[1])
-                if reached(c, scratch[0], scratch[1], trial) < 1.0:
-                    fits = False
-                    break
-                put_row(scratch[0], scratch[1])
-            if fits:
-                break
-            size *= 0.5
-        sizes[k] = size
+def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: float, trial: Trial) -> float:
+    """How far from a corner (n,), s, its largest valid rounding begins and ends: ``size`` at most, or 0."""
+    x = np.linspace(0.0, 1.0, CHORDS + 1)[:, None]
+    for halving in range(HALVINGS):
+        if _reached_all(c, _parabola(corner, slopes, size * 0.5**halving, x), trial):
+            return size * 0.5**halving
+    return 0.0
 
 
 @njit
-def put_path(c: Constraints, path: FloatArray, count: int, sizes: FloatArray, pace: Pace) -> int:
-    """Write the rounded path on its grid; how many points that has."""
-    n = path.shape[1]
-    g = 0
-    pace.s[0] = 0.0
-    for k in range(1, count):
-        time = time_between(c, path[k - 1], path[k])
-        straight = time - sizes[k - 1] - sizes[k]
-        parts = STRAIGHT if straight > 1e-9 else 0
-        for j in range(parts + 1 if k == 1 else parts):
-            done = sizes[k - 1] + straight * (j if k == 1 else j + 1) / STRAIGHT
-            if j > 0 or k > 1:
-                g += 1
-                pace.s[g] = pace.s[g - 1] + straight / STRAIGHT
-            for i in range(n):
-                slope = (path[k, i] - path[k - 1, i]) / time
-                pace.q[g, i] = path[k - 1, i] + done * slope
-                pace.dq[g, i] = slope
-                if g > 0:
-                    pace.ddq[g - 1, i] = 0.0
-        if k < count - 1 and sizes[k] > 0.0:
-            after = time_between(c, path[k], path[k + 1])
-            for j in range(1, ROUNDED + 1):
-                x = j / ROUNDED
-                g += 1
-                pace.s[g] = pace.s[g - 1] + 2.0 * sizes[k] / ROUNDED
-                _corner(path, k, sizes[k], time, after, x, pace.q[g])
-                for i in range(n):
-                    slope = (path[k, i] - path[k - 1, i]) / time
-                    change = (path[k + 1, i] - path[k, i]) / after - slope
-                    pace.dq[g, i] = slope + x * change
-                    pace.ddq[g - 1, i] = change / (2.0 * sizes[k])
-    return g + 1
+def _reached_all(c: Constraints, path: FloatArray, trial: Trial) -> bool:
+    """Whether all straight pieces of a path (k, n) from valid joints are valid."""
+    for k in range(path.shape[0] - 1):
+        if reached(c, path[k], path[k + 1], trial) < 1.0:
+            return False
+    return True
+
+
+def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: FloatArray) -> Pace:
+    """The rounded path on its grid, its pace still to be found."""
+    steps, q, dq, ddq = [np.zeros(1)], [path[:1]], [slopes[:1]], []
+    even = np.ones((STRAIGHT, 1))
+    x = np.arange(1, ROUNDED + 1)[:, None] / ROUNDED
+    for k, slope in enumerate(slopes):
+        straight = times[k] - sizes[k] - sizes[k + 1]
+        if straight > LEAST:
+            step = straight / STRAIGHT * even
+            steps.append(step[:, 0])
+            q.append(path[k] + (sizes[k] + np.cumsum(step, axis=0)) * slope)
+            dq.append(even * slope)
+            ddq.append(0.0 * even * slope)
+        size = sizes[k + 1]
+        if size > 0.0:
+            change = slopes[k + 1] - slope
+            steps.append(np.full(ROUNDED, 2.0 * size / ROUNDED))
+            q.append(_parabola(path[k + 1], slopes[k : k + 2], size, x))
+            dq.append(slope + x * change)
+            ddq.append(np.tile(change / (2.0 * size), (ROUNDED, 1)))
+    s = np.cumsum(np.concatenate(steps))
+    return Pace(s, np.vstack(q), np.vstack(dq), np.vstack(ddq), np.zeros(len(s)), np.zeros(len(s)))
 
 
 @merged
@@ -139,12 +126,9 @@ def _accelerations(pace: Pace, i: int, x: float, ahead: float, most: FloatArray)
 
 
 @njit
-def put_pace(pace: Pace, count: int, speed: FloatArray, acceleration: FloatArray) -> float:
-    """Write the quickest pace from rest to rest within speeds and accelerations (n,), and its times.
-
-    Returns the duration, s; NaN where a sharp corner lets none pass.
-    """
-    n = speed.shape[0]
+def _put_pace(pace: Pace, speed: FloatArray, acceleration: FloatArray) -> None:
+    """Write the quickest pace from rest to rest within speeds and accelerations (n,), and its times."""
+    n, count = speed.shape[0], pace.s.shape[0]
     for i in range(count):
         most = math.inf
         for j in range(n):
@@ -173,7 +157,6 @@ def put_pace(pace: Pace, count: int, speed: FloatArray, acceleration: FloatArray
         step = pace.s[i + 1] - pace.s[i]
         pace.x[i + 1] = max(0.0, pace.x[i] + 2.0 * step * u)
         pace.time[i + 1] = pace.time[i] + 2.0 * step / (math.sqrt(pace.x[i]) + math.sqrt(pace.x[i + 1]))
-    return float(pace.time[count - 1])
 
 
 def joints_at(pace: Pace, times: FloatArray) -> FloatArray:

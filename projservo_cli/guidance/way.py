@@ -9,7 +9,7 @@ import numpy as np
 from projservo_cli.guidance.goals import STARTS, Aim, new_bench, put_goals
 from projservo_cli.guidance.keep_out import only
 from projservo_cli.guidance.search import Tree, first_straight, grow, new_tree
-from projservo_cli.guidance.timing import Pace, new_pace, put_corners, put_pace, put_path
+from projservo_cli.guidance.timing import Pace, timed
 from projservo_cli.guidance.validity import (
     CLEAR,
     FRONT,
@@ -35,8 +35,6 @@ SHORTENINGS = 150
 ROUND_OFF = 1e-9
 # A margin that is not asked for.
 _NOTHING = 1e12
-# Share of the limits of speed and acceleration that is planned with, so that feedback has room.
-ROOM = 0.9
 
 
 class Search(NamedTuple):
@@ -256,17 +254,3 @@ def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial
         else:
             k += 1
     return path
-
-
-def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
-    """The pace of a path of corners, from rest to rest at ``ROOM`` of the limits."""
-    keep = np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > 1e-12]
-    path = np.ascontiguousarray(path[keep])
-    if len(path) == 1:
-        at, still = np.vstack([path, path]), np.zeros((2, path.shape[1]))
-        return Pace(np.array([0.0, 1.0]), at, still, still[:1], np.zeros(2), np.zeros(2))
-    sizes, pace = np.zeros(len(path)), new_pace(len(path), path.shape[1])
-    put_corners(c, path, len(path), sizes, np.empty((2, path.shape[1])), trial)
-    count = put_path(c, path, len(path), sizes, pace)
-    put_pace(pace, count, ROOM * c.speed, ROOM * acceleration)
-    return Pace(*(column[: count - (name == "ddq")] for name, column in zip(Pace._fields, pace, strict=True)))

@@ -5,9 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from projservo_cli.guidance.timing import joints_at
+from projservo_cli.guidance.timing import ROOM, joints_at, timed
 from projservo_cli.guidance.validity import LIMITS, SIDE, WIDTH, new_trial
-from projservo_cli.guidance.way import ROOM, Search, find_way, length, margins_at, timed
+from projservo_cli.guidance.way import Search, find_way, length, margins_at
 from tests.guidance.cases import COUNT, case
 
 SEARCH = Search()
