@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.geometry.algebra import mat, vec
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.guidance.margins import (
     IMAGE,
     VISIBILITY,
@@ -156,48 +156,64 @@ class _Lattice(NamedTuple):
     # (a, a, a, n + 1) joints, and the smaller share of their limits and of conditioning, between which is
     # interpolated; the shares μ themselves in place of joints where those need not follow
     field: FloatArray
-    nodes: FloatArray  # (k³, n + 1) the same at the nodes
     speed: FloatArray  # (n,) limits, rad/s or m/s
-    shares: FloatArray  # (k³,) the smallest share
+    q: FloatArray  # (k³, n) joints
     value: FloatArray  # (k³,) the largest smallest share of all monotone paths up to a node
+
+    def worth(self, mu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Smallest share (s,) of all constraints at shares mu (s, 3), and the joints (s, n) there."""
+        between = _between(self.field, mu)
+        views = _view_margins(self.reaching, mu) / self.scale
+        return np.minimum(views.min(axis=1), between[:, -1]), between[:, :-1]
+
+
+def _grid(size: int) -> FloatArray:
+    """Shares (size³, 3) at the nodes of a lattice."""
+    return np.ascontiguousarray(np.indices((size, size, size)).reshape(3, -1).T / (size - 1.0))
+
+
+def _view_margins(reaching: Reaching, mu: FloatArray) -> FloatArray:
+    """Margins of visibility and image (s, 2) at shares mu (s, 3)."""
+    margins = np.empty((len(mu), 2))
+    _put_view_margins(reaching, mu, room_along(reaching, 1), margins)
+    return margins
+
+
+def _between(field: FloatArray, mu: FloatArray) -> FloatArray:
+    """What a field (a, a, a, c) has at shares mu (s, 3): (s, c)."""
+    found = np.zeros((len(mu), field.shape[3]))
+    _put_between(field, mu, found)
+    return found
 
 
 def _in_view(reaching: Reaching) -> _Lattice:
     """Shares of the views alone, where joints need not follow: what takes time are the shares themselves."""
-    margins = np.empty((NODES**3, 2))
-    _put_view_margins(reaching, NODES, room_along(reaching, 1), margins)
+    grid = _grid(NODES)
+    margins = _view_margins(reaching, grid)
     scale = scale_of(margins[0], margins[-1])
-    field = np.ones((2, 2, 2, 4))
-    field[..., :3] = np.moveaxis(np.indices((2, 2, 2)), 0, 3)
-    return _valued(reaching, scale, field, np.ones(3), (margins / scale).min(axis=1))
+    field = np.concatenate([_grid(2), np.ones((8, 1))], axis=1).reshape(2, 2, 2, 4)
+    return _Lattice(reaching, scale, field, np.ones(3), grid, widest((margins / scale).min(axis=1)))
 
 
 def _with_joints(view: _Lattice, coarse: int) -> _Lattice:
     """The same with joints, solved at so many values of each share."""
-    reaching, speed = view.reaching, view.reaching.demands.speed
-    n, count = len(reaching.q_start), coarse**3
+    reaching, speed, grid = view.reaching, view.reaching.demands.speed, _grid(coarse)
+    n, count = len(reaching.q_start), len(grid)
     q, margins = np.tile(reaching.q_start, (count, 1)), np.full((count, 2), WORST)
-    _put_coarse(carrier_of(reaching), coarse, np.full(n, MOST_STRIDE), q, margins, np.full(count, WORST))
+    _put_coarse(carrier_of(reaching), coarse, grid, q, margins, np.full(count, WORST))
     shares = (margins / scale_of(margins[0], margins[-1])).min(axis=1, keepdims=True)
     field = np.concatenate([q, shares], axis=1).reshape(coarse, coarse, coarse, n + 1)
+    nodes = _between(field, _grid(NODES))
     speed = speed if np.isfinite(speed).any() else np.ones(n)
-    return _valued(reaching, view.scale, field, speed, view.shares)
-
-
-def _valued(
-    reaching: Reaching, scale: FloatArray, field: FloatArray, speed: FloatArray, shares: FloatArray
-) -> _Lattice:
-    nodes = np.empty((NODES**3, field.shape[3]))
-    _put_refined(field, NODES, nodes)
-    shares = np.minimum(shares, nodes[:, -1])
-    return _Lattice(reaching, scale, field, nodes, speed, shares, widest(shares))
+    # Along a path the least of these values is the least share of its views.
+    value = widest(np.minimum(view.value, nodes[:, -1]))
+    return _Lattice(reaching, view.scale, field, speed, nodes[:, :-1], value)
 
 
 def _quickest(lattice: _Lattice) -> Motion:
     """Quickest path among those of the largest smallest share, in straight pieces."""
-    nodes = shortest(lattice.value >= lattice.value[-1], lattice.nodes[:, :-1], lattice.speed)
-    mu = np.stack(np.unravel_index(nodes, (NODES, NODES, NODES)), axis=1) / (NODES - 1)
-    corners = _straightened(lattice, mu)
+    nodes = shortest(lattice.value >= lattice.value[-1], lattice.q, lattice.speed)
+    corners = _straightened(lattice, _grid(NODES)[nodes])
     length = np.r_[0.0, np.cumsum(np.abs(np.diff(corners, axis=0)).max(axis=1))]
     places = np.linspace(0.0, length[-1], CHECKS)
     mu = np.stack([np.interp(places, length, column) for column in corners.T], axis=1)
@@ -209,20 +225,20 @@ def _straightened(lattice: _Lattice, mu: FloatArray) -> FloatArray:
 
     A piece grows as long as its shares stay as good and it takes no longer than the nodes.
     """
-    kept, stepwise = [0], 0.0
-    room = np.empty((2, lattice.nodes.shape[1])), room_along(lattice.reaching, 1)
-    for j in range(1, len(mu)):
-        _, step = _piece(lattice, mu[j - 1], mu[j], 1, *room)
-        least, time = _piece(lattice, mu[kept[-1]], mu[j], 2 * (j - kept[-1]), *room)
-        late = time > DETOUR * (stepwise + step) + ROUND_OFF
-        if j > kept[-1] + 1 and (late or least < lattice.value[-1] - ROUND_OFF):
+    time = least_time(lattice.speed, lattice.worth(mu)[1])
+    kept = [0]
+    for j in range(2, len(mu)):
+        anchor = kept[-1]
+        x = np.linspace(0.0, 1.0, 2 * (j - anchor) + 1)[:, None]
+        shares, q = lattice.worth((1.0 - x) * mu[anchor] + x * mu[j])
+        late = least_time(lattice.speed, q)[-1] > DETOUR * (time[j] - time[anchor]) + ROUND_OFF
+        if late or shares.min() < lattice.value[-1] - ROUND_OFF:
             kept.append(j - 1)
-            stepwise = 0.0
-        stepwise += step
     return mu[[*kept, len(mu) - 1]]
 
 
 def _size(nodes: FloatArray) -> int:
+    """Nodes a side of a lattice of (size³, ...)."""
     return round(math.cbrt(len(nodes)))
 
 
@@ -255,13 +271,6 @@ def _before(node: int, step: int, size: int) -> int:
     if node // (size * size) < a or node // size % size < b or node % size < c:
         return -1
     return node - (a * size + b) * size - c
-
-
-@merged
-def _shares_at(node: int, size: int) -> tuple[float, float, float]:
-    """Shares μ_t, μ_r, μ_p of a node."""
-    last = size - 1
-    return node // (size * size) / last, node // size % size / last, node % size / last
 
 
 @merged
@@ -301,104 +310,56 @@ def _put_shortest(
                     cost[node], came[node] = total, before
 
 
-@merged
-def _put_view(reaching: Reaching, mu_t: float, mu_r: float, mu_p: float, found: Along) -> None:
-    """Write what the views have at shares, of a single instant."""
-    put_displaced(reaching, mu_t, mu_r, mu_p, found, 0)
-    put_images(reaching, found)
-    put_margins(reaching, found)
+@njit
+def _put_view_margins(reaching: Reaching, mu: FloatArray, found: Along, margins: FloatArray) -> None:
+    """Write margins of visibility and image (s, 2) at shares mu (s, 3), by way of a single instant."""
+    for i in range(mu.shape[0]):
+        put_displaced(reaching, mu[i, 0], mu[i, 1], mu[i, 2], found, 0)
+        put_images(reaching, found)
+        put_margins(reaching, found)
+        margins[i, VISIBILITY], margins[i, IMAGE] = found.margins[0, VISIBILITY], found.margins[0, IMAGE]
 
 
 @njit
-def _put_view_margins(reaching: Reaching, size: int, found: Along, margins: FloatArray) -> None:
-    """Write margins of visibility and image (size³, 2) at the nodes, by way of a single instant."""
-    for node in range(margins.shape[0]):
-        mu_t, mu_r, mu_p = _shares_at(node, size)
-        _put_view(reaching, mu_t, mu_r, mu_p, found)
-        for i in range(2):
-            margins[node, i] = found.margins[0, i]
-
-
-@internal
-def _put_between(field: FloatArray, mu_t: float, mu_r: float, mu_p: float, found: FloatArray) -> None:
-    """Write what a field (a, a, a, c) has at shares, linear in each between its nodes."""
+def _put_between(field: FloatArray, mu: FloatArray, found: FloatArray) -> None:
+    """Add what a field (a, a, a, c) has at shares mu (s, 3), linear in each between its nodes, to (s, c)."""
     last = field.shape[0] - 1
-    x, y, z = mu_t * last, mu_r * last, mu_p * last
-    i, j, k = min(int(x), last - 1), min(int(y), last - 1), min(int(z), last - 1)
-    x, y, z = x - i, y - j, z - k
-    for l in range(found.shape[0]):
-        found[l] = 0.0
-    for corner in range(8):
-        a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
-        weight = (x if a else 1.0 - x) * (y if b else 1.0 - y) * (z if c else 1.0 - z)
-        for l in range(found.shape[0]):
-            found[l] += weight * field[i + a, j + b, k + c, l]
-
-
-@njit
-def _put_refined(field: FloatArray, size: int, nodes: FloatArray) -> None:
-    """Write what a field has at the nodes (size³, c)."""
-    for node in range(nodes.shape[0]):
-        mu_t, mu_r, mu_p = _shares_at(node, size)
-        _put_between(field, mu_t, mu_r, mu_p, nodes[node])
-
-
-@njit
-def _piece(
-    lattice: _Lattice, start: FloatArray, end: FloatArray, parts: int, scratch: FloatArray, found: Along
-) -> tuple[float, float]:
-    """Smallest share on a straight way between shares (3,), looked at in equal parts, and its time, s.
-
-    scratch : (2, n + 1); found : of a single instant.
-    """
-    least, time = math.inf, 0.0
-    n = lattice.speed.shape[0]
-    for part in range(parts + 1):
-        x = part / parts
-        mu_t = (1.0 - x) * start[0] + x * end[0]
-        mu_r = (1.0 - x) * start[1] + x * end[1]
-        mu_p = (1.0 - x) * start[2] + x * end[2]
-        _put_view(lattice.reaching, mu_t, mu_r, mu_p, found)
-        here = scratch[part % 2]
-        _put_between(lattice.field, mu_t, mu_r, mu_p, here)
-        least = min(least, here[n])
-        for i in range(2):
-            least = min(least, found.margins[0, i] / lattice.scale[i])
-        if part > 0:
-            time += _time_between(lattice.speed, scratch[1 - part % 2], here)
-    return least, time
+    for s in range(mu.shape[0]):
+        x, y, z = mu[s, 0] * last, mu[s, 1] * last, mu[s, 2] * last
+        i, j, k = min(int(x), last - 1), min(int(y), last - 1), min(int(z), last - 1)
+        for corner in range(8):
+            a, b, c = corner >> 2, corner >> 1 & 1, corner & 1
+            weight = (x - i if a else 1.0 - x + i) * (y - j if b else 1.0 - y + j)
+            weight *= z - k if c else 1.0 - z + k
+            for l in range(found.shape[1]):
+                found[s, l] += weight * field[i + a, j + b, k + c, l]
 
 
 @njit
 def _put_coarse(
-    carrier: Carrier, size: int, stride: FloatArray, q: FloatArray, margins: FloatArray, value: FloatArray
+    carrier: Carrier, size: int, mu: FloatArray, q: FloatArray, margins: FloatArray, value: FloatArray
 ) -> None:
     """Write joints (size³, n), margins of their limits and of conditioning (size³, 2), and the best value.
 
-    Each node is continued from the best before it; all joints are those at the start yet, all margins and
-    values ``WORST``, and stay so where the joints cannot be reached.
-    stride : (n,) most that a joint may move from node to node, rad or m.
+    Each node, of shares mu (size³, 3), is continued from the best before it. All joints are those at the
+    start yet, all margins and values ``WORST``, and stay so where the joints cannot be reached.
     """
     demands, ends = carrier.reaching.demands, carrier.ends
     for node in range(q.shape[0]):
-        taken, best = 0, math.inf if node == 0 else WORST
-        for step in range(7, 0, -1):
-            before = _before(node, step, size)
+        step, best = 0, math.inf if node == 0 else WORST
+        for other in range(7, 0, -1):
+            before = _before(node, other, size)
             if before >= 0 and value[before] > best:
-                taken, best = step, value[before]
-        before = _before(node, taken, size)
-        earlier = _before(before, taken, size)
-        ends[0, 0], ends[0, 1], ends[0, 2] = _shares_at(before, size)
-        ends[1, 0], ends[1, 1], ends[1, 2] = _shares_at(node, size)
+                step, best = other, value[before]
+        before = _before(node, step, size)
+        put_row(ends[0], mu[before])
+        put_row(ends[1], mu[node])
         for parts in (1, BETWEEN):
+            put_row(q[node], q[before])
             if best == WORST:
                 break
-            for i in range(q.shape[1]):
-                q[node, i] = q[before, i]
-                if parts == 1 and earlier >= 0:
-                    q[node, i] += q[before, i] - q[earlier, i]
-            condition = carry_joints(carrier, ends, parts, ROUGH, math.inf, q[node])
-            if condition >= 0.0 and _time_between(stride, q[node], q[before]) <= 1.0:
+            condition = carry_joints(carrier, ends, parts, ROUGH, MOST_STRIDE / parts, q[node])
+            if condition >= 0.0:
                 margins[node, 0] = limit_margin(demands, q[node])
                 margins[node, 1] = condition - demands.conditioning
                 value[node] = max(min(best, margins[node, 0], margins[node, 1]), WORST + 1.0)
