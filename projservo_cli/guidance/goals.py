@@ -273,7 +273,7 @@ def _keep_turns(
             if not clear_by(c, H, bench.s, -DEVIATIONS * left, -DEVIATIONS * right) > 0.0:
                 return BARRED
         found += 1
-        time = time_between(c, start, q)
+        time = time_between(c.speed, start, q)
         if time < times[most - 1]:
             place = most - 1
             while place > 0 and times[place - 1] > time:

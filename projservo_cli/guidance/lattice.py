@@ -31,7 +31,7 @@ from projservo_cli.guidance.margins import (
     room_along,
     scale_of,
 )
-from projservo_cli.guidance.validity import put_row
+from projservo_cli.guidance.validity import put_row, time_between
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 from projservo_cli.task.visibility import margin_coefficients
 
@@ -273,15 +273,6 @@ def _before(node: int, step: int, size: int) -> int:
     return node - (a * size + b) * size - c
 
 
-@merged
-def _time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
-    """Time between joints, s, at the speed limits (n,)."""
-    most = 0.0
-    for i in range(speed.shape[0]):
-        most = max(most, abs(q[i] - r[i]) / speed[i])
-    return most
-
-
 @njit
 def _put_widest(shares: FloatArray, size: int, value: FloatArray) -> None:
     for node in range(shares.shape[0]):
@@ -304,7 +295,7 @@ def _put_shortest(
             before = _before(node, step, size)
             if free[node] and before >= 0 and cost[before] < math.inf:
                 axes = (step >> 2) + (step >> 1 & 1) + (step & 1)
-                total = cost[before] + _time_between(speed, q[before], q[node])
+                total = cost[before] + time_between(speed, q[before], q[node])
                 total += STRAIGHTER * math.sqrt(axes)
                 if total < cost[node]:
                     cost[node], came[node] = total, before

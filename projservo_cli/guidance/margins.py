@@ -131,11 +131,16 @@ def visibility_margin(reaching: Reaching, view: int, mu_t: float, mu_r: float) -
 
 
 @merged
-def pixel(model: Model, view: int, A: Vec4) -> tuple[float, float]:
-    """Pixel of a point, as the camera reports it, [RH00] eq. (1)."""
-    P = model.P[view]
+def straight_pixel(P: FloatArray, A: Vec4) -> tuple[float, float]:
+    """Pixel of a point by a projective camera, [RH00] eq. (1)."""
     depth = row(P, 2, A)
-    u, v = row(P, 0, A) / depth, row(P, 1, A) / depth
+    return row(P, 0, A) / depth, row(P, 1, A) / depth
+
+
+@merged
+def pixel(model: Model, view: int, A: Vec4) -> tuple[float, float]:
+    """Pixel of a point, as the camera reports it."""
+    u, v = straight_pixel(model.P[view], A)
     return bend(model.lens[view], u, v) if bends(model.lens) else (u, v)
 
 

@@ -57,7 +57,7 @@ def _extended(
     node = _nearest(c, tree, q)
     n = q.shape[0]
     while True:
-        time = time_between(c, tree.q[node], q)
+        time = time_between(c.speed, tree.q[node], q)
         if time <= LEAST:
             return node, True
         if tree.size[0] == tree.q.shape[0]:

@@ -25,9 +25,8 @@ from projservo_cli.calibration.prediction import covariance_root, predict, predi
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
-from projservo_cli.geometry.lens import bend, bends
 from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance
-from projservo_cli.guidance.margins import Demands
+from projservo_cli.guidance.margins import Demands, inside, pixel, straight_pixel
 from projservo_cli.records import Calibration, FloatArray, IntArray, Model
 from projservo_cli.task.face import Task, center_of, face_plane
 
@@ -208,12 +207,6 @@ def width(s: FloatArray, m: int) -> float:
     return least if math.isfinite(least) else 0.0
 
 
-@merged
-def _inside(c: Constraints, u: float, v: float) -> float:
-    """Distance of a pixel from the border of the image, px; negative outside."""
-    return min(u + 0.5, v + 0.5, float(c.image_size[0]) - 0.5 - u, float(c.image_size[1]) - 0.5 - v)
-
-
 @internal
 def off(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float, float]:
     """How far a marker of the face would be off, px, if the calibration were by the deviation j."""
@@ -225,7 +218,7 @@ def off(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float
 @merged
 def _predicted(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float, float]:
     twin = _twin(c, j)
-    return _pixel(twin.P[view], apply(forward(twin, q), vec(c.spread.M[j, k])))
+    return straight_pixel(twin.P[view], apply(forward(twin, q), vec(c.spread.M[j, k])))
 
 
 @merged
@@ -258,10 +251,10 @@ def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray
             nearest = min(nearest, depth)
             if not depth > 0.0:
                 continue
-            u, v = _image(c, view, A)
+            u, v = pixel(c.model, view, A)
             s[view, k, 0], s[view, k, 1] = u, v
             if k < c.face:
-                border = min(border, _inside(c, u, v))
+                border = min(border, inside(c.image_size, u, v))
         margins[FRONT + view] = nearest / c.depth[view]
         if not nearest > 0.0:
             return False
@@ -272,7 +265,9 @@ def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray
             border = math.inf
             for k in range(c.face):
                 deviation = math.sqrt(_variance(c, q, view, k))
-                border = min(border, _inside(c, s[view, k, 0], s[view, k, 1]) - DEVIATIONS * deviation)
+                border = min(
+                    border, inside(c.image_size, s[view, k, 0], s[view, k, 1]) - DEVIATIONS * deviation
+                )
         else:
             border -= DEVIATIONS * deviation
         margins[BORDER + view] = border
@@ -301,8 +296,9 @@ def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
         worst_left, worst_right = 0.0, 0.0
         for k in range(c.M.shape[0]):
             A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
-            worst_left = max(worst_left, _squared(_pixel(c.model.P[0], A), _pixel(twin.P[0], A_j)))
-            worst_right = max(worst_right, _squared(_pixel(c.model.P[1], A), _pixel(twin.P[1], A_j)))
+            s_left, s_right = straight_pixel(c.model.P[0], A), straight_pixel(c.model.P[1], A)
+            worst_left = max(worst_left, _squared(s_left, straight_pixel(twin.P[0], A_j)))
+            worst_right = max(worst_right, _squared(s_right, straight_pixel(twin.P[1], A_j)))
         left, right = left + 0.5 * worst_left, right + 0.5 * worst_right
     return math.sqrt(left), math.sqrt(right)
 
@@ -324,7 +320,10 @@ def clear_by(c: Constraints, H: Mat4, s: FloatArray, left: float, right: float) 
             if keep.views[region] != BOTH or (keep.hides[region] == 1 and k < c.face):
                 least = min(least, first, second)
             else:
-                first, second = min(first, _inside(c, u, v) - left), min(second, _inside(c, x, y) - right)
+                first, second = (
+                    min(first, inside(c.image_size, u, v) - left),
+                    min(second, inside(c.image_size, x, y) - right),
+                )
                 least = min(least, max(first, second))
         for k in range(c.face if keep.views[region] == BOTH else 0):
             for l in range(k):
@@ -355,10 +354,10 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4, off: tuple[flo
         )
         here, all_along, half = -math.inf, -math.inf, 0.0
         for view in range(2):
-            at = _image(c, view, middle)
-            longest = max(_squared(at, _image(c, view, first)), _squared(at, _image(c, view, last)))
+            at = pixel(c.model, view, middle)
+            longest = max(_squared(at, pixel(c.model, view, first)), _squared(at, pixel(c.model, view, last)))
             radius = math.sqrt(longest)
-            clear = min(clearance(c.keep_out, region, view, at[0], at[1]), _inside(c, at[0], at[1]))
+            clear = min(clearance(c.keep_out, region, view, at[0], at[1]), inside(c.image_size, at[0], at[1]))
             clear -= off[0] if view == 0 else off[1]
             here, all_along, half = max(here, clear), max(all_along, clear - radius), max(half, radius)
         if all_along >= c.full[CLEAR] or half <= max(PIECE, 0.25 * abs(here)):
@@ -368,19 +367,6 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4, off: tuple[flo
         else:
             step *= 0.5
     return least
-
-
-@merged
-def _image(c: Constraints, view: int, A: Vec4) -> tuple[float, float]:
-    """Pixel of a point, as the camera reports it."""
-    u, v = _pixel(c.model.P[view], A)
-    return bend(c.model.lens[view], u, v) if bends(c.model.lens) else (u, v)
-
-
-@merged
-def _pixel(P: FloatArray, A: Vec4) -> tuple[float, float]:
-    depth = row(P, 2, A)
-    return row(P, 0, A) / depth, row(P, 1, A) / depth
 
 
 @merged
@@ -411,18 +397,18 @@ def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
     for i in range(MARGINS):
         demands[i] = c.full[i]
     for e in range(c.ends.shape[0]):
-        rise = time_between(c, q, c.ends[e]) / RISE
+        rise = time_between(c.speed, q, c.ends[e]) / RISE
         if rise < 1.0:
             for i in range(MARGINS):
                 demands[i] = min(demands[i], c.had[e, i] + rise * (c.full[i] - c.had[e, i]))
 
 
 @merged
-def time_between(c: Constraints, q: FloatArray, r: FloatArray) -> float:
-    """Time, s, of the straight way between joints at the speed limits."""
+def time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
+    """Time, s, of the straight way between joints at the speed limits (n,)."""
     most = 0.0
     for i in range(q.shape[0]):
-        most = max(most, abs(q[i] - r[i]) / c.speed[i])
+        most = max(most, abs(q[i] - r[i]) / speed[i])
     return most
 
 
