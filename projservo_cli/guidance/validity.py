@@ -141,7 +141,8 @@ def spread_of(calibration: Calibration, indices: IntArray, face: int, demands: D
     J = prediction_derivative(calibration, q)[:, :, indices[:face]] @ factor
     variance = (J**2).sum(axis=-1)
     rows = J.reshape(-1, J.shape[-1]) / np.maximum(np.sqrt(variance).reshape(-1, 1), 1e-9)
-    main = np.linalg.svd(rows, full_matrices=False)[2][:DIRECTIONS].T
+    # LAPACK's singular value decomposition fails on some of these rows, finite as they are.
+    main = np.linalg.eigh(rows.T @ rows)[1][:, : -DIRECTIONS - 1 : -1]
     rest = float(np.sqrt(np.median(np.maximum(variance - ((J @ main) ** 2).sum(axis=-1), 0.0))))
     moved = (factor @ main).T
     n, b = calibration.H_hat_0.shape[0], calibration.M.shape[0]
