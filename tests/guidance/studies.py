@@ -7,12 +7,12 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
-from projservo_cli.task.margins import within
 from scipy.stats import binomtest
 from tqdm import tqdm
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.guidance.goals import Aim
+from projservo_cli.guidance.margins import within
 from projservo_cli.guidance.validity import Asked, constraints_of
 from projservo_cli.guidance.way import Search, find_way
 from projservo_cli.stages.world import joints_of, truth_of

@@ -1,4 +1,4 @@
-"""How often guided runs succeed, and why others do not: the table of the sweep of configs/sweep_guidance.yaml.
+"""How often guided runs succeed, and why others do not: the table of the sweep of sweep_guidance.yaml.
 
     projservo sweep -c configs/sweep_guidance.yaml
     python -m tests.guidance.success_study results/sweep_guidance [FOLDER ...] [-o runs.csv]
