@@ -11,6 +11,8 @@ from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray
 from projservo_cli.task.trajectory import Reference, following, near_way, put_aim, under_way
 
+# Share of what the images ask for in a period that corrects a way through joint space.
+_CORRECTED = 0.2
 _DIRECT_THREE, _DIRECT_TWO, _STACKED = direct_three.CODE, direct_two.CODE, stacked.CODE
 _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = blockwise.CODE, euclidean_points.CODE, exact.CODE
 CODES = {
@@ -69,10 +71,14 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
 def _keep_near(reference: Reference, gains: Gains, q: FloatArray, unique: bool, state: State) -> None:
     """Keep the joints near a way through joint space, and within their limits, whatever the images ask for.
 
+    Images correct by a share of what they ask for: near a singularity that is noise, made large.
+
     unique : whether the law found a joint motion; else the joints follow the way alone.
     """
     for i in range(q.shape[0]):
-        step = gains.period * state.q_dot[i] if unique else state.q_ahead[i]
+        step = state.q_ahead[i]
+        if unique:
+            step += _CORRECTED * (gains.period * state.q_dot[i] - step)
         q_next = near_way(reference, float(state.clock[0]) + 1.0, i, q[i] + step)
         state.q_dot[i] = (min(max(q_next, gains.lower[i]), gains.upper[i]) - q[i]) / gains.period
     state.parts[0], state.blocked[0] = 0, -1

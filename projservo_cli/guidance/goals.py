@@ -41,6 +41,11 @@ LEAST_SIGMA = 0.2
 # What a solution may leave of the images, px, as a multiple of the least.
 MUCH = 2.0
 DISTINCT = math.radians(1.0)
+# A joint of a solution that deviates more than this, rad or m, is near a singularity: what the model reaches
+# there the robot may not. No solution is taken to be nearer to a limit than that by its deviation alone.
+DEFINITE = 0.05
+# Rank, s, from which on goals are unsure.
+UNSURE = 1e3
 ROUND_OFF = 1e-9
 # Starts; the search for further goals ends early once so many times the starts until the last new one, and
 # ``AT_LEAST``, have found none.
@@ -69,6 +74,7 @@ class Bench(NamedTuple):
     M: FloatArray  # (2, 4) a point and its derivative
     base: FloatArray  # (k, n) solutions that are no turns of each other
     left: FloatArray  # (k,) their sums of squares, px²
+    deviation: FloatArray  # (k, n) standard deviations of their joints, rad or m
     choice: IntArray  # (n,)
     lowest: FloatArray  # (n,) least of the joints that are whole turns of a solution
     s: FloatArray
@@ -87,6 +93,7 @@ def new_bench(n: int, b: int) -> Bench:
         np.zeros((2, 4)),
         np.zeros((most, n)),
         np.zeros(most),
+        np.zeros((most, n)),
         np.zeros(n, dtype=np.int64),
         np.zeros(n),
         np.zeros((2, b, 2)),
@@ -186,18 +193,24 @@ def _settled(c: Constraints, aim: Aim, images: bool, settled: float, q: FloatArr
 
 
 @internal
-def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench) -> float:
+def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench, deviation: FloatArray) -> float:
     """Sum of squares, px², that noise and calibration explain of what is left at joints that show the goal.
 
-    Of each way in which the calibration may be off, what no motion of the joints makes up for. The normal
-    equations of the images at these joints are in the bench.
+    Of each way in which the calibration may be off, what no motion of the joints makes up for. The motion
+    that makes up for the rest, and for noise, is what the joints may be off: its standard deviation (n,), rad
+    or m, is written; none of an arm of more joints than six, which can move them at will.
     """
     n = q.shape[0]
     L, M = bench.L, bench.M
-    total: float = (4.0 * c.face - min(n, 6)) * (
-        aim.sigma * aim.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
-    )
+    noise = aim.sigma * aim.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
+    total: float = (4.0 * c.face - min(n, 6)) * noise
     _put_equations(c, aim, q, True, bench)
+    for i in range(n):
+        deviation[i] = 0.0
+        for j in range(n):
+            bench.N[j, n] = 1.0 if i == j else 0.0
+        if n <= 6:
+            deviation[i] = noise * L[i, n] if _put_step(bench.N, 0.0, L) else math.inf
     H = operators_at(c.model, q, bench.H_hat)
     for j in range(1, c.spread.P.shape[0]):
         away = 0.0
@@ -215,7 +228,10 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench) -> float:
         if _put_step(bench.N, 0.0, L):
             for i in range(n):
                 away -= L[i, n] * bench.N[i, n]
+                deviation[i] += L[i, n] * L[i, n] if n <= 6 else 0.0
         total += max(away, 0.0)
+    for i in range(n):
+        deviation[i] = math.sqrt(deviation[i])
     return DEVIATIONS * DEVIATIONS * total
 
 
@@ -234,28 +250,49 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
     return False
 
 
+@merged
+def _slack(deviation: float) -> float:
+    """How far beyond a limit, rad or m, the model may put joints that are within."""
+    return ROUND_OFF + min(DEVIATIONS * deviation, DEFINITE)
+
+
+@merged
+def _rank(c: Constraints, start: FloatArray, q: FloatArray, deviation: FloatArray) -> float:
+    """Time from the start, s; ``UNSURE`` and more of joints that may be beyond a limit or near a singularity.
+
+    The less they are within the limits, in standard deviations (n,), the more.
+    """
+    sure = 1.0
+    for i in range(q.shape[0]):
+        if deviation[i] > 0.0:
+            room = min(q[i] - c.lower[i], c.upper[i] - q[i])
+            sure = min(sure, room / (DEVIATIONS * deviation[i]), DEFINITE / deviation[i])
+    return time_between(c, start, q) if sure >= 1.0 else UNSURE * (2.0 - max(sure, -1.0))
+
+
 @internal
 def _keep_turns(
     c: Constraints,
     start: FloatArray,
-    solution: FloatArray,
+    k: int,
     goals: FloatArray,
-    times: FloatArray,
+    rank: FloatArray,
     bench: Bench,
 ) -> int:
-    """Put the whole turns of a solution within the limits among the goals nearest in time; how many.
+    """Put the whole turns of a solution within the limits among the goals of least rank; how many.
 
     ``BARRED`` where it lies within a region that is kept out of, whatever its prediction may be off.
     """
+    solution, deviation = bench.base[k], bench.deviation[k]
     n, most = solution.shape[0], goals.shape[0]
     q, choice, lowest = bench.q, bench.choice, bench.lowest
     turn = 2.0 * math.pi
     for i in range(n):
-        lowest[i] = solution[i]
+        lowest[i], slack = solution[i], _slack(deviation[i])
         if c.model.joint_types[i] != PRISMATIC:
             low = c.lower[i] if math.isfinite(c.lower[i]) else start[i] - math.pi
-            lowest[i] += turn * math.ceil((low - ROUND_OFF - solution[i]) / turn)
-        if lowest[i] < c.lower[i] - ROUND_OFF or lowest[i] > c.upper[i] + ROUND_OFF:
+            lowest[i] += turn * math.ceil((low - slack - solution[i]) / turn)
+        if lowest[i] < c.lower[i] - slack or lowest[i] > c.upper[i] + slack:
             return 0
         choice[i] = 0
         q[i] = lowest[i]
@@ -273,14 +310,14 @@ def _keep_turns(
             if not clear_by(c, H, bench.s, -DEVIATIONS * left, -DEVIATIONS * right) > 0.0:
                 return BARRED
         found += 1
-        time = time_between(c.speed, start, q)
-        if time < times[most - 1]:
+        own = _rank(c, start, q, deviation)
+        if own < rank[most - 1]:
             place = most - 1
-            while place > 0 and times[place - 1] > time:
-                times[place] = times[place - 1]
+            while place > 0 and rank[place - 1] > own:
+                rank[place] = rank[place - 1]
                 put_row(goals[place], goals[place - 1])
                 place -= 1
-            times[place] = time
+            rank[place] = own
             for i in range(n):
                 goals[place, i] = min(max(q[i], c.lower[i]), c.upper[i])
         i = 0
@@ -288,7 +325,7 @@ def _keep_turns(
             high = c.upper[i] if math.isfinite(c.upper[i]) else start[i] + math.pi
             choice[i] += 1
             q[i] = lowest[i] + choice[i] * turn
-            if c.model.joint_types[i] != PRISMATIC and q[i] <= high + ROUND_OFF:
+            if c.model.joint_types[i] != PRISMATIC and q[i] <= high + _slack(deviation[i]):
                 break
             choice[i] = 0
             q[i] = lowest[i]
@@ -298,9 +335,17 @@ def _keep_turns(
 
 
 @internal
-def _solutions(c: Constraints, aim: Aim, starts: FloatArray, bench: Bench) -> int:
-    """Write solutions that are no turns of each other, and what is left of each; how many."""
+def _solutions(c: Constraints, aim: Aim, known: FloatArray, starts: FloatArray, bench: Bench) -> int:
+    """Write solutions that are no turns of each other, and what is left of each; how many.
+
+    First those known, which need no proof: the goal was seen there, whatever the model says.
+    """
     count, last, most = 0, 0, bench.base.shape[0]
+    for k in range(known.shape[0]):
+        put_row(bench.base[count], known[k])
+        bench.deviation[count, :] = 0.0
+        bench.left[count] = 0.0
+        count += 1
     for k in range(starts.shape[0]):
         if count == most or k > AT_LEAST + PATIENCE * last:
             break
@@ -309,7 +354,8 @@ def _solutions(c: Constraints, aim: Aim, starts: FloatArray, bench: Bench) -> in
         if _is_known(c, q, bench.base, count):
             continue
         left = _settled(c, aim, True, SETTLED, q, bench)
-        if left <= _explained(c, aim, q, bench) and not _is_known(c, q, bench.base, count):
+        explained = _explained(c, aim, q, bench, bench.deviation[count])
+        if left <= explained and not _is_known(c, q, bench.base, count):
             put_row(bench.base[count], q)
             bench.left[count] = left
             count += 1
@@ -322,30 +368,33 @@ def put_goals(
     c: Constraints,
     aim: Aim,
     start: FloatArray,
+    known: FloatArray,
     starts: FloatArray,
     goals: FloatArray,
-    times: FloatArray,
+    rank: FloatArray,
     bench: Bench,
 ) -> tuple[int, int, int, int]:
-    """Write the joints (g, n) that show the goal, and their times (g,) from the start, nearest first.
+    """Write the joints (g, n) that show the goal, and their rank (g,), the least first.
 
-    A solution that leaves much more than the best is a local minimum beside it.
+    Rank is the time from the start, s, or ``UNSURE`` and more. A solution that leaves much more than the best
+    is a local minimum beside it.
 
-    start : (n,) joints at the start; starts : (k, n) from which solutions are sought, overwritten.
+    start : (n,) joints at the start; known : (l, n) joints at which the goal was shown.
+    starts : (k, n) from which solutions are sought, those known first; overwritten.
     Returns how many there are, of which the first g are written; how many solutions, apart from whole turns;
     how many of those do not show the face or lie beyond the limits; how many within a region kept out of.
     """
-    for g in range(times.shape[0]):
-        times[g] = math.inf
-    count = _solutions(c, aim, starts, bench)
+    for g in range(rank.shape[0]):
+        rank[g] = math.inf
+    count = _solutions(c, aim, known, starts, bench)
     most = math.inf
-    for k in range(count):
+    for k in range(known.shape[0], count):
         most = min(most, bench.left[k])
     most = MUCH * MUCH * max(most, 4.0 * c.face * LEAST_SIGMA * LEAST_SIGMA)
     solutions, total, hidden, barred = 0, 0, 0, 0
     for k in range(count):
         if bench.left[k] <= most:
-            turns = _keep_turns(c, start, bench.base[k], goals, times, bench)
+            turns = _keep_turns(c, start, k, goals, rank, bench)
             solutions += 1
             total += max(turns, 0)
             hidden += turns == 0

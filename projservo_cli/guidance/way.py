@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.guidance.goals import STARTS, Aim, new_bench, put_goals
+from projservo_cli.guidance.goals import STARTS, UNSURE, Aim, new_bench, put_goals
 from projservo_cli.guidance.keep_out import only
 from projservo_cli.guidance.search import Tree, first_straight, grow, new_tree
 from projservo_cli.guidance.timing import Pace, timed
@@ -163,9 +163,9 @@ def find_way(
         return np.asarray(low + (high - low) * rng.random((count, n)))
 
     starts = np.vstack([known, start[None], draw(STARTS)])
-    goals, times = np.empty((search.goals, n)), np.empty(search.goals)
-    counts = put_goals(c, aim, start, starts, goals, times, new_bench(n, len(c.M)))
-    goals, times = goals[: counts[0]], times[: counts[0]]
+    goals, rank = np.empty((search.goals, n)), np.empty(search.goals)
+    counts = put_goals(c, aim, start, known, starts, goals, rank, new_bench(n, len(c.M)))
+    goals, rank = goals[: counts[0]], rank[: counts[0]]
     had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
     trial = new_trial(n, len(c.M))
     way = Way(
@@ -174,25 +174,49 @@ def find_way(
     if len(goals) == 0 or not (had > 0.0).all():
         return way
     c = with_ends(c, np.vstack([start[None], goals]))
-    best, shortest = np.empty((0, n)), math.inf
+    sure = goals[rank < UNSURE]
+    for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
+        most = search.samples if asked is goals else min(search.samples, FURTHER)
+        best, draws, trees = _shortest(c, start, asked, most, (draw, rng), trial)
+        way = way._replace(draws=way.draws + draws, trees=trees)
+        if len(best) > 0:
+            pace = timed(c, best, acceleration, trial)
+            return way._replace(corners=best, straight=len(best) == 2, pace=pace)
+    return way
+
+
+def _shortest(
+    c: Constraints,
+    start: FloatArray,
+    goals: FloatArray,
+    most: int,
+    random: tuple[Callable[[int], FloatArray], np.random.Generator],
+    trial: Trial,
+) -> tuple[FloatArray, int, tuple[Tree, Tree] | None]:
+    """The shortest way (k, n) that was met with to any of the goals (g, n), in so many draws of joints.
+
+    A straight one, if it takes little longer than to the nearest goal; else the best of some that trees find.
+    Returns the way, empty where there is none; how many draws it took; the last trees.
+    """
+    draw, rng = random
+    best, shortest = np.empty((0, len(start))), math.inf
     straight = first_straight(c, start, goals, trial)
     if straight >= 0:
-        best, shortest = np.stack([start, goals[straight]]), float(times[straight])
+        best = np.stack([start, goals[straight]])
+        shortest = length(c, best)
     draws, trees = 0, None
-    if not shortest <= LONGER * times[0]:
+    if not shortest <= LONGER * (np.abs(goals - start) / c.speed).max(axis=1).min():
         for _ in range(WAYS):
-            most = search.samples if math.isinf(shortest) else FURTHER
-            if draws >= most:
+            left = (most if math.isinf(shortest) else FURTHER) - draws
+            if left <= 0:
                 break
-            found, used, trees = _by_trees(c, start, goals, most - draws, draw, trial)
+            found, used, trees = _by_trees(c, start, goals, left, draw, trial)
             draws += used
             if found is not None:
                 found = _shortened(c, found, rng, trial)
-                time = length(c, found)
-                if time < shortest:
-                    best, shortest = found, time
-    pace = None if len(best) == 0 else timed(c, best, acceleration, trial)
-    return way._replace(corners=best, straight=len(best) == 2, pace=pace, draws=draws, trees=trees)
+                if length(c, found) < shortest:
+                    best, shortest = found, length(c, found)
+    return best, draws, trees
 
 
 def _times(c: Constraints, path: FloatArray) -> FloatArray:
