@@ -375,6 +375,7 @@ class Trace:
         "behind the face and every marker of the face in both images; none where the truth is not known",
         default=None,
     )
+    searches_anew: int = _scalar(about="how often a way to the goal was searched anew", default=0)
     unplanned: str = _scalar(
         about="why a run that was to follow the plan went without it; empty where it followed", default=""
     )

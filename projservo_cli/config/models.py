@@ -72,12 +72,26 @@ class _FrozenJoint(Section):
     steps: Count | None = Field(None, description="for how many steps; null for ever")
 
 
+class _CameraMoved(Section):
+    """A camera that is knocked, so that all it sees is shifted."""
+
+    at_step: Whole = Field(description="first step at which its image is shifted")
+    view: Literal["left", "right"] = Field(description="which camera")
+    by_px: Number | tuple[Number, Number] = Field(description="how far, along u, or along u and v")
+
+    def by_view(self) -> tuple[tuple[float, float], ...]:
+        """How far along u and v, left and right."""
+        given = self.by_px if isinstance(self.by_px, tuple) else (self.by_px, 0.0)
+        return tuple(given if self.view == view else (0.0, 0.0) for view in ("left", "right"))
+
+
 class _Disturbance(Section):
     """Everything that befalls the simulated robot and its images."""
 
     lost_markers: _LostMarkers | None = None
     bump: _Bump | None = None
     frozen_joint: _FrozenJoint | None = None
+    camera_moved: _CameraMoved | None = None
     delay_periods: StrictInt = Field(0, ge=0, le=1000, description="by how many periods images are late")
 
 
@@ -324,6 +338,9 @@ class _Control(Section):
     )
     without_plan: Literal["replan", "refuse"] = Field(
         "replan", description="whether a law that no joints could follow the plan with replans, or is not run"
+    )
+    searches_anew: Whole = Field(
+        3, description="how often a way is searched anew where one comes to nothing, profiles joint and auto"
     )
     must_converge: tuple[Law, ...] = Field(
         ("direct_three", "direct_two"), description="laws whose failure is that of the call, exit code 1"

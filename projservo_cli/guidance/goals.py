@@ -73,7 +73,7 @@ class Bench(NamedTuple):
     q: FloatArray  # (n,) trial
     M: FloatArray  # (2, 4) a point and its derivative
     base: FloatArray  # (k, n) solutions that are no turns of each other
-    left: FloatArray  # (k,) their sums of squares, px²
+    left: FloatArray  # (k,) their sums of squares, px²; 0 of those known, which are certain
     deviation: FloatArray  # (k, n) standard deviations of their joints, rad or m
     choice: IntArray  # (n,)
     lowest: FloatArray  # (n,) least of the joints that are whole turns of a solution
@@ -251,23 +251,26 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
 
 
 @merged
-def _slack(deviation: float) -> float:
-    """How far beyond a limit, rad or m, the model may put joints that are within."""
-    return ROUND_OFF + min(DEVIATIONS * deviation, DEFINITE)
+def _slack(bench: Bench, k: int, joint: int) -> float:
+    """How far beyond a limit, rad or m, the model may put a joint of solution k that is within."""
+    doubt = 0.0 if bench.left[k] == 0.0 else DEVIATIONS * float(bench.deviation[k, joint])
+    return ROUND_OFF + min(doubt, DEFINITE)
 
 
 @merged
-def _rank(c: Constraints, start: FloatArray, q: FloatArray, deviation: FloatArray) -> float:
+def _rank(c: Constraints, start: FloatArray, q: FloatArray, bench: Bench, k: int) -> float:
     """Time from the start, s; ``UNSURE`` and more of joints that may be beyond a limit or near a singularity.
 
-    The less they are within the limits, in standard deviations (n,), the more.
+    The less they are within the limits, in standard deviations of solution k, the more.
     """
     sure = 1.0
     for i in range(q.shape[0]):
-        if deviation[i] > 0.0:
-            room = min(q[i] - c.lower[i], c.upper[i] - q[i])
-            sure = min(sure, room / (DEVIATIONS * deviation[i]), DEFINITE / deviation[i])
-    return time_between(c, start, q) if sure >= 1.0 else UNSURE * (2.0 - max(sure, -1.0))
+        deviation = float(bench.deviation[k, i])
+        if deviation > 0.0:
+            sure = min(sure, DEFINITE / deviation)
+            if bench.left[k] > 0.0:
+                sure = min(sure, min(q[i] - c.lower[i], c.upper[i] - q[i]) / (DEVIATIONS * deviation))
+    return time_between(c.speed, start, q) if sure >= 1.0 else UNSURE * (2.0 - max(sure, -1.0))
 
 
 @internal
@@ -283,12 +286,12 @@ def _keep_turns(
 
     ``BARRED`` where it lies within a region that is kept out of, whatever its prediction may be off.
     """
-    solution, deviation = bench.base[k], bench.deviation[k]
+    solution = bench.base[k]
     n, most = solution.shape[0], goals.shape[0]
     q, choice, lowest = bench.q, bench.choice, bench.lowest
     turn = 2.0 * math.pi
     for i in range(n):
-        lowest[i], slack = solution[i], _slack(deviation[i])
+        lowest[i], slack = solution[i], _slack(bench, k, i)
         if c.model.joint_types[i] != PRISMATIC:
             low = c.lower[i] if math.isfinite(c.lower[i]) else start[i] - math.pi
             lowest[i] += turn * math.ceil((low - slack - solution[i]) / turn)
@@ -310,7 +313,7 @@ def _keep_turns(
             if not clear_by(c, H, bench.s, -DEVIATIONS * left, -DEVIATIONS * right) > 0.0:
                 return BARRED
         found += 1
-        own = _rank(c, start, q, deviation)
+        own = _rank(c, start, q, bench, k)
         if own < rank[most - 1]:
             place = most - 1
             while place > 0 and rank[place - 1] > own:
@@ -325,7 +328,7 @@ def _keep_turns(
             high = c.upper[i] if math.isfinite(c.upper[i]) else start[i] + math.pi
             choice[i] += 1
             q[i] = lowest[i] + choice[i] * turn
-            if c.model.joint_types[i] != PRISMATIC and q[i] <= high + _slack(deviation[i]):
+            if c.model.joint_types[i] != PRISMATIC and q[i] <= high + _slack(bench, k, i):
                 break
             choice[i] = 0
             q[i] = lowest[i]
@@ -343,7 +346,7 @@ def _solutions(c: Constraints, aim: Aim, known: FloatArray, starts: FloatArray, 
     count, last, most = 0, 0, bench.base.shape[0]
     for k in range(known.shape[0]):
         put_row(bench.base[count], known[k])
-        bench.deviation[count, :] = 0.0
+        _explained(c, aim, known[k], bench, bench.deviation[count])
         bench.left[count] = 0.0
         count += 1
     for k in range(starts.shape[0]):

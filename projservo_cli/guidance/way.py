@@ -33,6 +33,8 @@ WAYS, FURTHER = 6, 300
 LONGER = 1.2
 SHORTENINGS = 150
 ROUND_OFF = 1e-9
+# Goals within so much of shunned joints, rad or m, are shunned too.
+NEARBY = 0.1
 # A margin that is not asked for.
 _NOTHING = 1e12
 
@@ -43,6 +45,7 @@ class Search(NamedTuple):
     samples: int = 20_000
     seed: int = 0
     goals: int = 64
+    shunned: FloatArray = np.zeros((0, 1))  # (k, n) joints near which no goal is taken, rad or m
 
 
 class Way(NamedTuple):
@@ -74,7 +77,7 @@ class Way(NamedTuple):
                 f"of {self.solutions} joint vectors that show the goal, whole turns apart, {self.hidden} lie "
                 f"beyond the joint limits or do not show the face to both cameras{barred}"
             )
-        if not (self.had > 0.0).all():
+        if not may_start(self.had):
             return f"the start is already at or beyond {self._told(int(self.had.argmin()))}"
         at = self._told(int(self.failures[:MARGINS].argmax()))
         return (
@@ -94,6 +97,11 @@ class Way(NamedTuple):
             f"the width of the face in the {view} image",
             f"the border of the {view} image",
         )[kind]
+
+
+def may_start(had: FloatArray) -> bool:
+    """Whether a way may begin at joints of such margins (10,): at a limit, but not at the edge of a view."""
+    return bool(had[LIMITS] >= 0.0 and (had[FRONT:] > 0.0).all())
 
 
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
@@ -166,12 +174,15 @@ def find_way(
     goals, rank = np.empty((search.goals, n)), np.empty(search.goals)
     counts = put_goals(c, aim, start, known, starts, goals, rank, new_bench(n, len(c.M)))
     goals, rank = goals[: counts[0]], rank[: counts[0]]
+    off = np.abs(goals[:, None] - search.shunned)
+    far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
+    goals, rank = goals[far], rank[far]
     had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
     trial = new_trial(n, len(c.M))
     way = Way(
         goals, *counts, np.empty((0, n)), False, None, 0, None, trial.failures, had, within_region(c, start)
     )
-    if len(goals) == 0 or not (had > 0.0).all():
+    if len(goals) == 0 or not may_start(had):
         return way
     c = with_ends(c, np.vstack([start[None], goals]))
     sure = goals[rank < UNSURE]

@@ -10,7 +10,7 @@ from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import RUNNING, WAITING, Command, Instant, Limits, Log, bounded, note, verdict_at
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant, move, observe, rig_distance
+from projservo_cli.robots.simulated import Plant, move, observe, put_camera_moved, rig_distance
 
 
 class Course(NamedTuple):
@@ -53,6 +53,7 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
             for j in range(s.shape[1]):
                 s[view, j, 0] += noise[k, view, j, 0]
                 s[view, j, 1] += noise[k, view, j, 1]
+        put_camera_moved(plant, k, s)
         left = note(log, k, law.task.s_star, plant, limits)
         status = OK
         if in_front:

@@ -126,9 +126,16 @@ class BuiltInLaw:
         self.gains = gains
         span = span_of(model, task.A_star)
         self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M), span)
-        self._bound = _bind(Law(code, model, task, gains), self.state)
+        self.law = Law(code, model, task, gains)
+        self._bound = _bind(self.law, self.state)
         self.errors, self.share, self.fit = self.state.errors, self.state.share, self.state.fit
         self.face_px, self.blocked = self.state.face_px, self.state.blocked
+
+    def follow(self, task: Task) -> None:
+        """Follow another plan to the goal from its beginning."""
+        self.law = self.law._replace(task=task)
+        self.state.clock[0] = 0.0
+        self._bound = _bind(self.law, self.state)
 
     @property
     def path(self) -> FloatArray:
@@ -141,13 +148,28 @@ class BuiltInLaw:
         return status, self.state.q_dot.copy()
 
 
+class _Watch(Protocol):
+    """Who watches over a run, and may overrule the verdict of an instant."""
+
+    def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
+        """Verdict of an instant, or what it becomes; joint velocities (n,) may be written instead."""
+
+
 def run_in_python(
-    law: LoopLaw, plant: _LoopPlant, s_star: FloatArray, period: float, limits: Limits, scale: float = 1.0
+    law: LoopLaw,
+    plant: _LoopPlant,
+    s_star: FloatArray,
+    period: float,
+    limits: Limits,
+    scale: float = 1.0,
+    *,
+    watch: _Watch | None = None,
 ) -> tuple[int, int, Log]:
     """Drive a law on a plant to its verdict.
 
     plant : any; it is stopped however the run ends.
     s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
+    watch : asked at every instant what becomes of its verdict.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
     if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
     fails before the first instant is complete.
@@ -161,13 +183,17 @@ def run_in_python(
         while verdict < 0:
             try:
                 verdict, q_dot = _instant(law, plant, s_star, limits, log, k)
-                if verdict == WAITING:
-                    plant.command(np.zeros_like(q_dot), period)
-                elif verdict == RUNNING:
+                if watch is not None:
+                    verdict = watch.ruled(log, k, verdict, q_dot)
+                if verdict == RUNNING:
                     told = float(_told(law, "share")[0]), int(_told(law, "blocked")[0])
                     verdict = bounded(log, k, Command(q_dot, *told, period, scale), plant.plant, limits)
                     if verdict == RUNNING:
                         _send(law, plant, log.scratch[0, : len(q_dot)], limits, period, scale)
+                    elif watch is not None:
+                        verdict = watch.ruled(log, k, verdict, q_dot)
+                if verdict == WAITING:
+                    plant.command(np.zeros_like(q_dot), period)
             except WorkFailed as error:
                 if k == 0:
                     raise

@@ -187,7 +187,7 @@ def verdict_at(log: Log, k: int, now: Instant, limits: Limits) -> int:
         return WAITING
     log.begun[2] = 0.0
     if verdict == RUNNING and k == limits.max_steps:
-        return PLATEAU if _on_plateau(log.judged, k, limits.plateau_steps) else MAX_STEPS
+        return PLATEAU if on_plateau(log.judged, k, limits.plateau_steps) else MAX_STEPS
     return verdict
 
 
@@ -234,7 +234,7 @@ def _finite(q_dot: FloatArray) -> bool:
 
 
 @merged
-def _on_plateau(errors: FloatArray, k: int, window: int) -> bool:
+def on_plateau(errors: FloatArray, k: int, window: int) -> bool:
     """Whether the image error fell by less than 1 % over the last ``window`` steps."""
     return bool(k >= window and errors[k] > (1.0 - _PLATEAU_FALL) * errors[k - window])
 

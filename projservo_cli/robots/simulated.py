@@ -1,6 +1,7 @@
 """The simulated robot and its rig: from published dimensions, and as the compiled loop sees them."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -42,10 +43,12 @@ class Disturbance(NamedTuple):
     # frozen_at, frozen_until: instant of the reading that stays, and the first that is true again
     frozen_at: int
     frozen_until: int
+    moved_at: int  # instant from which images of a camera that was moved are shifted
+    moved: FloatArray  # (2, 2) by how much, both views, px
 
 
 # For any number of joints a configuration may have.
-UNDISTURBED = Disturbance(0, -1, np.zeros(64), True, -1, 0, NEVER)
+UNDISTURBED = Disturbance(0, -1, np.zeros(64), True, -1, 0, NEVER, NEVER, np.zeros((2, 2)))
 
 
 class Ends(NamedTuple):
@@ -147,6 +150,16 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
 
 
 @merged
+def put_camera_moved(plant: Plant, instant: int, s: FloatArray) -> None:
+    """Shift the pixels (2, k, 2) of an instant where a camera was moved."""
+    if instant >= plant.disturbance.moved_at:
+        for view in range(2):
+            for k in range(s.shape[1]):
+                for i in range(2):
+                    s[view, k, i] += plant.disturbance.moved[view, i]
+
+
+@merged
 def _put_pixel(camera: FloatArray, lens: FloatArray, A: Vec4, pixel: FloatArray) -> bool:
     """Write the pixel (2,) of a point; where it is not in front of the camera, NaN, and return False."""
     depth = row(camera, 2, A)
@@ -198,12 +211,11 @@ class AnalyticPlant:
     noise : (k, 2, markers, 2) added to the pixels of each observation in turn, px.
     ``q, H``: (n,) true joints, rad or m, and (4, 4) displacement of the face. ``in_front``: whether every
     marker was in front of both cameras when last observed. ``markers``: how many are observed, those of the
-    face first. ``hidden``: (2,) 1 where the face was self-occluded when last observed. ``disturbance``:
-    nothing ever disturbs it; why the law that drove it failed. ``takes_parts``: it goes straight to the end
-    of each step; the samples are the same.
+    face first. ``hidden``: (2,) 1 where the face was self-occluded when last observed. ``disturbance``: why
+    the images no longer agree with what they are tested by, or the law that drove it failed; else empty.
+    ``takes_parts``: it goes straight to the end of each step; the samples are the same.
     """
 
-    disturbance = ""
     takes_parts = False
 
     def __init__(self, plant: Plant, q_start: FloatArray, noise: FloatArray) -> None:
@@ -218,6 +230,21 @@ class AnalyticPlant:
         self.hidden = np.zeros(2)
         self.in_front = True
         self.markers = len(plant.M) + len(plant.pins)
+        self.disturbance = ""
+        self._test: Callable[[FloatArray], str] = lambda s: ""
+
+    def tested_by(self, test: Callable[[FloatArray, FloatArray], str], places: IntArray, count: int) -> None:
+        """Test what is observed: by joint readings (n,) and pixels (2, count, 2), NaN where unseen.
+
+        places : (markers,) of the markers that are observed among those of the test.
+        """
+
+        def tested(s: FloatArray) -> str:
+            seen = np.full((2, count, 2), np.nan)
+            seen[:, places] = s
+            return test(self.reading, seen)
+
+        self._test = tested
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
@@ -232,6 +259,8 @@ class AnalyticPlant:
             late = as_mat(self.shown[max(0, self.observations - self.plant.disturbance.delay)])
             observe(self.plant, late, np.zeros_like(self.M), s, np.zeros(2))
         s += self.noise[self.observations]
+        put_camera_moved(self.plant, self.observations, s)
+        self.disturbance = self._test(s)
         self.observations += 1
         return s
 

@@ -13,7 +13,7 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
 from projservo_cli.guidance.lattice import duration, evenly, least_time, plan_path
-from projservo_cli.guidance.margins import Motion, Reaching, along_joints, along_shares, within
+from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares, within
 from projservo_cli.guidance.timing import Pace, joints_at
 from projservo_cli.guidance.validity import NO_SPREAD, Asked, Constraints, Spread, constraints_of, spread_of
 from projservo_cli.guidance.way import Search, Way, find_way, first_within, within_region
@@ -90,6 +90,15 @@ def search_of(scenario: Scenario) -> JointSearch:
     return JointSearch(joints.acceleration, scenario.q_shown, sigma, spread, closed)
 
 
+def closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
+    """Why no way through joint space can be looked for, or given a time; empty where it can."""
+    for i in np.flatnonzero(~np.isfinite(demands.speed)):
+        kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
+        unit = "m_s" if kind == "prismatic" else "deg_s"
+        return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
+    return "no search was given" if search is None else search.closed
+
+
 @lru_cache(maxsize=64)
 def _spread(
     calibration: Calibration,
@@ -157,7 +166,7 @@ def body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> Floa
 _INTERPOLATED_PX = 0.05
 
 
-def _constraints(
+def joint_constraints(
     reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread
 ) -> Constraints:
     """What joints are held against, for a body at A (b, 4)."""
@@ -183,7 +192,7 @@ def _entered(c: Constraints, q: FloatArray) -> str:
 
 def kept_out(found: Found, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
     """What was found, infeasible where it enters a region that a body at A (b, 4) is kept out of."""
-    c = _constraints(found.motion.reaching, A, task, trajectory, spread)
+    c = joint_constraints(found.motion.reaching, A, task, trajectory, spread)
     entered = _entered(c, found.motion.along.q)
     return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
 
@@ -192,7 +201,7 @@ def through_joints(
     reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, search: JointSearch
 ) -> Found:
     """A way through joint space for a body at A (b, 4); the linear motion where there is none."""
-    c = _constraints(reaching, A, task, trajectory, search.spread)
+    c = joint_constraints(reaching, A, task, trajectory, search.spread)
     aim = Aim(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
     how = Search(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
     way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
@@ -202,7 +211,7 @@ def through_joints(
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
         return Found(linear.judged, motion, unknown, False, way.why_none(), way)
-    motion = _sampled(reaching, way.pace, trajectory.samples)
+    motion = sampled_way(reaching, way.pace, trajectory.samples)
     least = float(way.pace.time[-1])
     asked = least if trajectory.duration_s is None else trajectory.duration_s
     _require_time(asked, least)
@@ -210,7 +219,7 @@ def through_joints(
     return Found(motion, motion, time, True, way_words(way), way)
 
 
-def _sampled(reaching: Reaching, pace: Pace, samples: int) -> Motion:
+def sampled_way(reaching: Reaching, pace: Pace, samples: int) -> Motion:
     """The motion at so many places even in time, or more where joints between them were too far off."""
     while True:
         q = joints_at(pace, np.linspace(0.0, float(pace.time[-1]), 2 * samples - 1))

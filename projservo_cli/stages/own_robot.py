@@ -59,10 +59,6 @@ def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
     assert scenario.calibration is not None
     known, numbers = scenario.calibration.marker.tolist(), scenario.observed
     face = [known.index(number) for number in scenario.numbers[: scenario.m]]
-    innovation = None
-    if not untested(scenario):
-        noise = scenario.config.stop.innovation_factor * scenario.noise_px
-        innovation = Innovation(scenario.calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
     shown = np.array([numbers.index(number) for number in scenario.numbers_of(law)])
     order = np.array([numbers.index(number) if number in numbers else -1 for number in known])
     task, rig = scenario.ends.by_points().task(scenario.model), scenario.config.rig
@@ -79,7 +75,15 @@ def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
         False,
     )
     robot = foreign_robot(scenario.config, scenario.joints, len(numbers))
-    return robot, DrivenRobot(robot, plant, shown, order, innovation)
+    return robot, DrivenRobot(robot, plant, shown, order, innovation_of(scenario))
+
+
+def innovation_of(scenario: Scenario) -> Innovation | None:
+    """What tests the images of a run against the calibration; None where that is not done."""
+    if scenario.calibration is None or untested(scenario):
+        return None
+    noise = scenario.config.stop.innovation_factor * scenario.noise_px
+    return Innovation(scenario.calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
 
 
 def untested(scenario: Scenario) -> str:

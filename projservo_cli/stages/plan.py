@@ -17,7 +17,6 @@ from projservo_cli.guidance.margins import Demands, Reaching
 from projservo_cli.guidance.validity import NO_SPREAD
 from projservo_cli.loop.trial import begin
 from projservo_cli.records import (
-    PRISMATIC,
     Calibration,
     FloatArray,
     InputError,
@@ -30,6 +29,7 @@ from projservo_cli.stages.motions import (
     Found,
     JointSearch,
     body_at_start,
+    closed,
     coupled,
     given,
     kept_out,
@@ -148,10 +148,10 @@ def plan_task(
     if trajectory.profile != "auto":
         return _planned(model, shown, trajectory, demands, search)[0]
     before: list[str] = []
-    closed = _closed(model, demands, search)
+    shut = closed(model, demands, search)
     for profile in ("linear", "constrained", "joint"):
         asked = trajectory.model_copy(update={"profile": profile})
-        last = profile == "joint" or (profile == "constrained" and bool(closed))
+        last = profile == "joint" or (profile == "constrained" and bool(shut))
         try:
             plan, fails = _planned(model, shown, asked, demands, search)
         except WorkFailed as error:
@@ -160,19 +160,10 @@ def plan_task(
             before.append(f"not {profile}: {error}")
             continue
         if not fails or last:
-            after = [] if profile == "joint" or not fails else [f"not joint: {closed}"]
+            after = [] if profile == "joint" or not fails else [f"not joint: {shut}"]
             return replace(plan, reason="; ".join([plan.reason, *before, *after]))
         before.append(f"not {profile}: {fails}")
     raise AssertionError(before)
-
-
-def _closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
-    """Why no way through joint space can be looked for, or given a time; empty where it can."""
-    for i in np.flatnonzero(~np.isfinite(demands.speed)):
-        kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
-        unit = "m_s" if kind == "prismatic" else "deg_s"
-        return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
-    return "no search was given" if search is None else search.closed
 
 
 def _found(
@@ -186,9 +177,9 @@ def _found(
     """The motion of one profile; ``tau_limit`` of the translation at most before a rotation."""
     profile = trajectory.profile
     if profile == "joint":
-        closed = _closed(reaching.model, reaching.demands, search)
-        if search is None or closed:
-            raise InputError(f"the profile joint: {closed}")
+        shut = closed(reaching.model, reaching.demands, search)
+        if search is None or shut:
+            raise InputError(f"the profile joint: {shut}")
         A = body_at_start(reaching.model, task, shown, reaching.A)
         return through_joints(reaching, A, task, trajectory, search)
     if profile == "constrained":

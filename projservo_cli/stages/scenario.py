@@ -388,7 +388,7 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
 def _disturbance(config: Config, n: int) -> Disturbance:
     """What befalls the joints and the images of a robot of n joints."""
     given = config.disturbance
-    bump, frozen = given.bump, given.frozen_joint
+    bump, frozen, camera = given.bump, given.frozen_joint, given.camera_moved
     step = np.zeros(n)
     if bump is not None:
         step[bump.joint - 1] = math.radians(bump.by_deg) if bump.by_deg is not None else bump.by_m
@@ -400,6 +400,8 @@ def _disturbance(config: Config, n: int) -> Disturbance:
         -1 if frozen is None else frozen.joint - 1,
         0 if frozen is None else frozen.from_step,
         _end(frozen.from_step, frozen.steps) if frozen is not None else NEVER,
+        NEVER if camera is None else camera.at_step,
+        np.zeros((2, 2)) if camera is None else np.array(camera.by_view()),
     )
 
 

@@ -4,7 +4,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.loop.summary import MM, Ended, Summary, path_deviation, summarize
+from projservo_cli.loop.watch import Watch
 from projservo_cli.records import (
     REPLAN,
     Calibration,
@@ -35,8 +36,10 @@ from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.robots.yours import DrivenRobot, at_rest_after
 from projservo_cli.stages import own_robot
+from projservo_cli.stages.motions import closed, search_of
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.ways import Ways
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
 
@@ -56,6 +59,7 @@ class Outcome:
     mode: str = REPLAN  # law, mode: what it is a run of
     planned_s: float | None = None  # when the plan that it followed arrives, s
     unplanned: str = ""  # why it went without the plan that it was to follow
+    anew: tuple[str, ...] = ()  # when and why a way was searched anew
 
     @cached_property
     def summary(self) -> Summary:
@@ -97,7 +101,8 @@ class Outcome:
             mode=self.mode,
             planned_s=self.planned_s,
             verdict=self.verdict,
-            reason=self.disturbance or _reason(self, joint, remaining),
+            reason="; ".join([self.disturbance or _reason(self, joint, remaining), *_told_anew(self.anew)]),
+            searches_anew=len(self.anew),
             steps=steps,
             period=scenario.gains.period,
             observation="points" if np.isnan(views).all() else "body",
@@ -132,6 +137,10 @@ class Outcome:
 
 # Numbers of a trace that are those of the summary of its run, and one more.
 _TOLD = [field.name for field in fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}]
+
+
+def _told_anew(anew: tuple[str, ...]) -> list[str]:
+    return [f"a way was searched anew {', '.join(anew)}"] if anew else []
 
 
 def _left(log: Log, steps: int) -> tuple[float | None, float | None]:
@@ -209,11 +218,10 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
     if scenario.truth is None:
         assert isinstance(plan, Plan)
         run = _drive_own_robot(scenario, plan, law, replans)
-    elif isinstance(plan, Plan) and not _in_compiled_loop(scenario.config, law):
-        controller = _law_for(scenario, plan, law, replans)
-        noise = scenario.noise_of(law, scenario.config.seed, scenario.limits.max_steps + 1)
-        simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
-        run = _driven_in_python(scenario, controller, simulated)
+    elif isinstance(plan, Plan) and (
+        not _in_compiled_loop(scenario.config, law) or _is_guided(scenario, law, replans)
+    ):
+        run = _drive_simulated(scenario, plan, law, replans)
     else:
         run = _drive_compiled(scenario, plan, law, replans, believed)
     return replace(run, law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
@@ -221,7 +229,14 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
 
 def _in_compiled_loop(config: Config, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
-    return law in CODES and config.plant.speed_scale == 1.0
+    tested = config.disturbance != type(config.disturbance)() and config.stop.innovation_factor > 0.0
+    return law in CODES and config.plant.speed_scale == 1.0 and not tested
+
+
+def _is_guided(scenario: Scenario, law: str, replans: bool) -> bool:
+    """Whether a run follows a plan which gives way to another one where it fails."""
+    guided = scenario.config.trajectory.profile in ("joint", "auto") and not replans and law in CODES
+    return guided and not closed(scenario.model, scenario.demands, search_of(scenario))
 
 
 def sense_is_enough(config: Config, name: str) -> bool:
@@ -259,13 +274,41 @@ def _drive_compiled(
     return Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
 
 
-def _driven_in_python(scenario: Scenario, law: LoopLaw, plant: AnalyticPlant | DrivenRobot) -> Outcome:
+def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
+    """Drive a law on the simulated robot in the Python loop; disturbed images are tested."""
+    config, numbers = scenario.config, scenario.numbers_of(law)
+    controller = _law_for(scenario, plan, law, replans)
+    noise = scenario.noise_of(law, config.seed, scenario.limits.max_steps + 1)
+    disturbed = config.disturbance != type(config.disturbance)()
+    innovation = own_robot.innovation_of(scenario) if disturbed else None
+    simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
+    if innovation is not None:
+        places = [innovation.calibration.marker.tolist().index(number) for number in numbers]
+        simulated.tested_by(innovation.disturbed, np.array(places), len(innovation.calibration.marker))
+    return _driven_in_python(
+        scenario, controller, simulated, _watch(scenario, plan, law, controller, replans)
+    )
+
+
+def _watch(scenario: Scenario, plan: Plan, law: str, controller: LoopLaw, replans: bool) -> Watch | None:
+    """What watches over a run that is guided."""
+    if not _is_guided(scenario, law, replans) or not isinstance(controller, BuiltInLaw):
+        return None
+    follow = partial(_task_for, scenario, law=law, replans=False, model=controller.law.model)
+    searches = scenario.config.control.searches_anew
+    return Watch(controller, follow, Ways(scenario, plan), searches, scenario.limits)
+
+
+def _driven_in_python(
+    scenario: Scenario, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, watch: Watch | None
+) -> Outcome:
     """Drive any law on any plant, every command scaled."""
     gains, scale = scenario.gains, scenario.config.plant.speed_scale
     s_star = scenario.ends.by_points().s_star
-    code, steps, log = run_in_python(law, plant, s_star, gains.period, scenario.limits, scale)
+    code, steps, log = run_in_python(law, plant, s_star, gains.period, scenario.limits, scale, watch=watch)
     limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
-    return Outcome(scenario, VERDICTS[code], plant.disturbance, steps, log, limited, plant.plant)
+    anew = () if watch is None else tuple(watch.told)
+    return Outcome(scenario, VERDICTS[code], plant.disturbance, steps, log, limited, plant.plant, anew=anew)
 
 
 def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
@@ -283,7 +326,8 @@ def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
         if wrong:
             raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
         own_robot.drive_to(driven, scenario.ends.q_start, scenario.config, scenario.joints, "servo")
-        return _driven_in_python(scenario, controller, driven)
+        watch = _watch(scenario, plan, law, controller, replans)
+        return _driven_in_python(scenario, controller, driven, watch)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.geometry import stereo
 from projservo_cli.geometry.algebra import Vec4, add, axpy, dot, meet, scale, sub, unit, vec
-from projservo_cli.geometry.jit import composed, njit
+from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.stereo import fundamental_matrix, optical_centers, put_points
 from projservo_cli.records import FloatArray, IntArray, Model, WorkFailed
 from projservo_cli.task.body import NO_BODY, Body
@@ -173,6 +173,8 @@ def put_task(
 ) -> tuple[int, int]:
     """What the images at start and goal say of a task: target points, order of the markers, visible side.
 
+    Those of a body are told by ``put_body_task``: points and side.
+
     shown : (2, 2, ≥m, 2) straight pixels at the start and at the goal, the m markers of the face first.
     task : as of ``new_task``; on return with the rest.
     A : (m, 4) on return the face at the start.
@@ -186,14 +188,22 @@ def put_task(
         return NO_POINT, lost
     if not _put_order(task.A_star, task.order, angle):
         return ONE_LINE, 0
+    if task.body.M.shape[0] > 0:  # which tells better than points what the face is like edge-on
+        return FOUND, 0
+    return put_sides(task, A), 0
+
+
+@merged
+def put_sides(task: Task, A: FloatArray) -> int:
+    """Which sides of the face A (m, 4) the cameras see at the start; what is wrong if not so at the goal."""
     a = face_plane(A, task.order, center_of(A, task.center))
     a_star = face_plane(task.A_star, task.order, center_of(task.A_star, task.center))
     for view in range(2):
         O = vec(task.O[view])
         task.visible[view] = 1.0 if dot(O, a) > 0.0 else -1.0
         if task.visible[view] * dot(O, a_star) <= 0.0:
-            return OTHER_SIDE_LEFT if view == 0 else OTHER_SIDE_RIGHT, 0
-    return FOUND, 0
+            return OTHER_SIDE_LEFT if view == 0 else OTHER_SIDE_RIGHT
+    return FOUND
 
 
 def require_found(status: int, detail: int) -> None:

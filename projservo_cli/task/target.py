@@ -14,7 +14,6 @@ from projservo_cli.geometry.mechanisms import span_of, workspace
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, Model, Plan, WorkFailed
 from projservo_cli.task.body import NO_BODY, SETTLED, Body, carry, fit_body
 from projservo_cli.task.face import (
-    FOUND,
     MISFIT_GOAL,
     MISFIT_START,
     NOT_UNIQUE,
@@ -22,6 +21,7 @@ from projservo_cli.task.face import (
     UNSEEN_START,
     Task,
     new_task,
+    put_sides,
     put_task,
     require_found,
 )
@@ -111,7 +111,7 @@ def put_body_task(
     for view in range(2):
         for k in range(goal.shape[1]):
             task.body.shown[view, k] = math.isfinite(goal[view, k, 0]) and math.isfinite(goal[view, k, 1])
-    return FOUND, fit.views
+    return put_sides(task, split.A), fit.views
 
 
 def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -> Task:
