@@ -187,7 +187,7 @@ def find_way(
     c = with_ends(c, np.vstack([start[None], goals]))
     sure = goals[rank < UNSURE]
     for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
-        most = search.samples if asked is goals else min(search.samples, FURTHER)
+        most = search.samples - way.draws if asked is goals else min(search.samples // 2, FURTHER)
         best, draws, trees = _shortest(c, start, asked, most, (draw, rng), trial)
         way = way._replace(draws=way.draws + draws, trees=trees)
         if len(best) > 0:

@@ -45,19 +45,22 @@ class Ways:
         Each is searched with a seed of its own.
         """
         self._made += 1
-        c, plan, asked, model = (
-            self._c._replace(offset=off),
-            self._plan,
-            self._trajectory,
-            self._reaching.model,
-        )
+        c, plan, asked = self._c._replace(offset=off), self._plan, self._trajectory
         how = Search(asked.search.samples, asked.search.seed + self._made, asked.goals, shunned)
         start = np.clip(q, c.lower, c.upper)
         way = find_way(c, self._aim, start, self._search.q_shown, how, self._search.acceleration)
         if way.pace is None:
             return None
         found = sampled_way(self._reaching, way.pace, asked.samples)
-        moved = forward_kinematics(model, start) @ np.linalg.inv(forward_kinematics(model, plan.q_start))
+        H, H_start = (forward_kinematics(self._reaching.model, q) for q in (start, plan.q_start))
         sigma, duration = np.linspace(0.0, 1.0, len(found.mu)), float(way.pace.time[-1])
-        motion = {"q": found.along.q, "mu": found.mu, "sigma": sigma, "time": duration * sigma}
-        return replace(plan, **motion, duration=duration, q_start=start, A=plan.A @ moved.T)
+        return replace(
+            plan,
+            q_start=start,
+            A=plan.A @ (H @ np.linalg.inv(H_start)).T,
+            q=found.along.q,
+            mu=found.mu,
+            sigma=sigma,
+            time=duration * sigma,
+            duration=duration,
+        )

@@ -35,6 +35,8 @@ def moved(angle_deg, axis=NORMAL, point=CENTER, shift=(0.0, 0.0, 0.0)):
 
 
 WRIST = "{{joints: [10, -40, 130, 0, {}, 20], unit: deg}}"  # stretched where the fifth is at zero
+UNTESTED = "stop.innovation_factor=0"
+SLIP = "disturbance.bump={at_step: 10, joint: 2, by_deg: 3, read: false}"
 DONE = {
     **{f"turn of {angle} deg": turn(angle) for angle in (0, 90, 170, 179.9, 180)},
     **{f"tilted turn of {angle} deg": moved(angle, TILTED, BESIDE) for angle in (90, 170, 179.9, 180)},
@@ -48,8 +50,10 @@ DONE = {
     ],
     "noise of 1 px": turn(180, "noise.servo_px=1.0"),
     "bump": turn(180, "disturbance.bump={at_step: 10, joint: 2, by_deg: 3}"),
-    "frozen for 20 steps": turn(180, "disturbance.frozen_joint={joint: 4, from_step: 10, steps: 20}"),
-    **{f"images {n} periods late": turn(180, f"disturbance.delay_periods={n}") for n in (1, 2, 3)},
+    "frozen for 20 steps": turn(
+        180, "disturbance.frozen_joint={joint: 4, from_step: 10, steps: 20}", UNTESTED
+    ),
+    **{f"images {n} periods late": turn(180, f"disturbance.delay_periods={n}", UNTESTED) for n in (1, 2, 3)},
 }
 # Without noise a run ends within 0.01 px, a hundredth of a millimetre. The singular wrist stands where no
 # trial motion went: there the error of the calibration is left.
@@ -113,10 +117,24 @@ def test_lost_markers_are_waited_for_and_no_longer(driven):
 
 
 def test_what_befalls_the_readings_is_in_the_trace(driven):
-    slip = driven(turn(180, "disturbance.bump={at_step: 10, joint: 2, by_deg: 3, read: false}"))
+    slip = driven(turn(180, SLIP, UNTESTED))
     assert slip.verdict == "converged"
     assert np.degrees(slip.q_read - slip.q)[10:, 1] == pytest.approx(np.full(slip.steps - 9, -3.0))
     assert driven(DONE["bump"]).q_read is None
-    frozen = driven(turn(180, "disturbance.frozen_joint={joint: 4, from_step: 10, steps: null}"))
+    frozen = driven(turn(180, "disturbance.frozen_joint={joint: 4, from_step: 10, steps: null}", UNTESTED))
     assert frozen.verdict in ("plateau", "max steps", "diverged", "singular")
     assert (frozen.q_read[10:, 3] == frozen.q[10, 3]).all()
+
+
+def test_images_that_a_disturbance_sets_off_the_calibration_are_noticed(driven):
+    slip = driven(turn(180, SLIP))
+    assert (slip.verdict, slip.success) == ("disturbed", False)
+    assert 10 < slip.steps < 20
+    moved = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: [1.5, -1]}"))
+    assert (moved.verdict, "right camera" in moved.reason) == ("disturbed", True)
+    untested = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: 3}", UNTESTED))
+    assert untested.verdict == "converged"
+    assert untested.position_error_mm > 0.05  # where the shifted camera says that the goal is
+    # A knock that the readings follow, and markers that nobody sees, take nothing from the calibration.
+    lost = driven(turn(180, "disturbance.lost_markers={from_step: 10, steps: 2}"))
+    assert lost.verdict == driven(DONE["bump"]).verdict == "converged"
