@@ -8,7 +8,7 @@ from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.margins import Reaching
-from projservo_cli.guidance.validity import BORDER, NO_SPREAD
+from projservo_cli.guidance.validity import BORDER, CLEAR, NO_SPREAD
 from projservo_cli.guidance.way import Search, find_way, margins_at
 from projservo_cli.records import FloatArray, Plan
 from projservo_cli.stages.motions import body_at_start, joint_constraints, sampled_way, search_of
@@ -35,17 +35,24 @@ class Ways:
 
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
         """Whether a path of joints (s, n) leaves an image, where images are off by (s, 2, 2), px."""
-        c = self._c._replace(spread=NO_SPREAD)
-        margins = [margins_at(c._replace(offset=px), row)[0] for row, px in zip(q, off, strict=True)]
-        return bool(np.array(margins)[:, BORDER:].min() < 0.0)
+        for joints, px in zip(q, off, strict=True):
+            P = self._c.model.P.copy()
+            P[:, :2] += px[:, :, None] * P[:, 2:]
+            c = self._c._replace(spread=NO_SPREAD, model=self._c.model._replace(P=P))
+            if margins_at(c, joints)[0][BORDER:].min() < 0.0:
+                return True
+        return False
 
     def anew(self, q: FloatArray, shunned: FloatArray, off: FloatArray) -> Plan | None:
         """Plan of a way from joints (n,), off by (2, 2) px, to other goals than those shunned (k, n).
 
-        Each is searched with a seed of its own.
+        It keeps so much farther from borders and regions. Each is searched with a seed of its own.
         """
         self._made += 1
-        c, plan, asked = self._c._replace(offset=off), self._plan, self._trajectory
+        plan, asked, full = self._plan, self._trajectory, self._c.full.copy()
+        full[BORDER:CLEAR] += np.abs(off).max(axis=1)
+        full[CLEAR] += np.abs(off).max()
+        c = self._c._replace(full=full)
         how = Search(asked.search.samples, asked.search.seed + self._made, asked.goals, shunned)
         start = np.clip(q, c.lower, c.upper)
         way = find_way(c, self._aim, start, self._search.q_shown, how, self._search.acceleration)
