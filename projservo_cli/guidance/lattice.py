@@ -27,7 +27,7 @@ from projservo_cli.guidance.margins import (
     limit_margin,
     put_displaced,
     put_images,
-    put_margins,
+    put_path_margins,
     room_along,
     scale_of,
 )
@@ -307,7 +307,7 @@ def _put_view_margins(reaching: Reaching, mu: FloatArray, found: Along, margins:
     for i in range(mu.shape[0]):
         put_displaced(reaching, mu[i, 0], mu[i, 1], mu[i, 2], found, 0)
         put_images(reaching, found)
-        put_margins(reaching, found)
+        put_path_margins(reaching, found)
         margins[i, VISIBILITY], margins[i, IMAGE] = found.margins[0, VISIBILITY], found.margins[0, IMAGE]
 
 

@@ -325,7 +325,7 @@ def put_images(reaching: Reaching, found: Along) -> None:
 
 
 @njit
-def put_margins(reaching: Reaching, found: Along) -> None:
+def put_path_margins(reaching: Reaching, found: Along) -> None:
     """Write distances and margins, where all else is known."""
     demands, A, P = reaching.demands, reaching.A, reaching.model.P
     for i in range(found.q.shape[0]):
@@ -366,5 +366,5 @@ def _measured(motion: Motion) -> Motion:
     model, found = motion.reaching.model, motion.along
     M = motion.reaching.A @ np.swapaxes(found.H_d, 1, 2)
     found.s[:] = np.moveaxis(project(model.P, M, model.lens), 0, 1)
-    put_margins(motion.reaching, found)
+    put_path_margins(motion.reaching, found)
     return motion

@@ -13,7 +13,14 @@ from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, put_vie
 from projservo_cli.geometry.algebra import IDENTITY
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.geometry.mechanisms import Seen, reach
-from projservo_cli.guidance.margins import Reaching, carrier_of, put_carried, put_margins, room_along, within
+from projservo_cli.guidance.margins import (
+    Reaching,
+    carrier_of,
+    put_carried,
+    put_path_margins,
+    room_along,
+    within,
+)
 from projservo_cli.loop.step import new_log
 from projservo_cli.loop.summary import Ended, path_deviation, summarize
 from projservo_cli.records import Model
@@ -56,6 +63,6 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     yield put_view, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)
     yield put_carried, (carrier_of(reaching), O, along)
-    yield put_margins, (reaching, along)
+    yield put_path_margins, (reaching, along)
     yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))
     yield path_deviation, (plant, log, 1, 0.04, q, q)
