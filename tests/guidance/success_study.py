@@ -17,6 +17,7 @@ import numpy as np
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import plan, servo
+from projservo_cli.stages.world import truth_of
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweep.folder import Folder, run_of
 from tests.guidance.studies import has_no_way, in_two_processes, quantiles, rate, write_rows
@@ -54,15 +55,18 @@ def why(row):
     if not planned.feasible:
         return told | {"cause": f"no plan, {trace.verdict}"}
     if trace.verdict == "converged":
-        return told | {"cause": "converged, " + broken(trace)}
+        return told | {"cause": "converged, " + broken(config, trace)}
     return told | {"cause": trace.verdict}
 
 
-def broken(trace):
-    """What a run that converged did on its way."""
+def broken(config, trace):
+    """What a run that converged did on its way, in truth."""
     if trace.self_occluded.any():
         return "behind the face"
-    return "measured out of an image" if trace.first_outside_image >= 0 else "past a limit or out of an image"
+    truth = truth_of(config)
+    seen = np.array([truth.images(q, truth.M_face) for q in trace.q])
+    inside = (seen >= -0.5) & (seen <= truth.image_size - 0.5)
+    return "past a limit" if inside.all() else "out of an image"
 
 
 def arm_lines(rows):
@@ -78,20 +82,20 @@ def arm_lines(rows):
 
 
 def paired(rows):
-    """Median ratio of the final errors on the tasks that both solve, and how many those are."""
+    """How the final errors compare on the tasks that both solve, in words."""
     errors = {law: {} for law in (GUIDED, ALONE)}
     for row in rows:
         if row["success"]:
-            errors[row["law"]][row["folder"], row["arm"], row["draw"], row["noise_px"]] = row[
-                "position_error_mm"
-            ]
-    both = [(error, errors[ALONE][key]) for key, error in errors[GUIDED].items() if key in errors[ALONE]]
+            task = row["folder"], row["arm"], row["draw"], row["noise_px"]
+            errors[row["law"]][task] = row["position_error_mm"]
+    both = [(error, errors[ALONE][task]) for task, error in errors[GUIDED].items() if task in errors[ALONE]]
     if not both:
         return "no task that both solve"
     first, second = np.array(both).T
+    medians = np.median(first), np.median(second), np.median(first / second)
     return (
-        f"{len(both)} tasks that both solve: median error {np.median(first):.3g} guided, "
-        f"{np.median(second):.3g} alone, ratio {np.median(first) / np.median(second):.3f}"
+        "{} tasks that both solve: median error {:.3g} guided, {:.3g} alone, mm; median of the ratios "
+        "{:.3f}".format(len(both), *medians)
     )
 
 
@@ -127,7 +131,8 @@ def main():
 
     for (arm, noise_px), mine in groupby(sorted(rows, key=place), place):
         tell(f"{arm}, {noise_px:g} px", list(mine))
-    tell("pooled", rows)
+    for noise_px in sorted({row["noise_px"] for row in rows}):
+        tell(f"pooled, {noise_px:g} px", [row for row in rows if row["noise_px"] == noise_px])
 
 
 if __name__ == "__main__":
