@@ -11,9 +11,12 @@ from projservo_cli.provenance import __version__
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import ArrayLike
+
+    from projservo_cli.records import Plan
     from projservo_cli.results import Experiment
 
-__all__ = ["__version__", "load"]
+__all__ = ["__version__", "guide", "load"]
 
 
 def load(run: "Path | str") -> "Experiment":
@@ -39,3 +42,39 @@ def load(run: "Path | str") -> "Experiment":
 
     found = stored(run)
     return Experiment(found.path, found.configuration, found.results)
+
+
+def guide(
+    run: "Experiment",
+    q_start: "ArrayLike",
+    goal: "ArrayLike",
+    *,
+    limits: "ArrayLike | None" = None,
+    speed: "ArrayLike | None" = None,
+) -> "Plan":
+    """Find a way from joints to a face in the images, by the calibration of a run alone.
+
+    Parameters
+    ----------
+    run : a run with a calibration, from ``load``.
+    q_start : (n,) joint readings at the start, rad or m.
+    goal : (2, m, 2) pixels of the markers of ``markers.face`` in the left and the right image, in that order.
+    limits : (n, 2) lowest and highest reading of each joint, rad or m; by default those of the configuration.
+    speed : (n,) most motion of each joint per second, rad/s or m/s; likewise.
+
+    Returns
+    -------
+    Plan
+        ``time`` (k,), s, and ``q`` (k, n), rad or m, even in time, from rest to rest; ``s`` the images.
+        What else it keeps to is set in ``trajectory`` and ``control`` of the configuration of the run.
+
+    Raises
+    ------
+    projservo_cli.records.InputError
+        When an array has another shape, the start is beyond a limit, or a joint has no speed limit.
+    projservo_cli.records.WorkFailed
+        When no way was found; the message says what was in the way.
+    """
+    from projservo_cli.stages.guide import guide as found  # so that importing the package stays light
+
+    return found(run, q_start, goal, limits, speed)

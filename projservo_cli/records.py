@@ -34,6 +34,8 @@ SIZES = {
     "law": 2,
     "operators": 2,
     "limit": 2,
+    "end": 2,
+    "demand": 10,
 }
 
 
@@ -292,6 +294,52 @@ class Plan:
     )
     samples: int | None = _scalar(
         about="joint vectors that the search grew towards; none but in the profile joint", default=None
+    )
+    goals_tried: int | None = _scalar(
+        about="how many of the goals, nearest in time, were tried; none but in the profile joint",
+        default=None,
+    )
+    seed: int | None = _scalar(
+        about="of the random numbers of the search; none but in the profile joint", default=None
+    )
+    tree_nodes: int | None = _scalar(
+        about="joint vectors of both search trees, of which the first are stored; none but in the profile "
+        "joint",
+        default=None,
+    )
+    instead: tuple[str, ...] = _scalar(
+        about="profiles that auto did not take, each with the reason", default=()
+    )
+    lowered: tuple[str, ...] = _scalar(
+        about="what start and goal ask less of than the configuration, having less themselves", default=()
+    )
+    validity: FloatArray | None = _array(
+        "sample",
+        "demand",
+        about="in the profile joint: distance from the joint limits over that asked for; of each view least "
+        "depth (start = 1), visibility a·O (start = 1), width of the face in px, distance from the image "
+        "border less three deviations in px; distance from regions that are kept out of in px",
+        default=None,
+    )
+    validity_asked: FloatArray | None = _array(
+        "sample", "demand", about="what is asked of these, less near start and goals", default=None
+    )
+    corner: FloatArray | None = _array(
+        "rounding",
+        "end",
+        units="s",
+        about="in the profile joint: when each rounded corner begins and ends",
+        default=None,
+    )
+    tree_q: FloatArray | None = _array(
+        "node",
+        "joint",
+        units="rad or m",
+        about="joints of the search trees: that from the start, then that from the goals",
+        default=None,
+    )
+    tree_parent: IntArray | None = _array(
+        "node", about="place of the joints that each is joined to, -1 at a root", default=None
     )
 
     def rotation_sense(self) -> FloatArray:

@@ -208,6 +208,11 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
 
     feasible = "feasible" if value["feasible"] else "NOT feasible"
     yield wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}")
+    instead = [text if detailed else ": ".join(text.split(": ")[:2]) for text in value["instead"]]
+    if instead:
+        yield wrapped("; ".join(f"not {text}" for text in instead), "  ")
+    for text in value["lowered"]:
+        yield wrapped(text, "  ")
     if detailed:
         yield (
             "  rotation {theta_s_deg:.2f} deg = {theta_r_deg:.2f} deg onto the plane, "
@@ -217,6 +222,12 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
         yield f"  least: {', '.join(least)}"
         if value["duration"]:
             yield f"  duration {value['duration']:.3g} s"
+        if value["goals"] is not None:
+            yield wrapped(
+                "search: {goals} joint vectors show the goal, {goals_tried} were tried; {samples} samples of "
+                "seed {seed}, {tree_nodes} joint vectors in both trees".format_map(value),
+                "  ",
+            )
 
 
 def _of_laws(value: dict[str, Any]) -> Iterator[str]:

@@ -404,6 +404,14 @@ def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
                 demands[i] = min(demands[i], c.had[e, i] + rise * (c.full[i] - c.had[e, i]))
 
 
+@njit
+def put_along(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray, demands: FloatArray) -> None:
+    """Write margins and demands (k, 10) along joints (k, n), and the last images (2, b, 2), px."""
+    for i in range(q.shape[0]):
+        put_margins(c, q[i], s, margins[i])
+        put_demands(c, q[i], demands[i])
+
+
 @merged
 def time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
     """Time, s, of the straight way between joints at the speed limits (n,)."""

@@ -32,6 +32,8 @@ WAYS, FURTHER = 6, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
 LONGER = 1.2
 SHORTENINGS = 150
+# Margins that are told where no way was found: those that stopped most.
+TOLD = 2
 ROUND_OFF = 1e-9
 # Goals within so much of shunned joints, rad or m, are shunned too.
 NEARBY = 0.1
@@ -64,6 +66,7 @@ class Way(NamedTuple):
     failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
     had: FloatArray  # (10,) margins of the start
     region: int  # the one that the start is within, counted from 1; 0 for none
+    held: Constraints  # what was held against: with less asked for at start and goals
 
     def why_none(self) -> str:
         """Why no way was found, in words."""
@@ -79,10 +82,15 @@ class Way(NamedTuple):
             )
         if not may_start(self.had):
             return f"the start is already at or beyond {self._told(int(self.had.argmin()))}"
-        at = self._told(int(self.failures[:MARGINS].argmax()))
+        failed = self.failures[:MARGINS]
+        most = [
+            f"{self._told(int(i))} ({failed[i] / failed.sum():.0%})"
+            for i in np.argsort(-failed, kind="stable")[:TOLD]
+            if failed[i] > 0
+        ]
         return (
             f"no way was found to any of {len(self.goals)} joint vectors that show the goal, in {self.draws} "
-            f"samples; what stopped most was {at}"
+            f"samples; what stopped most: {', '.join(most)}"
         )
 
     def _told(self, margin: int) -> str:
@@ -180,11 +188,22 @@ def find_way(
     had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
     trial = new_trial(n, len(c.M))
     way = Way(
-        goals, *counts, np.empty((0, n)), False, None, 0, None, trial.failures, had, within_region(c, start)
+        goals,
+        *counts,
+        np.empty((0, n)),
+        False,
+        None,
+        0,
+        None,
+        trial.failures,
+        had,
+        within_region(c, start),
+        c,
     )
     if len(goals) == 0 or not may_start(had):
         return way
     c = with_ends(c, np.vstack([start[None], goals]))
+    way = way._replace(held=c)
     sure = goals[rank < UNSURE]
     for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
         most = search.samples - way.draws if asked is goals else min(search.samples // 2, FURTHER)

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.config import Config
+from projservo_cli.config.models import Trajectory
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import (
     IMAGE_TRACK,
@@ -102,6 +103,7 @@ class Material(Fit):
     traces: Mapping[str, Trace] = field(default_factory=dict)  # runs of the laws by name
     studies: Studies | None = None  # extra runs; None where they could not be made
     no_studies: str = ""  # why not
+    trajectory: Trajectory = field(default_factory=Trajectory, kw_only=True)  # what the plan was asked for
     plateau_steps: int = 20  # steps in which the error of a run that stands still falls by less than 1 %
 
     def compared(self) -> list[str]:
@@ -156,6 +158,7 @@ class FigureSpec:
     laws: tuple[str, ...] = ()  # whose traces it shows: all of them, or any of them where ``any_law`` is set
     any_law: bool = False
     studies: bool = False  # whether it shows the extra runs
+    shares: bool = False  # whether it shows shares of translation and rotations
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
     task: bool = True  # whether it needs a task; without, a calibration and what it was made from will do
@@ -171,6 +174,8 @@ class FigureSpec:
             return f"no run of {', '.join(missing)} with a step to show; make it: projservo servo report"
         if self.studies and material.studies is None:
             return f"the extra runs could not be made: {material.no_studies}"
+        if self.shares and np.isnan(material.plan.mu).all():
+            return "a way through joint space has no shares of translation and rotations: see figure 16"
         if self.modes and not material.compared():
             return "no run follows the plan: set control.mode, such as [replan, track], and run servo report"
         if self.goal and not material.goal_known():

@@ -16,6 +16,7 @@ from projservo_cli.records import BODY_LAWS, BoolArray, FloatArray, InputError, 
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.scene import pyramids, skeleton
+from projservo_cli.report.figures.way import tree_edges, with_gaps
 from projservo_cli.report.material import CLASSICAL, PAGE_FILE, VIEWS, title
 from projservo_cli.report.page import template
 from projservo_cli.robots.simulated import Arm, Plant
@@ -49,6 +50,7 @@ _KEY = (
     ("goal, planned path of the centre", style.PURPLE),
     ("driven path of the centre", style.GREEN),
 )
+_TREES = (("search tree from the start", "#9cc9e8"), ("search tree from the goals", "#dcb4cd"))
 _AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
 _PLAYING = _AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
 
@@ -72,6 +74,9 @@ class _Motion(NamedTuple):
     start: FloatArray  # (m, 3) corners of the face
     goal: FloatArray | None  # the same, None where only images of the goal are known
     planned: FloatArray  # (s, 3) centre of the face along the joints of the plan, as far as they follow it
+    trees: tuple[
+        FloatArray, ...
+    ]  # (e, 3) centre of the face along the edges of each search tree, NaN between
     runs: Mapping[str, _Driven]
 
 
@@ -85,7 +90,9 @@ def motion_of(
     goal = (face @ np.linalg.solve(robot.base_tool.T, goals[0].T))[:, :3] if goals else None
     planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
     runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
-    return _Motion(pyramids(plant, start), start, goal, planned, runs)
+    edges = () if plan.tree_q is None else tree_edges(plan)
+    trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
+    return _Motion(pyramids(plant, start), start, goal, planned, trees, runs)
 
 
 def _instants(q: FloatArray) -> IntArray:
@@ -138,7 +145,8 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
         div_id="scene",
         post_script=_NEARER,
     )
-    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=_KEY)
+    key = _KEY + (_TREES if motion.trees else ())
+    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
@@ -202,6 +210,7 @@ def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
     """Range of each coordinate that a run keeps to, so that the scene stands still while the robot moves."""
     points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
     points += [] if motion.goal is None else [motion.goal]
+    points += [tree[np.isfinite(tree[:, 0])] for tree in motion.trees]
     shown = np.concatenate([some.reshape(-1, 3) for some in points])
     low, high = shown.min(axis=0), shown.max(axis=0)
     pad = _PAD * float((high - low).max())
@@ -236,8 +245,11 @@ def _still(go: Any, motion: _Motion) -> Iterator[Any]:
     yield _line(go, style.closed(motion.start), "face at the start", style.BLACK, width=3)
     if motion.goal is not None:
         yield _line(go, style.closed(motion.goal), "face at the goal", style.PURPLE, width=4)
+    for points, (name, color) in zip(motion.trees, _TREES, strict=False):
+        yield _line(go, points, name, color, width=1)
     if len(motion.planned):
         dots = np.linspace(0, len(motion.planned) - 1, min(_DOTS, len(motion.planned))).astype(int)
+        yield _line(go, motion.planned, "planned path", style.PURPLE, width=2)
         yield _line(go, motion.planned[dots], "planned path", style.PURPLE)
 
 

@@ -37,8 +37,9 @@ from projservo_cli.stages.motions import (
     through_joints,
 )
 from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.told import told_of
 from projservo_cli.stages.verdicts import least_of, verdict_of
-from projservo_cli.stages.world import face_numbers
+from projservo_cli.stages.world import Joints, face_numbers
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import Shown
@@ -107,9 +108,10 @@ def _require_in_span(model: Model, A: FloatArray, q_start: FloatArray, images: F
         )
 
 
-def run(config: Config, calibration: Calibration) -> Plan:
+def run(config: Config, calibration: Calibration, joints: Joints | None = None) -> Plan:
     """Partition the task and plan its motion, from the calibration and the images alone.
 
+    joints : other than the configuration says, of a robot of which no more than the calibration is known.
     Raises InputError if the configuration lacks the task or the face; WorkFailed if the task cannot be
     partitioned.
     """
@@ -120,7 +122,7 @@ def run(config: Config, calibration: Calibration) -> Plan:
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    return _plan_of(scenario_of(config, calibration))
+    return _plan_of(scenario_of(config, calibration, joints=joints))
 
 
 def needs_covariance(trajectory: Trajectory) -> bool:
@@ -157,12 +159,12 @@ def plan_task(
         except WorkFailed as error:
             if last:
                 raise
-            before.append(f"not {profile}: {error}")
+            before.append(f"{profile}: {error}")
             continue
         if not fails or last:
-            after = [] if profile == "joint" or not fails else [f"not joint: {shut}"]
-            return replace(plan, reason="; ".join([plan.reason, *before, *after]))
-        before.append(f"not {profile}: {fails}")
+            after = [] if profile == "joint" or not fails else [f"joint: {shut}"]
+            return replace(plan, instead=(*before, *after))
+        before.append(f"{profile}: {fails}")
     raise AssertionError(before)
 
 
@@ -254,8 +256,7 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        goals=None if way is None else way.shown,
-        samples=None if way is None else way.draws,
+        **({} if way is None else told_of(way, along.q, time, trajectory.search.seed)),
     )
     return plan, found.entered or ("" if holds or (way is not None and found.feasible) else words)
 

@@ -111,6 +111,7 @@ def _material(
         "" if studies else left_out[-1]["reason"],
         bench.scenario.limits.plateau_steps,
         held_out=run.cross_validation,
+        trajectory=bench.scenario.config.trajectory,
     )
 
 

@@ -155,18 +155,21 @@ class Scenario:
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
 
-def scenario_of(config: Config, calibration: Calibration | None = None) -> Scenario:
+def scenario_of(
+    config: Config, calibration: Calibration | None = None, *, joints: Joints | None = None
+) -> Scenario:
     """Make the scenario of a configuration, of its simulated robot or of the one in ``plant.use``.
 
+    joints : other than the configuration says, of a robot of which no more than the calibration is known.
     Without a calibration laws are given the true model of the simulated robot. Raises InputError if the
     configuration lacks a part of it, naming the key to set; WorkFailed if the goal cannot be reached or
     seen, or the body not be measured with.
     """
-    truth = truth_of(config) if config.plant.use is None else None
+    truth = truth_of(config) if config.plant.use is None and joints is None else None
     face = face_numbers(config)
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
-    joints = joints_of(config, "" if calibration is None else calibration.joint_types, calibration)
+    joints = joints or joints_of(config, "" if calibration is None else calibration.joint_types, calibration)
     assert config.markers is not None
     center, sigma_px = center_index(config.markers), config.noise.servo_px
     if truth is not None:

@@ -105,9 +105,10 @@ def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
 def way_words(way: Way) -> str:
     """How a way through joint space leads to the goal, in words."""
     g = int(np.abs(way.goals - way.corners[-1]).max(axis=1).argmin())
-    how = "a straight way" if way.straight else f"a way through {len(way.corners) - 2} corners"
-    some = f"the {len(way.goals)} nearest of " if way.shown > len(way.goals) else ""
-    return (
-        f"{how} in joint space, after {way.draws} samples, leads to joints {g + 1} of {some}{way.shown} that "
-        f"show the goal{f'; {way.barred} more are within a region' if way.barred else ''}"
-    )
+    corners = len(way.corners) - 2
+    how = "a straight way" if way.straight else f"a way round {corners} corner{'s' * (corners != 1)}"
+    nearest = "the nearest" if g == 0 else f"number {g + 1}"
+    some = "" if way.shown == len(way.goals) else f", of which the {len(way.goals)} nearest were tried"
+    barred = f"; {way.barred} more are within a region" if way.barred else ""
+    goal = "the only joints" if way.shown == 1 else f"{nearest} of {way.shown} joint vectors"
+    return f"{how} in joint space leads to {goal} that show the goal{some}{barred}"

@@ -131,8 +131,8 @@ def test_auto_says_which_way_it_took_and_why_not_the_ones_before():
             _, _, plan = guided(name, k, "auto")
             taken.add(plan.profile)
             assert plan.feasible
-            assert ("not linear: " in plan.reason) == (plan.profile != "linear")
-            assert ("not constrained: " in plan.reason) == (plan.profile == "joint")
+            before = {"linear": [], "constrained": ["linear"], "joint": ["linear", "constrained"]}
+            assert [text.split(": ")[0] for text in plan.instead] == before[plan.profile]
             assert (plan.goals is None) == (plan.profile != "joint")
     assert {"linear", "joint"} <= taken
 
@@ -156,7 +156,7 @@ def test_a_joint_without_a_speed_limit_is_refused_by_its_key():
         scenario.model, scenario.ends, asked("auto"), scenario.demands._replace(border_px=480.0)
     )
     assert not plan.feasible
-    assert "not joint: joint 3 has no speed limit: set control.prismatic_speed_limit_m_s" in plan.reason
+    assert plan.instead[-1] == "joint: joint 3 has no speed limit: set control.prismatic_speed_limit_m_s"
 
 
 def test_no_way_is_told_and_the_law_goes_alone():
