@@ -18,7 +18,7 @@ from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, run_page
 
 PAGES = sorted(DOCS.glob("*.md"))
 # Those that run laws or plan: only with the compiler.
-DRIVING = {"api", "commands", "law", "report", "run-file", "sweeps", "tutorial"}
+DRIVING = {"api", "commands", "guidance", "law", "report", "run-file", "sweeps", "tutorial"}
 LANGUAGES = {"sh", "python", "text", "yaml"}
 # What cannot be run by a test, and how often it stands there.
 NOT_RUN = {"installation": 1, "sweeps": 1}
@@ -110,6 +110,18 @@ def check_api(folder, names, read):
     np.testing.assert_allclose(names["same"], names["pixels"], atol=1e-9)  # px, of a thousand
 
 
+def check_guidance(folder, names, read):
+    """The points keep the limits, and lead from the start to the goal as the true cameras see it."""
+    config = load_config(folder / "configs" / "paper.yaml")
+    truth, points = truth_of(config), names["points"]
+    q, rate = (np.array([point[name] for point in points]) for name in ("positions", "velocities"))
+    assert ((q >= truth.robot.lower) & (q <= truth.robot.upper)).all()
+    assert np.abs(rate).max() <= np.radians(config.control.joint_speed_limit_deg_s)
+    assert [points[0]["time_from_start"], points[-1]["time_from_start"]] == [0.0, names["plan"].duration]
+    np.testing.assert_array_equal(q[0], names["q_start"])
+    np.testing.assert_allclose(truth.images(q[-1], truth.M_face), [names["left"], names["right"]], atol=1.5)
+
+
 def check_run_file(folder, names, read):
     """What the page says of groups is what is there, and in which."""
     pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
@@ -139,6 +151,7 @@ CHECK = {
     "law": check_law,
     "report": check_report,
     "api": check_api,
+    "guidance": check_guidance,
     "run-file": check_run_file,
 }
 
