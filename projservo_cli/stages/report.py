@@ -59,7 +59,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
         bench = comparison_of(config, run.calibration, run.plan)
         with _unless_it_fails("studies", left_out):
             studies = run_studies(bench, progress=progress)
-        material = _material(run, bench, studies, left_out)
+        material = replace(_material(run, bench, studies, left_out), trajectory=config.trajectory)
         with _unless_it_fails("equation (22)", left_out):
             distance, _ = composition_error(metric_plan(bench))
             share = np.array(LAMBDAS)
@@ -111,7 +111,6 @@ def _material(
         "" if studies else left_out[-1]["reason"],
         bench.scenario.limits.plateau_steps,
         held_out=run.cross_validation,
-        trajectory=bench.scenario.config.trajectory,
     )
 
 

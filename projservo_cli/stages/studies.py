@@ -76,10 +76,16 @@ def projective_twin(model: Model) -> Model:
 
 
 def comparison_of(config: Config, calibration: Calibration, plan: Plan) -> Comparison:
-    """Set up the extra runs; images are without noise, but for a goal that is known by them alone."""
+    """Set up the extra runs; images are without noise, but for a goal that is known by them alone.
+
+    They are of laws by themselves: nothing keeps them out of regions.
+    """
     truth_of(config)  # refuses what lacks a part of the simulation
-    control = config.control.model_copy(update={"observation": "points"})
-    scenario = scenario_of(idealized(config).model_copy(update={"control": control}), calibration)
+    alone = {
+        "control": config.control.model_copy(update={"observation": "points"}),
+        "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
+    }
+    scenario = scenario_of(idealized(config).model_copy(update=alone), calibration)
     limits = scenario.limits._replace(stop_at_joint_limit=False, stop_at_border=False)
     scenario = replace(scenario, limits=limits)
     assert scenario.truth is not None

@@ -8,10 +8,12 @@ import pytest
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.report import style
 from projservo_cli.report.figures.way import PIECES
-from projservo_cli.stages.plan import JointSearch, plan_task
+from projservo_cli.stages import studies
+from projservo_cli.stages.motions import JointSearch
+from projservo_cli.stages.plan import plan_task
 from tests.figures.cases import SPECS, case
 from tests.figures.test_figure_drawing import drawn, require_readable
-from tests.known import asked
+from tests.known import asked, configured
 
 BOX = [[600.0, 480.0], [700.0, 480.0], [700.0, 560.0], [600.0, 560.0]]
 SPEC = SPECS["fig16_way"]
@@ -110,3 +112,14 @@ def test_no_way_is_drawn_with_what_stood_in_it(material, monkeypatch):
     require_readable(drawn(SPEC, shown), monkeypatch)
     assert len(style.contents(drawn(SPEC, shown), ["svg"])["svg"]) > 10_000
     assert "figure 16" in SPECS["fig14_path"].lacking(material)
+
+
+def test_the_extra_runs_of_a_report_are_made_whatever_regions_the_plan_keeps_out_of(material):
+    region = f"trajectory.keep_out=[{{left: {BOX}, right: {BOX}}}]"
+    config = configured(
+        "paper", "trajectory.profile=joint", "control.mode=track", "control.laws=[exact]", region
+    )
+    bench = studies.comparison_of(config, material.calibration, material.plan)
+    runs = studies.run_studies(bench, (0.5,), ())
+    assert runs.own["direct_three", "true", False].verdict == "converged"
+    assert studies.metric_plan(bench).profile == "linear"
