@@ -16,6 +16,7 @@ from projservo_cli.geometry.kinematics import forward, image_velocity, operators
 from projservo_cli.guidance.validity import (
     BORDER,
     DEVIATIONS,
+    FINE_PX,
     MARGINS,
     Constraints,
     clear_by,
@@ -284,7 +285,7 @@ def _keep_turns(
 ) -> int:
     """Put the whole turns of a solution within the limits among the goals of least rank; how many.
 
-    ``BARRED`` where it lies within a region that is kept out of, whatever its prediction may be off.
+    ``BARRED`` where it lies within a region that is kept out of, by more than its prediction may be off.
     """
     solution = bench.base[k]
     n, most = solution.shape[0], goals.shape[0]
@@ -307,10 +308,11 @@ def _keep_turns(
             for j in range(1, BORDER):
                 if not bench.margins[j] > 0.0:
                     return 0
-            # What a prediction may be off speaks for a goal: it was chosen, and is seen on arrival.
+            # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
             H = forward(c.model, q)
             left, right = most_off(c, q, H)
-            if not clear_by(c, H, bench.s, -DEVIATIONS * left, -DEVIATIONS * right) > 0.0:
+            doubt = -min(DEVIATIONS * left, FINE_PX), -min(DEVIATIONS * right, FINE_PX)
+            if not clear_by(c, H, bench.s, doubt, math.inf) > 0.0:
                 return BARRED
         found += 1
         own = _rank(c, start, q, bench, k)

@@ -25,7 +25,7 @@ from projservo_cli.calibration.prediction import covariance_root, predict, predi
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
-from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance
+from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, apart, bulge, clearance, squared
 from projservo_cli.guidance.margins import Demands, inside, pixel, straight_pixel
 from projservo_cli.records import Calibration, FloatArray, IntArray, Model
 from projservo_cli.task.face import Task, center_of, face_plane
@@ -240,8 +240,11 @@ def _variance(c: Constraints, q: FloatArray, view: int, k: int) -> float:
 
 
 @merged
-def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray) -> bool:
-    """Write the images (2, b, 2) and what they tell; False where a marker is behind a camera."""
+def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray, asked: float) -> bool:
+    """Write the images (2, b, 2) and what they tell; False where a marker is behind a camera.
+
+    asked : what the distance from regions is held against, infinite where it is told.
+    """
     H = forward(c.model, q)
     P = c.model.P
     for view in range(2):
@@ -272,24 +275,29 @@ def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray
         else:
             border -= DEVIATIONS * deviation
         margins[BORDER + view] = border
-    margins[CLEAR] = _clear(c, q, H, s) if c.keep_out.image.shape[0] > 0 else math.inf
+    margins[CLEAR] = _clear(c, q, H, s, asked) if c.keep_out.image.shape[0] > 0 else math.inf
     return True
 
 
+# No marker of the body is off by so many times as much as the face was at most.
+FAR_OFF = 5.0
+
+
 @internal
-def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray) -> float:
+def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray, asked: float) -> float:
     """Margin of the regions that are kept out of; near them what a prediction may be off there tells."""
-    most = DEVIATIONS * c.spread.most
-    least = clear_by(c, H, s, most, most)
-    if most > 0.0 and least < c.full[CLEAR]:
-        left, right = most_off(c, q, H)
-        least = clear_by(c, H, s, DEVIATIONS * left, DEVIATIONS * right)
-    return least
+    off = DEVIATIONS * FAR_OFF * c.spread.most
+    if off > 0.0:
+        far = clear_by(c, H, s, (off, off), c.full[CLEAR])
+        if far >= c.full[CLEAR]:
+            return far
+    left, right = most_off(c, q, H)
+    return clear_by(c, H, s, (DEVIATIONS * left, DEVIATIONS * right), asked)
 
 
 @internal
 def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
-    """Standard deviation of a coordinate in each image, px, no less than that of any marker."""
+    """Standard deviation of a coordinate in each image, px, no less than that of any marker of the body."""
     left = right = c.spread.rest * c.spread.rest
     for j in range(1, c.spread.P.shape[0]):
         twin = _twin(c, j)
@@ -298,38 +306,43 @@ def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
         for k in range(c.M.shape[0]):
             A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
             s_left, s_right = straight_pixel(c.model.P[0], A), straight_pixel(c.model.P[1], A)
-            worst_left = max(worst_left, _squared(s_left, straight_pixel(twin.P[0], A_j)))
-            worst_right = max(worst_right, _squared(s_right, straight_pixel(twin.P[1], A_j)))
+            worst_left = max(worst_left, squared(s_left, straight_pixel(twin.P[0], A_j)))
+            worst_right = max(worst_right, squared(s_right, straight_pixel(twin.P[1], A_j)))
         left, right = left + 0.5 * worst_left, right + 0.5 * worst_right
     return math.sqrt(left), math.sqrt(right)
 
 
 @internal
-def clear_by(c: Constraints, H: Mat4, s: FloatArray, left: float, right: float) -> float:
+def clear_by(c: Constraints, H: Mat4, s: FloatArray, off: tuple[float, float], asked: float) -> float:
     """Least distance, px, of the displaced body with images s (2, b, 2) from regions that are kept out of.
 
-    left, right : how far off predictions may be in each image, px.
+    off : how far predictions may be off in each image, px.
+    asked : what the distance is held against: beyond it, and once it is missed, less is looked at; infinite
+        where the distance itself matters.
     A point is clear where one camera sees it beside a region. Markers of a face that the obstacle may hide
     are so in both images, and all markers in the only image in which a region is drawn.
     """
     keep, least = c.keep_out, math.inf
+    enough = min(asked, c.full[CLEAR])
     for region in range(keep.hides.shape[0]):
         for k in range(c.M.shape[0]):
             u, v, x, y = s[0, k, 0], s[0, k, 1], s[1, k, 0], s[1, k, 1]
-            first = clearance(keep, region, 0, u, v) - left
-            second = clearance(keep, region, 1, x, y) - right
+            first = clearance(keep, region, 0, (u, v)) - off[0]
+            second = clearance(keep, region, 1, (x, y)) - off[1]
             if keep.views[region] != BOTH or (keep.hides[region] == 1 and k < c.face):
                 least = min(least, first, second)
             else:
                 first, second = (
-                    min(first, inside(c.image_size, u, v) - left),
-                    min(second, inside(c.image_size, x, y) - right),
+                    min(first, inside(c.image_size, u, v) - off[0]),
+                    min(second, inside(c.image_size, x, y) - off[1]),
                 )
                 least = min(least, max(first, second))
         for k in range(c.face if keep.views[region] == BOTH else 0):
             for l in range(k):
+                if least < asked < math.inf:
+                    return least
                 A, B = apply(H, vec(c.M[k])), apply(H, vec(c.M[l]))
-                least = min(least, _clear_between(c, region, A, B, (left, right)))
+                least = min(least, _clear_between(c, region, (A, B), off, enough))
     return least
 
 
@@ -338,42 +351,41 @@ PIECE = 0.5
 
 
 @internal
-def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4, off: tuple[float, float]) -> float:
+def _clear_between(
+    c: Constraints, region: int, ends: tuple[Vec4, Vec4], off: tuple[float, float], enough: float
+) -> float:
     """Least distance, px, of a segment from a region of both images, as above; never too large.
 
-    A distance changes by no more than the way in an image, so that what holds in the middle of a piece less
-    its half length holds all along it. Pieces are of the segment in space, the same in both images; they
-    are halved until they are clear, or short.
+    Pieces of it, of the segment in space and so the same in both images, are halved until one image shows
+    all of each ``enough`` beside the region, or they are short: a distance changes by no more than the way.
     """
     least, done, step = math.inf, 0.0, 1.0
     while done < 1.0:
         step = min(step, 1.0 - done)
-        first, middle, last = (
-            combined(done, A, B),
-            combined(done + 0.5 * step, A, B),
-            combined(done + step, A, B),
-        )
+        first, last = combined(done, ends[0], ends[1]), combined(done + step, ends[0], ends[1])
+        middle = combined(done + 0.5 * step, ends[0], ends[1])
         here, all_along, half = -math.inf, -math.inf, 0.0
         for view in range(2):
-            at = pixel(c.model, view, middle)
-            longest = max(_squared(at, pixel(c.model, view, first)), _squared(at, pixel(c.model, view, last)))
-            radius = math.sqrt(longest)
-            clear = min(clearance(c.keep_out, region, view, at[0], at[1]), inside(c.image_size, at[0], at[1]))
-            clear -= off[0] if view == 0 else off[1]
-            here, all_along, half = max(here, clear), max(all_along, clear - radius), max(half, radius)
-        if all_along >= c.full[CLEAR] or half <= max(PIECE, 0.25 * abs(here)):
-            least = min(least, all_along)
-            done += step
-            step *= 2.0
-        else:
+            s, at, t = pixel(c.model, view, first), pixel(c.model, view, middle), pixel(c.model, view, last)
+            radius = math.sqrt(max(squared(at, s), squared(at, t)))
+            clear = (
+                min(clearance(c.keep_out, region, view, at), inside(c.image_size, at[0], at[1])) - off[view]
+            )
+            along = clear - radius
+            if along < enough <= clear:
+                # A lens bends the image of a straight piece: by no more than in its middle.
+                border = min(inside(c.image_size, s[0], s[1]), inside(c.image_size, t[0], t[1]))
+                along = min(apart(c.keep_out, region, view, s, t), border) - off[view] - bulge(s, at, t)
+            here, all_along, half = max(here, clear), max(all_along, along), max(half, radius)
+            if all_along >= enough:
+                break
+        if all_along < enough and half > max(PIECE, 0.25 * abs(here)):
             step *= 0.5
+            continue
+        least = min(least, max(all_along, here - half))
+        done += step
+        step *= 2.0
     return least
-
-
-@merged
-def _squared(s: tuple[float, float], t: tuple[float, float]) -> float:
-    du, dv = s[0] - t[0], s[1] - t[1]
-    return du * du + dv * dv
 
 
 @merged
@@ -389,7 +401,7 @@ def put_margins(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArra
         margins[i] = -math.inf
     _put_limits(c, q, margins)
     _put_sides(c, q, margins)
-    _put_views(c, q, s, margins)
+    _put_views(c, q, s, margins, math.inf)
 
 
 @njit
@@ -487,7 +499,7 @@ def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
         if not margins[SIDE + view] > demands[SIDE + view]:
             trial.failures[SIDE + view] += 1
             return False
-    if not _put_views(c, q, trial.s, margins):
+    if not _put_views(c, q, trial.s, margins, demands[CLEAR]):
         trial.failures[FRONT if not margins[FRONT] > 0.0 else FRONT + 1] += 1
         return False
     for i in (FRONT, FRONT + 1, WIDTH, WIDTH + 1, BORDER, BORDER + 1, CLEAR):

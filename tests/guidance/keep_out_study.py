@@ -13,7 +13,6 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
-from projservo_cli.task.margins import within
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
@@ -23,6 +22,7 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
+from projservo_cli.guidance.margins import within
 from projservo_cli.guidance.validity import Asked, constraints_of
 from projservo_cli.guidance.way import Search, find_way, within_region
 from projservo_cli.records import WorkFailed
