@@ -66,9 +66,9 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
     if math.isfinite(goal[0]):
         length, at_samples = _path_along(plant, log, steps, start, goal)
     base_tool, goal_pose = mat(ends.base_tool), mat(ends.goal_pose)
-    kept = hidden_left == 0 and hidden_right == 0 and _keeps_within(plant, log, steps)
+    arrived = ended.verdict == CONVERGED and hidden_left == 0 and hidden_right == 0
     return Summary(
-        1.0 if kept and ended.verdict == CONVERGED else 0.0,
+        1.0 if arrived and _keeps_within(plant, log, steps) else 0.0,
         float(log.error[steps]),
         hidden_left,
         hidden_right,
