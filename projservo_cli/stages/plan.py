@@ -284,10 +284,7 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
 
 
 def rotation_sense(scenario: Scenario) -> FloatArray:
-    """Joint motions (2, n) of both rotations in the sense of the plan; few profiles need all of that."""
-    trajectory, joints = scenario.config.trajectory, scenario.joints
-    if not rehearses(trajectory.profile):
-        return _plan_of(scenario).rotation_sense()
-    ends = scenario.model, scenario.ends
-    state, _, parts, _ = _partitioned(*ends, trajectory.profile, joints.lower, joints.upper)
+    """Joint motions (2, n) of both rotations in the sense of a plan whose profile rehearses half turns."""
+    profile, joints = scenario.config.trajectory.profile, scenario.joints
+    state, _, parts, _ = _partitioned(scenario.model, scenario.ends, profile, joints.lower, joints.upper)
     return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

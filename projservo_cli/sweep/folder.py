@@ -77,9 +77,13 @@ class Folder:
         return sorted(self.parts.glob("[0-9]*-[0-9]*.h5"))
 
     def missing(self, design: Design, chunk: int) -> Iterator[tuple[int, int]]:
-        """First run of each part that is not done, and the one after its last."""
+        """First run of each part that is not done, and the one after its last.
+
+        Runs of one number in all cells come one after the other: they may share a plan, and an interrupted
+        sweep has as many of each cell.
+        """
         stored = set(self.stored())
-        for first in range(0, design.total, chunk):
+        for first in sorted(range(0, design.total, chunk), key=lambda first: first % design.sweep.runs):
             last = min(first + chunk, design.total)
             if self.part(first, last) not in stored:
                 yield first, last

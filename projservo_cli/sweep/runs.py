@@ -15,7 +15,7 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.step import RUNNING, VERDICTS
 from projservo_cli.loop.trial import NUMBERS, VERDICT, Setting, Trials
-from projservo_cli.records import BODY_LAWS, Calibration, FloatArray, IntArray, Trace, WorkFailed
+from projservo_cli.records import BODY_LAWS, Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rehearses, rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
@@ -251,18 +251,19 @@ def _interned(design: Design) -> Design:
     return _designs[design.key]
 
 
-_senses: dict[str, FloatArray] = {}
+_plans: dict[str, Plan] = {}
+PLANS = 128  # that are kept
 
 
-def _sense(scenario: Scenario, calibration_key: str) -> FloatArray:
-    """Sense of the rotations; laws on the same images share one that takes a plan, 0.2 to 0.4 s."""
-    config = scenario.config
-    if rehearses(config.trajectory.profile):
-        return rotation_sense(scenario)
+def _plan(config: Config, calibration: Calibration, calibration_key: str) -> Plan:
+    """Plan of a run; laws on the same images share one."""
     key = key_of(config, "plan", before=calibration_key)
-    if key not in _senses:
-        _senses[key] = rotation_sense(scenario)
-    return _senses[key]
+    if key not in _plans:
+        made = planning.run(config, calibration)
+        if len(_plans) >= PLANS:
+            del _plans[next(iter(_plans))]
+        _plans[key] = made
+    return _plans[key]
 
 
 def _run(
@@ -273,10 +274,10 @@ def _run(
     name, (cell, _, number, _) = name_of_run(config), design.numbers(run)
     try:
         scenario = scenario_of(config, calibration)
-        if sense_is_enough(config, name):
-            made = drive(scenario, _sense(scenario, design.calibration_key(cell, number)), name)
+        if sense_is_enough(config, name) and rehearses(config.trajectory.profile):
+            made = drive(scenario, rotation_sense(scenario), name)
         else:
-            made = drive(scenario, planning.run(config, calibration), name)
+            made = drive(scenario, _plan(config, calibration, design.calibration_key(cell, number)), name)
     except WorkFailed:
         return {"verdict": NOT_STARTED}, None
     row = {"verdict": made.verdict, "steps": made.steps, **made.summary._asdict()}

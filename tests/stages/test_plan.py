@@ -134,7 +134,6 @@ SENSES = [
     ("paper", ("noise.servo_px=0.5",)),  # half a turn, either sense of which is rehearsed
     ("ur5", ("noise.servo_px=1", "control.observation=points")),
     ("coupled", ("trajectory.profile=exponential",)),
-    ("coupled", ("trajectory.profile=constrained", "trajectory.samples=5")),
 ]
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.plan import rotation_sense as sense_of
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep import runs
@@ -132,9 +131,9 @@ def test_the_deviation_is_unknown_where_images_alone_show_the_goal():
 
 
 @pytest.mark.volume
-def test_laws_on_the_same_images_share_the_plan_that_tells_the_sense(monkeypatch):
-    planned = []
-    monkeypatch.setattr(runs, "rotation_sense", lambda given: planned.append(given) or sense_of(given))
+def test_laws_on_the_same_images_share_the_plan(monkeypatch):
+    planned, plan_of = [], plan.run
+    monkeypatch.setattr(plan, "run", lambda *given: planned.append(given) or plan_of(*given))
     run_part(part_of(design(**CASES["constrained"] | {"runs": 2, "seed": 7})))
     assert len(planned) == 2
 
