@@ -83,6 +83,22 @@ class Model(NamedTuple):
     lens: FloatArray = NO_LENS
 
 
+class Spread(NamedTuple):
+    """How far predictions err: models off the calibrated one by a deviation, each in a direction of its own.
+
+    The directions are those in which the covariance of the calibration moves images most.
+    """
+
+    P: FloatArray  # (k, 2, 3, 4)
+    H_hat: FloatArray  # (k, n, 4, 4)
+    M: FloatArray  # P, H_hat, M: (k, b, 4) cameras, operators, markers; first as calibrated
+    rest: float  # standard deviation that is left to all other directions, px
+    most: float  # largest standard deviation of a coordinate that was met with, px
+
+
+NO_SPREAD = Spread(np.zeros((0, 2, 3, 4)), np.zeros((0, 0, 4, 4)), np.zeros((0, 0, 4)), 0.0, 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Observation:
     """Stereo images of the markers at a sequence of robot poses."""

@@ -21,13 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import covariance_root, predict, prediction_derivative
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
 from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, apart, bulge, clearance, squared
 from projservo_cli.guidance.margins import Demands, inside, pixel, straight_pixel
-from projservo_cli.records import Calibration, FloatArray, IntArray, Model
+from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, Model, Spread
 from projservo_cli.task.face import Task, center_of, face_plane
 
 LIMITS, FRONT, SIDE, WIDTH, BORDER, CLEAR = 0, 1, 3, 5, 7, 9
@@ -41,20 +40,6 @@ FINE_PX = 4.0
 FINE_STEP = 0.2
 
 
-class Spread(NamedTuple):
-    """How far predictions err: models off the calibrated one by a deviation, each in a direction of its own.
-
-    The directions are those in which the covariance of the calibration moves images most.
-    """
-
-    P: FloatArray  # (k, 2, 3, 4)
-    H_hat: FloatArray  # (k, n, 4, 4)
-    M: FloatArray  # P, H_hat, M: (k, b, 4) cameras, operators, markers; first as calibrated
-    rest: float  # standard deviation that is left to all other directions, px
-    most: float  # largest standard deviation of a coordinate that was met with, px
-
-
-NO_SPREAD = Spread(np.zeros((0, 2, 3, 4)), np.zeros((0, 0, 4, 4)), np.zeros((0, 0, 4)), 0.0, 0.0)
 # So many standard deviations a prediction may be off.
 DEVIATIONS = 3.0
 
@@ -119,58 +104,6 @@ class Asked(NamedTuple):
     demands: Demands  # limits and speeds of the joints, of which each has one, images and their border
     keep: FloatArray  # (n,) distance from the joint limits, rad or m
     least_face_px: float  # width of the face in the images
-
-
-# Directions of the covariance that are told apart, and joints at which they are looked for.
-DIRECTIONS, LOOKED_AT = 8, 150
-BATCH, BATCHES = 1_500, 40
-
-
-def spread_of(calibration: Calibration, indices: IntArray, face: int, demands: Demands, seed: int) -> Spread:
-    """How far predictions err within the joint limits, of markers (b,) by index, those of the face first.
-
-    The directions are those that move the images of the face most, among joints drawn at random that show it;
-    what they leave is taken to be the same everywhere. None without a covariance.
-    """
-    if not np.isfinite(calibration.covariance).all():
-        return NO_SPREAD
-    q = _showing(calibration, indices[:face], demands, seed)
-    if len(q) == 0:
-        return NO_SPREAD
-    factor = covariance_root(calibration.covariance)
-    J = prediction_derivative(calibration, q)[:, :, indices[:face]] @ factor
-    variance = (J**2).sum(axis=-1)
-    rows = J.reshape(-1, J.shape[-1]) / np.maximum(np.sqrt(variance).reshape(-1, 1), 1e-9)
-    # LAPACK's singular value decomposition fails on some of these rows, finite as they are.
-    main = np.linalg.eigh(rows.T @ rows)[1][:, : -DIRECTIONS - 1 : -1]
-    rest = float(np.sqrt(np.median(np.maximum(variance - ((J @ main) ** 2).sum(axis=-1), 0.0))))
-    moved = (factor @ main).T
-    n, b = calibration.H_hat_0.shape[0], calibration.M.shape[0]
-    P, H_hat, M = np.split(moved[:, : 24 + 16 * n + 4 * b], [24, 24 + 16 * n], axis=1)
-    return Spread(
-        np.concatenate([calibration.P[None], calibration.P + P.reshape(-1, 2, 3, 4)]),
-        np.concatenate([calibration.H_hat_0[None], calibration.H_hat_0 + H_hat.reshape(-1, n, 4, 4)]),
-        np.ascontiguousarray(
-            np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)])[:, indices]
-        ),
-        rest,
-        float(np.sqrt(variance.max())),
-    )
-
-
-def _showing(calibration: Calibration, indices: IntArray, demands: Demands, seed: int) -> FloatArray:
-    """Joints (k, n) within the limits at which both images hold the markers."""
-    rng = np.random.default_rng(seed)
-    low = np.where(np.isfinite(demands.lower), demands.lower, calibration.q_reference - np.pi)
-    high = np.where(np.isfinite(demands.upper), demands.upper, calibration.q_reference + np.pi)
-    found: list[FloatArray] = []
-    for _ in range(BATCHES):
-        q = rng.uniform(low, high, (BATCH, len(low)))
-        s = predict(calibration, q)[:, :, indices]
-        found += list(q[((s >= -0.5) & (s <= demands.image_size - 0.5)).all(axis=(1, 2, 3))])
-        if len(found) >= LOOKED_AT:
-            break
-    return np.array(found[:LOOKED_AT]).reshape(-1, len(low))
 
 
 @merged

@@ -15,7 +15,6 @@ from projservo_cli.guidance.validity import (
     FRONT,
     LIMITS,
     MARGINS,
-    NO_SPREAD,
     SHARE,
     Constraints,
     Trial,
@@ -23,7 +22,7 @@ from projservo_cli.guidance.validity import (
     put_margins,
     reached,
 )
-from projservo_cli.records import FloatArray, IntArray
+from projservo_cli.records import NO_SPREAD, FloatArray, IntArray
 
 # Draws that the trees are given at a time.
 CHUNK = 250
@@ -32,8 +31,6 @@ WAYS, FURTHER = 6, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
 LONGER = 1.2
 SHORTENINGS = 150
-# Margins that are told where no way was found: those that stopped most.
-TOLD = 2
 ROUND_OFF = 1e-9
 # Goals within so much of shunned joints, rad or m, are shunned too.
 NEARBY = 0.1
@@ -67,44 +64,6 @@ class Way(NamedTuple):
     had: FloatArray  # (10,) margins of the start
     region: int  # the one that the start is within, counted from 1; 0 for none
     held: Constraints  # what was held against: with less asked for at start and goals
-
-    def why_none(self) -> str:
-        """Why no way was found, in words."""
-        if self.region:
-            return f"the start is already within region {self.region}"
-        if self.solutions == 0:
-            return "no joints were found that show the goal"
-        if len(self.goals) == 0:
-            barred = f" and {self.barred} within a region that is kept out of" if self.barred else ""
-            return (
-                f"of {self.solutions} joint vectors that show the goal, whole turns apart, {self.hidden} lie "
-                f"beyond the joint limits or do not show the face to both cameras{barred}"
-            )
-        if not may_start(self.had):
-            return f"the start is already at or beyond {self._told(int(self.had.argmin()))}"
-        failed = self.failures[:MARGINS]
-        most = [
-            f"{self._told(int(i))} ({failed[i] / failed.sum():.0%})"
-            for i in np.argsort(-failed, kind="stable")[:TOLD]
-            if failed[i] > 0
-        ]
-        return (
-            f"no way was found to any of {len(self.goals)} joint vectors that show the goal, in {self.draws} "
-            f"samples; what stopped most: {', '.join(most)}"
-        )
-
-    def _told(self, margin: int) -> str:
-        if margin == LIMITS:
-            return f"the limits of joint {int(self.failures[MARGINS:].argmax()) + 1}"
-        if margin == CLEAR:
-            return "a region that is kept out of"
-        kind, view = (margin - FRONT) // 2, ("left", "right")[(margin - FRONT) % 2]
-        return (
-            f"a marker behind the {view} camera",
-            f"the face edge-on to the {view} camera",
-            f"the width of the face in the {view} image",
-            f"the border of the {view} image",
-        )[kind]
 
 
 def may_start(had: FloatArray) -> bool:

@@ -1,11 +1,11 @@
 """The motion of a plan by its profile, and its time."""
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.calibration.spread import spread_of
 from projservo_cli.config.models import LIMITS_MISSING, Trajectory
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
@@ -13,13 +13,13 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
 from projservo_cli.guidance.lattice import duration, evenly, least_time, plan_path
-from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares, within
+from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares
 from projservo_cli.guidance.timing import Pace, joints_at
-from projservo_cli.guidance.validity import NO_SPREAD, Asked, Constraints, Spread, constraints_of, spread_of
+from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
 from projservo_cli.guidance.way import Search, Way, find_way, first_within, within_region
-from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, WorkFailed
+from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Spread, WorkFailed
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.verdicts import sight_words, verdict_of, way_words
+from projservo_cli.stages.verdicts import sight_words, verdict_of, way_words, why_no_way
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.target import Shown
@@ -76,7 +76,7 @@ def search_of(scenario: Scenario) -> JointSearch:
     if calibration is not None:
         numbers = scenario.numbers if len(scenario.ends.body.M) else scenario.numbers[: scenario.m]
         known, demands = calibration.marker.tolist(), scenario.demands
-        spread = _spread(
+        spread = spread_of(
             calibration,
             tuple(known.index(number) for number in numbers),
             scenario.m,
@@ -97,20 +97,6 @@ def closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
         unit = "m_s" if kind == "prismatic" else "deg_s"
         return f"joint {i + 1} has no speed limit: set control.{kind}_speed_limit_{unit}"
     return "no search was given" if search is None else search.closed
-
-
-@lru_cache(maxsize=64)
-def _spread(
-    calibration: Calibration,
-    indices: tuple[int, ...],
-    m: int,
-    bounds: tuple[tuple[float, ...], ...],
-    seed: int,
-) -> Spread:
-    """How far predictions of a calibration err, the same for every task; it takes 20 ms."""
-    lower, upper, size = (np.array(bound) for bound in bounds)
-    demands = within(lower, upper)._replace(image_size=size)
-    return spread_of(calibration, np.array(indices), m, demands, seed)
 
 
 def _timed(shortest: FloatArray, sigma: FloatArray, trajectory: Trajectory) -> FloatArray:
@@ -210,7 +196,7 @@ def through_joints(
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
-        return Found(linear.judged, motion, unknown, False, way.why_none(), way)
+        return Found(linear.judged, motion, unknown, False, why_no_way(way), way)
     motion = sampled_way(reaching, way.pace, trajectory.samples)
     least = float(way.pace.time[-1])
     asked = least if trajectory.duration_s is None else trajectory.duration_s

@@ -14,9 +14,9 @@ from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.margins import Demands, Reaching
-from projservo_cli.guidance.validity import NO_SPREAD
 from projservo_cli.loop.trial import begin
 from projservo_cli.records import (
+    NO_SPREAD,
     Calibration,
     FloatArray,
     InputError,

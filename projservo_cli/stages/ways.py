@@ -8,9 +8,9 @@ from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.margins import Reaching
-from projservo_cli.guidance.validity import BORDER, CLEAR, NO_SPREAD
+from projservo_cli.guidance.validity import BORDER, CLEAR
 from projservo_cli.guidance.way import Search, find_way, margins_at
-from projservo_cli.records import FloatArray, Plan
+from projservo_cli.records import NO_SPREAD, FloatArray, Plan
 from projservo_cli.stages.motions import body_at_start, joint_constraints, sampled_way, search_of
 from projservo_cli.stages.scenario import Scenario
 
