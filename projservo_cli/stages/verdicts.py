@@ -122,7 +122,10 @@ def why_no_way(way: Way) -> str:
     if way.region:
         return f"the start is already within region {way.region}"
     if way.solutions == 0:
-        return "no joints were found that show the goal"
+        return (
+            "no joints were found that show the goal: the arm may not reach it, or its images are of "
+            "other markers or in another order"
+        )
     if len(way.goals) == 0:
         barred = f" and {way.barred} within a region that is kept out of" if way.barred else ""
         return (
@@ -130,7 +133,9 @@ def why_no_way(way: Way) -> str:
             f"beyond the joint limits or do not show the face to both cameras{barred}"
         )
     if not may_start(way.had):
-        return f"the start is already at or beyond {_stopped(way, int(way.had.argmin()))}"
+        worst = int(way.had.argmin())
+        what = "a joint limit" if worst == LIMITS else _stopped(way, worst)
+        return f"the start is already at or beyond {what}"
     failed = way.failures[:MARGINS]
     most = [
         f"{_stopped(way, int(i))} ({failed[i] / failed.sum():.0%})"

@@ -8,9 +8,11 @@ import pytest
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.report import style
 from projservo_cli.report.figures.way import PIECES
+from projservo_cli.report.motion import motion_of
 from projservo_cli.stages import studies
 from projservo_cli.stages.motions import JointSearch
 from projservo_cli.stages.plan import plan_task
+from projservo_cli.stages.world import truth_of
 from tests.figures.cases import SPECS, case
 from tests.figures.test_figure_drawing import drawn, require_readable
 from tests.known import asked, configured
@@ -123,3 +125,14 @@ def test_the_extra_runs_of_a_report_are_made_whatever_regions_the_plan_keeps_out
     runs = studies.run_studies(bench, (0.5,), ())
     assert runs.own["direct_three", "true", False].verdict == "converged"
     assert studies.metric_plan(bench).profile == "linear"
+
+
+def test_the_view_in_space_shows_the_planned_path_and_both_trees(material):
+    truth, plan = truth_of(case()[0]), material.plan
+    scene = motion_of(truth.robot, material.plant, truth.M, plan, {"exact": material.traces["exact"]})
+    start = (forward_kinematics(material.plant.model, plan.q_start) @ material.middle)[:3]
+    np.testing.assert_allclose([scene.planned[0], scene.trees[0][0]], [start, start], atol=1e-12)
+    goals = plan.tree_q[np.flatnonzero(plan.tree_parent < 0)[1:]]
+    there = np.array([(forward_kinematics(material.plant.model, q) @ material.middle)[:3] for q in goals])
+    assert np.linalg.norm(there - scene.trees[1][0], axis=1).min() < 1e-12
+    assert len(scene.planned) == len(plan.q)
