@@ -251,15 +251,18 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
     """What is left of a path (k, n) when straight ways cut it short: first between drawn places on it."""
+    time = np.r_[0.0, np.cumsum(_times(c, path))]
     for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:
             return path
-        time = np.r_[0.0, np.cumsum(_times(c, path))]
         low, high = ends * time[-1]
         i, j = np.clip(np.searchsorted(time, (low, high)) - 1, 0, None)
+        if i == j:  # on one straight piece
+            continue
         new = np.stack([np.interp((low, high), time, column) for column in path.T], axis=1)
-        if i < j and _times(c, new)[0] < high - low and reached(c, new[0], new[1], trial) == 1.0:
+        if _times(c, new)[0] < high - low and reached(c, new[0], new[1], trial) == 1.0:
             path = np.vstack([path[: i + 1], new, path[j + 1 :]])
+            time = np.r_[0.0, np.cumsum(_times(c, path))]
     k = 1
     while k < len(path) - 1:
         if reached(c, path[k - 1], path[k + 1], trial) == 1.0:
