@@ -185,7 +185,7 @@ def _shortest(
     """The shortest way (k, n) that was met with to any of the goals (g, n), in so many draws of joints.
 
     A straight one, if it takes little longer than to the nearest goal; else the best of some that trees find.
-    Returns the way, empty where there is none; how many draws it took; the last trees.
+    Returns the way, empty where there is none; how many draws it took; the trees that found it, or the first.
     """
     draw, rng = random
     best, shortest = np.empty((0, len(start))), math.inf
@@ -193,18 +193,19 @@ def _shortest(
     if straight >= 0:
         best = np.stack([start, goals[straight]])
         shortest = length(c, best)
-    draws, trees = 0, None
+    draws = 0
+    trees: tuple[Tree, Tree] | None = None
     if not shortest <= LONGER * (np.abs(goals - start) / c.speed).max(axis=1).min():
         for _ in range(WAYS):
             left = (most if math.isinf(shortest) else FURTHER) - draws
             if left <= 0:
                 break
-            found, used, trees = _by_trees(c, start, goals, left, draw, trial)
-            draws += used
+            found, used, grown = _by_trees(c, start, goals, left, draw, trial)
+            draws, trees = draws + used, trees or grown
             if found is not None:
                 found = _shortened(c, found, rng, trial)
                 if length(c, found) < shortest:
-                    best, shortest = found, length(c, found)
+                    best, shortest, trees = found, length(c, found), grown
     return best, draws, trees
 
 
