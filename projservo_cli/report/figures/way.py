@@ -38,7 +38,7 @@ _SHARES = {
 _DISTANCES = {
     "border_px": ("face from the border", style.ORANGE),
     "width_px": ("width of the face", style.BLACK),
-    "clear_px": ("face from kept-out regions", style.VERMILION),
+    "clear_px": ("body from kept-out regions", style.VERMILION),
 }
 
 
