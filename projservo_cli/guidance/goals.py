@@ -45,6 +45,7 @@ DISTINCT = math.radians(1.0)
 # A joint of a solution that deviates more than this, rad or m, is near a singularity: what the model reaches
 # there the robot may not. No solution is taken to be nearer to a limit than that by its deviation alone.
 DEFINITE = 0.05
+REDUNDANT = 0.01
 # Rank, s, from which on goals are unsure.
 UNSURE = 1e3
 ROUND_OFF = 1e-9
@@ -199,7 +200,7 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench, deviation:
 
     Of each way in which the calibration may be off, what no motion of the joints makes up for. The motion
     that makes up for the rest, and for noise, is what the joints may be off: its standard deviation (n,), rad
-    or m, is written; none of an arm of more joints than six, which can move them at will.
+    or m, is written; ``REDUNDANT`` of an arm of more joints than six, which can move them at will.
     """
     n = q.shape[0]
     L, M = bench.L, bench.M
@@ -207,9 +208,9 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench, deviation:
     total: float = (4.0 * c.face - min(n, 6)) * noise
     _put_equations(c, aim, q, True, bench)
     for i in range(n):
-        deviation[i] = 0.0
         for j in range(n):
             bench.N[j, n] = 1.0 if i == j else 0.0
+        deviation[i] = REDUNDANT * REDUNDANT
         if n <= 6:
             deviation[i] = noise * L[i, n] if _put_step(bench.N, 0.0, L) else math.inf
     H = operators_at(c.model, q, bench.H_hat)
@@ -271,7 +272,9 @@ def _rank(c: Constraints, start: FloatArray, q: FloatArray, bench: Bench, k: int
             sure = min(sure, DEFINITE / deviation)
             if bench.left[k] > 0.0:
                 sure = min(sure, min(q[i] - c.lower[i], c.upper[i] - q[i]) / (DEVIATIONS * deviation))
-    return time_between(c.speed, start, q) if sure >= 1.0 else UNSURE * (2.0 - max(sure, -1.0))
+    if sure >= 1.0:
+        return time_between(c.speed, start, q)
+    return UNSURE if bench.left[k] == 0.0 else UNSURE * (2.0 - max(sure, -1.0))
 
 
 @internal

@@ -31,6 +31,8 @@ from projservo_cli.task.face import Task
 
 # The path ahead is looked at every so many periods, by the mean of what images were off in the last ones.
 EVERY, LAST = 10, 5
+# What stops a law.
+STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
 
 
 class Ways(Protocol):
@@ -77,21 +79,25 @@ class Watch:
             return self._anew(log, k, verdict, "the face was lost, and seen again on the way back")
         way, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
         if clock < len(way) - 1:
-            self._alone = 0
-            if verdict == DIVERGED and np.isfinite(q_dot).all():
-                verdict = RUNNING  # a way may lead away from the goal
-            looks = verdict == RUNNING and k % EVERY == 0 and self.left > 0
-            if looks and self._leaves_image(log, k, way[int(clock) :]):
-                return self._anew(log, k, verdict, "what is ahead would leave an image")
-            return verdict
+            return self._on_the_way(log, k, verdict, way[int(clock) :])
         self._alone += 1
-        why = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
         window = self.limits.plateau_steps
         stalls = verdict == RUNNING and self._alone > window and on_plateau(log.judged, k, window)
-        if verdict not in why and not stalls:
+        if verdict not in STOPPED and not stalls:
             return verdict
         self._shunned += [way[-1].copy(), log.read[k].copy()]
-        return self._anew(log, k, verdict, f"{why.get(verdict, 'no progress')} at the goal")
+        return self._anew(log, k, verdict, f"{STOPPED.get(verdict, 'no progress')} at the goal")
+
+    def _on_the_way(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
+        """What becomes of a verdict with joints (s, n) ahead, which may lead away from the goal."""
+        self._alone = 0
+        if verdict in (RUNNING, DIVERGED):
+            looks = k % EVERY == 0 and self.left > 0
+            leaves = looks and self._leaves_image(log, k, ahead)
+            return self._anew(log, k, RUNNING, "what is ahead would leave an image") if leaves else RUNNING
+        return (
+            self._anew(log, k, verdict, f"{STOPPED[verdict]} on the way") if verdict in STOPPED else verdict
+        )
 
     def _anew(self, log: Log, k: int, verdict: int, why: str) -> int:
         """Hold the robot and follow another way, if there is one; else the verdict stays."""
