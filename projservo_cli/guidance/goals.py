@@ -13,6 +13,7 @@ import numpy as np
 from projservo_cli.geometry.algebra import apply, mat, put_vec, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import forward, image_velocity, operators_at
+from projservo_cli.guidance.margins import straight_pixel
 from projservo_cli.guidance.validity import (
     BORDER,
     DEVIATIONS,
@@ -21,10 +22,10 @@ from projservo_cli.guidance.validity import (
     Constraints,
     clear_by,
     most_off,
-    off,
     put_margins,
     put_row,
     time_between,
+    twin_of,
 )
 from projservo_cli.records import PRISMATIC, FloatArray, IntArray
 
@@ -218,10 +219,14 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench, deviation:
         away = 0.0
         for i in range(n):
             bench.N[i, n] = 0.0
+        twin = twin_of(c, j)
+        H_j = forward(twin, q)
         for k in range(c.face):
-            put_vec(M[0], apply(H, vec(c.M[k])))
+            A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
+            put_vec(M[0], A)
             for view in range(2):
-                du, dv = off(c, q, view, k, j)
+                (u, v), (u_j, v_j) = straight_pixel(c.model.P[view], A), straight_pixel(twin.P[view], A_j)
+                du, dv = u_j - u, v_j - v
                 away += du * du + dv * dv
                 for i in range(n):
                     put_vec(M[1], apply(mat(bench.H_hat[i]), vec(M[0])))

@@ -141,35 +141,11 @@ def width(s: FloatArray, m: int) -> float:
     return least if math.isfinite(least) else 0.0
 
 
-@internal
-def off(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float, float]:
-    """How far a marker of the face would be off, px, if the calibration were by the deviation j."""
-    u, v = _predicted(c, q, view, k, j)
-    u_0, v_0 = _predicted(c, q, view, k, 0)
-    return u - u_0, v - v_0
-
-
 @merged
-def _predicted(c: Constraints, q: FloatArray, view: int, k: int, j: int) -> tuple[float, float]:
-    twin = _twin(c, j)
-    return straight_pixel(twin.P[view], apply(forward(twin, q), vec(c.spread.M[j, k])))
-
-
-@merged
-def _twin(c: Constraints, j: int) -> Model:
+def twin_of(c: Constraints, j: int) -> Model:
     """The calibrated model, off by the deviation j."""
     m = c.model
     return Model(c.spread.P[j], c.spread.H_hat[j], m.joint_types, m.q_reference, m.a_inf, m.lens)
-
-
-@merged
-def _variance(c: Constraints, q: FloatArray, view: int, k: int) -> float:
-    """Variance of a coordinate of a predicted marker, px², the mean of both coordinates."""
-    total = 0.0
-    for j in range(1, c.spread.P.shape[0]):
-        du, dv = off(c, q, view, k, j)
-        total += 0.5 * (du * du + dv * dv)
-    return total + c.spread.rest * c.spread.rest
 
 
 @merged
@@ -196,18 +172,13 @@ def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray
         if not nearest > 0.0:
             return False
         margins[WIDTH + view] = width(s[view], c.face)
-        deviation = c.spread.most
-        if border < c.full[BORDER + view] + DEVIATIONS * deviation and deviation > 0.0:
-            # Near enough for the deviation there to tell.
-            border = math.inf
-            for k in range(c.face):
-                deviation = math.sqrt(_variance(c, q, view, k))
-                border = min(
-                    border, inside(c.image_size, s[view, k, 0], s[view, k, 1]) - DEVIATIONS * deviation
-                )
-        else:
-            border -= DEVIATIONS * deviation
         margins[BORDER + view] = border
+    left = right = most = c.spread.most
+    room = min(margins[BORDER] - c.full[BORDER], margins[BORDER + 1] - c.full[BORDER + 1])
+    if most > 0.0 and room < DEVIATIONS * most:  # near enough for the deviation there to tell
+        left, right = most_off(c, q, H)
+    margins[BORDER] -= DEVIATIONS * left
+    margins[BORDER + 1] -= DEVIATIONS * right
     margins[CLEAR] = _clear(c, q, H, s, asked) if c.keep_out.image.shape[0] > 0 else math.inf
     return True
 
@@ -233,7 +204,7 @@ def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
     """Standard deviation of a coordinate in each image, px, no less than that of any marker of the body."""
     left = right = c.spread.rest * c.spread.rest
     for j in range(1, c.spread.P.shape[0]):
-        twin = _twin(c, j)
+        twin = twin_of(c, j)
         H_j = forward(twin, q)
         worst_left, worst_right = 0.0, 0.0
         for k in range(c.M.shape[0]):

@@ -27,10 +27,10 @@ from projservo_cli.records import NO_SPREAD, FloatArray, IntArray
 # Draws that the trees are given at a time.
 CHUNK = 250
 # Ways that are looked for by trees, and draws after which no further one is begun.
-WAYS, FURTHER = 6, 300
+WAYS, FURTHER = 2, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
 LONGER = 1.2
-SHORTENINGS = 150
+SHORTENINGS = 60
 ROUND_OFF = 1e-9
 # Goals within so much of shunned joints, rad or m, are shunned too.
 NEARBY = 0.1
