@@ -113,6 +113,7 @@ class Watch:
         self.told.append(f"at step {k} ({why})")
         self.law.follow(self.follow(plan))
         log.events[2] = -1.0
+        self._alone = 0
         return WAITING
 
     def _back(self, log: Log, k: int, q_dot: FloatArray) -> int:

@@ -182,3 +182,18 @@ def test_plans_in_threads_are_equal_to_the_bit():
     for here, there in zip(alone * 2, made, strict=True):
         for field in fields(here):
             np.testing.assert_array_equal(getattr(here, field.name), getattr(there, field.name))
+
+
+def test_a_face_that_is_lost_for_long_is_found_on_the_way_back():
+    """Waited for in 25 periods, then sought back along the path, and another way is taken from there."""
+    config, calibration, plan = guided("ur5", 0)
+    lost = {"lost_markers": {"from_step": 12, "steps": 30}}
+    disturbed = config.model_copy(update={"disturbance": type(config.disturbance).model_validate(lost)})
+    trace = servo.run(disturbed, calibration, plan, "exact_track")
+    assert trace.verdict == "converged"
+    assert trace.success
+    assert trace.searches_anew == 1
+    assert "seen again on the way back" in trace.reason
+    assert not trace.q_dot[12 : 12 + 25].any()
+    there = np.linalg.norm(trace.q[37:43] - trace.q[0], axis=1)
+    assert (np.diff(there) < 0.0).all()
