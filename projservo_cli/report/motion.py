@@ -14,9 +14,9 @@ from projservo_cli.files import replacing
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import BODY_LAWS, BoolArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
+from projservo_cli.report.figures.guided import tree_edges, with_gaps
 from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.scene import pyramids, skeleton
-from projservo_cli.report.figures.way import tree_edges, with_gaps
 from projservo_cli.report.material import CLASSICAL, PAGE_FILE, VIEWS, title
 from projservo_cli.report.page import template
 from projservo_cli.robots.simulated import Arm, Plant

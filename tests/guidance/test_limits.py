@@ -8,7 +8,7 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.stages import calibrate, plan
+from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.record import new_recording, record
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.tables import read_table
@@ -70,7 +70,13 @@ def test_limits_from_a_list(mine):
     config, calibration = mine(f"robot.limits={{joints: {pairs}, unit: deg}}", "trajectory.profile=joint")
     lower = scenario_of(config, calibration).joints.lower
     np.testing.assert_allclose(lower, np.radians([0, -180, -180, -90, 0, 0]))
-    assert plan.run(config, calibration).feasible
+    found = plan.run(config, calibration)
+    assert found.feasible
+    trace = servo.run(config, calibration, found, "exact_track")  # a robot of somebody else, on its way
+    assert trace.verdict == "converged"
+    assert trace.planned_s == found.duration
+    assert trace.steps * trace.period > 0.9 * found.duration
+    assert (trace.q >= lower).all()
 
 
 def test_without_limits_the_way_through_joint_space_is_closed(mine):

@@ -7,7 +7,7 @@ import pytest
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.report import style
-from projservo_cli.report.figures.way import PIECES
+from projservo_cli.report.figures.guided import PIECES
 from projservo_cli.report.motion import motion_of
 from projservo_cli.stages import studies
 from projservo_cli.stages.motions import JointSearch
