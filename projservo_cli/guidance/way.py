@@ -11,7 +11,9 @@ from projservo_cli.guidance.keep_out import only
 from projservo_cli.guidance.search import Tree, first_straight, grow, new_tree
 from projservo_cli.guidance.timing import Pace, timed
 from projservo_cli.guidance.validity import (
+    BORDER,
     CLEAR,
+    DEVIATIONS,
     FRONT,
     LIMITS,
     MARGINS,
@@ -145,6 +147,7 @@ def find_way(
     far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
     had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
+    had[BORDER:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
     trial = new_trial(n, len(c.M))
     way = Way(
         goals,

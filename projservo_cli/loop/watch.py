@@ -82,7 +82,8 @@ class Watch:
             return self._on_the_way(log, k, verdict, way[int(clock) :])
         self._alone += 1
         window = self.limits.plateau_steps
-        stalls = verdict == RUNNING and self._alone > window and on_plateau(log.judged, k, window)
+        still = on_plateau(log.judged, k, window) and on_plateau(log.judged, k, window // 2)
+        stalls = verdict == RUNNING and self._alone > window and still
         if verdict not in STOPPED and not stalls:
             return verdict
         self._shunned += [way[-1].copy(), log.read[k].copy()]
