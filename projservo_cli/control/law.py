@@ -351,7 +351,7 @@ def put_view(model: Model, task: Task, s: FloatArray, state: State, view: int, f
         operator = mat(operators[i])
         for k in range(state.A.shape[0]):
             put_vec(state.A_t[k], apply(operator, vec(state.A[k])))
-            _, _, u_dot, v_dot = image_velocity(model.P[view], state.A[k], state.A_t[k])
+            _, _, u_dot, v_dot = image_velocity(model.P[view], vec(state.A[k]), vec(state.A_t[k]))
             system.B[i, first + 2 * k] = u_dot
             system.B[i, first + 2 * k + 1] = v_dot
     for k in range(state.A.shape[0]):

@@ -44,6 +44,13 @@ def new_system(n: int, rows: int) -> System:
     )
 
 
+@merged
+def put_row(target: FloatArray, source: FloatArray) -> None:
+    """Copy a row; a slice would be copied by way of memory that compiled code has none of."""
+    for i in range(target.shape[0]):
+        target[i] = source[i]
+
+
 @inline
 def _product(x: FloatArray, y: FloatArray, rows: int) -> float:
     """Product of two columns."""
@@ -236,4 +243,38 @@ def least_norm(system: System, J: FloatArray, b: FloatArray, x: FloatArray) -> b
             a = pivot[k]
             for i in range(n):
                 x[i] += J[a, i] * z[k]
+    return True
+
+
+@merged
+def solve_normal(N: FloatArray, n: int, tolerance: float) -> bool:
+    """Solution of symmetric positive definite equations by the root-free Cholesky factorisation, in place.
+
+    N : (n, n + 1) upper triangle of the matrix, and the right-hand side in the last column, which the
+        solution replaces; the rest is overwritten.
+    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is what of a column
+        of the least-squares problem the columns before do not explain, squared.
+    Returns false where the matrix is singular; source: G. Golub, C. Van Loan, Matrix Computations, section
+    4.1.2.
+    """
+    for j in range(n):
+        pivot = N[j, j]
+        for k in range(j):
+            pivot -= N[j, k] * N[k, j]
+        if not pivot > tolerance * N[j, j]:
+            return False
+        N[j, j] = pivot
+        for i in range(j + 1, n + 1):
+            total = N[j, i]
+            for k in range(j):
+                total -= N[j, k] * N[k, i]
+            N[j, i] = total
+        inverse = 1.0 / pivot
+        for i in range(j + 1, n):
+            N[i, j] = inverse * N[j, i]
+    for j in range(n - 1, -1, -1):
+        total = N[j, n] / N[j, j]
+        for i in range(j + 1, n):
+            total -= N[i, j] * N[i, n]
+        N[j, n] = total
     return True

@@ -5,6 +5,7 @@ import numpy as np
 from projservo_cli.geometry.algebra import (
     IDENTITY,
     Mat4,
+    Vec4,
     as_array,
     mat,
     mul,
@@ -97,18 +98,24 @@ def beyond_limits(q: FloatArray, lower: FloatArray, upper: FloatArray) -> int:
 
 
 @njit
-def image_velocity(P: FloatArray, M: FloatArray, M_dot: FloatArray) -> tuple[float, float, float, float]:
-    """Pixel of a point and its velocity for one camera, [RH00] eq. (7), second row corrected.
+def image_velocity(P: FloatArray, A: Vec4, D: Vec4) -> tuple[float, float, float, float]:
+    """Pixel of a point A and its velocity for one camera, of its velocity D: [RH00] eq. (7), corrected.
 
     Returns u, v (px) and their velocities. The point must not lie in the camera's principal plane.
     """
-    A = vec(M)
-    D = vec(M_dot)
     m = (row(P, 0, A), row(P, 1, A), row(P, 2, A))
     d = (row(P, 0, D), row(P, 1, D), row(P, 2, D))
     u = m[0] / m[2]
     v = m[1] / m[2]
     return u, v, (d[0] - u * d[2]) / m[2], (d[1] - v * d[2]) / m[2]
+
+
+@merged
+def image_motion(P: FloatArray, A: Vec4, D: Vec4) -> tuple[Vec4, Vec4]:
+    """Pixels of a point in both views (2, 3, 4), left u, v and right, and their velocities."""
+    u, v, u_dot, v_dot = image_velocity(P[0], A, D)
+    x, y, x_dot, y_dot = image_velocity(P[1], A, D)
+    return (u, v, x, y), (u_dot, v_dot, x_dot, y_dot)
 
 
 @inline
@@ -145,5 +152,6 @@ def image_jacobian(P: FloatArray, M: FloatArray, H_hat: FloatArray) -> FloatArra
     for view in range(2):
         for k in range(M.shape[0]):
             for i in range(H_hat.shape[0]):
-                _, _, J[view, k, 0, i], J[view, k, 1, i] = image_velocity(P[view], M[k], H_hat[i] @ M[k])
+                D = vec(H_hat[i] @ M[k])
+                _, _, J[view, k, 0, i], J[view, k, 1, i] = image_velocity(P[view], vec(M[k]), D)
     return J

@@ -13,6 +13,7 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import mat, vec
 from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.kernels import put_row
 from projservo_cli.guidance.margins import (
     IMAGE,
     VISIBILITY,
@@ -31,7 +32,8 @@ from projservo_cli.guidance.margins import (
     room_along,
     scale_of,
 )
-from projservo_cli.guidance.validity import put_row, time_between
+from projservo_cli.guidance.timing import least_time
+from projservo_cli.guidance.validity import time_between
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 from projservo_cli.task.visibility import margin_coefficients
 
@@ -53,15 +55,6 @@ ROUND_OFF = 1e-9
 CHECKS = 151
 # Shares of this part of the best one are as good, joints being interpolated; the quicker path is better.
 EQUALLY = 0.95
-
-
-def least_time(speed: FloatArray, q: FloatArray) -> FloatArray:
-    """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s.
-
-    Where nothing limits, the motion of the joint that moves most.
-    """
-    speed = speed if np.isfinite(speed).any() else np.ones_like(speed)
-    return np.concatenate([[0.0], np.cumsum((np.abs(np.diff(q, axis=0)) / speed).max(axis=1))])
 
 
 def duration(motion: Motion) -> float:
@@ -335,7 +328,7 @@ def _put_coarse(
     Each node, of shares mu (size³, 3), is continued from the best before it. All joints are those at the
     start yet, all margins and values ``WORST``, and stay so where the joints cannot be reached.
     """
-    demands, ends = carrier.reaching.demands, carrier.ends
+    demands = carrier.reaching.demands
     for node in range(q.shape[0]):
         step, best = 0, math.inf if node == 0 else WORST
         for other in range(7, 0, -1):
@@ -343,12 +336,11 @@ def _put_coarse(
             if before >= 0 and value[before] > best:
                 step, best = other, value[before]
         before = _before(node, step, size)
-        put_row(ends[0], mu[before])
-        put_row(ends[1], mu[node])
         for parts in (1, BETWEEN):
             put_row(q[node], q[before])
             if best == WORST:
                 break
+            ends = (mu[before], mu[node])
             condition = carry_joints(carrier, ends, parts, ROUGH, MOST_STRIDE / parts, q[node])
             if condition >= 0.0:
                 margins[node, 0] = limit_margin(demands, q[node])

@@ -21,8 +21,8 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_mat, put_vec, vec
 from projservo_cli.geometry.jit import internal, merged, njit
-from projservo_cli.geometry.kernels import COORDINATES, orthogonalize
-from projservo_cli.geometry.kinematics import backward, forward, image_velocity, operators_at, project, row
+from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, put_row
+from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
 from projservo_cli.geometry.lens import bend, bends
 from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, reach, span_of, workspace
 from projservo_cli.records import FloatArray, Model
@@ -186,30 +186,31 @@ def limit_margin(demands: Demands, q: FloatArray) -> float:
     return least
 
 
+_Ends = tuple[FloatArray, FloatArray]
+
+
 class Carrier(NamedTuple):
     """What carries the joints along a path."""
 
     reaching: Reaching  # the task
     work: Work  # workspace of n joints and 4m rows
-    before: FloatArray
-    M: FloatArray
-    ends: FloatArray  # before, M, ends: (n,), (2, 4) and (2, 3) workspaces
+    before: FloatArray  # (n,) joints before a part of it
 
 
 def carrier_of(reaching: Reaching) -> Carrier:
     """Workspace in which the joints of a task are carried."""
     n = len(reaching.q_start)
     work = workspace(n, 4 * len(reaching.A), span_of(reaching.model, reaching.A))
-    return Carrier(reaching, work, np.empty(n), np.empty((2, 4)), np.empty((2, 3)))
+    return Carrier(reaching, work, np.empty(n))
 
 
 @internal
 def carry_joints(
-    carrier: Carrier, ends: FloatArray, parts: int, settled: float, stride: float, q: FloatArray
+    carrier: Carrier, ends: _Ends, parts: int, settled: float, stride: float, q: FloatArray
 ) -> float:
     """Carry the joints ``q``, in place, along a straight piece of path in equal parts.
 
-    ends : (2, 3) shares at both ends.
+    ends : shares (3,) at both ends.
     parts : how many; of none the joints stay where they are.
     settled : Newton step, rad or m, that is the last of a part.
     stride : most that a part may move a joint, rad or m.
@@ -220,14 +221,14 @@ def carry_joints(
     model = reaching.model
     face = Seen(reaching.A, backward(model, reaching.q_start))
     operators_at(model, q, work.H_hat)
-    goal = displaced(reaching.H_hat, reaching.amplitudes, ends[0, 0], ends[0, 1], ends[0, 2])
+    first, last = ends
+    goal = displaced(reaching.H_hat, reaching.amplitudes, first[0], first[1], first[2])
     for part in range(1, parts + 1):
         x = part / parts
-        for i in range(q.shape[0]):
-            before[i] = q[i]
-        mu_t = (1.0 - x) * ends[0, 0] + x * ends[1, 0]
-        mu_r = (1.0 - x) * ends[0, 1] + x * ends[1, 1]
-        mu_p = (1.0 - x) * ends[0, 2] + x * ends[1, 2]
+        put_row(before, q)
+        mu_t = (1.0 - x) * first[0] + x * last[0]
+        mu_r = (1.0 - x) * first[1] + x * last[1]
+        mu_p = (1.0 - x) * first[2] + x * last[2]
         goal = displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p)
         if not reach(model, face, goal, q, work, settled):
             return -1.0
@@ -244,17 +245,13 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
     The ratio of the last to the first pivot of an orthogonalisation, which no projective frame changes.
     The operators at the joints are in the workspace.
     """
-    work, M = carrier.work, carrier.M
-    A, P = carrier.reaching.A, carrier.reaching.model.P
+    work, A, P = carrier.work, carrier.reaching.A, carrier.reaching.model.P
     n, m = work.H_hat.shape[0], A.shape[0]
     for k in range(m):
-        put_vec(M[0], apply(H, vec(A[k])))
+        M = apply(H, vec(A[k]))
         for i in range(n):
-            put_vec(M[1], apply(mat(work.H_hat[i]), vec(M[0])))
-            for view in range(2):
-                _, _, du, dv = image_velocity(P[view], M[0], M[1])
-                work.system.B[i, 4 * k + 2 * view] = du
-                work.system.B[i, 4 * k + 2 * view + 1] = dv
+            _, s_dot = image_motion(P, M, apply(mat(work.H_hat[i]), M))
+            put_vec(work.system.B[i, 4 * k : 4 * k + 4], s_dot)
     first, _, last = orthogonalize(work.system, 4 * m, n, False)
     if n > COORDINATES:  # further joints add no motion of the face
         sixth = work.system.B[COORDINATES - 1, COORDINATES - 1]
@@ -283,9 +280,8 @@ def put_carried(carrier: Carrier, mu: FloatArray, found: Along) -> None:
         parts = 0 if i == 0 else 1
         condition = -1.0
         while condition < 0.0 and parts <= MOST_PARTS:
-            for l in range(found.q.shape[1]):
-                found.q[i, l] = reaching.q_start[l] if i == 0 else found.q[i - 1, l]
-            ends = mu[max(0, i - 1) : i + 1]
+            put_row(found.q[i], reaching.q_start if i == 0 else found.q[i - 1])
+            ends = (mu[max(0, i - 1)], mu[i])
             condition = carry_joints(carrier, ends, parts, SETTLED, MOST_PART, found.q[i])
             parts = 2 * parts if parts > 0 else MOST_PARTS + 1
         if condition < 0.0:

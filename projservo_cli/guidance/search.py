@@ -50,9 +50,7 @@ def _nearest(c: Constraints, tree: Tree, q: FloatArray) -> int:
 
 
 @internal
-def _extended(
-    c: Constraints, tree: Tree, q: FloatArray, target: FloatArray, trial: Trial
-) -> tuple[int, bool]:
+def _extended(c: Constraints, tree: Tree, q: FloatArray, trial: Trial) -> tuple[int, bool]:
     """Grow the tree from its nearest node towards joints q; the last node, and whether it is there."""
     node = _nearest(c, tree, q)
     n = q.shape[0]
@@ -64,16 +62,17 @@ def _extended(
             return node, False
         share = min(1.0, REACH / time)
         new = tree.size[0]
+        here, there = tree.q[node], tree.q[new]
         for i in range(n):
-            target[i] = q[i] if share == 1.0 else tree.q[node, i] + share * (q[i] - tree.q[node, i])
-        got = reached(c, tree.q[node], target, trial)
+            there[i] = q[i] if share == 1.0 else here[i] + share * (q[i] - here[i])
+        got = reached(c, here, there, trial)
         if got < 1.0:
             # What was reached before a check failed is valid, but too near a border to grow from.
             got *= 0.5
             if got * share * time <= 0.05:
                 return node, False
-        for i in range(n):
-            tree.q[new, i] = tree.q[node, i] + got * (target[i] - tree.q[node, i]) if got < 1.0 else target[i]
+            for i in range(n):
+                there[i] = here[i] + got * (there[i] - here[i])
         tree.parent[new] = node
         tree.size[0] += 1
         node = new
@@ -82,12 +81,9 @@ def _extended(
 
 
 @njit
-def grow(
-    c: Constraints, trees: tuple[Tree, Tree], draws: FloatArray, scratch: FloatArray, trial: Trial
-) -> tuple[int, int, int]:
+def grow(c: Constraints, trees: tuple[Tree, Tree], draws: FloatArray, trial: Trial) -> tuple[int, int, int]:
     """Grow two trees towards drawn joints (k, n) and each other until they meet.
 
-    scratch : (n,).
     Returns the nodes of both at which they met, −1 where they did not; how many draws it took.
     """
     for k in range(draws.shape[0]):
@@ -96,19 +92,10 @@ def grow(
         if first.size[0] == first.q.shape[0] or second.size[0] == second.q.shape[0]:
             return -1, -1, k
         before = first.size[0]
-        node, _ = _extended(c, first, draws[k], scratch, trial)
+        node, _ = _extended(c, first, draws[k], trial)
         if first.size[0] == before:
             continue
-        other, there = _extended(c, second, first.q[node], scratch, trial)
+        other, there = _extended(c, second, first.q[node], trial)
         if there:
             return (node, other, k + 1) if k % 2 == 0 else (other, node, k + 1)
     return -1, -1, draws.shape[0]
-
-
-@njit
-def first_straight(c: Constraints, start: FloatArray, goals: FloatArray, trial: Trial) -> int:
-    """The first of the goals (g, n) to which the straight way is valid, −1 for none."""
-    for g in range(goals.shape[0]):
-        if reached(c, start, goals[g], trial) == 1.0:
-            return g
-    return -1

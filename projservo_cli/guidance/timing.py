@@ -41,13 +41,22 @@ class Pace(NamedTuple):
     time: FloatArray  # (k,) s
 
 
+def least_time(speed: FloatArray, q: FloatArray) -> FloatArray:
+    """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s.
+
+    Where nothing limits, the motion of the joint that moves most.
+    """
+    speed = speed if np.isfinite(speed).any() else np.ones_like(speed)
+    return np.concatenate([[0.0], np.cumsum((np.abs(np.diff(q, axis=0)) / speed).max(axis=1))])
+
+
 def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
     """The pace of a path of corners (k, n), from rest to rest at ``ROOM`` of the limits."""
     path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > LEAST]]
     if len(path) == 1:
         still = np.zeros((2, path.shape[1]))
         return Pace(np.array([0.0, 1.0]), path + still, still, still[:1], np.zeros(2), np.zeros(2))
-    times = (np.abs(np.diff(path, axis=0)) / c.speed).max(axis=1)
+    times = np.diff(least_time(c.speed, path))
     slopes = np.diff(path, axis=0) / times[:, None]
     sizes = np.zeros(len(path))
     for k in range(1, len(path) - 1):
@@ -66,18 +75,10 @@ def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: floa
     """How far from a corner (n,), s, its largest valid rounding begins and ends: ``size`` at most, or 0."""
     x = np.linspace(0.0, 1.0, CHORDS + 1)[:, None]
     for halving in range(HALVINGS):
-        if _reached_all(c, _parabola(corner, slopes, size * 0.5**halving, x), trial):
+        path = _parabola(corner, slopes, size * 0.5**halving, x)
+        if all(reached(c, path[k], path[k + 1], trial) == 1.0 for k in range(CHORDS)):
             return size * 0.5**halving
     return 0.0
-
-
-@njit
-def _reached_all(c: Constraints, path: FloatArray, trial: Trial) -> bool:
-    """Whether all straight pieces of a path (k, n) from valid joints are valid."""
-    for k in range(path.shape[0] - 1):
-        if reached(c, path[k], path[k + 1], trial) < 1.0:
-            return False
-    return True
 
 
 def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: FloatArray) -> Pace:

@@ -338,13 +338,6 @@ def time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
 
 
 @merged
-def put_row(target: FloatArray, source: FloatArray) -> None:
-    """Copy a row; a slice would be copied by way of memory that compiled code has none of."""
-    for i in range(target.shape[0]):
-        target[i] = source[i]
-
-
-@merged
 def _moved(s: FloatArray, before: FloatArray) -> float:
     """Longest way of an image point between two views (2, b, 2), px."""
     most = 0.0

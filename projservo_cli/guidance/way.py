@@ -1,15 +1,14 @@
 """A way to the goal through joint space: goals, a search, shortened, rounded and timed; or why none."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.guidance.goals import STARTS, UNSURE, Aim, new_bench, put_goals
+from projservo_cli.guidance.goals import STARTS, UNSURE, Aim, goals_of
 from projservo_cli.guidance.keep_out import only
-from projservo_cli.guidance.search import Tree, first_straight, grow, new_tree
-from projservo_cli.guidance.timing import Pace, timed
+from projservo_cli.guidance.search import Tree, grow, new_tree
+from projservo_cli.guidance.timing import Pace, least_time, timed
 from projservo_cli.guidance.validity import (
     BORDER,
     CLEAR,
@@ -58,7 +57,6 @@ class Way(NamedTuple):
     hidden: int  # how many of those lie beyond the limits or do not show the face
     barred: int  # how many of those lie within a region that is kept out of
     corners: FloatArray  # (k, n) of the way; none where none was found
-    straight: bool  # whether it is a straight line
     pace: Pace | None  # in time; None where there is no way or nothing limits its speed
     draws: int  # by the trees
     trees: tuple[Tree, Tree] | None  # from the start and from the goals, where they were grown
@@ -131,18 +129,10 @@ def find_way(
     known : (k, n) joints known to show the goal, k ≥ 0.
     acceleration : (n,) rad/s² or m/s².
     """
-    n = len(start)
-    rng = np.random.default_rng(search.seed)
-    low = np.where(np.isfinite(c.lower), c.lower, start - np.pi)
-    high = np.where(np.isfinite(c.upper), c.upper, start + np.pi)
-
-    def draw(count: int) -> FloatArray:
-        return np.asarray(low + (high - low) * rng.random((count, n)))
-
-    starts = np.vstack([known, start[None], draw(STARTS)])
-    goals, rank = np.empty((search.goals, n)), np.empty(search.goals)
-    counts = put_goals(c, aim, start, known, starts, goals, rank, new_bench(n, len(c.M)))
-    goals, rank = goals[: counts[0]], rank[: counts[0]]
+    n, rng = len(start), np.random.default_rng(search.seed)
+    starts = np.vstack([known, start[None], _drawn(c, start, STARTS, rng)])
+    every, rank, counts = goals_of(c, aim, start, known, starts)
+    goals, rank = every[: search.goals], rank[: search.goals]
     off = np.abs(goals[:, None] - search.shunned)
     far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
@@ -150,17 +140,19 @@ def find_way(
     had[BORDER:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
     trial = new_trial(n, len(c.M))
     way = Way(
-        goals,
-        *counts,
-        np.empty((0, n)),
-        False,
-        None,
-        0,
-        None,
-        trial.failures,
-        had,
-        within_region(c, start),
-        c,
+        goals=goals,
+        shown=len(every),
+        solutions=counts[0],
+        hidden=counts[1],
+        barred=counts[2],
+        corners=np.empty((0, n)),
+        pace=None,
+        draws=0,
+        trees=None,
+        failures=trial.failures,
+        had=had,
+        region=within_region(c, start),
+        held=c,
     )
     if len(goals) == 0 or not may_start(had):
         return way
@@ -169,74 +161,58 @@ def find_way(
     sure = goals[rank < UNSURE]
     for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
         most = search.samples - way.draws if asked is goals else min(search.samples // 2, FURTHER)
-        best, draws, trees = _shortest(c, start, asked, most, (draw, rng), trial)
+        best, draws, trees = _shortest(c, start, asked, most, rng, trial)
         way = way._replace(draws=way.draws + draws, trees=trees)
         if len(best) > 0:
-            pace = timed(c, best, acceleration, trial)
-            return way._replace(corners=best, straight=len(best) == 2, pace=pace)
+            return way._replace(corners=best, pace=timed(c, best, acceleration, trial))
     return way
 
 
+def _drawn(c: Constraints, start: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """Random joints (count, n) within the limits; within half a turn of the start where there are none."""
+    low = np.where(np.isfinite(c.lower), c.lower, start - np.pi)
+    high = np.where(np.isfinite(c.upper), c.upper, start + np.pi)
+    return np.asarray(low + (high - low) * rng.random((count, len(start))))
+
+
 def _shortest(
-    c: Constraints,
-    start: FloatArray,
-    goals: FloatArray,
-    most: int,
-    random: tuple[Callable[[int], FloatArray], np.random.Generator],
-    trial: Trial,
+    c: Constraints, start: FloatArray, goals: FloatArray, most: int, rng: np.random.Generator, trial: Trial
 ) -> tuple[FloatArray, int, tuple[Tree, Tree] | None]:
     """The shortest way (k, n) that was met with to any of the goals (g, n), in so many draws of joints.
 
     A straight one, if it takes little longer than to the nearest goal; else the best of some that trees find.
     Returns the way, empty where there is none; how many draws it took; the trees that found it, or the first.
     """
-    draw, rng = random
-    best, shortest = np.empty((0, len(start))), math.inf
-    straight = first_straight(c, start, goals, trial)
-    if straight >= 0:
-        best = np.stack([start, goals[straight]])
-        shortest = length(c, best)
-    draws = 0
+    best, shortest, draws = np.empty((0, len(start))), math.inf, 0
+    straight = next((goal for goal in goals if reached(c, start, goal, trial) == 1.0), None)
+    if straight is not None:
+        best = np.stack([start, straight])
+        shortest = least_time(c.speed, best)[-1]
     trees: tuple[Tree, Tree] | None = None
     if not shortest <= LONGER * (np.abs(goals - start) / c.speed).max(axis=1).min():
         for _ in range(WAYS):
             left = (most if math.isinf(shortest) else FURTHER) - draws
             if left <= 0:
                 break
-            found, used, grown = _by_trees(c, start, goals, left, draw, trial)
+            found, used, grown = _by_trees(c, start, goals, left, rng, trial)
             draws, trees = draws + used, trees or grown
             if found is not None:
                 found = _shortened(c, found, rng, trial)
-                if length(c, found) < shortest:
-                    best, shortest, trees = found, length(c, found), grown
+                if (time := least_time(c.speed, found)[-1]) < shortest:
+                    best, shortest, trees = found, time, grown
     return best, draws, trees
 
 
-def _times(c: Constraints, path: FloatArray) -> FloatArray:
-    """Time (k − 1,) of each straight piece of a path (k, n) at the speed limits, s."""
-    return np.asarray((np.abs(np.diff(path, axis=0)) / c.speed).max(axis=1))
-
-
-def length(c: Constraints, path: FloatArray) -> float:
-    """Time of a path (k, n) at the speed limits, s."""
-    return float(_times(c, path).sum())
-
-
 def _by_trees(
-    c: Constraints,
-    start: FloatArray,
-    goals: FloatArray,
-    most: int,
-    draw: Callable[[int], FloatArray],
-    trial: Trial,
+    c: Constraints, start: FloatArray, goals: FloatArray, most: int, rng: np.random.Generator, trial: Trial
 ) -> tuple[FloatArray | None, int, tuple[Tree, Tree]]:
     """A path of corners (k, n), None where none was found; how many draws it took; the trees."""
     nodes = min(most, 100_000) * 4 + len(goals)
     trees = new_tree(nodes, start[None]), new_tree(nodes, goals)
-    scratch, draws = np.empty(len(start)), 0
+    draws = 0
     while draws < most:
-        chunk = draw(min(CHUNK, most - draws))
-        first, last, used = grow(c, trees, chunk, scratch, trial)
+        chunk = _drawn(c, start, min(CHUNK, most - draws), rng)
+        first, last, used = grow(c, trees, chunk, trial)
         draws += used
         if first >= 0:
             return np.vstack([_branch(trees[0], first)[::-1], _branch(trees[1], last)[1:]]), draws, trees
@@ -255,7 +231,7 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
     """What is left of a path (k, n) when straight ways cut it short: first between drawn places on it."""
-    time = np.r_[0.0, np.cumsum(_times(c, path))]
+    time = least_time(c.speed, path)
     for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:
             return path
@@ -264,9 +240,9 @@ def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial
         if i == j:  # on one straight piece
             continue
         new = np.stack([np.interp((low, high), time, column) for column in path.T], axis=1)
-        if _times(c, new)[0] < high - low and reached(c, new[0], new[1], trial) == 1.0:
+        if least_time(c.speed, new)[-1] < high - low and reached(c, new[0], new[1], trial) == 1.0:
             path = np.vstack([path[: i + 1], new, path[j + 1 :]])
-            time = np.r_[0.0, np.cumsum(_times(c, path))]
+            time = least_time(c.speed, path)
     k = 1
     while k < len(path) - 1:
         if reached(c, path[k - 1], path[k + 1], trial) == 1.0:

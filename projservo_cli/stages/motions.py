@@ -12,9 +12,9 @@ from projservo_cli.geometry.kinematics import forward
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
-from projservo_cli.guidance.lattice import duration, evenly, least_time, plan_path
+from projservo_cli.guidance.lattice import duration, evenly, plan_path
 from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares
-from projservo_cli.guidance.timing import Pace, joints_at
+from projservo_cli.guidance.timing import Pace, joints_at, least_time
 from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
 from projservo_cli.guidance.way import Search, Way, find_way, first_within, within_region
 from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Spread, WorkFailed

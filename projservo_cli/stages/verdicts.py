@@ -109,7 +109,7 @@ def way_words(way: Way) -> str:
     """How a way through joint space leads to the goal, in words."""
     g = int(np.abs(way.goals - way.corners[-1]).max(axis=1).argmin())
     corners = len(way.corners) - 2
-    how = "a straight way" if way.straight else f"a way round {corners} corner{'s' * (corners != 1)}"
+    how = "a straight way" if corners == 0 else f"a way round {corners} corner{'s' * (corners != 1)}"
     nearest = "the nearest" if g == 0 else f"number {g + 1}"
     some = "" if way.shown == len(way.goals) else f", of which the {len(way.goals)} nearest were tried"
     barred = f"; {way.barred} more are within a region" if way.barred else ""

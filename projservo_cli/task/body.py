@@ -26,7 +26,7 @@ from projservo_cli.geometry.algebra import (
     vec,
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
-from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.geometry.kernels import COORDINATES, solve_normal
 from projservo_cli.records import BoolArray, FloatArray, Model
 
 _Vec3 = tuple[float, float, float]
@@ -162,41 +162,6 @@ def _put_sums(N: FloatArray, sums: Sums) -> None:
             n += 1
 
 
-@merged
-def _solve_normal(N: FloatArray, tolerance: float) -> bool:
-    """Solution of symmetric positive definite equations by the root-free Cholesky factorisation, in place.
-
-    N : (6, 7) upper triangle of the matrix, and the right-hand side in the last column, which the solution
-        replaces; the rest is overwritten.
-    tolerance : a pivot below this share of its diagonal entry counts as zero. The share is what of a column
-        of the least-squares problem the columns before do not explain, squared.
-    Returns false where the matrix is singular; source: G. Golub, C. Van Loan, Matrix Computations, section
-    4.1.2.
-    """
-    n = COORDINATES
-    for j in range(n):
-        pivot = N[j, j]
-        for k in range(j):
-            pivot -= N[j, k] * N[k, j]
-        if not pivot > tolerance * N[j, j]:
-            return False
-        N[j, j] = pivot
-        for i in range(j + 1, n + 1):
-            total = N[j, i]
-            for k in range(j):
-                total -= N[j, k] * N[k, i]
-            N[j, i] = total
-        inverse = 1.0 / pivot
-        for i in range(j + 1, n):
-            N[i, j] = inverse * N[j, i]
-    for j in range(n - 1, -1, -1):
-        total = N[j, n] / N[j, j]
-        for i in range(j + 1, n):
-            total -= N[i, j] * N[i, n]
-        N[j, n] = total
-    return True
-
-
 @inline
 def _image_row(
     t: _Vec3, t_depth: _Vec3, pixel: float, inverse_depth: float, turn: FloatArray, e: float
@@ -306,7 +271,7 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, n
             normal[0, 6], normal[1, 6], normal[2, 6],
             normal[3, 6], normal[4, 6], normal[5, 6],
         )  # fmt: skip
-        if not _solve_normal(normal, _RANK_TOLERANCE):
+        if not solve_normal(normal, COORDINATES, _RANK_TOLERANCE):
             return _Fit(False, False, H, before, before, views)
         fall = 0.0
         for i in range(COORDINATES):

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from projservo_cli.guidance.timing import least_time
 from projservo_cli.guidance.validity import MARGINS, put_demands
-from projservo_cli.guidance.way import Search, find_way, length, margins_at, with_ends
+from projservo_cli.guidance.way import Search, find_way, margins_at, with_ends
 from tests.guidance.studies import ARMS, quantiles, task_configs, true_search, write_rows
 
 SEEDS = 5
@@ -71,7 +72,7 @@ def of_ompl(c, q_start, goals, samples, seed):
         return np.nan
     setup.simplifySolution(PATIENCE_S[1])
     path = setup.getSolutionPath()
-    return length(c, np.array([joints(path.getState(i)) for i in range(path.getStateCount())]))
+    return least_time(c.speed, np.array([joints(path.getState(i)) for i in range(path.getStateCount())]))[-1]
 
 
 def of_toppra(pace, speed, acceleration):
@@ -107,12 +108,13 @@ def compared(config):
     row = {"seed": seed, "s": time.process_time() - begin, "found": len(way.corners) > 0, "goals": way.shown}
     if way.pace is None:
         return row
-    row |= {"straight": way.straight, "length": length(c, way.corners), "duration": float(way.pace.time[-1])}
+    straight, length = len(way.corners) == 2, least_time(c.speed, way.corners)[-1]
+    row |= {"straight": straight, "length": length, "duration": float(way.pace.time[-1])}
     if find_spec("toppra"):
         row["toppra"] = of_toppra(way.pace, c.speed, acceleration)
-    if way.straight:
+    if straight:
         return row | {"slowest_joint": slowest_joint(way, c.speed, acceleration)}
-    nearest = min(length(c, np.stack([q_start, q])) for q in way.goals)
+    nearest = (np.abs(way.goals - q_start) / c.speed).max(axis=1).min()
     row["straight_to_nearest"] = nearest
     if find_spec("ompl"):
         ends = with_ends(c, np.vstack([q_start[None], way.goals]))

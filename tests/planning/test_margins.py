@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.guidance.lattice import least_time, shortest, widest
+from projservo_cli.guidance.lattice import shortest, widest
 from projservo_cli.guidance.margins import (
     BEHIND,
     Demands,
@@ -15,6 +15,7 @@ from projservo_cli.guidance.margins import (
     joint_margin,
     limit_margin,
 )
+from projservo_cli.guidance.timing import least_time
 from tests.planning.cases import reaching_of
 from tests.samples import frame, in_frame, pixels, poe
 from tests.stages.cases import case
