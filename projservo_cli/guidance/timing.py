@@ -62,7 +62,9 @@ def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Tri
     for k in range(1, len(path) - 1):
         sizes[k] = _rounding(c, path[k], slopes[k - 1 : k + 1], 0.5 * times[k - 1 : k + 1].min(), trial)
     pace = _on_grid(path, times, slopes, sizes)
-    _put_pace(pace, ROOM * c.speed, ROOM * acceleration)
+    with np.errstate(divide="ignore", over="ignore"):
+        pace.x[:] = ((ROOM * c.speed / np.abs(pace.dq)) ** 2).min(axis=1)
+    _put_pace(pace, ROOM * acceleration)
     return pace
 
 
@@ -127,16 +129,12 @@ def _accelerations(pace: Pace, i: int, x: float, ahead: float, most: FloatArray)
 
 
 @njit
-def _put_pace(pace: Pace, speed: FloatArray, acceleration: FloatArray) -> None:
-    """Write the quickest pace from rest to rest within speeds and accelerations (n,), and its times."""
-    n, count = speed.shape[0], pace.s.shape[0]
-    for i in range(count):
-        most = math.inf
-        for j in range(n):
-            rate = abs(pace.dq[i, j])
-            if rate > 0.0:
-                most = min(most, (speed[j] / rate) * (speed[j] / rate))
-        pace.x[i] = most
+def _put_pace(pace: Pace, acceleration: FloatArray) -> None:
+    """Write the quickest pace from rest to rest within accelerations (n,), and its times.
+
+    The pace is as quick as speeds allow yet.
+    """
+    count = pace.s.shape[0]
     pace.x[count - 1] = 0.0
     for i in range(count - 2, -1, -1):
         low, high = 0.0, pace.x[i]

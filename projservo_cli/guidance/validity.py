@@ -368,15 +368,8 @@ class Trial(NamedTuple):
 
 def new_trial(n: int, b: int) -> Trial:
     """Workspace for n joints and b markers."""
-    pixels = np.zeros((2, b, 2))
-    return Trial(
-        np.zeros(MARGINS),
-        np.zeros(MARGINS),
-        pixels,
-        pixels.copy(),
-        np.zeros(n),
-        np.zeros(MARGINS + n, np.int64),
-    )
+    one, s = np.zeros(MARGINS), np.zeros((2, b, 2))
+    return Trial(one, one.copy(), s, s.copy(), np.zeros(n), np.zeros(MARGINS + n, np.int64))
 
 
 @internal

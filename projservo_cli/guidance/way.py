@@ -35,8 +35,6 @@ SHORTENINGS = 60
 ROUND_OFF = 1e-9
 # Goals within so much of shunned joints, rad or m, are shunned too.
 NEARBY = 0.1
-# A margin that is not asked for.
-_NOTHING = 1e12
 
 
 class Search(NamedTuple):
@@ -56,14 +54,14 @@ class Way(NamedTuple):
     solutions: int  # how many apart from whole turns
     hidden: int  # how many of those lie beyond the limits or do not show the face
     barred: int  # how many of those lie within a region that is kept out of
-    corners: FloatArray  # (k, n) of the way; none where none was found
-    pace: Pace | None  # in time; None where there is no way or nothing limits its speed
-    draws: int  # by the trees
-    trees: tuple[Tree, Tree] | None  # from the start and from the goals, where they were grown
     failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
     had: FloatArray  # (10,) margins of the start
     region: int  # the one that the start is within, counted from 1; 0 for none
     held: Constraints  # what was held against: with less asked for at start and goals
+    corners: FloatArray  # (k, n) of the way; none where none was found
+    pace: Pace | None = None  # in time; None where there is no way or nothing limits its speed
+    draws: int = 0  # by the trees
+    trees: tuple[Tree, Tree] | None = None  # from the start and from the goals, where they were grown
 
 
 def may_start(had: FloatArray) -> bool:
@@ -110,7 +108,7 @@ def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
     """
     n = q.shape[1]
     endless = np.full(n, math.inf)
-    full = np.r_[np.full(CLEAR, -_NOTHING), c.full[CLEAR]]
+    full = np.r_[np.full(CLEAR, -1e12), c.full[CLEAR]]  # finite, as demands are interpolated
     speed = np.where(np.isfinite(c.speed), c.speed, 1.0)
     c = with_ends(c._replace(lower=-endless, upper=endless, full=full, speed=speed), q[[0, -1]])
     trial = new_trial(n, len(c.M))
@@ -139,21 +137,8 @@ def find_way(
     had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
     had[BORDER:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
     trial = new_trial(n, len(c.M))
-    way = Way(
-        goals=goals,
-        shown=len(every),
-        solutions=counts[0],
-        hidden=counts[1],
-        barred=counts[2],
-        corners=np.empty((0, n)),
-        pace=None,
-        draws=0,
-        trees=None,
-        failures=trial.failures,
-        had=had,
-        region=within_region(c, start),
-        held=c,
-    )
+    region, nowhere = within_region(c, start), np.empty((0, n))
+    way = Way(goals, len(every), *counts, trial.failures, had, region, c, nowhere)
     if len(goals) == 0 or not may_start(had):
         return way
     c = with_ends(c, np.vstack([start[None], goals]))
