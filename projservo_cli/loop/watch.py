@@ -35,7 +35,7 @@ EVERY, LAST = 10, 5
 STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
 
 
-class Ways(Protocol):
+class _Ways(Protocol):
     """Ways to the goal of a task."""
 
     def predicted(self, q: FloatArray) -> FloatArray:
@@ -58,7 +58,7 @@ class Watch:
     """
 
     def __init__(
-        self, law: BuiltInLaw, follow: Callable[[Plan], Task], ways: Ways, searches: int, limits: Limits
+        self, law: BuiltInLaw, follow: Callable[[Plan], Task], ways: _Ways, searches: int, limits: Limits
     ) -> None:
         self.law, self.follow, self.ways, self.left, self.limits = law, follow, ways, searches, limits
         self.told: list[str] = []
