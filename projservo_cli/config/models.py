@@ -18,7 +18,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from projservo_cli.config.regions import Region
+from projservo_cli.config.regions import KeptOut
 from projservo_cli.config.robot import (
     Count,
     Finding,
@@ -316,7 +316,7 @@ class Trajectory(Section):
         8.0, description="in the profile joint: least width of the face in an image, seen ever more edge-on"
     )
     search: _Search = Field(_Search(), description="how long the profile joint searches, and from which seed")
-    keep_out: Annotated[tuple[Region, ...], Field(max_length=100)] = Field(
+    keep_out: Annotated[tuple[KeptOut, ...], Field(max_length=100)] = Field(
         (),
         description="outlines of obstacles, each {left: [[u, v], ...], right: [[u, v], ...], hides: true}, "
         "that no marker enters, nor what is between those of the face",

@@ -11,7 +11,7 @@ from projservo_cli.config.robot import Finding, Section, Vector2
 _Polygon = Annotated[tuple[Vector2, ...], Field(min_length=3, max_length=200)]
 
 
-class Region(Section):
+class KeptOut(Section):
     """What an obstacle covers in the images: simple polygons, convex or not, in pixels."""
 
     left: _Polygon | None = Field(None, description="corners u and v in the left image; null for none there")

@@ -51,7 +51,7 @@ class Demands(NamedTuple):
     conditioning: float  # least reciprocal condition of the image Jacobian of the face
 
 
-def within(lower: FloatArray, upper: FloatArray) -> Demands:
+def limits_alone(lower: FloatArray, upper: FloatArray) -> Demands:
     """Demands of joint limits alone, (n,) rad or m."""
     endless = np.full(len(lower), math.inf)
     return Demands(lower, upper, endless, np.full(2, math.inf), 0.0, 0.0)
@@ -152,7 +152,7 @@ def in_front(P: FloatArray, A: Vec4, M: Vec4) -> bool:
 
 
 @merged
-def inside(image_size: FloatArray, u: float, v: float) -> float:
+def from_border(image_size: FloatArray, u: float, v: float) -> float:
     """Distance of a pixel from the border of the image, px; negative outside, ``BEHIND`` of none."""
     if not math.isfinite(u + v):
         return BEHIND
@@ -331,7 +331,7 @@ def put_path_margins(reaching: Reaching, found: Along) -> None:
             for k in range(A.shape[0]):
                 u, v = found.s[i, view, k, 0], found.s[i, view, k, 1]
                 shown = in_front(P[view], vec(A[k]), apply(H, vec(A[k])))
-                least = min(least, inside(demands.image_size, u, v) if shown else BEHIND)
+                least = min(least, from_border(demands.image_size, u, v) if shown else BEHIND)
             found.distance[i, view] = least
         margins = found.margins[i]
         margins[VISIBILITY] = min(found.visibility[i, 0], found.visibility[i, 1])

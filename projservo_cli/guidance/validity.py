@@ -25,7 +25,7 @@ from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, ve
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
 from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, apart, bulge, clearance, squared
-from projservo_cli.guidance.margins import Demands, inside, pixel, straight_pixel
+from projservo_cli.guidance.margins import Demands, from_border, pixel, straight_pixel
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, Model, Spread
 from projservo_cli.task.face import Task, center_of, face_plane
 
@@ -167,7 +167,7 @@ def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray
             u, v = pixel(c.model, view, A)
             s[view, k, 0], s[view, k, 1] = u, v
             if k < c.face:
-                border = min(border, inside(c.image_size, u, v))
+                border = min(border, from_border(c.image_size, u, v))
         margins[FRONT + view] = nearest / c.depth[view]
         if not nearest > 0.0:
             return False
@@ -237,8 +237,8 @@ def clear_by(c: Constraints, H: Mat4, s: FloatArray, off: tuple[float, float], a
                 least = min(least, first, second)
             else:
                 first, second = (
-                    min(first, inside(c.image_size, u, v) - off[0]),
-                    min(second, inside(c.image_size, x, y) - off[1]),
+                    min(first, from_border(c.image_size, u, v) - off[0]),
+                    min(second, from_border(c.image_size, x, y) - off[1]),
                 )
                 least = min(least, max(first, second))
         for k in range(c.face if keep.views[region] == BOTH else 0):
@@ -273,12 +273,13 @@ def _clear_between(
             s, at, t = pixel(c.model, view, first), pixel(c.model, view, middle), pixel(c.model, view, last)
             radius = math.sqrt(max(squared(at, s), squared(at, t)))
             clear = (
-                min(clearance(c.keep_out, region, view, at), inside(c.image_size, at[0], at[1])) - off[view]
+                min(clearance(c.keep_out, region, view, at), from_border(c.image_size, at[0], at[1]))
+                - off[view]
             )
             along = clear - radius
             if along < enough <= clear:
                 # A lens bends the image of a straight piece: by no more than in its middle.
-                border = min(inside(c.image_size, s[0], s[1]), inside(c.image_size, t[0], t[1]))
+                border = min(from_border(c.image_size, s[0], s[1]), from_border(c.image_size, t[0], t[1]))
                 along = min(apart(c.keep_out, region, view, s, t), border) - off[view] - bulge(s, at, t)
             here, all_along, half = max(here, clear), max(all_along, along), max(half, radius)
             if all_along >= enough:

@@ -37,7 +37,7 @@ ROUND_OFF = 1e-9
 NEARBY = 0.1
 
 
-class Search(NamedTuple):
+class Budget(NamedTuple):
     """How long is searched, and with which random numbers."""
 
     samples: int = 20_000
@@ -119,7 +119,7 @@ def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
 
 
 def find_way(
-    c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, search: Search, acceleration: FloatArray
+    c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, search: Budget, acceleration: FloatArray
 ) -> Way:
     """Find a way from the start to joints that show the goal.
 

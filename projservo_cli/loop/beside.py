@@ -16,10 +16,10 @@ from projservo_cli.geometry.mechanisms import Seen, reach
 from projservo_cli.guidance.margins import (
     Reaching,
     carrier_of,
+    limits_alone,
     put_carried,
     put_path_margins,
     room_along,
-    within,
 )
 from projservo_cli.loop.step import new_log
 from projservo_cli.loop.summary import Ended, path_deviation, summarize
@@ -56,7 +56,7 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     task = Task(np.zeros((2, 4, 2)), matrices[0], order, 0, np.zeros((3, 3)), O, q)
     plant = Plant(model, matrices[0], order, 0, O, q, q, q, q, True)
     state, log = new_state(4, 4), new_log(4, 4, 1, len(ERRORS))
-    reaching = Reaching(model, within(q, q), matrices, q, matrices[0], q, O, q)
+    reaching = Reaching(model, limits_alone(q, q), matrices, q, matrices[0], q, O, q)
     along = room_along(reaching, 1)
     yield reach, (model, Seen(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
     yield pseudo_inverse, (state, 8, q)

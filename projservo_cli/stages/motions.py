@@ -16,7 +16,7 @@ from projservo_cli.guidance.lattice import duration, evenly, plan_path
 from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares
 from projservo_cli.guidance.timing import Pace, joints_at, least_time
 from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
-from projservo_cli.guidance.way import Search, Way, find_way, first_within, within_region
+from projservo_cli.guidance.way import Budget, Way, find_way, first_within, within_region
 from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Spread, WorkFailed
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.verdicts import sight_words, verdict_of, way_words, why_no_way
@@ -90,7 +90,7 @@ def search_of(scenario: Scenario) -> JointSearch:
     return JointSearch(joints.acceleration, scenario.q_shown, sigma, spread, closed)
 
 
-def closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
+def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
     """Why no way through joint space can be looked for, or given a time; empty where it can."""
     for i in np.flatnonzero(~np.isfinite(demands.speed)):
         kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
@@ -183,13 +183,13 @@ def kept_out(found: Found, A: FloatArray, task: Task, trajectory: Trajectory, sp
     return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
 
 
-def through_joints(
+def joint_way(
     reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, search: JointSearch
 ) -> Found:
     """A way through joint space for a body at A (b, 4); the linear motion where there is none."""
     c = joint_constraints(reaching, A, task, trajectory, search.spread)
     aim = Aim(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
-    how = Search(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
+    how = Budget(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
     way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
     if way.pace is None:
         linear = given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)

@@ -29,12 +29,12 @@ from projservo_cli.stages.motions import (
     Found,
     JointSearch,
     body_at_start,
-    closed,
     coupled,
     given,
+    joint_way,
     kept_out,
     search_of,
-    through_joints,
+    why_closed,
 )
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.told import told_of
@@ -150,7 +150,7 @@ def plan_task(
     if trajectory.profile != "auto":
         return _planned(model, shown, trajectory, demands, search)[0]
     before: list[str] = []
-    shut = closed(model, demands, search)
+    shut = why_closed(model, demands, search)
     for profile in ("linear", "constrained", "joint"):
         asked = trajectory.model_copy(update={"profile": profile})
         last = profile == "joint" or (profile == "constrained" and bool(shut))
@@ -179,11 +179,11 @@ def _found(
     """The motion of one profile; ``tau_limit`` of the translation at most before a rotation."""
     profile = trajectory.profile
     if profile == "joint":
-        shut = closed(reaching.model, reaching.demands, search)
+        shut = why_closed(reaching.model, reaching.demands, search)
         if search is None or shut:
             raise InputError(f"the profile joint: {shut}")
         A = body_at_start(reaching.model, task, shown, reaching.A)
-        return through_joints(reaching, A, task, trajectory, search)
+        return joint_way(reaching, A, task, trajectory, search)
     if profile == "constrained":
         found = coupled(reaching, trajectory)
     else:

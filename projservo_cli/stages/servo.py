@@ -36,7 +36,7 @@ from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.robots.yours import DrivenRobot, at_rest_after
 from projservo_cli.stages import own_robot
-from projservo_cli.stages.motions import closed, search_of
+from projservo_cli.stages.motions import search_of, why_closed
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.ways import Ways
@@ -236,7 +236,7 @@ def _in_compiled_loop(config: Config, law: str) -> bool:
 def _is_guided(scenario: Scenario, law: str, replans: bool) -> bool:
     """Whether a run follows a plan which gives way to another one where it fails."""
     guided = scenario.config.trajectory.profile in ("joint", "auto") and not replans and law in CODES
-    return guided and not closed(scenario.model, scenario.demands, search_of(scenario))
+    return guided and not why_closed(scenario.model, scenario.demands, search_of(scenario))
 
 
 def sense_is_enough(config: Config, name: str) -> bool:

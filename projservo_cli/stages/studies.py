@@ -18,7 +18,7 @@ from projservo_cli.geometry.algebra import (
     exp_rotation,
     twist_exponential,
 )
-from projservo_cli.guidance.margins import within
+from projservo_cli.guidance.margins import limits_alone
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
@@ -132,7 +132,7 @@ def metric_plan(bench: Comparison) -> Plan:
     """The task partitioned with the true metric model, so that its operators are in metres."""
     short = {"profile": "linear", "samples": 2, "duration_s": None}
     trajectory, robot = bench.scenario.config.trajectory.model_copy(update=short), bench.truth.robot
-    shown, limits = bench.scenario.ends, within(robot.lower, robot.upper)
+    shown, limits = bench.scenario.ends, limits_alone(robot.lower, robot.upper)
     return plan_task(bench.models["true"], shown, trajectory, limits)
 
 

@@ -9,7 +9,7 @@ from projservo_cli.geometry.lens import straight_views
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.margins import Reaching
 from projservo_cli.guidance.validity import BORDER, CLEAR
-from projservo_cli.guidance.way import Search, find_way, margins_at
+from projservo_cli.guidance.way import Budget, find_way, margins_at
 from projservo_cli.records import NO_SPREAD, FloatArray, Plan
 from projservo_cli.stages.motions import body_at_start, joint_constraints, sampled_way, search_of
 from projservo_cli.stages.scenario import Scenario
@@ -53,7 +53,7 @@ class Ways:
         full[BORDER:CLEAR] += np.abs(off).max(axis=1)
         full[CLEAR] += np.abs(off).max()
         c = self._c._replace(full=full)
-        how = Search(asked.search.samples, asked.search.seed + self._made, asked.goals, shunned)
+        how = Budget(asked.search.samples, asked.search.seed + self._made, asked.goals, shunned)
         start = np.clip(q, c.lower, c.upper)
         way = find_way(c, self._aim, start, self._search.q_shown, how, self._search.acceleration)
         if way.pace is None:

@@ -22,9 +22,9 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
-from projservo_cli.guidance.margins import within
+from projservo_cli.guidance.margins import limits_alone
 from projservo_cli.guidance.validity import Asked, constraints_of
-from projservo_cli.guidance.way import Search, find_way, within_region
+from projservo_cli.guidance.way import Budget, find_way, within_region
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots.simulated import METRIC_A_INF
 from projservo_cli.stages import calibrate, plan
@@ -160,7 +160,9 @@ def true_constraints(config, truth: Truth, task: Drawn, q):
     s_start, s_star = (truth.images(x, truth.M_face) for x in (q, task.q_goal))
     aimed = Shown(q, s_start, s_star, truth.center).task(truth.model)
     joints, n = joints_of(config), len(q)
-    demands = within(joints.lower, joints.upper)._replace(speed=joints.speed, image_size=truth.image_size)
+    demands = limits_alone(joints.lower, joints.upper)._replace(
+        speed=joints.speed, image_size=truth.image_size
+    )
     A = truth.M[[*truth.face, *truth.pins]] @ truth.displacement(q).T
     c = constraints_of(truth.model, A, aimed, q, Asked(demands, np.zeros(n), 0.0))
     return c._replace(
@@ -178,7 +180,7 @@ def way_exists(config, truth: Truth, task: Drawn):
     searches = 0
     for samples, seeds in ESCALATED:
         for seed in range(seeds):
-            how = Search(samples, seed, 4096)
+            how = Budget(samples, seed, 4096)
             searches += 1
             acceleration = joints_of(config).acceleration
             if len(find_way(c, aim, task.q_start, task.q_goal[None], how, acceleration).corners):

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from projservo_cli.guidance.timing import least_time
 from projservo_cli.guidance.validity import MARGINS, put_demands
-from projservo_cli.guidance.way import Search, find_way, margins_at, with_ends
+from projservo_cli.guidance.way import Budget, find_way, margins_at, with_ends
 from tests.guidance.studies import ARMS, quantiles, task_configs, true_search, write_rows
 
 SEEDS = 5
@@ -102,7 +102,7 @@ def compared(config):
     """A way of a task, in numbers, against what other programs make of it."""
     c, aim, q_start, q_goal, acceleration = true_search(config, margins=True)
     seed = config.seed
-    how = Search(config.trajectory.search.samples, seed, config.trajectory.goals)
+    how = Budget(config.trajectory.search.samples, seed, config.trajectory.goals)
     begin = time.process_time()
     way = find_way(c, aim, q_start, q_goal[None], how, acceleration)
     row = {"seed": seed, "s": time.process_time() - begin, "found": len(way.corners) > 0, "goals": way.shown}

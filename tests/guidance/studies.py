@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.guidance.goals import Aim
-from projservo_cli.guidance.margins import within
+from projservo_cli.guidance.margins import limits_alone
 from projservo_cli.guidance.validity import Asked, constraints_of
-from projservo_cli.guidance.way import Search, find_way
+from projservo_cli.guidance.way import Budget, find_way
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweep.design import random_tasks
 from projservo_cli.task.target import Shown
@@ -50,7 +50,9 @@ def true_search(config, *, margins=False):
     s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
     task = Shown(q_start, s_start, s_star, truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
-    demands = within(joints.lower, joints.upper)._replace(speed=joints.speed, image_size=truth.image_size)
+    demands = limits_alone(joints.lower, joints.upper)._replace(
+        speed=joints.speed, image_size=truth.image_size
+    )
     keep, least_px = np.zeros(len(q_start)), 0.0
     if margins:
         demands, least_px = demands._replace(border_px=asked.border_px), asked.least_face_px
@@ -64,7 +66,7 @@ def has_no_way(config):
     """Whether no search with the true model finds a way."""
     c, aim, q_start, q_goal, acceleration = true_search(config)
     return not any(
-        len(find_way(c, aim, q_start, q_goal[None], Search(SAMPLES, seed), acceleration).corners)
+        len(find_way(c, aim, q_start, q_goal[None], Budget(SAMPLES, seed), acceleration).corners)
         for seed in range(SEARCHES)
     )
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.guidance.goals import UNSURE, goals_of
-from projservo_cli.guidance.way import Search, find_way
+from projservo_cli.guidance.way import Budget, find_way
 from tests.guidance.cases import case
 
 NONE = np.empty((0, 7))
@@ -63,7 +63,7 @@ def test_turns_are_goals_of_their_own():
 def test_few_are_the_nearest_of_many():
     found = case("ur5", 2)
     many, times, _ = goals_in(found)
-    way = find_way(found.c, found.aim, found.q_start, NONE[:, :6], Search(goals=5), found.acceleration)
+    way = find_way(found.c, found.aim, found.q_start, NONE[:, :6], Budget(goals=5), found.acceleration)
     assert way.shown == len(many)
     np.testing.assert_allclose(times[:5], (np.abs(way.goals - found.q_start) / found.c.speed).max(axis=1))
 
@@ -72,6 +72,6 @@ def test_a_goal_beyond_the_limits_is_told():
     found = case("paper", 0)
     # Limits around the start that none of the solutions lies within.
     c = found.c._replace(lower=found.q_start - 1e-3, upper=found.q_start + 1e-3)
-    way = find_way(c, found.aim, found.q_start, NONE[:, :6], Search(), found.acceleration)
+    way = find_way(c, found.aim, found.q_start, NONE[:, :6], Budget(), found.acceleration)
     assert len(way.goals) == len(way.corners) == way.shown == 0
     assert way.solutions == way.hidden > 0

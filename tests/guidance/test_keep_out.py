@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from projservo_cli.guidance.keep_out import keep_out_of, outside_polygon
 from projservo_cli.guidance.timing import joints_at
 from projservo_cli.guidance.validity import CLEAR, FINE_PX
-from projservo_cli.guidance.way import Search, find_way, margins_at
+from projservo_cli.guidance.way import Budget, find_way, margins_at
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.verdicts import why_no_way
@@ -100,7 +100,7 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
     for k in range(COUNT):
         found = case("paper", k)
         nothing = np.empty((0, 6))
-        free = find_way(found.c, found.aim, found.q_start, nothing, Search(), found.acceleration)
+        free = find_way(found.c, found.aim, found.q_start, nothing, Budget(), found.acceleration)
         middle, (left, right) = box_of(
             found, joints_at(free.pace, np.array([0.5 * free.pace.time[-1]]))[0], 0.02
         )
@@ -111,7 +111,7 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
         ):
             continue
         tried += 1
-        way = find_way(c, found.aim, found.q_start, nothing, Search(), found.acceleration)
+        way = find_way(c, found.aim, found.q_start, nothing, Budget(), found.acceleration)
         if len(way.corners) == 0:
             continue
         around += 1
@@ -129,12 +129,12 @@ def test_a_region_of_one_image_bars_that_image():
     nothing = np.empty((0, 6))
     everywhere = np.array([[-1e4, -1e4], [1e4, -1e4], [1e4, 1e4], [-1e4, 1e4]])
     c = found.c._replace(keep_out=keep_out_of([(everywhere, None, True)]))
-    way = find_way(c, found.aim, found.q_start, nothing, Search(samples=200), found.acceleration)
+    way = find_way(c, found.aim, found.q_start, nothing, Budget(samples=200), found.acceleration)
     assert len(way.corners) == 0
     assert why_no_way(way) == "the start is already within region 1"
     around = found.aim.s_star[0, 1] + [[-3.0, -3.0], [3.0, -3.0], [0.0, 5.0]]
     c = found.c._replace(keep_out=keep_out_of([(around, None, True)]))
-    way = find_way(c, found.aim, found.q_start, nothing, Search(samples=200), found.acceleration)
+    way = find_way(c, found.aim, found.q_start, nothing, Budget(samples=200), found.acceleration)
     assert way.solutions == way.hidden + way.barred
     assert f"and {way.barred} within a region that is kept out of" in why_no_way(way)
 

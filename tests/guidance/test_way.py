@@ -7,10 +7,10 @@ import pytest
 
 from projservo_cli.guidance.timing import ROOM, joints_at, least_time, timed
 from projservo_cli.guidance.validity import LIMITS, SIDE, WIDTH, new_trial
-from projservo_cli.guidance.way import Search, find_way, margins_at
+from projservo_cli.guidance.way import Budget, find_way, margins_at
 from tests.guidance.cases import COUNT, case
 
-SEARCH = Search()
+SEARCH = Budget()
 
 
 def way_of(found, search=SEARCH):
@@ -76,7 +76,7 @@ def test_a_way_is_the_same_to_the_bit_in_threads():
             np.testing.assert_array_equal(way.corners, alone.corners)
             np.testing.assert_array_equal(way.pace.time, alone.pace.time)
             assert way.draws == alone.draws
-    assert not np.array_equal(way_of(found, Search(seed=1)).corners, alone.corners)
+    assert not np.array_equal(way_of(found, Budget(seed=1)).corners, alone.corners)
 
 
 def test_no_way_is_told_with_what_stands_in_it():
@@ -84,7 +84,7 @@ def test_no_way_is_told_with_what_stands_in_it():
     found = case("paper", 0)
     full = found.c.full.copy()
     full[WIDTH : WIDTH + 2] = 1e4
-    way = way_of(found._replace(c=found.c._replace(full=full)), Search(samples=500))
+    way = way_of(found._replace(c=found.c._replace(full=full)), Budget(samples=500))
     assert len(way.goals) > 0
     assert len(way.corners) == 0
     assert way.pace is None
