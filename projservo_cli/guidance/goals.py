@@ -55,6 +55,8 @@ ROUND_OFF = 1e-9
 # Starts; the search for further goals ends early once so many times the starts until the last new one, and
 # ``AT_LEAST``, have found none.
 STARTS, PATIENCE, AT_LEAST = 400, 3, 40
+# So many whole turns to both sides of the nearest are goals of their own.
+TURNS = 1
 # Solutions of an arm of more joints than six.
 SAMPLED = 96
 # Where the body is at a solution: in sight, or not, or within a region that is kept out of.
@@ -266,13 +268,18 @@ def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
 
 
 def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) -> FloatArray:
-    """Whole turns (t, n) of joints (n,) within the limits and some slack (n,); else nearest to the start."""
+    """Whole turns (t, n) of joints (n,) within the limits and some slack (n,); else nearest to the start.
+
+    No more than ``TURNS`` to both sides of the nearest: of many joints that turn often there is no end.
+    """
     turn, slides = 2.0 * math.pi, c.model.joint_types == PRISMATIC
     half = np.where(slides, math.inf, 0.5 * turn)
     low = np.where(np.isfinite(c.lower), c.lower, start - half) - slack - q
     high = np.where(np.isfinite(c.upper), c.upper, start + half) + slack - q
-    first = np.where(slides, 0.0, np.ceil(low / turn))
-    last = np.where(slides, (low <= 0.0) & (high >= 0.0), np.floor(high / turn) + 1.0)
+    nearest = np.round((start - q) / turn)
+    first = np.where(slides, 0.0, np.maximum(np.ceil(low / turn), nearest - TURNS))
+    last = np.minimum(np.floor(high / turn), nearest + TURNS) + 1.0
+    last = np.where(slides, (low <= 0.0) & (high >= 0.0), last)
     counts = np.maximum(last - first, 0.0).astype(int)
     whole = first + np.indices(counts).reshape(len(q), -1, order="F").T
     return np.asarray(q + turn * whole)
