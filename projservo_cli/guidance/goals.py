@@ -56,7 +56,7 @@ ROUND_OFF = 1e-9
 # ``AT_LEAST``, have found none.
 STARTS, PATIENCE, AT_LEAST = 400, 3, 40
 # So many whole turns to both sides of the nearest are goals of their own.
-TURNS = 1
+TURNS = 2
 # Solutions of an arm of more joints than six.
 SAMPLED = 96
 # Where the body is at a solution: in sight, or not, or within a region that is kept out of.
@@ -281,7 +281,7 @@ def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) 
     last = np.minimum(np.floor(high / turn), nearest + TURNS) + 1.0
     last = np.where(slides, (low <= 0.0) & (high >= 0.0), last)
     counts = np.maximum(last - first, 0.0).astype(int)
-    whole = first + np.indices(counts).reshape(len(q), -1, order="F").T
+    whole = first + np.indices(tuple(counts.tolist())).reshape(len(q), -1, order="F").T
     return np.asarray(q + turn * whole)
 
 
