@@ -189,9 +189,9 @@ FAR_OFF = 5.0
 
 @internal
 def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray, asked: float) -> float:
-    """Margin of the regions that are kept out of; near them what a prediction may be off there tells."""
+    """Margin of the regions that are kept out of; near them, or to tell it, by what is off there."""
     off = DEVIATIONS * FAR_OFF * c.spread.most
-    if off > 0.0:
+    if off > 0.0 and asked < math.inf:
         far = clear_by(c, H, s, (off, off), c.full[CLEAR])
         if far >= c.full[CLEAR]:
             return far
@@ -227,7 +227,7 @@ def clear_by(c: Constraints, H: Mat4, s: FloatArray, off: tuple[float, float], a
     are so in both images, and all markers in the only image in which a region is drawn.
     """
     keep, least = c.keep_out, math.inf
-    enough = min(asked, c.full[CLEAR])
+    enough = min(asked, c.full[CLEAR]) if asked < math.inf else asked
     for region in range(keep.hides.shape[0]):
         for k in range(c.M.shape[0]):
             u, v, x, y = s[0, k, 0], s[0, k, 1], s[1, k, 0], s[1, k, 1]

@@ -12,9 +12,9 @@ from scipy.spatial import ConvexHull
 
 from projservo_cli.guidance.keep_out import keep_out_of, outside_polygon
 from projservo_cli.guidance.timing import joints_at
-from projservo_cli.guidance.validity import CLEAR, FINE_PX
+from projservo_cli.guidance.validity import CLEAR
 from projservo_cli.guidance.way import Budget, find_way, margins_at
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import Spread, WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.verdicts import why_no_way
 from tests.conftest import ROOT
@@ -76,10 +76,12 @@ def test_the_margin_is_that_of_every_point_of_every_segment(k):
         one = np.minimum(seen, border).max(axis=0).min()
         margin = margins_at(found.c._replace(keep_out=keep_out_of([(*drawn, False)])), q)[0][CLEAR]
         assert margin <= one + 1e-2
-        if one < FINE_PX:
-            assert margin >= one - max(1.0, 0.5 * abs(one))
-        else:
-            assert margin >= FINE_PX - 1.0
+        assert margin >= one - max(1.0, 0.5 * abs(one))
+        # What predictions may be off is that of these joints, not the most that it is anywhere.
+        spread = Spread(*(x[None] for x in (truth.P, found.c.model.H_hat_0, found.c.M)), rest=1.0, most=9.0)
+        off = found.c._replace(keep_out=keep_out_of([(*drawn, False)]), spread=spread)
+        if one > 8.0:
+            assert margins_at(off, q)[0][CLEAR] == pytest.approx(margin - 3.0, abs=0.3 * margin)
         both = min(outside(s[v], drawn[v]).min() for v in range(2))
         hides = margins_at(found.c._replace(keep_out=keep_out_of([(*drawn, True)])), q)[0][CLEAR]
         assert hides == pytest.approx(min(both, margin))
