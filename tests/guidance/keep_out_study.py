@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
-from projservo_cli.config.regions import Region
+from projservo_cli.config.regions import KeptOut
 from projservo_cli.config.robot import JointVector
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.guidance.goals import Aim
@@ -68,7 +68,7 @@ class Drawn(NamedTuple):
     q_start: np.ndarray
     q_goal: np.ndarray  # q_start, q_goal: (n,) rad or m
     box: Box
-    regions: tuple[Region, ...]
+    regions: tuple[KeptOut, ...]
 
 
 def positions(truth: Truth, q):
@@ -149,7 +149,7 @@ def with_box(config, truth: Truth, ends, rng):
         if met(truth, box, both).any() or hidden(truth, box, both).any():
             continue
         corners = [tuple((float(u), float(v)) for u, v in polygon) for polygon in drawn]
-        task = Drawn(*ends, box, (Region(left=corners[0], right=corners[1]),))
+        task = Drawn(*ends, box, (KeptOut(left=corners[0], right=corners[1]),))
         if all(within_region(true_constraints(config, truth, task, q), q) == 0 for q in ends):
             return task
     return None
