@@ -167,10 +167,16 @@ def legend_below(figure: "Figure", looks: Mapping[str, Look], columns: int) -> N
 
 
 def curve(index: int, *, marker: bool = False) -> Look:
-    """Look of the curve of a number: colour, line style and, if asked for, marker."""
-    color, style, symbol = _CURVES[index % len(_CURVES)]
-    look = {"color": color, "linestyle": style}
-    return look | {"marker": symbol} if marker else look
+    """Look of the curve of a number: colour, line style and, if asked for, marker.
+
+    Those of a second round are thin, and their markers hollow.
+    """
+    again, place = divmod(index, len(_CURVES))
+    color, style, symbol = _CURVES[place]
+    look = {"color": color, "linestyle": style} | ({"linewidth": 0.7} if again else {})
+    if not marker:
+        return look
+    return look | {"marker": symbol} | ({"markerfacecolor": "white"} if again else {})
 
 
 def image_axes(axes: "Axes", title: str, pixels: FloatArray, margin: float = 0.06) -> None:
