@@ -79,6 +79,8 @@ class Watch:
             return self._anew(log, k, verdict, "the face was lost, and seen again on the way back")
         way, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
         if clock < len(way) - 1:
+            if verdict == DIVERGED and np.isfinite(q_dot).all():
+                verdict = RUNNING  # a way may lead away from the goal
             return self._on_the_way(log, k, verdict, way[int(clock) :])
         self._alone += 1
         window = self.limits.plateau_steps
@@ -90,15 +92,14 @@ class Watch:
         return self._anew(log, k, verdict, f"{STOPPED.get(verdict, 'no progress')} at the goal")
 
     def _on_the_way(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
-        """What becomes of a verdict with joints (s, n) ahead, which may lead away from the goal."""
+        """What becomes of a verdict with joints (s, n) ahead."""
         self._alone = 0
-        if verdict in (RUNNING, DIVERGED):
-            looks = k % EVERY == 0 and self.left > 0
-            leaves = looks and self._leaves_image(log, k, ahead)
-            return self._anew(log, k, RUNNING, "what is ahead would leave an image") if leaves else RUNNING
-        return (
-            self._anew(log, k, verdict, f"{STOPPED[verdict]} on the way") if verdict in STOPPED else verdict
-        )
+        if verdict in STOPPED:
+            return self._anew(log, k, verdict, f"{STOPPED[verdict]} on the way")
+        looks = verdict == RUNNING and k % EVERY == 0 and self.left > 0
+        if looks and self._leaves_image(log, k, ahead):
+            return self._anew(log, k, verdict, "what is ahead would leave an image")
+        return verdict
 
     def _anew(self, log: Log, k: int, verdict: int, why: str) -> int:
         """Hold the robot and follow another way, if there is one; else the verdict stays."""

@@ -104,6 +104,14 @@ def test_a_way_may_lead_away_from_the_goal():
     assert watch.ruled(log, 7, DIVERGED, np.zeros(2)) == RUNNING
 
 
+def test_a_command_that_is_no_number_is_never_let_through():
+    ways = Ways()
+    watch, _, log = watched(ways, clock=4.0)
+    assert watch.ruled(log, 7, DIVERGED, np.array([0.0, np.nan])) == WAITING
+    assert watch.told == ["at step 7 (growing errors on the way)"]
+    assert watch.ruled(log, 8, DIVERGED, np.array([np.inf, 0.0])) == DIVERGED
+
+
 def test_what_is_ahead_is_looked_at_with_what_images_are_off():
     ways = Ways(leaves=True)
     watch, _, log = watched(ways, clock=16.0)
