@@ -229,8 +229,12 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
 
 def _in_compiled_loop(config: Config, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
-    tested = config.disturbance != type(config.disturbance)() and config.stop.innovation_factor > 0.0
+    tested = _is_disturbed(config) and config.stop.innovation_factor > 0.0
     return law in CODES and config.plant.speed_scale == 1.0 and not tested
+
+
+def _is_disturbed(config: Config) -> bool:
+    return config.disturbance != type(config.disturbance)()
 
 
 def _is_guided(scenario: Scenario, law: str, replans: bool) -> bool:
@@ -279,8 +283,7 @@ def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
     config, numbers = scenario.config, scenario.numbers_of(law)
     controller = _law_for(scenario, plan, law, replans)
     noise = scenario.noise_of(law, config.seed, scenario.limits.max_steps + 1)
-    disturbed = config.disturbance != type(config.disturbance)()
-    innovation = own_robot.innovation_of(scenario) if disturbed else None
+    innovation = own_robot.innovation_of(scenario) if _is_disturbed(config) else None
     simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
     if innovation is not None:
         places = [innovation.calibration.marker.tolist().index(number) for number in numbers]
