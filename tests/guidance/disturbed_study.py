@@ -6,13 +6,18 @@ Markers are lost for 20 steps, for 32 (longer than they are waited for), and for
 3 degrees; a camera is moved by 2 px, with the test of the images and without.
 """
 
-import argparse
 from collections import Counter
-from pathlib import Path
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from tests.guidance.studies import ARMS, in_two_processes, quantiles, rate, task_configs, write_rows
+from tests.guidance.studies import (
+    asked_for,
+    in_two_processes,
+    quantiles,
+    rate,
+    task_configs,
+    write_rows,
+)
 
 STEP = 12
 CONDITIONS = {
@@ -50,13 +55,7 @@ def driven(job):
 
 def main():
     """Drive all runs and print a line for each arm and condition."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", type=int, default=100, help="of each arm")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=["paper", "ur5"])
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("disturbed_study.csv"), help="every run, as CSV"
-    )
-    given = parser.parse_args()
+    given = asked_for("disturbed_study", __doc__, 100, ("paper", "ur5"))
     jobs = [(name, condition, given.tasks) for name in given.arms for condition in CONDITIONS]
     rows = []
     for mine in in_two_processes(driven, jobs, "arms and conditions"):

@@ -8,11 +8,9 @@ times the very path that was found, at the same limits of speed and acceleration
 against the slowest joint by itself. What is not installed is left out. The model is the true one.
 """
 
-import argparse
 import time
 from importlib.util import find_spec
 from itertools import count
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -20,7 +18,7 @@ from tqdm import tqdm
 from projservo_cli.guidance.timing import least_time
 from projservo_cli.guidance.validity import MARGINS, put_demands
 from projservo_cli.guidance.way import Budget, find_way, margins_at, with_ends
-from tests.guidance.studies import ARMS, quantiles, task_configs, true_search, write_rows
+from tests.guidance.studies import asked_for, quantiles, task_configs, true_search, write_rows
 
 SEEDS = 5
 # That OMPL searches, and then shortens, at most, s.
@@ -128,13 +126,7 @@ def compared(config):
 
 def main():
     """Compare the ways of random tasks and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", type=int, default=500, help="of each arm")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("oracle_study.csv"), help="every way, as CSV"
-    )
-    given = parser.parse_args()
+    given = asked_for("oracle_study", __doc__, 500)
     for name in ("ompl", "toppra"):
         if not find_spec(name):
             print(f"{name} is not installed: left out (pip install {name})")

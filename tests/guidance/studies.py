@@ -1,10 +1,12 @@
 """What studies of guidance share: tasks by seed, the true model as a judge, rates, two processes, tables."""
 
+import argparse
 import csv
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 from scipy.stats import binomtest
@@ -60,6 +62,15 @@ def true_search(config, *, margins=False):
         keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])
     c = constraints_of(truth.model, A, task, q_start, Asked(demands, keep, least_px))
     return c, Aim(task.A_star, s_star, 0.0), q_start, q_goal, joints.acceleration
+
+
+def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
+    """What the command line of a study asks for: tasks, arms and where its table goes."""
+    parser = argparse.ArgumentParser(description=about.splitlines()[0])
+    parser.add_argument("--tasks", type=int, default=tasks, help=counted)
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(arms))
+    parser.add_argument("-o", "--output", type=Path, default=Path(f"{study}.csv"), help="every row, as CSV")
+    return parser.parse_args()
 
 
 def has_no_way(config):

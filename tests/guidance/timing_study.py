@@ -5,16 +5,14 @@
 The tasks are shared out evenly among the arms; the profile ``auto`` is told beside ``joint``.
 """
 
-import argparse
 import time
-from pathlib import Path
 
 from tqdm import tqdm
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan
 from projservo_cli.stages.scenario import scenario_of
-from tests.guidance.studies import ARMS, quantiles, task_configs, write_rows
+from tests.guidance.studies import asked_for, quantiles, task_configs, write_rows
 
 PROFILES = ("joint", "auto")
 
@@ -38,13 +36,7 @@ def timed(config, calibration):
 
 def main():
     """Time the plans and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", type=int, default=1000, help="in all")
-    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("timing_study.csv"), help="every plan, as CSV"
-    )
-    given = parser.parse_args()
+    given = asked_for("timing_study", __doc__, 1000, counted="in all")
     rows = []
     for name in given.arms:
         count = given.tasks // len(given.arms)
