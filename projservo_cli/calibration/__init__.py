@@ -3,15 +3,15 @@
 The path of a calibration: what was seen (``readings``) → the rig (``epipolar``) → a start (``start``) →
 bundle adjustment (``adjustment``) of the ``forward`` model, robustly (``fit``) → what was left out
 (``diagnosis``) → its frame and covariance (``projective``) → the verdict (``quality``); ``estimate`` leads
-through it, and ``prediction`` is what the result is for, with ``spread`` for how far it errs.
+through it, and ``prediction`` is what the result is for, with ``spread`` for how far it errs and
+``innovation`` for what contradicts it in the loop.
 """
 
 from projservo_cli.calibration.diagnosis import findings
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
+from projservo_cli.calibration.innovation import WINDOW, Innovation
 from projservo_cli.calibration.prediction import (
-    WINDOW,
-    Innovation,
     Region,
     Suggestion,
     predict,

@@ -235,7 +235,10 @@ class DrivenRobot:
         s = self.robot.observe()
         if self.innovation is not None:
             known = np.where((self.order < 0)[:, None], np.nan, s[:, self.order])
-            self.disturbance = self.innovation.disturbed(self.q, known)
+            at_once, at_rest, certain = np.stack([self.q, self.q]), np.zeros_like(self.q), np.zeros(2)
+            self.disturbance = self.innovation.disturbed(
+                at_once, at_rest, certain, known, np.ones(2, dtype=np.bool_)
+            )
         return np.ascontiguousarray(s[:, self.shown])
 
     def fits(self) -> str:

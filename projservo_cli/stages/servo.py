@@ -287,7 +287,12 @@ def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
     simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
     if innovation is not None:
         places = [innovation.calibration.marker.tolist().index(number) for number in numbers]
-        simulated.tested_by(innovation.disturbed, np.array(places), len(innovation.calibration.marker))
+        at_rest, certain, fresh = np.zeros_like(simulated.q), np.zeros(2), np.ones(2, dtype=np.bool_)
+
+        def tested(q: FloatArray, s: FloatArray) -> str:
+            return innovation.disturbed(np.stack([q, q]), at_rest, certain, s, fresh)
+
+        simulated.tested_by(tested, np.array(places), len(innovation.calibration.marker))
     return _driven_in_python(
         scenario, controller, simulated, _watch(scenario, plan, law, controller, replans)
     )

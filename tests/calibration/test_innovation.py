@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from projservo_cli.calibration import WINDOW, Innovation, calibrate, prediction
+from projservo_cli.calibration import WINDOW, Innovation, calibrate, innovation
+from projservo_cli.calibration.prediction import prediction_derivative
 from tests.calibration.simulated_robot import random_robot, trials
 
 SIGMA = 0.5
@@ -29,9 +30,14 @@ def walk(robot, steps, rng):
     return q, s + SIGMA * rng.standard_normal(s.shape)
 
 
+def look(test, q, s):
+    """One look of an arm at rest."""
+    return test.disturbed(np.stack([q, q]), np.zeros(6), np.zeros(2), s, np.ones(2, dtype=bool))
+
+
 def first_alarm(test, q, s):
     for k in range(len(q)):
-        said = test.disturbed(q[k], s[k])
+        said = look(test, q[k], s[k])
         if said:
             return k, said
     return None, ""
@@ -41,7 +47,7 @@ def test_each_innovation_has_the_distribution_it_is_tested_by(arm, monkeypatch):
     """χ² of every part and instant, for errors of the calibration drawn from its covariance."""
     robot, calibration = arm
     m, shares = len(calibration.marker), []
-    monkeypatch.setattr(prediction, "predict", lambda calibration, q: np.zeros((1, 2, m, 2)))
+    monkeypatch.setattr(innovation, "predict", lambda calibration, q: np.zeros((2, 2, m, 2)))
     q = walk(robot, 12, np.random.default_rng(1))[0]
     left = np.outer([True, False], np.ones(m, dtype=bool))
     for seed in range(30):
@@ -49,11 +55,11 @@ def test_each_innovation_has_the_distribution_it_is_tested_by(arm, monkeypatch):
         test = Innovation(calibration, SIGMA, 100)
         error = rng.standard_normal(len(test._mean))
         for row in q:
-            J = test._scene.derivative(row[None] - calibration.q_reference)[0] @ test._factor
+            J = prediction_derivative(calibration, row[None])[0] @ test._factor
             r = J @ error + SIGMA * rng.standard_normal((2, m, 2))
             values, _, S = test._seen(r - J @ test._mean, J, left)
             shares.append(chi2.cdf(values @ np.linalg.solve(S, values), values.size))
-            assert test.disturbed(row, r) == ""
+            assert look(test, row, r) == ""
     # The innovations of a Kalman filter are independent, so all 360 shares are uniform.
     assert kstest(shares, "uniform").pvalue > 1e-3
 
