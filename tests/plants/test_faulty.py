@@ -1,0 +1,194 @@
+"""A robot as robots are, against closed forms and against its own truth over time."""
+
+import math
+
+import numpy as np
+import pytest
+
+from projservo_cli.records import REVOLUTE
+from projservo_cli.robots.faulty import Events, Faults, FaultyRobot, World, full_reach
+from projservo_cli.robots.simulated import Arm
+from tests.samples import displacement, pixels, revolute, rig
+
+PERIOD = 0.04
+M = np.array([[0.7, 0.05, 0.02, 1], [0.72, -0.05, 0.03, 1], [0.68, 0.0, -0.05, 1]])
+CAMERAS = rig() @ np.linalg.inv(displacement([0, 0, 0], [0.7, 0, -1.5]))  # 1.5 m below the tool, looking up
+WARPED = Events(
+    bump_at=6, bump=np.array([0.0, 0.02]), camera_at=4, camera=np.array([[2.0, -1.0], [0.0, 0.0]]),
+    marker_at=9, marker=1, marker_by=(0.01, 0.0, 0.0), lost_at=2, lost_until=4, lost=(2,),
+)  # fmt: skip
+
+
+def arm():
+    """Two links of 0.4 and 0.3 m that are raised by negative angles, stretched out along x at zero."""
+    twists = np.array([revolute([x, 0, 0], [0, 1, 0]) for x in (0.0, 0.4)])
+    limits = np.full(2, math.pi)
+    tool = displacement([0, 0, 0], [0.7, 0, 0])
+    return Arm(twists, np.full(2, REVOLUTE), np.zeros(2), tool, -limits, limits)
+
+
+def displaced(q):
+    return arm().pose(np.asarray(q)) @ np.linalg.inv(arm().base_tool)
+
+
+def images(q, M=M):
+    return pixels(CAMERAS, M @ displaced(q).T)
+
+
+def robot(events=None, sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **faults):
+    def random(view, k):
+        return np.random.default_rng([seed, view, k])
+
+    def see(H, M):
+        return pixels(CAMERAS, M @ H.T)
+
+    world = World(arm(), np.array(q_start), M, see, sigma_px, PERIOD, random)
+    return FaultyRobot(world, Faults(**faults), events or Events())
+
+
+def driven(plant, targets):
+    """What a robot tells after each of some set-points, and its true joints over time."""
+    rows = []
+    for q in targets:
+        plant.command(np.array(q, dtype=float), np.zeros(2), plant.now() + PERIOD)
+        rows.append(plant.read())
+    return [np.array(row[0]) for row in rows], [row[1] for row in rows]
+
+
+WAY = [[0.02 * k, -0.01 * k] for k in range(1, 26)]
+
+
+def test_an_ideal_robot_is_where_it_was_sent_and_shows_it():
+    plant = robot()
+    q, s = driven(plant, WAY)
+    assert q == pytest.approx(np.array(WAY), abs=1e-14)
+    assert s == pytest.approx(np.array([images(row) for row in WAY]), abs=1e-9)
+    assert (plant.now(), plant.truth()) == (pytest.approx(25 * PERIOD), pytest.approx(WAY[-1]))
+
+
+def test_a_servo_lags_as_a_system_of_first_order_does():
+    plant, lag, pace = robot(lag=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
+    q, _ = driven(plant, [*WAY, *[WAY[-1]] * 5])
+    for k, row in enumerate(q, 1):
+        t, end = k * PERIOD, 25 * PERIOD
+        behind = lag * (1.0 - math.exp(-min(t, end) / lag)) * math.exp(-max(0.0, t - end) / lag)
+        assert row == pytest.approx(pace * (min(t, end) - behind), abs=1e-12)
+
+
+def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
+    assert full_reach(arm()) == pytest.approx(0.7, rel=0.01)
+    reach, sag = full_reach(arm()), math.radians(0.5)
+    for q in ([0.0, 0.0], [-0.5, 0.2], [-math.pi / 2, 0.0]):
+        x_tool = 0.4 * math.cos(q[0]) + 0.3 * math.cos(q[0] + q[1])
+        load = np.array([x_tool, 0.3 * math.cos(q[0] + q[1])]) / reach  # drooping is positive here
+        for faults, read, true in (({"sag": sag}, load, load), ({"flex": sag}, 0.0 * load, load)):
+            plant = robot(q_start=q, **faults)
+            told, _ = driven(plant, [q] * 10)
+            assert told[-1] - q == pytest.approx(sag * read, abs=2e-4 * sag + sag**2)
+            assert plant.truth() - q == pytest.approx(sag * true, abs=2e-4 * sag + sag**2)
+
+
+def test_play_leaves_the_link_behind_where_the_way_turns():
+    play, plant = math.radians(0.5), robot(play=math.radians(0.5))
+    there, back = WAY, [*WAY[::-1], [0.0, 0.0]]
+    q, _ = driven(plant, there)
+    assert plant.truth() - q[-1] == pytest.approx(0.5 * play * np.array([-1, 1]), abs=1e-12)
+    q, _ = driven(plant, [*back, [0.2 * play, 0.0]])
+    assert q[-1] == pytest.approx([0.2 * play, 0.0])
+    assert plant.truth() == pytest.approx(0.5 * play * np.array([1, -1]), abs=1e-12)
+
+
+def test_encoders_count_ticks_and_servos_may_do_so_too():
+    tick = 2 * math.pi / 4096
+    for coarse in (False, True):
+        plant = robot(ticks=4096, setpoint_ticks=coarse)
+        for target, q in zip(WAY, driven(plant, WAY)[0], strict=True):
+            assert q / tick == pytest.approx(np.round(q / tick), abs=1e-9)
+            assert abs(q - target).max() <= 0.5 * tick + 1e-12
+        gap = abs(plant.truth() - WAY[-1]).max()
+        assert (gap > 1e-6) == coarse
+        assert gap <= 0.5 * tick
+
+
+def along(t):
+    """Where an ideal robot is on the way at times, s."""
+    k = np.clip(np.asarray(t) / PERIOD, 0.0, 25.0)
+    return np.stack([0.02 * k, -0.01 * k], axis=-1)
+
+
+@pytest.mark.parametrize("exposure", [0.0, 0.02])
+def test_images_are_late_and_averaged_over_their_exposure(exposure):
+    plant = robot(delay=(0.1, 0.033), exposure=exposure, jitter=0.004, stamps=True)
+    clocks = []
+    for target in WAY:
+        plant.command(np.array(target), np.zeros(2), plant.now() + PERIOD)
+        _, s, t_q, *stamps = plant.read()
+        assert t_q == plant.now()
+        assert t_q - plant.taken == pytest.approx([0.1, 0.033], abs=0.02)
+        clocks.append(stamps - plant.taken)
+        instants = plant.taken[:, None] + exposure * np.linspace(-0.5, 0.5, 21)
+        for view in range(2):
+            shown = np.mean([images(q)[view] for q in along(instants[view])], axis=0)
+            assert s[view] == pytest.approx(shown, abs=0.05 if exposure else 1e-9)
+    assert np.ptp(clocks, axis=0) == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert np.abs(clocks).min() > 0.1
+
+
+def test_cameras_that_run_freely_show_a_frame_until_the_next_has_come():
+    plant = robot(delay=(0.02, 0.02), interval=1 / 30, offset=0.016, jitter=0.002, sigma_px=0.5)
+    taken, shown, ages = [], [], []
+    for k in range(400):
+        plant.command(np.array(along(0.01 * k)), np.zeros(2), plant.now() + 0.01)
+        _, s = plant.read()
+        ages.append(plant.now() - plant.taken)
+        taken.append(plant.taken.copy())
+        shown.append(s)
+    taken, new = np.array(taken), np.diff(taken, axis=0) != 0
+    assert new.mean() == pytest.approx(0.3, abs=0.02)
+    assert (np.diff(shown, axis=0) != 0).any(axis=(2, 3)).tolist() == new.tolist()
+    assert np.min(ages) >= 0.02
+    assert np.max(ages) < 0.02 + 1 / 30 + 0.01
+    steps = np.concatenate([np.diff(np.unique(column)) for column in taken.T])
+    assert np.std(steps) == pytest.approx(0.002 * math.sqrt(2), rel=0.25)
+    behind = np.unique(taken[:, 1])[1:50, None] - np.unique(taken[:, 0])
+    assert np.abs(behind - 0.016).min(axis=1).max() < 0.012
+
+
+def test_events_befall_the_robot_in_their_period():
+    plant = robot(WARPED)
+    seen = [plant.read(), *zip(*driven(plant, WAY[:12]), strict=True)]
+    for k, (q, s) in enumerate(seen):
+        moved = M.copy()
+        moved[1, 0] += 0.01 * (k >= 9)
+        struck = np.array([0.02 * k, -0.01 * k + 0.02 * (k == 6)])
+        expected = images(struck, moved)
+        expected[0] += np.array([2.0, -1.0]) * (k >= 4)
+        expected[:, 2] = math.nan if 2 <= k < 4 else expected[:, 2]
+        assert q == pytest.approx(struck, abs=1e-12)
+        assert s == pytest.approx(expected, abs=1e-8, nan_ok=True)
+
+
+def test_a_slip_and_a_frozen_reading_are_not_read():
+    plant = robot(Events(bump_at=5, bump=np.array([0.05, 0.0]), slips=True))
+    q, _ = driven(plant, WAY[:8])
+    assert plant.truth() - q[-1] == pytest.approx([0.05, 0.0], abs=1e-12)
+    q, _ = driven(robot(Events(frozen=0, frozen_at=3, frozen_until=7)), WAY[:10])
+    assert np.array(q)[:, 0] / 0.02 == pytest.approx([1, 2, 3, 3, 3, 3, 7, 8, 9, 10])
+    assert np.array(q)[:, 1] / -0.01 == pytest.approx(np.arange(1, 11))
+
+
+def test_runs_are_the_same_to_the_bit_and_other_seeds_are_others():
+    faults = {
+        "delay": (0.05, 0.06),
+        "exposure": 0.01,
+        "jitter": 0.003,
+        "lag": 0.05,
+        "sag": 0.01,
+        "play": 0.01,
+    }
+    one, two, other = (driven(robot(WARPED, 0.5, seed, **faults), WAY) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one[1], two[1])
+    assert np.isfinite(one[1][0]).all()
+    assert (np.array(one[1])[0] != np.array(other[1])[0]).all()
+    noise = np.array([s - images(q) for q, s in zip(*driven(robot(sigma_px=0.5), WAY), strict=True)])
+    assert noise.std() == pytest.approx(0.5, rel=0.15)
