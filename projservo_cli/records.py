@@ -107,6 +107,32 @@ class Observation:
     marker: IntArray = _array("marker", about="number of the marker")
     q: FloatArray = _array("pose", "joint", units="rad or m", about="joint readings")
     images: FloatArray = _array("pose", "view", "marker", "xy", units="px", about="pixels, NaN where unseen")
+    moving: IntArray | None = _array(
+        "pose", about="number of the motion that the pose is a moment of, 0 at rest", default=None
+    )
+    t_q: FloatArray | None = _array(
+        "pose", units="s", about="when joints were read, NaN where unknown", default=None
+    )
+    t_view: FloatArray | None = _array(
+        "pose", "view", units="s", about="stamps of both images, NaN where there are none", default=None
+    )
+
+    def rows(self, keep: BoolArray) -> "Observation":
+        """Some of the poses (K,)."""
+        return Observation(
+            self.pose[keep],
+            self.marker,
+            self.q[keep],
+            self.images[keep],
+            None if self.moving is None else self.moving[keep],
+            None if self.t_q is None else self.t_q[keep],
+            None if self.t_view is None else self.t_view[keep],
+        )
+
+    @property
+    def at_rest(self) -> "Observation":
+        """The poses that were recorded at rest: all that a calibration rests on but for its delay."""
+        return self if self.moving is None else self.rows(self.moving == 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +200,32 @@ class Calibration:
         "lens_term",
         about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
         default=None,
+    )
+    sigma_q: float | None = _scalar(
+        units="rad",
+        about="rms of joint readings less true angles, of prismatic joints × 0.3 m/rad; 0 where no noise of "
+        "joints shows, none where it was not asked for",
+        default=None,
+    )
+    sigma_q_interval: FloatArray | None = _array(
+        "limit", units="rad", about="95 % interval of sigma_q, if estimated", default=None
+    )
+    delay_s: FloatArray | None = _array(
+        "view", units="s", about="instant of a joint reading less that of its image", default=None
+    )
+    delay_interval_s: FloatArray | None = _array(
+        "view", "limit", units="s", about="95 % interval of the delay", default=None
+    )
+    delay_jitter_s: FloatArray | None = _array(
+        "view",
+        units="s",
+        about="deviation of single images beyond what pixels and joints explain",
+        default=None,
+    )
+    model_px: float = _scalar(
+        units="px",
+        about="error of the model per coordinate by the residuals, 0 within noise",
+        default=0.0,
     )
 
     def model(self) -> Model:

@@ -1,8 +1,9 @@
 """Observation tables: one row per marker seen at one robot pose, as comma-separated values.
 
-Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``; further columns
-are ignored. Joint readings are rad or m, pixels are raw, empty pixel cells mean *unseen*. Files are
-UTF-8 with or without byte-order mark, with any line ends.
+Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, perhaps ``moving, t_q,
+t_left, t_right``; further columns are ignored. Joint readings are rad or m, pixels are raw, empty pixel
+cells mean *unseen*. A pose with a number in ``moving`` is a moment of that motion; times are s, empty where
+unknown. Files are UTF-8 with or without byte-order mark, with any line ends.
 """
 
 import csv
@@ -27,6 +28,7 @@ _MAX_BYTES = 100_000_000  # of a table; more would not be calibrated from
 _MAX_CELLS = 5_000_000  # poses × markers: mistyped numbers of poses must not fill the memory
 _TWO_TURNS = 4.0 * math.pi  # rad; no arm with stops turns a joint that far from its zero
 _PIXELS = ("u_left", "v_left", "u_right", "v_right")
+_MOVING, _TIMES = "moving", ("t_q", "t_left", "t_right")
 _RECORDING = "recording"  # column that says which recording a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
 _INTEGER = re.compile(r"[+-]?[0-9]{1,18}")
@@ -56,23 +58,23 @@ def read_table(
     Returns poses in the order of their first row, markers by number; NaN where unseen; readings in rad and m.
     Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
     """
-    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types)
-    readings: dict[int, tuple[int, list[float]]] = {}
+    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=[_MOVING, *_TIMES])
+    readings: dict[int, tuple[int, dict[str, float | None]]] = {}
     seen: dict[tuple[int, int], tuple[int, list[float]]] = {}
     for row in sheet.rows():
         for u, v in (_PIXELS[:2], _PIXELS[2:]):
             if (row[u] == "") != (row[v] == ""):
                 raise InputError(f"{row.where}: one of {u}, {v} is empty; give both or neither")
         pose, marker = row.integer("pose"), row.integer("marker")
-        q = [row.number(name) for name in sheet.joints]
+        of_pose = {name: row.number(name) for name in sheet.joints} | row.moment()
         pixels = [row.number(name) if row[name] else math.nan for name in _PIXELS]
-        line, first = readings.setdefault(pose, (row.line, q))
-        if q != first:
-            i = next(i for i, (a, b) in enumerate(zip(q, first, strict=True)) if a != b)
-            raise InputError(
-                f"{row.where}: q{i + 1} of pose {pose} is {q[i]!r}, but {first[i]!r} in line {line}; "
-                "a pose has one joint reading"
-            )
+        line, first = readings.setdefault(pose, (row.line, of_pose))
+        for name, value in of_pose.items():
+            if value != first[name]:
+                raise InputError(
+                    f"{row.where}: {name} of pose {pose} is {value!r}, but {first[name]!r} in line {line}; "
+                    "a pose has one joint reading"
+                )
         line, _ = seen.setdefault((pose, marker), (row.line, pixels))
         if line != row.line:
             raise InputError(f"{row.where}: marker {marker} at pose {pose} is already in line {line}")
@@ -85,9 +87,21 @@ def read_table(
     images = np.full((len(poses), 2, len(markers), 2), np.nan)
     for (pose, marker), (_, pixels) in seen.items():
         images[poses[pose], :, markers[marker]] = np.reshape(pixels, (2, 2))
-    numbers, q_read = np.array([*poses], dtype=np.int64), np.array([q for _, q in readings.values()])
-    q_read = sheet.in_radians(numbers, q_read, joint_unit)
-    return Observation(numbers, np.array([*markers], dtype=np.int64), q_read, images)
+    numbers, values = np.array([*poses], dtype=np.int64), [of_pose for _, of_pose in readings.values()]
+    # (K, columns); what is not known becomes NaN
+    q_read, moving, times = (
+        np.array([[of_pose.get(name) for name in names] for of_pose in values], dtype=np.float64)
+        for names in (sheet.joints, (_MOVING,), _TIMES)
+    )
+    return Observation(
+        numbers,
+        np.array([*markers], dtype=np.int64),
+        sheet.in_radians(numbers, q_read, joint_unit),
+        images,
+        moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
+        times[:, 0] if np.isfinite(times[:, 0]).any() else None,
+        times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
+    )
 
 
 def read_joint_list(
@@ -137,11 +151,24 @@ def write_table(observation: Observation, path: Path | str, *, recording: str = 
     columns = {"pose": np.repeat(observation.pose, m), "marker": np.tile(observation.marker, K)}
     columns |= {f"q{i}": np.repeat(values, m) for i, values in enumerate(observation.q.T, 1)}
     pixels = np.moveaxis(observation.images, 1, 2).reshape(K * m, 4).T
-    seen = np.where(np.isnan(pixels), "", pixels.astype(object))
-    columns |= dict(zip(_PIXELS, seen, strict=True))
+    columns |= {name: _or_empty(values) for name, values in zip(_PIXELS, pixels, strict=True)}
+    if observation.moving is not None:
+        columns[_MOVING] = np.repeat(observation.moving, m)
+    if observation.t_q is not None:
+        columns["t_q"] = _or_empty(np.repeat(observation.t_q, m))
+    if observation.t_view is not None:
+        columns |= {
+            name: _or_empty(np.repeat(values, m))
+            for name, values in zip(_TIMES[1:], observation.t_view.T, strict=True)
+        }
     if recording:
         columns[_RECORDING] = np.full(K * m, recording)
     write_whole(Path(path), to_csv(columns))
+
+
+def _or_empty(values: FloatArray) -> npt.NDArray[Any]:
+    """Cells of numbers, empty for NaN."""
+    return np.where(np.isnan(values), "", values.astype(object))
 
 
 def to_csv(arrays: Mapping[str, npt.NDArray[Any]], down: int | None = None) -> str:
@@ -188,6 +215,19 @@ class _Row(dict[str, str]):
         if not _INTEGER.fullmatch(self[column]):
             raise InputError(f"{self.where}: {column} is {self[column]!r}; expected an integer")
         return int(self[column])
+
+    def moment(self) -> dict[str, float | None]:
+        """What the columns tell of the motion and the times of a pose; None for a time that is not known."""
+        found: dict[str, float | None] = {
+            name: self.number(name) if self[name] else None for name in _TIMES if name in self
+        }
+        if _MOVING in self:
+            found[_MOVING] = moving = self.integer(_MOVING)
+            if moving < 0:
+                raise InputError(f"{self.where}: moving is {moving}; number motions from 1, 0 is at rest")
+            if moving > 0 and found.get("t_q") is None:
+                raise InputError(f"{self.where}: a pose in motion needs t_q, when its joints were read, in s")
+        return found
 
     def number(self, column: str) -> float:
         """A finite number with a decimal point."""

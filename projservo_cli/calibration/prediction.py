@@ -47,11 +47,13 @@ def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
 def residual_statistics(calibration: Calibration, observation: Observation) -> dict[str, Any]:
     """How far predicted pixels are from seen ones, a distance for each marker and view.
 
-    calibration : projective kinematics; observation : stereo images of the same robot, px.
+    calibration : projective kinematics; observation : stereo images of the same robot, px; those in motion do
+    not count.
     Returns ``count``; ``rms_px``, ``median_px``, ``p95_px`` (None without a pair); ``skipped`` with the
     pairs; of markers the calibration does not know, of points behind the camera, and not seen. Raises
     InputError if the readings have another number of joints or are not finite.
     """
+    observation = observation.at_rest
     known = np.isin(observation.marker, calibration.marker)
     numbers = calibration.marker.tolist()
     order = [numbers.index(number) for number in observation.marker[known].tolist()]

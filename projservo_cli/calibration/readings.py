@@ -36,11 +36,12 @@ class Readings:
 
     @classmethod
     def of(cls, observation: Observation, joint_types: str) -> "Readings":
-        """What was seen, flattened; one letter a joint, R or P.
+        """What was seen at rest, flattened; one letter a joint, R or P.
 
         Raises InputError if the arrays or the letters do not fit each other, or values are not finite.
         """
         _require_shapes(observation)
+        observation = observation.at_rest
         letters = joint_types.upper()
         n = observation.q.shape[1]
         if len(letters) != n or set(letters) - {"R", "P"}:
@@ -155,6 +156,10 @@ def _require_shapes(observation: Observation) -> None:
             f"images of shape {observation.images.shape}: expected {(K, 2, m, 2)} for {K} poses, two views, "
             f"{m} markers and two coordinates"
         )
+    for name, shape in (("moving", (K,)), ("t_q", (K,)), ("t_view", (K, 2))):
+        given = getattr(observation, name)
+        if given is not None and given.shape != shape:
+            raise InputError(f"{name} of shape {given.shape}: expected {shape} for {K} poses")
 
 
 # Reach at which predictions are judged, rad and m.

@@ -165,6 +165,10 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
             f"  lens {view}: k1 {terms['k1']:.3g}, k2 {terms['k2']:.3g} at {terms['radius_px']:.4g} px from "
             f"({terms['center_px'][0]:.4g}, {terms['center_px'][1]:.4g})"
         )
+    if value["sigma_q"] is not None:
+        yield f"  joint readings: {_joint_noise(value)}"
+    if value["delay_s"] is not None:
+        yield f"  images late by {_delays(value)}"
     weak = ", ".join(joint["name"] for joint in value["joints"] if joint["weak"])
     found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in LISTS if value[name]]
     if weak or found:
@@ -182,6 +186,27 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
     for text in value["advice"]:
         yield wrapped(f"advice: {text}", "  ")
     yield from _of_suggestions(value)
+
+
+def _joint_noise(value: dict[str, Any]) -> str:
+    """How far joint readings are off, in degrees (of prismatic joints × 0.3 m/rad)."""
+    found = f"off by {math.degrees(value['sigma_q']):.3g}° rms" if value["sigma_q"] else "no noise shows"
+    if value["sigma_q_interval"] is None:
+        return f"{found}, as given"
+    low, high = (math.degrees(end) for end in value["sigma_q_interval"])
+    return f"{found} (95 %: {low:.3g} to {high:.3g})"
+
+
+def _delays(value: dict[str, Any]) -> str:
+    """By how much images of both views are late, with the interval and by how much single ones differ, ms."""
+    names = ("delay_s", "delay_interval_s", "delay_jitter_s")
+    found = []
+    for view, delay, (low, high), jitter in zip(
+        ("left", "right"), *(value[name] for name in names), strict=True
+    ):
+        interval = f"95 %: {1e3 * low:.1f} to {1e3 * high:.1f}"
+        found.append(f"{1e3 * delay:.1f} ms {view} ({interval}; single ones ± {1e3 * jitter:.1f})")
+    return ", ".join(found)
 
 
 def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:

@@ -182,6 +182,18 @@ class _CalibrationSettings(Section):
     init: Annotated[str, StringConstraints(min_length=1)] | None = Field(
         None, description="JSON file of a robot and rig known beforehand, tried first as a start"
     )
+    random_poses: StrictInt | None = Field(
+        None,
+        ge=0,
+        le=10_000,
+        description="trial poses of all joints at once, within the amplitudes, after those of single joints; "
+        "null for 12 where joints may be read or images taken with faults, 0 for the ideal plant",
+    )
+    joint_noise_deg: NotNegative | None = Field(
+        None,
+        description="rms of joint readings less true angles (of prismatic joints × 0.3 m/rad); null to "
+        "estimate it, or 0 for the ideal plant",
+    )
     seed: Whole | None = Field(None, description="seed of the noise of the trials; null for that of the run")
     lens: StrictBool = Field(
         False, description="whether to estimate two coefficients of radial distortion a camera"

@@ -286,7 +286,9 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
             for view, (u, v, r, k1, k2) in terms
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    return _scalars(calibration) | {"joints": joints, "lens": lens} | findings(calibration) | held_out
+    names = ("sigma_q_interval", "delay_s", "delay_interval_s", "delay_jitter_s")
+    own = {name: getattr(calibration, name) for name in names}
+    return _scalars(calibration) | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 
 
 def _plan(run: Run) -> dict[str, Any]:

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from projservo_cli.calibration import (
+    REACH_M,
+    REACH_RAD,
     Nominal,
     Region,
     Solution,
@@ -18,10 +20,11 @@ from projservo_cli.config import Config
 from projservo_cli.files import write_whole
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, InputError, Observation
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, generator
+from projservo_cli.stages.scenario import CALIBRATION_NOISE, SUGGESTIONS, TRIAL_POSES, generator
 from projservo_cli.stages.world import (
     Truth,
     image_size_of,
+    is_ideal,
     joints_of,
     limit_passed,
     reference_of,
@@ -29,19 +32,31 @@ from projservo_cli.stages.world import (
 )
 from projservo_cli.tables import read_table, to_csv
 
+# Random poses where not given; how far trials are spread, rad, so that no reading repeats its error:
+# a tick of a coarse encoder, 4,096 a turn. Draws of one pose, of which each reaches less far, and the share
+# of markers that both cameras must see.
+_RANDOM_POSES, _TICKS = 12, 4096
+_DRAWS, _SHRINKING, _LEAST_SEEN = 100, 0.98, 0.75
+
 
 def trial_motions(config: Config) -> FloatArray:
-    """Joint readings (k, n) of the reference and of every single-joint trial, rad or m."""
+    """Joint readings (k, n) of the reference and of all trials, rad or m.
+
+    Every joint alone; then, where joints may be read or images taken with faults, all joints at once, and
+    the trials are spread by fractions of an encoder's tick.
+    """
     settings = config.calibration
     vector = reference_of(config)
     if vector is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
     joints = joints_of(config)
     reference = np.array(vector.values(joints.types))
+    amplitude = np.array(
+        [settings.amplitude_m if kind == "P" else np.radians(settings.amplitude_deg) for kind in joints.types]
+    )
     rows = [reference]
-    for i, kind in enumerate(joints.types):
-        amplitude = settings.amplitude_m if kind == "P" else np.radians(settings.amplitude_deg)
-        for offset in np.linspace(-amplitude, amplitude, settings.frames_per_joint):
+    for i, farthest in enumerate(amplitude):
+        for offset in np.linspace(-farthest, farthest, settings.frames_per_joint):
             q = reference.copy()
             q[i] += offset
             if wrong := limit_passed(q, joints.lower, joints.upper):
@@ -50,7 +65,34 @@ def trial_motions(config: Config) -> FloatArray:
                     "amplitude"
                 )
             rows.append(q)
-    return np.array(rows)
+    ideal, rng = is_ideal(config), generator(_seed(config), TRIAL_POSES)
+    count = settings.random_poses
+    if count is None:
+        count = 0 if ideal or settings.method == "closed_form" else _RANDOM_POSES
+    rows += [_random_pose(config, reference, amplitude, rng) for _ in range(count)]
+    q = np.array(rows)
+    if ideal or settings.method == "closed_form":  # which takes joints that are told to stand still to do so
+        return q
+    turn = 2.0 * np.pi / (getattr(config.disturbance, "encoder_ticks", None) or _TICKS)
+    tick = np.where([kind == "P" for kind in joints.types], REACH_M / REACH_RAD, 1.0) * turn
+    return np.clip(q + tick * rng.uniform(-1.0, 1.0, q.shape), joints.lower, joints.upper)
+
+
+def _random_pose(
+    config: Config, reference: FloatArray, amplitude: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Joints (n,) within the amplitudes and the limits, which show the markers of a simulated robot."""
+    joints, truth = joints_of(config), truth_of(config) if config.plant.use is None else None
+    for draw in range(_DRAWS):
+        q = reference + amplitude * _SHRINKING**draw * rng.uniform(-1.0, 1.0, len(reference))
+        if limit_passed(q, joints.lower, joints.upper):
+            continue
+        if truth is None:
+            return q
+        images = images_at(truth, q, np.zeros((2, len(truth.M), 2)))
+        if np.isfinite(images).all(axis=(0, 2)).mean() >= _LEAST_SEEN:
+            return q
+    return reference
 
 
 def _seed(config: Config) -> int:
@@ -135,6 +177,7 @@ def suggest_motions(
     the same range, or for a simulated robot in one three times as wide. ``path`` becomes a list of motions, a
     row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
     """
+    observation = observation.at_rest
     pixels, size = observation.images, image_size_of(config)
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:

@@ -53,7 +53,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     """
     config = load_config(run.path, text=run.configuration)
     left_out: list[dict[str, str]] = []
-    material: Fit = Fit(run.calibration, run.observation, held_out=run.cross_validation)
+    material: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
     studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
     if has_task(config):
         bench = comparison_of(config, run.calibration, run.plan)
@@ -100,7 +100,7 @@ def _material(
     truth = bench.truth
     return Material(
         run.calibration,
-        run.observation,
+        run.observation.at_rest,
         bench.models["calibrated"],
         truth.robot,
         bench.scenario.plant_of("direct_three"),

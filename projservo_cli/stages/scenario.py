@@ -43,6 +43,7 @@ from projservo_cli.task.target import Shown
 
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
+TRIAL_POSES = 6
 
 
 def generator(seed: int, stream: int) -> np.random.Generator:

@@ -23,6 +23,24 @@ def reference_of(config: Config) -> JointVector | None:
     return config.calibration.reference or (config.task.start if config.task is not None else None)
 
 
+# Disturbances of joints or of time: what a calibration has to reckon with.
+_FAULTS = (
+    *("delay_s", "exposure_s", "jitter_s", "frame_rate_hz", "frame_offset_s", "stamps"),
+    *("encoder_ticks", "setpoint_ticks", "lag_s", "sag_deg", "flex_deg", "play_deg"),
+)
+
+
+def has_faults(config: Config) -> bool:
+    """Whether joints of the simulated robot are read or followed, or images taken, with faults."""
+    given, none = config.disturbance, type(config.disturbance)()
+    return any(getattr(given, name, None) != getattr(none, name, None) for name in _FAULTS)
+
+
+def is_ideal(config: Config) -> bool:
+    """Whether joints of what is driven are known to be as they are read, and images to be of that moment."""
+    return config.plant.use is None and not has_faults(config)
+
+
 # Accelerations that the profile joint takes where no limit is given, deg/s² and m/s².
 _ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
 

@@ -377,7 +377,7 @@ def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
     few = ["--set", "calibration.frames_per_joint=2"]
     answer = projservo("record", "-c", UR5, *SOUND, *few, "-o", "t.csv", "--speed-scale", "0.5", "--json")
     assert answer.code == 0, answer.err
-    assert (answer.json["recorded"], answer.json["markers"]) == (13, 10)
+    assert (answer.json["recorded"], answer.json["markers"]) == (25, 10)
     assert max(np.abs(step).max() for _, step, _ in commands()) <= 0.5 * np.radians(125.0) * 0.04 * (
         1 + 1e-12
     )

@@ -1,5 +1,7 @@
 """Observation tables: what is read, what is refused and where, and round trips."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -59,6 +61,11 @@ BAD = {
     "fractional pose": ([HEADER, "0.5,1,1,-1,10,20,30,40"], ":2: pose is '0.5'; expected an integer"),
     "same marker twice": ([HEADER, ROWS[0], ROWS[0]], ":3: marker 1 at pose 0 is already in line 2"),
     "two readings": ([HEADER, ROWS[0], "0,0,0.5,-2,1,2,3,4"], ":3: q2 of pose 0 is -2.0, but -1.0 in line 2"),
+    "backwards": ([f"{HEADER},moving,t_q", f"{ROWS[0]},-1,0.5"], ":2: moving is -1; number motions from 1"),
+    "no moment": ([f"{HEADER},moving,t_q", f"{ROWS[0]},1,"], ":2: a pose in motion needs t_q"),
+    "two moments": (
+        [f"{HEADER},t_q", f"{ROWS[0]},0.5", f"{ROWS[1]},"], ":3: t_q of pose 0 is None, but 0.5 in line 2"
+    ),
     "open quote": ([HEADER, ROWS[0], '"0,1'], ":3: "),
     "nul byte": ([HEADER, "0,\0,1"], ":2: not a text file"),
 }  # fmt: skip
@@ -180,3 +187,19 @@ def test_writing_and_reading_is_exact(tmp_path_factory, data):
     back = read_table(path, joint_unit="rad")
     for name in ("pose", "marker", "q", "images"):
         np.testing.assert_array_equal(getattr(back, name), getattr(table, name))
+
+
+def test_poses_in_motion_and_times_come_back_and_stay_out_of_what_is_at_rest(tmp_path):
+    rng, path = np.random.default_rng(3), tmp_path / "table.csv"
+    t_view = rng.random((4, 2))
+    t_view[2, 1] = np.nan
+    moving, t_q = np.array([0, 1, 1, 2]), rng.random(4)
+    table = Observation(np.arange(4), np.arange(3), rng.random((4, 2)), rng.random((4, 2, 3, 2)), moving, t_q)
+    table = dataclasses.replace(table, t_view=t_view)
+    write_table(table, path)
+    found = read_table(path)
+    for name in ("pose", "marker", "q", "images", "moving", "t_q", "t_view"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(table, name))
+    assert found.at_rest.pose.tolist() == [0]
+    write_table(found.at_rest, path)
+    assert read_table(path).moving is None
