@@ -85,14 +85,70 @@ class _CameraMoved(Section):
         return tuple(given if self.view == view else (0.0, 0.0) for view in ("left", "right"))
 
 
-class _Disturbance(Section):
-    """Everything that befalls the simulated robot and its images."""
+class _MarkerMoved(Section):
+    """A marker that is knocked aside on the tool."""
 
+    at_step: Whole = Field(description="first step at which it is elsewhere")
+    marker: Whole = Field(description="its number")
+    by_m: Vector3 = Field(description="how far, in the frame of the tool")
+
+
+class _Delays(Section):
+    """Delays of both cameras, s."""
+
+    left: NotNegative = Field(0.0, description="of the left camera")
+    right: NotNegative = Field(0.0, description="of the right camera")
+
+
+def _of_both(value: Any) -> Any:
+    """One number stands for both cameras."""
+    return {"left": value, "right": value} if isinstance(value, int | float) else value
+
+
+class _Disturbance(Section):
+    """What is wrong with the simulated robot, and what befalls it and its images."""
+
+    delay_s: Annotated[_Delays, BeforeValidator(_of_both, json_schema_input_type=NotNegative | _Delays)] = (
+        Field(
+            _Delays(),
+            description="time from the middle of an exposure to the joint readings that come with its image, "
+            "half the exposure at least; a number for both cameras, or {left, right}",
+        )
+    )
+    exposure_s: NotNegative = Field(0.0, description="time over which an image is averaged")
+    jitter_s: NotNegative = Field(0.0, description="standard deviation of when single images are taken")
+    frame_rate_hz: Positive | None = Field(
+        None, description="of cameras that run freely; null for an image taken at each look"
+    )
+    frame_offset_s: Number = Field(
+        0.0, description="by which the right camera's images come after the left one's, with frame_rate_hz"
+    )
+    stamps: StrictBool = Field(
+        False, description="whether images carry the middle of their exposure, each camera by its own clock"
+    )
+    encoder_ticks: Count | None = Field(
+        None, description="steps of joint readings in a turn, or in 1.885 m of a prismatic joint"
+    )
+    setpoint_ticks: StrictBool = Field(False, description="whether set-points are whole ticks too")
+    lag_s: NotNegative = Field(0.0, description="time constant with which joints follow their set-points")
+    sag_deg: NotNegative = Field(
+        0.0, description="by which gravity turns a joint off its set-point at full reach; it is read"
+    )
+    flex_deg: NotNegative = Field(0.0, description="the same of a link beyond its encoder, which is not read")
+    play_deg: NotNegative = Field(0.0, description="play between each encoder and its link, from end to end")
     lost_markers: _LostMarkers | None = None
     bump: _Bump | None = None
     frozen_joint: _FrozenJoint | None = None
     camera_moved: _CameraMoved | None = None
+    marker_moved: _MarkerMoved | None = None
     delay_periods: StrictInt = Field(0, ge=0, le=1000, description="by how many periods images are late")
+
+    def contradictions(self) -> Iterator[Finding]:
+        """What says nothing without another key."""
+        if self.frame_offset_s and self.frame_rate_hz is None:
+            yield ("frame_offset_s",), "is that of cameras that run freely: set frame_rate_hz as well"
+        if self.setpoint_ticks and self.encoder_ticks is None:
+            yield ("setpoint_ticks",), "takes the ticks of encoders: set encoder_ticks as well"
 
 
 # What to do where a robot of somebody's has no joint limits.
@@ -539,10 +595,13 @@ def _disturbed_joints(disturbance: _Disturbance, robot: RobotSettings | None) ->
             yield ("disturbance", "bump"), f"joint {bump.joint} is of type {letter}: give {fitting}"
 
 
-def _lost_markers(disturbance: _Disturbance, markers: Markers | None) -> Iterator[Finding]:
-    lost = disturbance.lost_markers
+def _disturbed_markers(disturbance: _Disturbance, markers: Markers | None) -> Iterator[Finding]:
+    lost, moved = disturbance.lost_markers, disturbance.marker_moved
     if lost is not None and lost.markers is not None and markers is not None:
         yield from markers.unknown(lost.markers, "disturbance", "lost_markers", "markers")
+    if moved is not None and markers is not None:
+        for _, what in markers.unknown((moved.marker,)):
+            yield ("disturbance", "marker_moved", "marker"), what
 
 
 def _plan_to_follow(control: _Control, trajectory: Trajectory) -> Iterator[Finding]:
@@ -576,7 +635,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone),
-        *(_disturbed_joints, _lost_markers, _plan_to_follow, _keeping_out),
+        *(_disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
         *(_speed_in_joint_space, _limits_in_joint_space),
     )
 }

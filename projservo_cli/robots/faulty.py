@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from projservo_cli.calibration import REACH_M, REACH_RAD
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.robots.simulated import Arm
@@ -22,7 +23,7 @@ NEVER = 2**62
 _GRID_S = 0.005
 _EXPOSED = 5  # instants of an exposure that are averaged
 # What a prismatic joint moves where a revolute one turns by a radian, m.
-M_PER_RAD = 0.3
+_M_PER_RAD = REACH_M / REACH_RAD
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
@@ -172,7 +173,7 @@ class _Joints:
     def __init__(self, world: World, faults: Faults, events: Events) -> None:
         self.arm, self.faults, self.events = world.arm, faults, events
         self._strikes = [events.bump_at * world.period] if events.bump_at < NEVER else []
-        scale = np.where(world.arm.joint_types == PRISMATIC, M_PER_RAD, 1.0)
+        scale = np.where(world.arm.joint_types == PRISMATIC, _M_PER_RAD, 1.0)
         self.tick = scale * (2.0 * math.pi / faults.ticks if faults.ticks else 0.0)
         self._play = 0.5 * faults.play * scale
         self._loaded = faults.sag > 0.0 or faults.flex > 0.0
