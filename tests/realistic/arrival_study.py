@@ -3,9 +3,9 @@
     python -m tests.realistic.arrival_study [--arms ur5 hobby] [--conditions ...] [--tasks 30] [-o runs.csv]
 
 Thirty tasks by seed on ten recordings for each arm and condition, driven by ``exact_track`` with the profile
-auto. A task fails unless the run converged within 3 mm and 1 degree of the truth; one that the true model finds
-no way for is dropped. Of each recording it tells whether it is usable, whether chi-square lies in its 99 % band,
-and how delay and joint noise compare with the truth.
+auto. A task fails unless the run converged within 3 mm and 1 degree of the truth; one that the true model
+finds no way for is dropped. Of each recording it tells whether it is usable, whether chi-square lies in its
+99 % band, and how delay and joint noise compare with the truth.
 """
 
 import argparse
@@ -113,8 +113,8 @@ def tell(arm, condition, recordings, rows, ideal):
     ]
     mm = [row.get("mm", math.nan) for row in possible]
     print(
-        f"{arm}, {condition}: arrived {len(possible) - len(failed)} of {len(possible)}; error (mm, median / 95 % / most) "
-        f"{quantiles(mm)}; deg {quantiles([row.get('deg', math.nan) for row in possible])}; "
+        f"{arm}, {condition}: arrived {len(possible) - len(failed)} of {len(possible)}; error (mm, median / "
+        f"95 % / most) {quantiles(mm)}; deg {quantiles([row.get('deg', math.nan) for row in possible])}; "
         f"steps over ideal {quantiles(steps, (0.5, 0.95))}; else {dict(ended)}"
     )
     usable = sum(row["usable"] for row in recordings)

@@ -81,7 +81,7 @@ def tasks_of(arm):
 
 
 def task_config(config, arm, seed, taught_px=None):
-    """A configuration with the task of a seed; the goal is taught by images of so much noise, or by joints."""
+    """A configuration with the task of a seed; its goal is taught by images of so much noise, or by joints."""
     start, goal = tasks_of(arm)[seed]
     vectors = [JointVector(joints=tuple(q.tolist()), unit="rad") for q in (start, goal)]
     kind = type(config.task.goal)
@@ -105,7 +105,7 @@ def recorded_config(arm, condition, number):
 
 @contextmanager
 def watched():
-    """Joint noise, rad, and delay (2,), s, in truth of what simulated robots are asked meanwhile, at the end."""
+    """Joint noise, rad, and delay (2,), s, of simulated robots meanwhile, in truth; filled in at the end."""
     errors, ages, last = [], [], None
     read = FaultyRobot.read
 
