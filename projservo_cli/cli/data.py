@@ -73,7 +73,7 @@ def _record(
         try:
             record(settings, recording, progress=console.progress)
         except KeyboardInterrupt:
-            done = f"{len(recording.q)} of {len(recording.targets)}"
+            done = f"{len(recording.done)} of {len(recording.targets)}"
             console.say(f"{output}: {done} poses; run again to continue")
             raise
         _tell_recording(console, recording)
@@ -83,18 +83,21 @@ def _tell_recording(console: Console, recording: Any) -> None:
     value = {
         "table": recording.path.resolve(),
         "poses": len(recording.targets),
-        "recorded": len(recording.q) - recording.found,
+        "recorded": len(recording.done) - recording.found,
         "found": recording.found,
         "pending": len(recording.pending),
         "markers": len(recording.marker),
         "unseen": recording.unseen,
         "commands": recording.commands,
+        "spread_px": recording.spread_px,
     }
-    words = (
+    words = [
         "record: {recorded} poses recorded, {found} there before, {pending} to be recorded; "
         "{markers} markers",
         "  unseen: {unseen} marker-view pairs; {commands} commands sent",
-    )
+    ]
+    if recording.spread_px is not None:
+        words.append("  spread of the images of a pose: {spread_px:.3g} px per coordinate")
     console.tell(value, [*(text.format_map(value) for text in words), f"table: {recording.path}"])
 
 

@@ -449,6 +449,13 @@ class _Control(Section):
                 )
 
 
+class _EachView(Section):
+    """A number for each camera."""
+
+    left: Number
+    right: Number
+
+
 class _PlantSettings(Section):
     """What is driven, and what the simulated robot does at its borders.
 
@@ -461,6 +468,26 @@ class _PlantSettings(Section):
     )
     options: dict[str, Plain] = Field({}, description="arguments that the class is made with")
     timeout_s: Positive = Field(1.0, description="most time an answer of the robot may take")
+    open_s: Positive = Field(30.0, description="most time that opening the robot may take")
+    lead_deg: Positive | None = Field(
+        None, description="how far a set-point may lead the reading; null for what lag and sag ask for"
+    )
+    lag_s: NotNegative = Field(0.15, description="by how much the robot may lag behind its set-point")
+    sag_deg: NotNegative = Field(
+        1.0,
+        description="how far a joint at rest may stay from its set-point; prismatic: 5 mm a degree",
+    )
+    delay_s: Annotated[
+        _EachView | None, BeforeValidator(_of_both, json_schema_input_type=Number | _EachView | None)
+    ] = Field(
+        None,
+        description="time from the middle of an exposure to the joint readings that come with its image; "
+        "a number for both cameras, or {left, right}; null to estimate it",
+    )
+    frames: StrictInt = Field(1, ge=1, le=1000, description="images of each pose that record averages")
+    settle_s: Positive = Field(
+        0.5, description="for how long joints and images have stood still before a pose is recorded"
+    )
     speed_scale: Number = Field(1.0, gt=0, le=1, description="factor of every command to the robot")
     self_occlusion: Literal["transparent", "opaque"] = Field(
         "transparent", description="whether the face hides its markers from a camera behind it"

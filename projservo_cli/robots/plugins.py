@@ -20,7 +20,8 @@ from typing import Any
 from projservo_cli.records import InputError, WorkFailed
 
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
-_METHODS = {"plant": ("joints", "observe", "command", "stop"), "law": ("__call__",)}
+_METHODS = {"plant": ("open", "read", "command", "stop", "close"), "law": ("__call__",)}
+_OPTIONAL = {"plant": ("now", "truth"), "law": ()}
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
 _ALIKE = 0.8
@@ -47,7 +48,7 @@ def find(kind: str, target: str) -> Any:
     where = f"{kind} {target}"
     found = _found(where, *target.split(":"))
     if isinstance(found, type):
-        _require_methods(where, found, _METHODS[kind])
+        _require_methods(where, found, kind)
     return found
 
 
@@ -71,7 +72,7 @@ def make(kind: str, target: str, arguments: Sequence[Any], options: Mapping[str,
         result = found(*arguments, **options)
     except Exception as error:
         raise WorkFailed(f"{where}: cannot be made: {what_failed(error)}") from error
-    _require_methods(where, result, _METHODS[kind])
+    _require_methods(where, result, kind)
     return result
 
 
@@ -103,13 +104,19 @@ def _found(where: str, module: str, name: str) -> Any:
     return found
 
 
-def _require_methods(where: str, found: Any, methods: Sequence[str]) -> None:
+def _require_methods(where: str, found: Any, kind: str) -> None:
+    methods = _METHODS[kind]
     lacking = [name for name in methods if not callable(getattr(found, name, None))]
     if lacking:
         require_spelt(where, found, lacking)
         raise InputError(
             f"{where}: lacks {', '.join(f'{name}()' for name in lacking)}; needed: {', '.join(methods)}"
         )
+    for name in _OPTIONAL[kind]:
+        if not hasattr(found, name):
+            require_spelt(where, found, (name,))
+        elif not callable(getattr(found, name)):
+            raise InputError(f"{where}: has {name}, which is to be a method; give it another name")
 
 
 def require_spelt(where: str, found: Any, names: Sequence[str]) -> None:

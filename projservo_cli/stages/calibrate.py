@@ -106,9 +106,9 @@ def trial_noise(config: Config, poses: int, markers: int) -> FloatArray:
     return config.noise.calibration_px * drawn
 
 
-def simulate(config: Config, truth: Truth) -> Observation:
-    """Noisy images of all markers along the trial motions; markers outside an image are unseen."""
-    q = trial_motions(config)
+def simulate(config: Config, truth: Truth, q: FloatArray | None = None) -> Observation:
+    """Noisy images of all markers at poses (k, n), by default the trial motions; unseen outside an image."""
+    q = trial_motions(config) if q is None else q
     noise = trial_noise(config, len(q), len(truth.number))
     images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)

@@ -1,6 +1,8 @@
-"""The robot of ``plant.use``: made, checked against the calibration, and driven to given joints."""
+"""The robot of ``plant.use``: made, checked against the calibration, driven to given joints, waited for."""
 
 import math
+from collections import deque
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -8,50 +10,169 @@ from projservo_cli.calibration import WINDOW, Innovation
 from projservo_cli.config import Config
 from projservo_cli.records import FloatArray, InputError, WorkFailed
 from projservo_cli.robots import plugins
+from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
+from projservo_cli.robots.driven import DrivenRobot, Steered
 from projservo_cli.robots.simulated import Plant
-from projservo_cli.robots.yours import DrivenRobot, ForeignRobot, Robot
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.world import Joints
+from projservo_cli.stages.world import Joints, length_of
 
-ARRIVED = 1e-3  # rad or m: a robot this near to where it was sent is there
-SETTLE = 10  # further commands for what rounding or a controller left at the end of a motion
+# What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
+_STILL, _STILL_PX = 2e-5, 0.02
+_LEAST = 6  # looks that tell noise from motion
+_PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
+
+
+def bounds_of(config: Config, joints: Joints) -> Bounds:
+    """What no command to a robot may exceed."""
+    plant, period = config.plant, config.control.period_s
+    speed = joints.speed * plant.speed_scale
+    lead = speed * (plant.lag_s + period) + sag_of(config, joints)
+    if plant.lead_deg is not None:
+        lead = length_of(plant.lead_deg, joints)
+    return Bounds(joints.lower, joints.upper, speed, lead, period)
+
+
+def sag_of(config: Config, joints: Joints) -> FloatArray:
+    """How far (n,) a joint may stay from where it was sent, rad or m."""
+    return length_of(config.plant.sag_deg, joints)
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
     """Make the robot of ``plant.use``; an InputError where a joint has no speed limit."""
-    target = config.plant.use
+    plant, target = config.plant, config.plant.use
     assert target is not None
     for kind, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
         if kind in joints.types and getattr(config.control, key) is None:
             raise InputError(
                 f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot: Robot = plugins.make("plant", target, (), config.plant.options)
-    return ForeignRobot(robot, f"plant {target}", len(joints.types), markers, config.plant.timeout_s)
+    robot: Robot = plugins.make("plant", target, (), plant.options)
+    bounds = bounds_of(config, joints)
+    return ForeignRobot(robot, f"plant {target}", markers, bounds, plant.timeout_s, plant.open_s)
 
 
-def drive_to(robot: Robot, target: FloatArray, config: Config, joints: Joints, what: str) -> int:
-    """Move to joints (n,) along a straight line, each command within the speed limit; how many there were.
+def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: str) -> Iterator[Reading]:
+    """Move to joints (n,) along a straight line at the speed limit and come to rest there.
 
-    what : the command it is for, in messages. Raises WorkFailed if the robot does not arrive.
+    what : the command it is for, in messages.
+    Yields what is read after each command. The robot has then stood still for ``plant.settle_s``, and so have
+    the images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
     """
-    period = config.control.period_s
-    limit = joints.speed * period * config.plant.speed_scale  # (n,) rad or m a period; infinite for none
-    gap = target - robot.joints()
-    most = math.ceil(float(np.max(np.abs(gap) / limit))) + SETTLE
-    count = 0
-    while gap.any() and count < most:
-        robot.command(gap / np.max(np.abs(gap) / limit, initial=1.0), period)
-        count += 1
-        gap = target - robot.joints()
-    i = int(np.argmax(np.abs(gap)))
-    if not abs(gap[i]) <= ARRIVED:
+    period, bounds = config.control.period_s, robot.robot.bounds
+    begun, still = robot.look().q, Standstill(config.plant.settle_s)
+    assert robot.target is not None
+    while (gap := q - robot.target).any():
+        robot.command(gap / np.max(np.abs(gap) / (bounds.speed * period), initial=1.0), period)
+        stands = still.joints(robot.look())
+        yield robot.reading
+        away = np.abs(q - robot.reading.q) - np.abs(q - begun)
+        held = np.abs(robot.target - robot.reading.q) >= bounds.lead * (1.0 - 1e-6)
+        if (away > bounds.lead).any() or (stands and held.any()):
+            break
+    else:
+        yield from _at_rest(robot, config, what)
+    gap = np.abs(q - robot.reading.q)
+    i = int(np.argmax(gap / np.maximum(sag_of(config, joints), _STILL)))
+    if gap[i] > max(sag_of(config, joints)[i], _STILL) or (q != robot.target).any():
+        remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
+        if gap[i] > abs(q[i] - begun[i]) + sag_of(config, joints)[i]:
+            remedy = f"it went away from there, from {begun[i]:.6g}: look at its sign and unit"
         raise WorkFailed(
-            f"{what}: joint {i + 1} was sent to {target[i]:.6g} and stands at {target[i] - gap[i]:.6g} (rad "
-            "or m): look what holds the robot, then run the command again"
+            f"{what}: joint {i + 1} was sent to {q[i]:.6g} and stands at {robot.reading.q[i]:.6g}, "
+            f"{gap[i]:.3g} short (rad or m): {remedy}; then run the command again"
             + (" to continue" if what == "record" else "")
         )
-    return count
+
+
+def _at_rest(robot: Steered, config: Config, what: str) -> Iterator[Reading]:
+    """Hold the set-point until joints and images stand still, and yield what is read meanwhile."""
+    still = Standstill(config.plant.settle_s)
+    first = robot.reading.t_q
+    while not still.all(robot.reading):
+        if robot.reading.t_q > first + config.plant.settle_s + _PATIENCE_S:
+            raise WorkFailed(
+                f"{what}: {still.moving or 'the robot'} does not come to rest within {_PATIENCE_S:g} s: look "
+                "for what vibrates, creeps or flickers"
+            )
+        robot.command(np.zeros_like(robot.reading.q), config.control.period_s)
+        yield robot.look()
+
+
+class Standstill:
+    """Whether a robot has stood still for a time, s, as one look after the other shows.
+
+    Over that time, and no fewer than six looks, the means of its thirds differ by no more than noise
+    explains, which the differences of consecutive looks tell: motion adds up, noise does not.
+
+    Source: J. von Neumann, "Distribution of the ratio of the mean square successive difference to the
+    variance", Annals of Mathematical Statistics 12, 1941.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._since = math.inf
+        self._q: _Rows = deque()
+        self._s: tuple[_Rows, _Rows] = deque(), deque()
+        self._last: Reading | None = None
+        self.moving = ""  # what is not still, in words
+
+    def joints(self, reading: Reading) -> bool:
+        """Whether the joints have stood still up to the next reading."""
+        self._since = min(self._since, reading.t_q)
+        square, variance = _drift(self._kept(self._q, reading.t_q, reading.q))
+        moving = np.flatnonzero(square > np.maximum(_STILL**2, 9.0 * variance))
+        self.moving = f"joint {moving[0] + 1}" if len(moving) else ""
+        whole = reading.t_q - self._since >= self.seconds * (1.0 - 1e-9)
+        return whole and len(self._q) >= _LEAST and not self.moving
+
+    def all(self, reading: Reading) -> bool:
+        """Whether joints and images have stood still up to the next reading."""
+        still = self.joints(reading)
+        new = new_views(reading, self._last)
+        self._last = reading
+        for view, rows in enumerate(self._s):
+            frames = self._kept(rows, reading.t_q, reading.s[view].ravel() if new[view] else None)
+            if rows[-1][0] < reading.t_q - self.seconds:
+                continue  # the same image all the time
+            square, variance = _drift(frames[:, np.isfinite(frames).all(axis=0)])
+            if square.size and square.mean() > max(_STILL_PX**2, 2.0 * variance.mean()):
+                self.moving = self.moving or f"the {('left', 'right')[view]} image"
+            still = still and len(rows) >= _LEAST
+        return still and not self.moving
+
+    def _kept(self, rows: "_Rows", now: float, row: FloatArray | None) -> FloatArray:
+        """The rows of the time that counts, with one more unless it is None."""
+        if row is not None:
+            rows.append((now, row))
+        while len(rows) > _LEAST and rows[0][0] < now - self.seconds * (1.0 + 1e-9):
+            rows.popleft()
+        return np.array([values for _, values in rows])
+
+
+_Rows = deque[tuple[float, FloatArray]]
+
+
+def new_views(reading: Reading, before: Reading | None) -> tuple[bool, bool]:
+    """Whether each view has another frame than in the reading before, by its stamp or its pixels."""
+    if before is None:
+        return True, True
+    same = [
+        reading.t_view[view] == before.t_view[view]
+        if np.isfinite(reading.t_view[view])
+        else np.array_equal(reading.s[view], before.s[view], equal_nan=True)
+        for view in range(2)
+    ]
+    return not same[0], not same[1]
+
+
+def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variance of the means of the thirds of rows (k, c), and what noise makes of it, (c,)."""
+    third = len(rows) // 3
+    if third == 0:
+        return np.zeros(rows.shape[1]), np.zeros(rows.shape[1])
+    means = [part.mean(axis=0) for part in (rows[:third], rows[third:-third], rows[-third:])]
+    noise = 0.5 * (np.diff(rows, axis=0) ** 2).mean(axis=0)
+    return np.var(means, axis=0, ddof=1), noise / third
 
 
 def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:

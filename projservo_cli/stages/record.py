@@ -1,6 +1,8 @@
 """Record: drive a robot through trial motions and write what both cameras saw into a table."""
 
 import time
+from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,11 +10,12 @@ import numpy as np
 
 from projservo_cli.config import Config, digest
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
-from projservo_cli.robots.yours import Robot, at_rest_after
+from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
+from projservo_cli.robots.driven import Steered
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.calibrate import images_at, trial_motions, trial_noise
-from projservo_cli.stages.own_robot import ARRIVED, drive_to, foreign_robot
-from projservo_cli.stages.world import Truth, joints_of, limit_passed, truth_of
+from projservo_cli.stages.calibrate import simulate, trial_motions
+from projservo_cli.stages.own_robot import foreign_robot, new_views, sag_of, way_to
+from projservo_cli.stages.world import Joints, joints_of, limit_passed, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
@@ -21,31 +24,8 @@ DEPENDS_ON = (
     *("plant.use", "plant.options"),
 )
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
-
-
-class SimulatedRobot:
-    """The robot of a configuration, from joints (n,) on, with noise (k, 2, m, 2) px for each look in turn."""
-
-    def __init__(self, truth: Truth, q_start: FloatArray, noise: FloatArray) -> None:
-        self._truth = truth
-        self._q = np.array(q_start, dtype=np.float64)
-        self._noise = iter(noise)
-
-    def joints(self) -> FloatArray:
-        """Joint readings (n,), rad or m."""
-        return self._q.copy()
-
-    def observe(self) -> FloatArray:
-        """Noisy pixels (2, m, 2) of all markers, NaN outside an image."""
-        return images_at(self._truth, self._q, next(self._noise))
-
-    def command(self, step: FloatArray, period: float) -> None:
-        """Move by the joint step (n,), rad or m; the simulated robot always arrives."""
-        del period
-        self._q = self._q + step
-
-    def stop(self) -> None:
-        """Nothing moves between commands."""
+_SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
+_WAITED = 5  # looks for each image that is wanted, where the same one comes again
 
 
 @dataclass
@@ -56,26 +36,32 @@ class _Recording:
     key: str  # hash of what the pixels depend on, stored with every row
     targets: FloatArray  # (K, n) joints to drive to, rad or m; the row is the number of the pose
     marker: IntArray  # (m,) numbers of the markers
-    # q, images: joints (n,) and pixels (2, m, 2) of the poses that are done
-    q: dict[int, FloatArray] = field(default_factory=dict)
-    images: dict[int, FloatArray] = field(default_factory=dict)
+    done: dict[int, Reading] = field(default_factory=dict)  # the poses that are done
     found: int = 0  # how many of them an earlier call recorded
     commands: int = 0  # steps sent to the robot
+    # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
+    scatter: FloatArray = field(default_factory=lambda: np.zeros(2))
 
     @property
     def pending(self) -> list[int]:
         """Poses that are still to be recorded."""
-        return [pose for pose in range(len(self.targets)) if pose not in self.q]
+        return [pose for pose in range(len(self.targets)) if pose not in self.done]
 
     @property
     def unseen(self) -> int:
         """Marker–view pairs without a pixel in the poses that are done."""
-        return sum(int(np.isnan(images[..., 0]).sum()) for images in self.images.values())
+        return sum(int(np.isnan(reading.s[..., 0]).sum()) for reading in self.done.values())
+
+    @property
+    def spread_px(self) -> float | None:
+        """Standard deviation of the pixels of a pose, per coordinate; None for single images."""
+        squares, freedom = self.scatter
+        return float(np.sqrt(squares / freedom)) if freedom > 0.0 else None
 
     def save(self) -> None:
         """Write all poses that are done, in their order; the file appears whole or not at all."""
-        pose = sorted(self.q)
-        q, images = (np.array([done[k] for k in pose]) for done in (self.q, self.images))
+        pose = sorted(self.done)
+        q, images = (np.array([getattr(self.done[k], name) for k in pose]) for name in ("q", "s"))
         observation = Observation(np.array(pose, dtype=np.int64), self.marker, q, images)
         write_table(observation, self.path, recording=self.key)
 
@@ -90,12 +76,11 @@ def new_recording(
     """
     if config.plant.use is None:
         truth_of(config)  # refuses what lacks a part of the simulation
-    targets = trial_motions(config)
+    targets, joints = trial_motions(config), joints_of(config)
     numbers = config.markers.known if config.markers is not None else None
     if numbers is None:
         raise InputError("record needs to know which markers the robot observes: set markers.numbers")
     if motions is not None:
-        joints = joints_of(config)
         for pose, q in zip(motions.pose, motions.q, strict=True):
             if wrong := limit_passed(q, joints.lower, joints.upper):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
@@ -103,12 +88,12 @@ def new_recording(
     key = digest(config, DEPENDS_ON)[:16]
     recording = _Recording(path, key, targets, np.array(numbers, dtype=np.int64))
     if path.exists() and not force:
-        _resume(recording)
+        _resume(recording, sag_of(config, joints) + _SLACK)
     return recording
 
 
-def _resume(recording: _Recording) -> None:
-    """Take over the poses of an interrupted recording."""
+def _resume(recording: _Recording, most: FloatArray) -> None:
+    """Take over the poses of an interrupted recording, at most so far (n,) from where they were to be."""
     path, remedy = recording.path, "choose another --output, or replace it with --force"
     if recording_of(path) != recording.key:
         raise InputError(f"{path}: was not recorded with this configuration; {remedy}")
@@ -119,37 +104,85 @@ def _resume(recording: _Recording) -> None:
     column = np.searchsorted(table.marker, recording.marker)
     for k, pose in enumerate(table.pose.tolist()):
         known = 0 <= pose < len(recording.targets)
-        if not known or np.abs(table.q[k] - recording.targets[pose]).max() > ARRIVED:
+        if not known or (np.abs(table.q[k] - recording.targets[pose]) > most).any():
             raise InputError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
-        recording.q[pose], recording.images[pose] = table.q[k], table.images[k][:, column]
-    recording.found = len(recording.q)
+        recording.done[pose] = Reading(
+            table.q[k], table.images[k][:, column], np.nan, np.full(2, np.nan), None
+        )
+    recording.found = len(recording.done)
 
 
 def record(
-    config: Config, recording: _Recording, robot: Robot | None = None, *, progress: Progress = silent
+    config: Config, recording: _Recording, robot: ForeignRobot | None = None, *, progress: Progress = silent
 ) -> None:
     """Record the pending poses, and keep those that are done however it ends.
 
-    robot : what is driven; None takes that of ``plant.use``, or simulates the robot of the configuration.
+    robot : what is driven; None takes that of ``plant.use``, or simulates that of the configuration, which
+        stands wherever it is sent.
     """
     joints = joints_of(config)
     if robot is None and config.plant.use is not None:
         robot = foreign_robot(config, joints, len(recording.marker))
-    if robot is None:
-        noise = trial_noise(config, len(recording.targets), len(recording.marker))  # as calibrate adds it
-        robot = SimulatedRobot(truth_of(config), recording.targets[0], noise[recording.pending])
-    kept, due = len(recording.q), time.monotonic() + SAVE_EVERY
+    poses = _simulated(config, recording)
+    if robot is not None:
+        poses = _recorded(Steered(robot), config, joints, recording)
+    kept, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
-        with at_rest_after(robot):
-            for pose in recording.pending:
-                recording.commands += drive_to(robot, recording.targets[pose], config, joints, "record")
-                recording.q[pose], recording.images[pose] = robot.joints(), robot.observe()
-                progress("record", len(recording.q), len(recording.targets))
+        with nullcontext() if robot is None else at_rest_after(robot):
+            for _ in poses:
+                progress("record", len(recording.done), len(recording.targets))
                 if (start := time.monotonic()) >= due:
                     recording.save()
-                    kept, now = len(recording.q), time.monotonic()
+                    kept, now = len(recording.done), time.monotonic()
                     # A long table takes long to write: most of the time must stay for recording.
                     due = now + max(SAVE_EVERY, 10.0 * (now - start))
     finally:
-        if len(recording.q) > kept:
+        if len(recording.done) > kept:
             recording.save()
+
+
+def _simulated(config: Config, recording: _Recording) -> Iterator[int]:
+    """One pending pose after the other as calibrate simulates it; the number of each."""
+    seen = simulate(config, truth_of(config), recording.targets)
+    for pose in recording.pending:
+        recording.done[pose] = Reading(seen.q[pose], seen.images[pose], np.nan, np.full(2, np.nan), None)
+        yield pose
+
+
+def _recorded(robot: Steered, config: Config, joints: Joints, recording: _Recording) -> Iterator[int]:
+    """Drive to one pending pose after the other and look; the number of each that was recorded."""
+    for pose in recording.pending:
+        for _ in way_to(robot, recording.targets[pose], config, joints, "record"):
+            recording.commands += 1
+        recording.done[pose] = _look(robot, config, recording)
+        yield pose
+
+
+def _look(robot: Steered, config: Config, recording: _Recording) -> Reading:
+    """The mean of as many images as configured, each frame once, of a robot at rest, and of their readings.
+
+    Markers that most of the frames of a view do not show are NaN.
+    """
+    wanted, looks = config.plant.frames, [robot.reading]
+    frames = [[view] for view in robot.reading.s]
+    for _ in range(_WAITED * wanted):
+        if min(map(len, frames)) >= wanted:
+            break
+        robot.command(np.zeros_like(robot.reading.q), config.control.period_s)
+        looks.append(robot.look())
+        recording.commands += 1
+        for view, new in enumerate(new_views(*looks[:-3:-1])):
+            if new and len(frames[view]) < wanted:
+                frames[view].append(looks[-1].s[view])
+    s = np.stack([_mean(np.array(rows), recording.scatter) for rows in frames])
+    q = looks[0].q + np.mean([look.q - looks[0].q for look in looks], axis=0)
+    return looks[-1]._replace(q=q, s=s)
+
+
+def _mean(frames: FloatArray, scatter: FloatArray) -> FloatArray:
+    """Mean (m, 2) of frames (k, m, 2) of one view, px; how they scatter is added to ``scatter``."""
+    count = np.isfinite(frames[..., 0]).sum(axis=0)
+    mean: FloatArray = np.nansum(frames, axis=0) / np.maximum(count, 1)[:, None]
+    mean[2 * count <= len(frames)] = np.nan
+    scatter += np.nansum((frames - mean) ** 2), 2.0 * np.sum(count[2 * count > len(frames)] - 1)
+    return mean

@@ -32,9 +32,10 @@ from projservo_cli.records import (
 )
 from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
+from projservo_cli.robots.contract import at_rest_after
+from projservo_cli.robots.driven import DrivenRobot
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
-from projservo_cli.robots.yours import DrivenRobot, at_rest_after
 from projservo_cli.stages import own_robot
 from projservo_cli.stages.motions import search_of, why_closed
 from projservo_cli.stages.own_robot import untested
@@ -323,7 +324,7 @@ def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
     """Drive the robot of ``plant.use`` to the start of the task and from there under a law.
 
     Before the first motion, what the robot sees must agree with the calibration where it stands. The
-    robot is stopped on every way out.
+    robot is stopped and closed on every way out.
     """
     if scenario.calibration is None or not scenario.calibration.usable:
         raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
@@ -333,7 +334,9 @@ def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
         wrong = driven.fits()
         if wrong:
             raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-        own_robot.drive_to(driven, scenario.ends.q_start, scenario.config, scenario.joints, "servo")
+        start = scenario.ends.q_start
+        for _ in own_robot.way_to(driven.steered, start, scenario.config, scenario.joints, "servo"):
+            pass
         watch = _watch(scenario, plan, law, controller, replans)
         return _driven_in_python(scenario, controller, driven, watch)
 

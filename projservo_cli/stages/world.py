@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from projservo_cli.calibration import REACH_M, REACH_RAD
 from projservo_cli.config import Config
 from projservo_cli.config.models import Goal
 from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, RobotSettings
@@ -79,6 +80,12 @@ def joints_of(config: Config, default_types: str = "", calibration: Calibration 
     sliding = c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2
     acceleration = np.array([sliding if kind == "P" else turning for kind in types])
     return Joints(types, lower, upper, speed, acceleration)
+
+
+def length_of(degrees: float, joints: Joints) -> FloatArray:
+    """An angle as (n,) rad, and for prismatic joints the length, m, that makes as much of a difference."""
+    ratio = [REACH_M / REACH_RAD if kind == "P" else 1.0 for kind in joints.types]
+    return math.radians(degrees) * np.array(ratio)
 
 
 def _limits_of(

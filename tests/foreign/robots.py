@@ -1,6 +1,7 @@
 """Robots and laws of others, sound and faulty, as users would write them."""
 
 import time
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,35 +15,43 @@ CALLS = []
 
 
 class Sound:
-    """The robot of a configuration with pixel noise; everything it is asked for is noted in ``CALLS``."""
+    """The robot of a configuration with pixel noise; everything it is asked for is noted in ``CALLS``.
+
+    Its time passes in commands alone.
+    """
 
     def __init__(self, config, noise_px=0.5):
         CALLS.clear()
-        self.truth = truth_of(load_config(config))
-        self.q = self.truth.robot.lower * 0 + [3.66, -1.68, -1.85, 0.28, 1.16, 3.53]
+        self.world = truth_of(load_config(config))
+        self.q = self.world.robot.lower * 0 + [3.66, -1.68, -1.85, 0.28, 1.16, 3.53]
         self.noise_px, self.random = noise_px, np.random.default_rng(5)
-        self.count = 0
+        self.count, self.time = 0, 0.0
 
-    def joints(self):
-        CALLS.append("joints")
-        return self.q
+    def open(self):
+        CALLS.append("open")
 
-    def observe(self):
-        CALLS.append("observe")
+    def read(self):
+        CALLS.append("read")
         self.count += 1
-        s = self.truth.images(self.q, self.truth.M)
-        return s + self.noise_px * self.random.standard_normal(s.shape)
+        s = self.world.images(self.q, self.world.M)
+        return self.q, s + self.noise_px * self.random.standard_normal(s.shape)
 
-    def command(self, step, period):
-        CALLS.append(("command", step.copy(), period))
-        self.q = self.q + step
+    def command(self, target, speed, due):
+        CALLS.append(Sent(target.copy(), speed.copy(), due, target - self.q, due - self.time))
+        self.q, self.time = target, due
+
+    def now(self):
+        return self.time
 
     def stop(self):
         CALLS.append("stop")
 
+    def close(self):
+        CALLS.append("close")
+
 
 class Faulty(Sound):
-    """Goes wrong in a way of its own after so many observations."""
+    """Goes wrong in a way of its own after so many looks."""
 
     def __init__(self, config, fault, after=0, noise_px=0.5):
         super().__init__(config, noise_px)
@@ -52,16 +61,13 @@ class Faulty(Sound):
     def wrong(self):
         return self.count > self.after
 
-    def joints(self):
-        q = super().joints()
-        if not self.wrong or self.fault != "frozen readings":
-            self.still = q
-        return self.still
-
-    def observe(self):
-        s = super().observe()
+    def read(self):
+        q, s = super().read()
         if not self.wrong:
-            return s
+            self.still = q
+            return q, s
+        if self.fault == "frozen readings":
+            q = self.still
         if self.fault == "bumped camera":
             s[0] += [2.0, -2.5]
         if self.fault == "lost" or (self.fault == "lost for a while" and self.count < self.after + 10):
@@ -71,23 +77,42 @@ class Faulty(Sound):
         if self.fault == "interrupted":
             raise KeyboardInterrupt
         if self.fault == "hangs":
-            time.sleep(5.0)
-        return s
+            time.sleep(2.0)
+        return q, s
 
-    def command(self, step, period):
-        super().command(step, period)
+    def command(self, target, speed, due):
+        super().command(target, speed, due)
         if self.wrong and self.fault == "command raises":
             raise RuntimeError("protective stop")
 
 
 class NoStop:
-    def joints(self): ...
-    def observe(self): ...
-    def command(self, step, period): ...
+    def open(self): ...
+    def read(self): ...
+    def command(self, target, speed, due): ...
+    def close(self): ...
 
 
 class Stopp(NoStop):
     def stopp(self): ...
+
+
+class Old:
+    def joints(self): ...
+    def observe(self): ...
+    def command(self, step, period): ...
+    def stop(self): ...
+
+
+class Truths(NoStop):
+    def stop(self): ...
+    def truths(self): ...
+
+
+class Now(NoStop):
+    now = 0.0
+
+    def stop(self): ...
 
 
 class Unmakeable(Sound):
@@ -96,6 +121,16 @@ class Unmakeable(Sound):
 
 
 NOT_A_CLASS = 3
+
+
+class Sent(NamedTuple):
+    """A command, and how far and for how long it was to move."""
+
+    target: np.ndarray
+    speed: np.ndarray
+    due: float
+    step: np.ndarray
+    period: float
 
 
 class DirectThree:

@@ -37,7 +37,10 @@ def written(name, text):
         (f"{HERE}:Faulti", r"tests\.foreign\.robots has no Faulti; did you mean Faulty\?"),
         (f"{HERE}:Zzz", r"has no Zzz; classes: Sound, Faulty, "),
         (f"{HERE}:NOT_A_CLASS", r"is no class, but of type int"),
-        (f"{HERE}:NoStop", r"lacks stop\(\); needed: joints, observe, command, stop"),
+        (f"{HERE}:NoStop", r"lacks stop\(\); needed: open, read, command, stop, close"),
+        (f"{HERE}:Old", r"lacks open\(\), read\(\), close\(\); needed: open, read,"),
+        (f"{HERE}:Truths", r"has truths, which nothing looks for; did you mean truth\?"),
+        (f"{HERE}:Now", r"has now, which is to be a method; give it another name"),
         (f"{HERE}:Stopp", r"has stopp, which nothing looks for; did you mean stop\?"),
         (f"{HERE}:Sound", r"does not take plant\.options: missing a required argument: 'config'"),
         ("mine_bad_syntax:A", r"importing mine_bad_syntax failed: SyntaxError: .* \(mine_bad_syntax.py:2\)$"),
@@ -69,7 +72,7 @@ def test_a_function_may_make_the_robot():
         "mine_made", "from tests.foreign.robots import Sound\n\ndef robot(path):\n    return Sound(path)\n"
     )
     made = plugins.make("plant", "mine_made:robot", (), {"path": str(UR5)})
-    assert made.joints().shape == (6,)
+    assert made.read()[0].shape == (6,)
 
 
 def test_the_working_directory_comes_last():

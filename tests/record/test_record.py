@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from projservo_cli import files
+from projservo_cli.cli.output import Console
 from projservo_cli.config import load_config
 from projservo_cli.records import WorkFailed
+from projservo_cli.robots.contract import ForeignRobot
 from projservo_cli.stages import record as stage
-from projservo_cli.stages.calibrate import simulate
-from projservo_cli.stages.own_robot import drive_to
+from projservo_cli.stages.calibrate import simulate, trial_motions
+from projservo_cli.stages.own_robot import bounds_of
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.store import load
 from projservo_cli.tables import read_joint_list, read_table
@@ -58,23 +60,16 @@ def test_recording_then_calibrating_is_calibrating(projservo):
         np.testing.assert_array_equal(getattr(two, name), getattr(one, name), err_msg=name)
 
 
-class Interrupting(stage.SimulatedRobot):
-    """A robot whose user loses patience."""
-
-    left = 5
-
-    def observe(self):
-        if self.left == 0:
-            raise KeyboardInterrupt
-        self.left -= 1
-        return super().observe()
+def lose_patience(console, what, done, total):
+    if (what, done) == ("record", 5):
+        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("gone", [0, 2])
 def test_an_interrupted_recording_goes_on_where_it_was(projservo, monkeypatch, gone):
     assert projservo("record", "-c", UR5, *FEW, "-o", "whole.csv", "-q").code == 0
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "SimulatedRobot", Interrupting)
+        patch.setattr(Console, "progress", lose_patience)
         answer = projservo("record", "-c", UR5, *FEW, "-o", "t.csv")
     assert answer.code == 130
     assert "t.csv: 5 of 13 poses; run again to continue" in answer.err
@@ -95,7 +90,7 @@ def test_the_table_grows_while_the_robot_moves(monkeypatch):
     config = load_config(UR5, ["calibration.frames_per_joint=2"])
     path, sizes = Path("t.csv"), []
     recording = stage.new_recording(config, path)
-    monkeypatch.setattr(recording, "save", lambda: sizes.append(len(recording.q)))
+    monkeypatch.setattr(recording, "save", lambda: sizes.append(len(recording.done)))
     stage.record(config, recording)
     assert sizes[0] < 13
     assert sizes == sorted(set(sizes))
@@ -162,56 +157,158 @@ def test_further_motions_follow_the_trials_and_continue_their_table(projservo):
     assert not Path("u.csv").exists()
 
 
-class Watched(stage.SimulatedRobot):
-    """Keeps what it was told."""
+class Arm:
+    """The arm of a configuration that lags, sags and plays; joints are read in ticks, images are late.
 
-    steps, stopped = None, False
+    Time passes in commands alone, in parts of a millisecond.
+    """
 
-    def command(self, step, period):
-        self.steps = [*(self.steps or []), step]
-        super().command(step, period)
+    lag, sag, play, tick, late, noise, rate = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e9
+
+    def __init__(self, config, **faults):
+        vars(self).update(faults)
+        self.world = truth_of(config)
+        self.q = np.array(trial_motions(config)[0]) + 0.3
+        self.motor, self.target, self.time = self.q.copy(), self.q.copy(), 0.0
+        self.past, self.sent, self.calls = [self.q], [], []
+        self.random = np.random.default_rng(3)
+
+    def open(self):
+        self.calls.append("open")
+
+    def read(self):
+        seen = (
+            (self.time - self.late) // (1.0 / self.rate) / self.rate
+            if self.rate < 1e9
+            else self.time - self.late
+        )
+        s = self.world.images(self.past[max(0, round(1e3 * seen))], self.world.M)
+        if self.rate < 1e9:  # the same frame until there is another
+            self.random = np.random.default_rng(round(1e6 * max(0.0, seen)))
+        s += self.noise * self.random.standard_normal(s.shape)
+        q = self.q if not self.tick else self.tick * np.round(self.q / self.tick)
+        return q, s, self.time
+
+    def command(self, target, speed, due):
+        self.sent.append(target - self.target)
+        self.target = target
+        while self.time < due - 5e-4:
+            self.time += 1e-3
+            self.motor = self.motor + (target - self.motor) * (1e-3 / self.lag if self.lag else 1.0)
+            joint = self.motor - self.sag * np.cos(self.motor)
+            self.q = np.clip(self.q, joint - self.play / 2, joint + self.play / 2)
+            self.moved()
+            self.past.append(self.q)
+
+    def moved(self):
+        pass
+
+    def now(self):
+        return self.time
 
     def stop(self):
-        self.stopped = True
+        self.calls.append("stop")
+
+    def close(self):
+        self.calls.append("close")
+
+
+def driven(config, robot):
+    bounds = bounds_of(config, joints_of(config))
+    return ForeignRobot(robot, "plant Arm", len(config.markers.known), bounds, 1.0, 1.0)
+
+
+TEN = ["calibration.frames_per_joint=2"]
 
 
 def test_every_step_keeps_the_speed_limit_and_the_joint_limits():
-    config = load_config(STANFORD)
+    config = load_config(STANFORD, [*TEN, "control.prismatic_speed_limit_m_s=0.5"])
     recording = stage.new_recording(config, Path("t.csv"))
-    noise = np.zeros((49, 2, 10, 2))
-    robot = Watched(truth_of(config), recording.targets[0], noise)
-    stage.record(config, recording, robot)
-    steps = np.array(robot.steps)
+    robot = Arm(config)
+    stage.record(config, recording, driven(config, robot))
+    steps = np.array(robot.sent)
     limit = np.array([125 * np.pi / 180 * 0.04] * 6)
     limit[2] = 0.5 * 0.04
-    assert (np.abs(steps) <= limit * (1 + 1e-12)).all()
+    assert (np.abs(steps) <= limit * (1 + 1e-9)).all()
     assert recording.commands == len(steps)
-    path = recording.targets[0] + np.cumsum(steps, axis=0)
-    truth = truth_of(config).robot
+    truth, path = robot.world.robot, np.array(robot.past)
     assert ((path >= truth.lower - 1e-9) & (path <= truth.upper + 1e-9)).all()
-    # each leg takes the least number of commands, and up to two for rounding
-    legs = np.ceil(np.abs(np.diff(recording.targets, axis=0)) / limit - 1e-9).max(axis=1)
-    assert legs.sum() <= recording.commands <= legs.sum() + 2 * len(legs)
-    assert robot.stopped
+    # each leg takes the least number of commands, one more for rounding, and half a second to stand still
+    ways = np.vstack([robot.past[:1], recording.targets])
+    legs = np.ceil(np.abs(np.diff(ways, axis=0)) / limit - 1e-9).max(axis=1)
+    assert legs.sum() <= recording.commands <= legs.sum() + (2 + 13) * len(legs)
+    assert robot.calls == ["open", "stop", "close"]
+    np.testing.assert_array_equal(read_table("t.csv").q, recording.targets)
 
 
-class Stuck(Watched):
-    """A robot whose first joint does not go beyond a place."""
+REAL = {
+    "lag": {"lag": 0.15},
+    "sag and play": {"sag": 0.00873, "play": 0.00873, "lag": 0.05},
+    "ticks": {"tick": 2 * np.pi / 4096, "lag": 0.05},
+    "late": {"late": 0.3, "lag": 0.05},
+    "webcam": {"late": 0.12, "lag": 0.15, "rate": 30.0, "noise": 0.5, "tick": 2 * np.pi / 4096},
+}
 
-    def command(self, step, period):
-        super().command(step, period)
-        self._q[0] = min(self._q[0], 3.7)
 
-
-def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept():
-    config = load_config(UR5)
+@pytest.mark.parametrize("faults", REAL.values(), ids=REAL)
+def test_a_pose_is_recorded_where_joints_and_images_have_come_to_rest(faults):
+    config = load_config(UR5, [*TEN, "plant.frames=5"])
     recording = stage.new_recording(config, Path("t.csv"))
-    robot = Stuck(truth_of(config), recording.targets[0], np.zeros((49, 2, 10, 2)))
-    with pytest.raises(WorkFailed, match=r"joint 1 was sent to 3.73.* and stands at 3.7 "):
-        stage.record(config, recording, robot)
-    assert robot.stopped
-    assert read_table("t.csv").pose.tolist() == list(range(len(recording.q)))
+    robot = Arm(config, **faults)
+    stage.record(config, recording, driven(config, robot))
+    table = read_table("t.csv")
+    assert len(table.pose) == 13
+    off = robot.sag + robot.play / 2 + robot.tick / 2
+    assert np.abs(table.q - recording.targets).max() <= off + 1e-5
+    rest = np.array([robot.past[round(1e3 * reading.t_q)] for reading in recording.done.values()])
+    clean = np.stack([robot.world.images(q, robot.world.M) for q in rest])
+    error = table.images - clean
+    if robot.noise:
+        assert recording.spread_px == pytest.approx(0.5, abs=0.03)
+        assert np.std(error) == pytest.approx(0.5 / np.sqrt(5), rel=0.1)
+    else:
+        assert np.abs(error).max() < 0.02
+
+
+class Stuck(Arm):
+    """An arm whose first joint does not go beyond a place."""
+
+    def moved(self):
+        self.q[0] = min(self.q[0], 3.7)
+
+
+class Backwards(Arm):
+    """An arm whose second joint turns the other way."""
+
+    def command(self, target, speed, due):
+        super().command(np.where(np.arange(6) == 1, 2.0 * self.past[0] - target, target), speed, due)
+
+
+class Shaking(Arm):
+    """An arm whose last joint does not come to rest."""
+
+    def moved(self):
+        self.q[5] = self.motor[5] + 0.01 * np.sin(5.0 * self.time)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (Stuck, r"joint 1 was sent to 4.18.* and stands at 3.7, 0.48\d short"),
+        (Backwards, r"joint 2 was sent to -1.678.*went away from there, from -1.378.*: look at its sign"),
+        (Shaking, r"joint 6 does not come to rest within 20 s"),
+    ],
+)
+def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept(kind, message):
+    config = load_config(UR5, TEN)
+    recording = stage.new_recording(config, Path("t.csv"))
+    robot = kind(config)
+    with pytest.raises(WorkFailed, match=message):
+        stage.record(config, recording, driven(config, robot))
+    assert robot.calls == ["open", "stop", "close"]
     assert recording.pending
+    if recording.done:
+        assert read_table("t.csv").pose.tolist() == list(range(len(recording.done)))
 
 
 def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo):
@@ -219,13 +316,3 @@ def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo)
     answer = projservo("record", "-c", "mine.yaml", "-o", "u.csv")
     assert answer.code == 2
     assert "set robot.dh or robot.screws" in answer.err
-
-
-def test_no_limit_is_one_step():
-    config = load_config(UR5, ["control.joint_speed_limit_deg_s=null"])
-    joints = joints_of(config)
-    assert np.isinf(joints.speed).all()
-    robot = Watched(truth_of(config), np.zeros(6), np.zeros((1, 2, 10, 2)))
-    target = np.array([1.0, -2.0, 0.1, 1e-9, 0.0, 3.0])
-    assert drive_to(robot, target, config, joints, "record") <= 2
-    np.testing.assert_array_equal(robot.joints(), target)

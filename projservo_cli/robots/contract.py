@@ -1,0 +1,366 @@
+"""The contract with a robot: called in one thread, awaited, checked, stopped and closed on every way out."""
+
+import math
+import queue
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, wait
+from contextlib import contextmanager, suppress
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from projservo_cli.records import FloatArray, WorkFailed
+from projservo_cli.robots.plugins import what_failed
+
+# Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
+STOP_S = 10.0
+# Share of a bound by which rounding may exceed it, and of a period to which an instant is kept.
+_ROUND_OFF, _LATE = 1e-9, 1e-3
+
+
+class Reading(NamedTuple):
+    """One look at a robot, checked."""
+
+    q: FloatArray  # (n,) rad or m
+    s: FloatArray  # (2, m, 2) px, NaN in both coordinates where unseen
+    t_q: float  # when the joints were read, s: the robot's stamp, else its clock just before it was asked
+    t_view: FloatArray  # (2,) stamps of both frames, s, by whatever clock; NaN where there are none
+    sigma_px: FloatArray | None  # (2, m) standard deviation of each corner, px; None where none is told
+
+
+class Bounds(NamedTuple):
+    """What no command may exceed, (n,) each, rad or m, per s where it is a speed."""
+
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: joint limits; infinite for none
+    speed: FloatArray  # with the factor of every command
+    lead: FloatArray  # of a set-point before the last reading
+    period: float  # of the loop, s
+
+
+class Robot(Protocol):
+    """A robot with its two cameras.
+
+    A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken; and, if
+    it is a simulator, ``truth()``, the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for
+    results alone. A simulator's time passes in ``command`` alone, which moves it to ``due``.
+    """
+
+    def open(self) -> None:
+        """Connect to robot and cameras; the first call."""
+
+    def read(self) -> tuple[Any, ...]:
+        """Look once.
+
+        Returns ``q, pixels``, perhaps ``t_q, t_left, t_right`` and ``sigma_px`` after them, each of which may
+        be None: joints (n,), rad or m; pixels (2, m, 2) of all markers in both views, NaN where unseen; when
+        the joints were read, s, by the robot's clock; stamps of both images, s, by any clock; standard
+        deviations (2, m) of the pixels.
+        """
+
+    def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
+        """Be at the joints ``target`` (n,), rad or m, when the clock shows ``due``, s; return at once.
+
+        ``speed`` (n,), per s, goes with it: a position servo needs the target, a velocity interface the speed
+        and the target, a trajectory interface all three. With no new command two periods after one was due,
+        hold.
+        """
+
+    def stop(self) -> None:
+        """Come to rest; from another thread where a call has not returned in time."""
+
+    def close(self) -> None:
+        """Let go of robot and cameras; the last call."""
+
+
+class ForeignRobot:
+    """A robot of somebody whose answers are awaited for a time and checked, as are its commands.
+
+    robot : what is driven.
+    name : of it, for messages.
+    markers : how many it observes.
+    bounds : of its commands; they tell the number of joints, too.
+    timeout_s, open_s : most time an answer may take, s, and opening it.
+    All methods raise ``WorkFailed`` where the robot fails, is late or answers nonsense. Calls are made in one
+    thread of its own, so that the loop goes on where one never returns.
+    """
+
+    def __init__(
+        self, robot: Robot, name: str, markers: int, bounds: Bounds, timeout_s: float, open_s: float
+    ) -> None:
+        self.robot, self.name, self.bounds = robot, name, bounds
+        self.timeout_s, self.open_s = timeout_s, open_s
+        self._joints, self._markers = len(bounds.speed), markers
+        self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
+        self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
+        self._last: Reading | None = None
+        self._sent: FloatArray | None = None  # the last set-point (n,)
+        self._due = -math.inf  # when it is to be there, s
+        self._orders: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
+        # begun, opened: whether opening it began, and ended; answers: whether its thread does
+        self._begun = self._opened = self._stopped = False
+        self._answers = True
+
+    def open(self) -> None:
+        """Open the robot in the thread in which it is driven from now on."""
+        self._begun = True
+        # A daemon: a call that never returns must not keep the process alive.
+        threading.Thread(target=self._serve, daemon=True, name=self.name).start()
+        self._ask("open", self.robot.open, self.open_s)
+        self._opened = True
+
+    def read(self) -> Reading:
+        """Joints and pixels of one look."""
+        before, answer = self._ask("read", lambda: (self._now(), self.robot.read()))
+        self._last = self._checked(self._time(before), answer)
+        return self._last
+
+    def now(self) -> float:
+        """What the clock of the robot shows, s; that of this machine where it has none."""
+        return self._time(time.monotonic() if self._now is time.monotonic else self._ask("now", self._now))
+
+    def truth(self) -> FloatArray | None:
+        """True pose (4, 4) of the tool, m, or true joints (n,), rad or m; None where nobody tells."""
+        tell = getattr(self.robot, "truth", None)
+        if tell is None:
+            return None
+        answer = self._ask("truth", tell)
+        shape = (4, 4) if np.ndim(answer) == 2 else (self._joints,)
+        return self._numbers("truth() gave numbers", answer, shape, finite=True)
+
+    def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
+        """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""
+        if wrong := self._wrong(target, speed, due):
+            raise WorkFailed(f"{self.name}: a command was not sent: {wrong}")
+        given = target.copy(), speed.copy(), due
+        self._ask("command", lambda: self.robot.command(*given))
+        self._sent, self._due = target.copy(), due
+
+    def wait_until(self, due: float) -> bool:
+        """Wait until the clock shows an instant, s, to a thousandth of a period; whether that was past."""
+        before, asleep = self.now(), time.monotonic()
+        now, slack = before, _LATE * self.bounds.period
+        while now < due - slack:
+            time.sleep(min(due - now, self.bounds.period))
+            now = self.now()
+            if now == before and time.monotonic() > asleep + self.timeout_s:
+                raise WorkFailed(
+                    f"{self.name}: its clock stands still at {now:.6g} s: now() must go on by itself, or "
+                    "command() move it to when it is due"
+                )
+        return before > due + slack
+
+    def stop(self) -> None:
+        """Bring the robot to rest, once: in its thread, and from another where that does not answer.
+
+        An impatient Ctrl-C does not cut it short.
+        """
+        if not self._begun or self._stopped:
+            return
+        self._stopped = True
+        orders = [self._order(self.robot.stop)]
+        if _came(orders, self.timeout_s) is None:
+            self._answers = False
+            orders[0].cancel()
+            self._say(f"its thread has not answered for {self.timeout_s:g} s, so stop() comes from another")
+            orders = [*(order for order in orders if not order.cancelled()), Future()]
+            threading.Thread(target=_serve, args=(self.robot.stop, orders[-1]), daemon=True).start()
+        error = _came(orders, STOP_S)
+        if self._opened and error != "":
+            what = f"failed: {error}" if error else f"did not return within {STOP_S:g} s"
+            raise WorkFailed(f"{self.name}: stop() {what}; see to it that the robot is at rest")
+
+    def close(self) -> None:
+        """Let go of the robot, once, in its thread, even if opening it failed; what goes wrong is said."""
+        if not self._begun:
+            return
+        self._begun = False
+        error = _came([self._order(self.robot.close)], STOP_S if self._answers else self.timeout_s)
+        self._orders.put(None)
+        if self._opened and error != "":
+            self._say(f"close() failed: {error}" if error else "not closed, since its thread is not free")
+
+    def _say(self, what: str) -> None:
+        print(f"{self.name}: {what}", file=sys.stderr)
+
+    def _serve(self) -> None:
+        while (order := self._orders.get()) is not None:
+            _serve(*order)
+
+    def _order(self, call: Callable[[], Any]) -> "Future[Any]":
+        order: Future[Any] = Future()
+        self._orders.put((call, order))
+        return order
+
+    def _ask(self, what: str, call: Callable[[], Any], seconds: float | None = None) -> Any:
+        order, key = self._order(call), "timeout_s" if seconds is None else "open_s"
+        seconds = seconds or self.timeout_s
+        try:
+            error = order.exception(seconds)
+        except TimeoutError:
+            raise WorkFailed(
+                f"{self.name}: {what}() did not return within {seconds:g} s: look what it waits for, or "
+                f"raise plant.{key}"
+            ) from None
+        if isinstance(error, KeyboardInterrupt):
+            raise error
+        if error is not None:
+            raise WorkFailed(f"{self.name}: {what}() failed: {what_failed(error)}") from error
+        return order.result()
+
+    def _time(self, answer: Any) -> float:
+        """An instant that the clock showed, s; one that jumps is named."""
+        now, here = float(self._numbers("now() gave a time", answer, (), finite=True)), time.monotonic()
+        before, there = self._shown
+        last = max(before + here - there, self._due) if self._shown[1] else math.inf
+        if not before <= now <= last + self.timeout_s:
+            raise WorkFailed(f"{self.name}: its clock jumped from {before:.6g} s to {now:.6g} s")
+        self._shown = now, here
+        return now
+
+    def _checked(self, before: float, answer: Any) -> Reading:
+        """What read() gave as new numbers; ``before`` is what the clock showed then, s."""
+        if not isinstance(answer, tuple) or not 2 <= len(answer) <= 6:
+            raise WorkFailed(
+                f"{self.name}: read() gave {type(answer).__name__}: expected (q, pixels), perhaps with t_q, "
+                "t_left, t_right and sigma_px after them"
+            )
+        q, pixels, *stamps, sigma = list(answer) + [None] * (6 - len(answer))
+        q = self._numbers("read() gave q", q, (self._joints,), finite=True)
+        s = self._numbers("read() gave pixels", pixels, (2, self._markers, 2))
+        if np.isinf(s).any():
+            raise WorkFailed(f"{self.name}: read() gave an infinite pixel: NaN stands for unseen")
+        s[np.isnan(s).any(axis=2)] = np.nan
+        times = np.full(3, np.nan)
+        for i, name in enumerate(("t_q", "t_left", "t_right")):
+            if stamps[i] is not None:
+                times[i] = self._numbers(f"read() gave {name}", stamps[i], (), finite=True)
+            last = -math.inf if self._last is None else (self._last.t_q, *self._last.t_view)[i]
+            if times[i] < last - (i and self.timeout_s):  # exposures that jitter may overtake each other
+                what = f"{name} went back from {last:.6g} s to {times[i]:.6g} s"
+                raise WorkFailed(f"{self.name}: {what}: one clock must stamp all of them")
+        if sigma is not None:
+            sigma = self._numbers("read() gave sigma_px", sigma, (2, self._markers))
+            if not (sigma[np.isfinite(s[..., 0])] > 0.0).all():
+                raise WorkFailed(f"{self.name}: read() gave a sigma_px that is not positive")
+        return Reading(q, s, before if np.isnan(times[0]) else float(times[0]), times[1:], sigma)
+
+    def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:
+        """Why a command must not be sent, whoever computed it; empty where it may."""
+        bounds = self.bounds
+        if self._last is None:
+            return "nothing was read before"
+        if not (np.isfinite(target).all() and np.isfinite(speed).all() and math.isfinite(due)):
+            return f"{target} at {speed} by {due} is not finite"
+        q = self._last.q
+        sent = q if self._sent is None else self._sent
+        # From the last set-point on, which after a pause was held: thinking took a period at most.
+        step = bounds.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
+        allowed = {
+            "beyond its limits": (np.minimum(bounds.lower, q), np.maximum(bounds.upper, q)),
+            "too far ahead of the reading": (q - bounds.lead, q + bounds.lead),
+            # Back towards the reading it may jump: that shortens the way of the robot.
+            "too far from the last one": (np.minimum(sent, q) - step, np.maximum(sent, q) + step),
+        }
+        slack = _ROUND_OFF * (1.0 + np.abs(target))
+        for what, (low, high) in allowed.items():
+            for i in np.flatnonzero((target < low - slack) | (target > high + slack)):
+                limits = f"{low[i]:.6g} to {high[i]:.6g} (rad or m)"
+                return f"the set-point of joint {i + 1}, {target[i]:.6g}, is {what}: allowed are {limits}"
+        for i in np.flatnonzero(np.abs(speed) > bounds.speed * (1.0 + _ROUND_OFF)):
+            return f"the speed of joint {i + 1}, {speed[i]:.6g}, is beyond its limit {bounds.speed[i]:.6g}"
+        return ""
+
+    def _numbers(self, what: str, answer: Any, shape: tuple[int, ...], *, finite: bool = False) -> FloatArray:
+        """The answer as new numbers of the right shape."""
+        try:
+            found = np.asarray(answer)
+        except ValueError:
+            found = np.empty(0, dtype=object)
+        if found.dtype.kind not in "fiu":
+            raise WorkFailed(
+                f"{self.name}: {what} as {type(answer).__name__}: expected numbers of shape {shape}"
+            )
+        if found.shape != shape:
+            raise WorkFailed(f"{self.name}: {what} of shape {found.shape}, expected {shape}")
+        if finite and not np.isfinite(found).all():
+            raise WorkFailed(f"{self.name}: {what} as {found}: must be finite")
+        return np.array(found, dtype=np.float64)
+
+
+def _serve(call: Callable[[], Any], order: "Future[Any]") -> None:
+    """Make a call, unless it was cancelled, and keep what comes of it."""
+    if order.set_running_or_notify_cancel():
+        try:
+            order.set_result(call())
+        except BaseException as error:
+            order.set_exception(error)
+
+
+def _came(orders: "list[Future[Any]]", seconds: float) -> str | None:
+    """What went wrong with the first of the orders that was carried out; None for none yet.
+
+    Whoever interrupts meanwhile is not heeded.
+    """
+    end = time.monotonic() + seconds
+    while True:
+        with suppress(KeyboardInterrupt):
+            done, _ = wait(orders, max(0.0, end - time.monotonic()), return_when="FIRST_COMPLETED")
+            if done:
+                errors = [order.exception() for order in done]
+                return "" if None in errors else what_failed(errors[0] or RuntimeError())
+            if time.monotonic() >= end:
+                return None
+
+
+@contextmanager
+def at_rest_after(robot: ForeignRobot) -> Iterator[None]:
+    """Open a robot; stop and close it on every way out, Ctrl-C, SIGTERM and a lost terminal among them.
+
+    Raises WorkFailed if it may not be at rest, beside what ended it.
+    """
+    with _signals_interrupt():
+        try:
+            robot.open()
+            yield
+        except BaseException as error:
+            try:
+                robot.stop()
+            except WorkFailed as failure:
+                raise WorkFailed(f"{_line(error)}; and {failure}") from error
+            raise
+        else:
+            robot.stop()
+        finally:
+            robot.close()
+
+
+def _line(error: BaseException) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+@contextmanager
+def _signals_interrupt() -> Iterator[None]:
+    """Treat a termination as Ctrl-C, which unwinds; only the main thread may set this up."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    names = ("SIGTERM", "SIGHUP") if threading.current_thread() is threading.main_thread() else ()
+    before = {}
+    for number in (getattr(signal, name) for name in names if hasattr(signal, name)):
+        handler = signal.getsignal(number)
+        if handler not in (signal.SIG_IGN, None):  # nohup has its reasons
+            before[number] = handler
+            signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
