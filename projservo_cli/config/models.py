@@ -452,8 +452,8 @@ class _Control(Section):
 class _EachView(Section):
     """A number for each camera."""
 
-    left: Number
-    right: Number
+    left: Number = Field(description="of the left camera")
+    right: Number = Field(description="of the right camera")
 
 
 class _PlantSettings(Section):
