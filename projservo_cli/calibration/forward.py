@@ -115,15 +115,21 @@ class Scene:
         by_camera = (G[..., None] * Y[0][:, None, None, :]).reshape(*pixels.shape, CAMERA)
         return _Images(pixels, Y, by_camera, D, by_lens)
 
-    def derivative(self, q: FloatArray) -> FloatArray:
+    def everywhere(self, q: FloatArray) -> _Images:
+        """Images of all markers at joints (K, n), pose by pose, with their derivatives."""
+        pose_of, marker_of = np.divmod(np.arange(len(q) * len(self.M)), len(self.M))
+        return self.images(q, pose_of, marker_of)
+
+    def derivative(self, q: FloatArray, images: _Images | None = None) -> FloatArray:
         """Derivative of all markers' pixels by P, H_hat, M (ravelled): (K, 2, m, 2, 24 + 16 n + 4 m).
 
         With a lens, by k1 and k2 of both views in four more columns. An operator enters by
-        E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ).
+        E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of
+        ``everywhere``, where they are known.
         """
         (K, n), m = q.shape, len(self.M)
         pose_of, marker_of = np.divmod(np.arange(K * m), m)
-        images = self.images(q, pose_of, marker_of)
+        images = self.everywhere(q) if images is None else images
         joints, markers = 2 * CAMERA, 2 * CAMERA + 16 * n
         lenses = markers + 4 * m
         J = np.zeros((2, K * m, 2, lenses + (0 if images.by_lens is None else 2 * LENS)))

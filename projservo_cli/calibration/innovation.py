@@ -1,56 +1,155 @@
 """Whether images in the loop agree with the calibration, and what is to blame where they do not."""
 
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import chdtri
 
-from projservo_cli.calibration.prediction import covariance_root, predict, prediction_derivative
+from projservo_cli.calibration.forward import CAMERA, Scene
+from projservo_cli.calibration.prediction import covariance_root
 from projservo_cli.calibration.readings import LEAST_SIGMA
-from projservo_cli.records import BoolArray, Calibration, FloatArray
+from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
-# Observations in a row that must agree on a disturbance: one may be blurred, or a marker taken for another.
+# Looks in a row that must agree on a gross disturbance: one may be blurred, or a marker taken for another.
 WINDOW = 3
-# Chance that a run of undisturbed observations is called disturbed, at most.
+# Chance that a run of undisturbed looks is called disturbed, at most.
 _FALSE_ALARM = 1e-3
 # What the first order leaves out of a prediction's error, at most, as a share of the calibration's own noise:
 # nearer than that no image need come to what is predicted, however good the detector.
 _BEYOND_FIRST_ORDER = 0.02
+# Lasting errors of a joint, by play and ticks, differ between two times by √2 of their deviation.
+_LASTING = np.sqrt(2.0)
+# Joints (rad or m) and instants (s) are known no better than this, whatever is said.
+_LEAST_ERROR = 1e-6
+# A prismatic joint errs by so many metres where a revolute one errs by a radian.
+_METRES_PER_RAD = 0.3
+# A direction counts where it keeps this share of its size beside the others; what is added for solving.
+_RANK, _RIDGE = 1e-6, 1e-9
+# Share of a large disturbance that the first order leaves out: its cause need not explain more.
+_BENT = 0.03
+# Advantage over the next cause, twice the logarithm of odds, at which one is named; looks that are waited for
+# that; share of what a cause explains that, left to others, shows that there are several.
+_CLEAR, _PATIENCE, _LEFT = 2.0 * np.log(100.0), 12, 0.25
 
 
-@dataclass(eq=False)
+class _Cause(NamedTuple):
+    """What may be wrong."""
+
+    kind: str
+    which: int  # joint, view or marker; −1 all of them
+    columns: IntArray  # its regressors
+    touches: BoolArray  # (2, m) images that it changes
+
+
+class _Look(NamedTuple):
+    """Residuals of one look: rows by view, marker and coordinate, zero where unseen."""
+
+    seen: BoolArray  # (2, m)
+    r: FloatArray  # (4 m,) seen less predicted, px
+    B: FloatArray  # (4 m, e) derivatives by the errors of the calibration, in units of their deviations
+    F: FloatArray  # (4 m, f) derivatives by what may be wrong
+    R: FloatArray  # (4 m, 4 m) covariance of what is new in each look, px²
+
+
+class _Sums(NamedTuple):
+    """Normal equations of looks."""
+
+    looks: int  # number of the last of them
+    normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
+    seen: FloatArray  # (2, m) coordinates seen of each marker
+
+
+class _Evidence(NamedTuple):
+    """What speaks for each cause since an onset, likelihoods as twice their logarithms."""
+
+    since: _Sums
+    lasting: float  # what lasting errors of joints and instants gain
+    prior: float  # what that costs by their prior
+    gain: FloatArray  # (h,) what each cause gains beside them
+    amount: FloatArray  # (h, p) of each the factors of its regressors, zeros behind
+    touched: FloatArray  # (h,) coordinates seen that it touches
+    rows: float  # coordinates seen
+
+
+class _Blame(NamedTuple):
+    """A cause that may be named, or markers together."""
+
+    score: float
+    causes: list[int]
+    evidence: _Evidence
+
+
 class Innovation:
-    """Whether a sequence of observations still agrees with a calibration: a bumped camera, a moved marker.
+    """Whether a sequence of looks still agrees with a calibration, and what happened where it does not.
 
     At given joint readings the calibration predicts the pixels of every marker. What is seen differs by
-    the pixel noise and by the error of the calibration, r = J δ + ε with δ ~ N(0, Σ) and ε ~ N(0, σ² I),
-    to first order. δ is the same all along, so it is estimated from one observation to the next by a
-    Kalman filter, and each innovation has the χ² distribution of its own S = J C Jᵀ + σ² I. The parts that
-    are tested are the two views and each marker; one that is beyond its threshold several times in a row
-    is no chance and no slip of the detector.
 
-    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
-    Navigation", Wiley 2001, section 5.4 (innovation as a test of the filter).
+        r = J δ + J_q δq + (J_q q̇) δd + ε
+
+    to first order: δ ~ N(0, Σ), errors of the calibration, the same all along; δq of the joint readings, the
+    same in both views; δd of the instant of each frame; ε ~ N(0, σ² I), pixel noise. Errors of joints and
+    instants are taken to be new in each look *and* to last, by a part that is constant since an onset: they
+    do not average away. Nor does an error of the model, which may add to the root of a statistic what it
+    can if it is ``model_px`` everywhere.
+
+    All looks add up in one normal matrix. From it follow the likelihood ratios of all causes for any onset,
+    beside δ and the lasting errors with their priors. Each look is first tested by itself, each view and each
+    marker: one that is grossly off stays out of the sums, and is a disturbance if that lasts. The cause of
+    the largest likelihood, less a penalty for its parameters, is named as soon as it is clear.
+
+    Sources: A. S. Willsky, H. L. Jones, "A Generalized Likelihood Ratio Approach to the Detection and
+    Estimation of Jumps in Linear Systems", IEEE Trans. Automatic Control 21 (1976) 108–112; G. Schwarz,
+    "Estimating the Dimension of a Model", Annals of Statistics 6 (1978) 461–464.
+
+    calibration : what predicts the pixels, with its covariance.
+    sigma_px : pixel noise per coordinate.
+    observations : most looks of one sequence, which sets the thresholds.
     """
 
-    calibration: Calibration  # what predicts the pixels, with its covariance
-    sigma_px: float  # pixel noise per coordinate
-    observations: int  # most observations of one sequence, which sets the threshold
-    _beyond: list[BoolArray] = field(default_factory=list)
+    def __init__(self, calibration: Calibration, sigma_px: float, observations: int) -> None:
+        self.calibration = calibration
+        m, n = len(calibration.M), len(calibration.H_hat_0)
+        prismatic = np.array([letter == "P" for letter in calibration.joint_types])
+        self._scene = Scene(calibration.P, calibration.H_hat_0, prismatic, calibration.M, calibration.lens)
+        self._factor = covariance_root(calibration.covariance)
+        bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
+        self._sigma = max(sigma_px, bent, LEAST_SIGMA)
+        self._floor = max(calibration.model_px, bent) / self._sigma
+        sigma_q = calibration.sigma_q or 0.0
+        if calibration.sigma_q_interval is not None:
+            sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
+        self._sigma_q = np.maximum(sigma_q * np.where(prismatic, _METRES_PER_RAD, 1.0), _LEAST_ERROR)
+        self._delay_sigma = np.full(2, _LEAST_ERROR)
+        # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
+        self._directions = np.linalg.svd(calibration.a_inf[None])[2][1:]
+        self._twists = _rigid_motions(calibration.H_hat_0, self._directions, calibration.a_inf)
+        self._cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
+        self._causes, self._f = _table_of(n, m, len(self._twists))
+        self._sizes = np.array([len(cause.columns) for cause in self._causes])
+        self._by_size = [
+            (which, np.array([self._causes[i].columns for i in which]))
+            for which in (np.flatnonzero(self._sizes == size) for size in np.unique(self._sizes))
+        ]
+        self._touches = np.array([cause.touches.ravel() for cause in self._causes], dtype=np.float64)
+        tail = _FALSE_ALARM / observations
+        self._most = np.sqrt(chdtri(self._sizes, tail / len(self._sizes)))
+        self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (2 + m)))
+        c = self._factor.shape[1] + self._f + 1
+        self._sums = [_Sums(0, np.zeros((c, c)), np.zeros((2, m)))]
+        self._pending: list[tuple[BoolArray, _Sums]] = []
+        self._readings: list[FloatArray] = []
+        self._doubtful = 0
 
-    def __post_init__(self) -> None:
-        self._factor = covariance_root(self.calibration.covariance)
-        r = self._factor.shape[1]
-        self._mean, self._C = np.zeros(r), np.eye(r)
-        self._sigma = max(self.sigma_px, _BEYOND_FIRST_ORDER * self.calibration.sigma_px, LEAST_SIGMA)
-        m = len(self.calibration.marker)
-        tail = _FALSE_ALARM / (self.observations * (2 + m))
-        self._threshold: FloatArray = np.asarray(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail))
+    @property
+    def doubtful(self) -> bool:
+        """Whether something is wrong of which it is not clear yet what; further looks make it clear."""
+        return self._doubtful > 0
 
     def disturbed(
         self, q: FloatArray, q_dot: FloatArray, delay_sigma: FloatArray, images: FloatArray, fresh: BoolArray
     ) -> str:
-        """What is wrong, in words; empty while nothing is.
+        """What is wrong, in words; empty while nothing is, or while it is not clear what.
 
         q : (2, n) joint readings at the instants of both frames, rad or m.
         q_dot : (n,) joint velocities, rad/s or m/s.
@@ -60,58 +159,288 @@ class Innovation:
         """
         if not fresh.any():
             return ""
-        views = np.arange(2)
-        J = prediction_derivative(self.calibration, q)[views, views] @ self._factor
-        seen = np.where(fresh[:, None, None], images, np.nan)
-        r = seen - predict(self.calibration, q)[views, views] - J @ self._mean
-        shape = r.shape[:2]
-        parts = [np.broadcast_to(view[:, None], shape) for view in np.eye(2, dtype=np.bool_)]
-        parts += [np.broadcast_to(marker, shape) for marker in np.eye(shape[1], dtype=np.bool_)]
-        beyond = np.array([self._beyond_chance(r, J, part) for part in parts])
-        self._beyond = [*self._beyond[1 - WINDOW :], beyond]
-        lasting = np.all(self._beyond, axis=0)
-        if len(self._beyond) == WINDOW and lasting.any():
-            return self._culprit(r, J, lasting[2:])
+        self._delay_sigma = np.maximum(delay_sigma, _LEAST_ERROR)
+        look = self._look(q, q_dot, np.where(fresh[:, None, None], images, np.nan))
+        self._readings.append(q[0])
+        beyond = self._beyond_chance(look)
+        self._pending.append((beyond, self._added(look)))
         if not beyond.any():
-            self._learn(r, J)
+            self._keep(self._pending[-1][1])
+            self._pending.clear()
+        lasting = np.all([row for row, _ in self._pending[-WINDOW:]], axis=0)
+        gross = len(self._pending) >= WINDOW and bool(lasting.any())
+        if gross or self._doubtful or self._significant():
+            return self._named(look, gross)
         return ""
 
-    def _seen(
-        self, r: FloatArray, J: FloatArray, part: BoolArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Innovation, derivative and covariance of the innovation of what was seen of a part (2, m)."""
-        seen = part & np.isfinite(r[..., 0])
-        B = J[seen].reshape(-1, J.shape[-1])
-        return r[seen].ravel(), B, B @ self._C @ B.T + self._sigma**2 * np.eye(len(B))
+    def _look(self, q: FloatArray, q_dot: FloatArray, images: FloatArray) -> _Look:
+        """Residuals and derivatives of one look: each view at its own joints (2, n)."""
+        scene, away, views = self._scene, q - self.calibration.q_reference, np.arange(2)
+        m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
+        r = images - scene.seen(away)[views, views]
+        seen = np.isfinite(r[..., 0])
+        at = scene.everywhere(away)
+        B = scene.derivative(away, at)[views, views] @ self._factor
+        D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
+        Y = at.points.reshape(n + 1, 2, m, 4)
+        by_camera = at.by_camera.reshape(2, 2, m, 2, CAMERA)[views, views]
+        F = self._causes_derivative(D, Y, by_camera, q_dot)
+        for part in (r, B, F):
+            part[~seen] = 0.0
+        F = F.reshape(rows, -1)
+        new = F[:, [*range(n), 2 * n, 2 * n + 1]] * np.append(self._sigma_q, self._delay_sigma)
+        # An instant so uncertain that the arm moves on a curve: half the square of the angle.
+        bend = 0.5 * np.abs(q_dot).sum() * (new[:, n:] @ self._delay_sigma)
+        R = new @ new.T + np.diag(self._sigma**2 + bend**2)
+        return _Look(seen, r.ravel(), B.reshape(rows, -1), F, R)
 
-    def _beyond_chance(self, r: FloatArray, J: FloatArray, part: BoolArray) -> bool:
-        """Whether χ² of what was seen of a part (2, m) is beyond what chance allows."""
-        values, _, S = self._seen(r, J, part)
-        return bool(values @ np.linalg.solve(S, values) > self._threshold[values.size])
+    def _causes_derivative(
+        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, q_dot: FloatArray
+    ) -> FloatArray:
+        """Derivatives (2, m, 2, f) of pixels by what may be wrong, in the order of ``_table_of``.
 
-    def _learn(self, r: FloatArray, J: FloatArray) -> None:
-        """Kalman update of the error of the calibration."""
-        values, B, S = self._seen(r, J, np.ones(r.shape[:2], dtype=np.bool_))
-        gain = np.linalg.solve(S, B @ self._C).T
-        self._mean = self._mean + gain @ values
-        self._C = self._C - gain @ B @ self._C
-        self._C = 0.5 * (self._C + self._C.T)
+        D : (n + 1, 2, m, 2, 4) by the points Y (n + 1, 2, m, 4) behind each joint; by_camera : (2, m, 2, 12).
+        """
+        n, _, m = Y[1:, ..., 0].shape
+        F, d = np.zeros((2, m, 2, self._f)), len(self._twists)
+        velocity = Y[:n] @ self._scene.H_hat[:, None].swapaxes(2, 3)
+        J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
+        F[..., :n], F[..., n : 2 * n] = J_q, J_q * len(self._readings)
+        by_marker, first = D[n] @ self._directions.T, 2 * n + 2
+        for v in (0, 1):
+            F[v, ..., 2 * n + v] = -J_q[v] @ q_dot
+            F[v, ..., first : first + CAMERA - 1] = by_camera[v] @ self._cameras[v]
+            first += CAMERA - 1
+        for j in range(m):
+            F[:, j, :, first : first + 3] = by_marker[:, j]
+            first += 3
+        F[..., first : first + d] = D[n] @ np.moveaxis(self._scene.M @ self._twists.swapaxes(1, 2), 0, -1)
+        F[..., first + d :] = D[0] @ np.moveaxis(Y[0] @ self._twists[:, None].swapaxes(2, 3), 0, -1)
+        return F
 
-    def _culprit(self, r: FloatArray, J: FloatArray, moved: BoolArray) -> str:
-        """The least that explains it: some markers, one camera, or everything."""
-        few = moved.sum() <= len(moved) // 2
-        views = [
-            self._beyond_chance(r, J, np.outer(np.arange(2) == view, ~moved | (not few))) for view in range(2)
+    def _error_root(self, sums: _Sums) -> FloatArray:
+        """Root (e, e) of the information on the errors of the calibration."""
+        e = self._factor.shape[1]
+        return np.asarray(np.linalg.cholesky(np.eye(e) + sums.normal[:e, :e]))
+
+    def _beyond_chance(self, look: _Look) -> BoolArray:
+        """Whether χ² of what is seen of each view and each marker is beyond what chance allows, (2 + m,)."""
+        e, m = self._factor.shape[1], look.seen.shape[1]
+        both = np.concatenate([look.B.T, self._sums[-1].normal[:e, -1:]], axis=1)
+        both = solve_triangular(self._error_root(self._sums[-1]), both, lower=True, check_finite=False)
+        W = both[:, :-1]
+        S, r = W.T @ W + look.R, look.r - W.T @ both[:, -1]
+        rows, seen = np.arange(4 * m).reshape(2, m, 2), np.repeat(look.seen.ravel(), 2)
+        beyond = []
+        for part in (rows.reshape(2, -1), rows.swapaxes(0, 1).reshape(m, -1)):
+            count = seen[part].sum(axis=1)
+            most = self._most_once[count] + self._floor * np.sqrt(count)
+            beyond.append(_gains(S, r, part, 0.0)[0] > most**2)
+        return np.concatenate(beyond)
+
+    def _added(self, look: _Look) -> _Sums:
+        """What one look adds to the sums."""
+        rows = np.concatenate([look.B, look.F, look.r[:, None]], axis=1)
+        rows = solve_triangular(np.linalg.cholesky(look.R), rows, lower=True, check_finite=False)
+        return _Sums(len(self._readings), rows.T @ rows, 2.0 * look.seen.astype(np.float64))
+
+    def _keep(self, new: _Sums) -> None:
+        """Add a look; of earlier sums those are kept that tell an onset to a quarter of its age."""
+        self._sums.append(_with(self._sums[-1], new))
+        age = [max(1, (new.looks - sums.looks) // 4) for sums in self._sums]
+        self._sums = [
+            sums
+            for sums, a in zip(self._sums, age, strict=True)
+            if sums.looks % (1 << (a.bit_length() - 1)) == 0
         ]
-        rms = float(np.sqrt(np.nanmean(r**2)))
+
+    def _evidence(self, since: _Sums, total: _Sums, *held: IntArray) -> _Evidence:
+        """What speaks for each cause since an onset, beside regressors that are free anyway.
+
+        Lasting errors of joints and instants are beside them always, with their priors.
+        """
+        e, n = self._factor.shape[1], len(self._sigma_q)
+        across = (total.normal - since.normal)[:, e:]
+        least = _RIDGE * across[e:].diagonal()
+        across[:e, -1] = total.normal[:e, -1]
+        W = solve_triangular(self._error_root(total), across[:e], lower=True, check_finite=False)
+        normal = across[e:] - W.T @ W
+        beside = np.concatenate([np.arange(n), 2 * n + np.arange(2), *held])
+        prior = (_LASTING * np.append(self._sigma_q, self._delay_sigma)) ** -2.0
+        weight = np.diag(np.append(prior, least[beside[n + 2 :]]))
+        information = normal[np.ix_(beside, beside)] + weight
+        solved = np.linalg.solve(information, normal[beside])
+        lasting = float(normal[beside, -1] @ solved[:, -1])
+        cost = float(np.linalg.slogdet(information)[1] - np.log(weight.diagonal()).sum())
+        normal -= normal[:, beside] @ solved
+        gain, amount = np.zeros(len(self._causes)), np.zeros((len(self._causes), self._sizes.max()))
+        for which, columns in self._by_size:
+            gain[which], amount[which, : columns.shape[1]] = _gains(normal, normal[:, -1], columns, least)
+        count = (total.seen - since.seen).ravel()
+        return _Evidence(since, lasting, cost, gain, amount, self._touches @ count, float(count.sum()))
+
+    def _beyond(self, evidence: _Evidence) -> BoolArray:
+        """Which causes (h,) are beyond what chance and errors of the model allow; what stands still must."""
+        possible = np.sqrt(evidence.gain) > self._most + self._floor * np.sqrt(evidence.touched)
+        if possible.any():
+            still = np.ptp(self._readings[evidence.since.looks :], axis=0) == 0.0
+            for i, cause in enumerate(self._causes):
+                if cause.kind == "frozen":
+                    possible[i] &= still.all() if cause.which < 0 else still[cause.which] and not still.all()
+        return np.asarray(possible)
+
+    def _significant(self) -> bool:
+        """Whether anything is beyond chance since an onset: at every other look, for windows in turn."""
+        total = self._sums[-1]
+        lengths = [WINDOW << i for i in range((total.looks // WINDOW).bit_length())]
+        if self._pending or not lengths or total.looks % 2:
+            return False
+        length = lengths[total.looks // 2 % len(lengths)]
+        since = min(self._sums, key=lambda sums: abs(total.looks - length - sums.looks))
+        return bool(self._beyond(self._evidence(since, total)).any())
+
+    def _named(self, look: _Look, gross: bool) -> str:
+        """The cause in words, once it is clear or has been waited for; empty until then."""
+        total = self._sums[-1]
+        for _, added in self._pending if gross else ():
+            total = _with(total, added)
+        blamed = self._blamed(total)
+        if not blamed:
+            self._doubtful = 0
+            return ""
+        self._doubtful += 1
+        best, *others = sorted(blamed, key=lambda blame: -blame.score)
+        clear = not others or best.score - others[0].score >= _CLEAR
+        if not clear and self._doubtful < _PATIENCE:
+            return ""
+        rms = np.sqrt(np.square(look.r).sum() / (2.0 * look.seen.sum()))
         fit = f"images are {rms:.3g} px rms per coordinate off what the calibration predicts"
-        if few and not any(views):
-            numbers = ", ".join(map(str, self.calibration.marker[moved]))
-            return f"{fit}: marker {numbers} was moved on the tool; put it back, or recalibrate"
-        if views[0] != views[1]:
-            side = ("left", "right")[int(views[1])]
-            return f"{fit}, those of the {side} camera alone: it was moved; recalibrate"
-        return (
-            f"{fit}, in both cameras alike: the joint readings are wrong, or the tool or the rig was moved; "
-            "check them and recalibrate"
-        )
+        left = self._evidence(best.evidence.since, total, *self._columns(best))
+        share = np.where(self._beyond(left), left.gain, 0.0) / best.evidence.gain[best.causes].sum()
+        if share.max() > _LEFT:
+            second = self._said(_Blame(0.0, [int(np.argmax(share))], left), look)
+            return f"{fit}, for more than one cause: {self._said(best, look)}; {second}"
+        return f"{fit}: {self._said(best, look)}" + ("" if clear else f"; or {self._said(others[0], look)}")
+
+    def _blamed(self, total: _Sums) -> list[_Blame]:
+        """What may be named, each cause since its best onset, by the criterion of Schwarz."""
+        onsets = [since for since in self._sums if since.seen.sum() < total.seen.sum()]
+        found = [self._evidence(since, total) for since in onsets]
+        possible = np.array([self._beyond(evidence) for evidence in found])
+        if not possible.any():
+            return []
+        gain = np.array([evidence.lasting + evidence.gain for evidence in found])
+        penalty = [evidence.prior + self._sizes * np.log(evidence.rows) for evidence in found]
+        scale = 1.0 + _BENT**2 * float(gain[possible].max())
+        score = np.where(possible, gain / scale - penalty, -np.inf)
+        best = score.argmax(axis=0)
+        blamed = [_Blame(score[t, i], [i], found[t]) for i, t in enumerate(best) if possible[t, i]]
+        markers = [blame for blame in blamed if self._causes[blame.causes[0]].kind == "marker"]
+        if not markers:
+            return blamed
+        together = self._with_others(max(markers, key=lambda blame: blame.score), total, scale)
+        return [together, *(blame for blame in blamed if blame.causes[0] not in together.causes)]
+
+    def _with_others(self, blame: _Blame, total: _Sums, scale: float) -> _Blame:
+        """A marker and those that moved too, one after the other, up to half of them."""
+        markers = np.array([cause.kind == "marker" for cause in self._causes])
+        while len(blame.causes) < markers.sum() // 2:
+            left = self._evidence(blame.evidence.since, total, *self._columns(blame))
+            more = left.gain / scale - self._sizes * np.log(left.rows)
+            more[~(self._beyond(left) & markers)] = 0.0
+            i = int(np.argmax(more))
+            if more[i] <= 0.0:
+                break
+            blame = blame._replace(score=blame.score + more[i], causes=[*blame.causes, i])
+        return blame
+
+    def _columns(self, blame: _Blame) -> list[IntArray]:
+        return [self._causes[i].columns for i in blame.causes]
+
+    def _said(self, blame: _Blame, look: _Look) -> str:
+        """Which, how far, what to do."""
+        first = blame.causes[0]
+        kind, i = self._causes[first].kind, self._causes[first].which
+        amount, px = blame.evidence.amount[first], self._changed(blame, look)
+        side = "both cameras" if i < 0 else f"the {('left', 'right')[min(i, 1)]} camera"
+        if kind == "slipped":
+            slides = self.calibration.joint_types[i] == "P"
+            far = f"{1e3 * amount[0]:.2g} mm" if slides else f"{np.degrees(amount[0]):.2g} deg"
+            alike = " or the base turned likewise" if i == 0 else ""
+            alike += " or the tool turned likewise in its holder" if i == len(self._sigma_q) - 1 else ""
+            return f"joint {i + 1} slipped by {far}{alike}; home it again, or recalibrate"
+        if kind == "frozen":
+            which = "all joints" if i < 0 else f"joint {i + 1}"
+            return f"the reading of {which} stands still while the arm moves; look at its encoder and cable"
+        if kind == "late":
+            ms = " and ".join(f"{1e3 * value:+.3g}" for value in amount[: self._sizes[first]])
+            return (
+                f"images of {side} come later than was taken, by {ms} ms; give plant.delay_s, or recalibrate"
+            )
+        if kind == "camera":
+            return f"{side} was moved, by {px:.2g} px; put it back, or recalibrate"
+        if kind == "marker":
+            numbers = sorted(int(self.calibration.marker[self._causes[c].which]) for c in blame.causes)
+            which = f"marker{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))} moved on the tool"
+            return f"{which}, by {px:.2g} px; put back what moved, or recalibrate"
+        if kind == "tool":
+            return f"the tool was moved in its holder, by {px:.2g} px; put it back, or recalibrate"
+        return f"both cameras were moved alike, or the base was, by {px:.2g} px; recalibrate"
+
+    def _changed(self, blame: _Blame, look: _Look) -> float:
+        """By how much a cause changes the coordinates that it touches and a look shows, rms, px."""
+        change, touched = np.zeros(len(look.r)), np.zeros(look.seen.shape, dtype=np.bool_)
+        for i in blame.causes:
+            columns = self._causes[i].columns
+            change += look.F[:, columns] @ blame.evidence.amount[i, : len(columns)]
+            touched |= self._causes[i].touches & look.seen
+        return float(np.sqrt(np.square(change).sum() / max(2.0 * touched.sum(), 1.0)))
+
+
+def _with(sums: _Sums, new: _Sums) -> _Sums:
+    """Sums and a look more."""
+    return _Sums(new.looks, sums.normal + new.normal, sums.seen + new.seen)
+
+
+def _gains(
+    normal: FloatArray, right: FloatArray, parts: IntArray, least: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """bᵀ A⁻¹ b (h,) and A⁻¹ b (h, p) for parts (h, p) of A x = b, its diagonal not below a least."""
+    size = np.sqrt(np.maximum(np.maximum(normal.diagonal(), least), 1e-300))[parts]
+    blocks = normal[parts[:, :, None], parts[:, None, :]] / (size[:, :, None] * size[:, None, :])
+    b = right[parts] / size
+    x = np.linalg.solve(blocks + _RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
+    return np.maximum((b * x).sum(axis=1), 0.0), x / size
+
+
+def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
+    """Basis (d, 4, 4) of rigid motions: translations, and what the joints generate together."""
+    brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
+    known = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
+    sizes, rows = np.linalg.svd(known.reshape(-1, 16))[1:]
+    return np.asarray(rows[:6][sizes[:6] > _RANK * sizes[0]].reshape(-1, 4, 4))
+
+
+def _table_of(n: int, m: int, d: int) -> tuple[list[_Cause], int]:
+    """All causes, and how many regressors they have.
+
+    Those are: joints, joints times looks, delays, cameras, markers, rigid motions of the tool and of the rig.
+    """
+    everything = np.ones((2, m), dtype=np.bool_)
+    views = [everything & (np.arange(2)[:, None] == v) for v in (0, 1)]
+    at_camera, free = 2 * n + 2, CAMERA - 1
+    at_marker = at_camera + 2 * free
+    at_tool = at_marker + 3 * m
+    causes = [_Cause("slipped", i, np.array([i]), everything) for i in range(n)]
+    causes += [_Cause("frozen", i, np.array([i, n + i]), everything) for i in range(n)]
+    causes.append(_Cause("frozen", -1, np.arange(2 * n), everything))
+    for v in (0, 1):
+        causes.append(_Cause("late", v, np.array([2 * n + v]), views[v]))
+        causes.append(_Cause("camera", v, at_camera + v * free + np.arange(free), views[v]))
+    causes.append(_Cause("late", -1, 2 * n + np.arange(2), everything))
+    for j in range(m):
+        columns = at_marker + 3 * j + np.arange(3)
+        causes.append(_Cause("marker", j, columns, everything & (np.arange(m) == j)))
+    causes.append(_Cause("tool", -1, at_tool + np.arange(d), everything))
+    causes.append(_Cause("rig", -1, at_tool + d + np.arange(d), everything))
+    return causes, at_tool + 2 * d

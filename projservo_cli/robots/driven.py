@@ -109,9 +109,11 @@ class DrivenRobot:
 
     def fits(self) -> str:
         """What is wrong with the images where the robot stands; empty where nothing is."""
-        for _ in range(WINDOW):
+        looks = 0
+        while not self.disturbance and (looks < WINDOW or (self.innovation and self.innovation.doubtful)):
             self.joints()
             self.observe()
+            looks += 1
         return self.disturbance
 
     def distance(self) -> float:
