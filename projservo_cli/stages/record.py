@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ DEPENDS_ON = (
 )
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
+_MOST_MOVING = 200  # frames on the way in a table
 _WAITED = 5  # looks for each image that is wanted, where the same one comes again
 
 
@@ -37,6 +39,8 @@ class _Recording:
     targets: FloatArray  # (K, n) joints to drive to, rad or m; the row is the number of the pose
     marker: IntArray  # (m,) numbers of the markers
     done: dict[int, Reading] = field(default_factory=dict)  # the poses that are done
+    # Frames on the way to poses that are done, by the number of the motion: that of the pose, from 1.
+    ways: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
     commands: int = 0  # steps sent to the robot
     # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
@@ -59,10 +63,28 @@ class _Recording:
         return float(np.sqrt(squares / freedom)) if freedom > 0.0 else None
 
     def save(self) -> None:
-        """Write all poses that are done, in their order; the file appears whole or not at all."""
-        pose = sorted(self.done)
-        q, images = (np.array([getattr(self.done[k], name) for k in pose]) for name in ("q", "s"))
-        observation = Observation(np.array(pose, dtype=np.int64), self.marker, q, images)
+        """Write all poses that are done, in their order; the file appears whole or not at all.
+
+        Frames on the way follow, with negative numbers of poses, of whole motions spread over all of them.
+        """
+        rest = sorted(self.done.items())
+        motions, every = sorted(self.ways), 1
+        while sum(len(self.ways[k]) for k in motions[::every]) > _MOST_MOVING and every < len(motions):
+            every += 1
+        way = [(k, reading) for k in motions[::every] for reading in self.ways[k]][:_MOST_MOVING]
+        rows = [reading for _, reading in (*rest, *way)]
+        pose = [*(k for k, _ in rest), *range(-1, -1 - len(way), -1)]
+        moving = [*(0 for _ in rest), *(k for k, _ in way)]
+        timed = np.isfinite([reading.t_q for reading in rows]).any()
+        observation = Observation(
+            np.array(pose, dtype=np.int64),
+            self.marker,
+            np.array([reading.q for reading in rows]),
+            np.array([reading.s for reading in rows]),
+            np.array(moving, dtype=np.int64) if way else None,
+            np.array([reading.t_q for reading in rows]) if timed else None,
+            np.array([reading.t_view for reading in rows]) if timed else None,
+        )
         write_table(observation, self.path, recording=self.key)
 
 
@@ -102,13 +124,19 @@ def _resume(recording: _Recording, most: FloatArray) -> None:
     if sorted(recording.marker) != table.marker.tolist():
         raise InputError(f"{path}: has other markers than the configuration; {remedy}")
     column = np.searchsorted(table.marker, recording.marker)
+    nobody = np.full(len(table.pose), np.nan)
+    moving = np.zeros(len(nobody), dtype=np.int64) if table.moving is None else table.moving
+    t_q = nobody if table.t_q is None else table.t_q
+    t_view = np.stack([nobody, nobody], axis=1) if table.t_view is None else table.t_view
     for k, pose in enumerate(table.pose.tolist()):
+        reading = Reading(table.q[k], table.images[k][:, column], t_q[k], t_view[k], None)
+        if moving[k] > 0:
+            recording.ways.setdefault(int(moving[k]), []).append(reading)
+            continue
         known = 0 <= pose < len(recording.targets)
         if not known or (np.abs(table.q[k] - recording.targets[pose]) > most).any():
             raise InputError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
-        recording.done[pose] = Reading(
-            table.q[k], table.images[k][:, column], np.nan, np.full(2, np.nan), None
-        )
+        recording.done[pose] = reading
     recording.found = len(recording.done)
 
 
@@ -152,10 +180,21 @@ def _simulated(config: Config, recording: _Recording) -> Iterator[int]:
 def _recorded(robot: Steered, config: Config, joints: Joints, recording: _Recording) -> Iterator[int]:
     """Drive to one pending pose after the other and look; the number of each that was recorded."""
     for pose in recording.pending:
-        for _ in way_to(robot, recording.targets[pose], config, joints, "record"):
-            recording.commands += 1
+        seen = list(way_to(robot, recording.targets[pose], config, joints, "record"))
+        recording.commands += len(seen)
         recording.done[pose] = _look(robot, config, recording)
+        recording.ways[pose + 1] = _moving(seen, config.plant.settle_s)
         yield pose
+
+
+def _moving(seen: list[Reading], settle_s: float) -> list[Reading]:
+    """What was read on a way before all stood still, each frame once."""
+    found = []
+    for before, reading in pairwise(seen):
+        new = np.array(new_views(reading, before))
+        if new.any() and reading.t_q < seen[-1].t_q - settle_s:
+            found.append(reading._replace(s=np.where(new[:, None, None], reading.s, np.nan)))
+    return found
 
 
 def _look(robot: Steered, config: Config, recording: _Recording) -> Reading:

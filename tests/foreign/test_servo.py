@@ -16,6 +16,7 @@ from projservo_cli.records import Calibration
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.store import load
+from projservo_cli.tables import read_table
 from tests.fake_records import fake
 from tests.foreign import robots
 from tests.foreign.robots import CALLS
@@ -386,4 +387,6 @@ def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
     assert answer.code == 1
     assert "camera 2 is unplugged" in answer.err
     assert CALLS[-2:] == ["stop", "close"]
-    assert len(Path("u.csv").read_text().splitlines()) == 1 + 5 * 10  # what was seen until then is kept
+    table = read_table("u.csv")  # what was seen until then is kept, on the way too
+    assert table.at_rest.pose.tolist() == [0, 1, 2, 3, 4]
+    assert table.moving.max() == 5

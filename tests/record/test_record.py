@@ -176,15 +176,15 @@ class Arm:
     def open(self):
         self.calls.append("open")
 
-    def read(self):
-        seen = (
-            (self.time - self.late) // (1.0 / self.rate) / self.rate
-            if self.rate < 1e9
-            else self.time - self.late
-        )
-        s = self.world.images(self.past[max(0, round(1e3 * seen))], self.world.M)
+    def shown(self, time):
+        seen = time - self.late
         if self.rate < 1e9:  # the same frame until there is another
+            seen = seen // (1.0 / self.rate) / self.rate
             self.random = np.random.default_rng(round(1e6 * max(0.0, seen)))
+        return self.past[max(0, round(1e3 * seen))]
+
+    def read(self):
+        s = self.world.images(self.shown(self.time), self.world.M)
         s += self.noise * self.random.standard_normal(s.shape)
         q = self.q if not self.tick else self.tick * np.round(self.q / self.tick)
         return q, s, self.time
@@ -238,7 +238,7 @@ def test_every_step_keeps_the_speed_limit_and_the_joint_limits():
     legs = np.ceil(np.abs(np.diff(ways, axis=0)) / limit - 1e-9).max(axis=1)
     assert legs.sum() <= recording.commands <= legs.sum() + (2 + 13) * len(legs)
     assert robot.calls == ["open", "stop", "close"]
-    np.testing.assert_array_equal(read_table("t.csv").q, recording.targets)
+    np.testing.assert_array_equal(read_table("t.csv").at_rest.q, recording.targets)
 
 
 REAL = {
@@ -256,13 +256,21 @@ def test_a_pose_is_recorded_where_joints_and_images_have_come_to_rest(faults):
     recording = stage.new_recording(config, Path("t.csv"))
     robot = Arm(config, **faults)
     stage.record(config, recording, driven(config, robot))
-    table = read_table("t.csv")
-    assert len(table.pose) == 13
+    whole = read_table("t.csv")
+    table, way = whole.at_rest, whole.rows(whole.moving > 0)
+    assert len(table.pose) == len(recording.targets) == 13
+    assert 100 < len(way.pose) <= 200
+    assert len(np.unique(way.moving)) > 3
     off = robot.sag + robot.play / 2 + robot.tick / 2
     assert np.abs(table.q - recording.targets).max() <= off + 1e-5
     rest = np.array([robot.past[round(1e3 * reading.t_q)] for reading in recording.done.values()])
     clean = np.stack([robot.world.images(q, robot.world.M) for q in rest])
     error = table.images - clean
+    # What was seen on the way was so some time before the joints were read.
+    then = [robot.shown(t) for t in way.t_q]
+    late = way.images - np.stack([robot.world.images(q, robot.world.M) for q in then])
+    assert np.nanmax(np.abs(late)) < 0.02 + 6.0 * robot.noise
+    assert np.ptp(way.images[:, 0, 0, 0]) > 100.0
     if robot.noise:
         assert recording.spread_px == pytest.approx(0.5, abs=0.03)
         assert np.std(error) == pytest.approx(0.5 / np.sqrt(5), rel=0.1)
@@ -308,7 +316,7 @@ def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept(kind, messag
     assert robot.calls == ["open", "stop", "close"]
     assert recording.pending
     if recording.done:
-        assert read_table("t.csv").pose.tolist() == list(range(len(recording.done)))
+        assert read_table("t.csv").at_rest.pose.tolist() == list(range(len(recording.done)))
 
 
 def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo):
