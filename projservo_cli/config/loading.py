@@ -279,6 +279,7 @@ def load_config(
         document.override(change)
         _spell_out(document.values)
     _fill_in(document.values, path)
+    _fill_in_taught(document, pathlib.Path(path).parent if path is not None else pathlib.Path())
     return _validated(Config, document)
 
 
@@ -371,6 +372,25 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
     for file in (data.get("table") if isinstance(data, dict) else None, path):
         if isinstance(file, (str, pathlib.Path)) and str(file):
             values.setdefault("name", pathlib.Path(file).stem)
+
+
+def _fill_in_taught(document: _Document, base: pathlib.Path) -> None:
+    """Put what was taught in place of the names of files that hold it, relative to the configuration."""
+    task = document.values.get("task")
+    for key in ("goal", "start") if isinstance(task, dict) else ():
+        if not isinstance(task.get(key), str):
+            continue
+        where, path = f"{document.place(('task', key))}: task.{key}", (base / task[key]).resolve()
+        try:
+            taught = _Document(text_of(path, "a file that projservo teach wrote", _MAX_BYTES), str(path))
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
+        images = taught.values.get("images") if isinstance(taught.values, dict) else None
+        if taught.problems or not isinstance(images, dict):
+            raise InputError(f"{where}: {path}: is no file that projservo teach wrote")
+        if key == "start" and not images.get("joints"):
+            raise InputError(f"{where}: {path}: tells no joints to start from")
+        task[key] = images["joints"] if key == "start" else taught.values
 
 
 def _translated(model: type[Root], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:

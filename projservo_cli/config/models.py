@@ -3,7 +3,7 @@
 import inspect
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -141,7 +141,6 @@ class _Disturbance(Section):
     frozen_joint: _FrozenJoint | None = None
     camera_moved: _CameraMoved | None = None
     marker_moved: _MarkerMoved | None = None
-    delay_periods: StrictInt = Field(0, ge=0, le=1000, description="by how many periods images are late")
 
     def contradictions(self) -> Iterator[Finding]:
         """What says nothing without another key."""
@@ -287,11 +286,51 @@ class _Perturbation(Section):
     rotation_rad: Vector3 = Field((0.0, 0.0, 0.0), description="rotation vector in the axes of the tool")
 
 
-class _GoalImages(Section):
-    """Pixels of the face at the goal, in the order of ``markers.face``."""
+_Pixels = tuple[Vector2 | None, ...]
+_Deviations = tuple[NotNegative | None, ...]
 
-    left: tuple[Vector2, ...] = Field(description="u and v of each marker in the left image, px")
-    right: tuple[Vector2, ...] = Field(description="u and v of each marker in the right image, px")
+
+class _GoalImages(Section):
+    """Pixels of the face at the goal, perhaps of further markers, and with how sure they are."""
+
+    markers: Annotated[tuple[Whole, ...], Field(min_length=1)] | None = Field(
+        None, description="numbers of the markers that pixels are of; null for those of markers.face"
+    )
+    left: _Pixels = Field(description="u and v of each marker in the left image, px; null where unseen")
+    right: _Pixels = Field(description="u and v of each marker in the right image, px; null where unseen")
+    sigma_left_px: _Deviations | None = Field(
+        None, description="standard deviation of each marker in the left image; null for noise.servo_px"
+    )
+    sigma_right_px: _Deviations | None = Field(None, description="the same of the right image")
+    joints: JointVector | None = Field(
+        None, description="joint readings there, of which a start is made where task.start names the file"
+    )
+
+    def pixels(self, face: Sequence[int]) -> dict[int, tuple[Vector2, Vector2]]:
+        """Left and right pixel of each marker, NaN where unseen; ``face`` are numbers of its markers."""
+        unseen = math.nan, math.nan
+        each = zip(self.markers or face, self.left, self.right, strict=True)
+        return {number: (left or unseen, right or unseen) for number, left, right in each}
+
+    def sigma_px(self, face: Sequence[int]) -> float | None:
+        """Standard deviation of a coordinate of the markers of the face, rms; None where it is not told."""
+        numbers = self.markers or face
+        told = [
+            dict(zip(numbers, side or (), strict=False)) for side in (self.sigma_left_px, self.sigma_right_px)
+        ]
+        values = [side.get(number) for side in told for number in face]
+        known = [value**2 for value in values if value is not None]
+        return math.sqrt(sum(known) / len(known)) if len(known) == len(values) else None
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Lists that are not of the same markers."""
+        count = len(self.markers or self.left)
+        for key in ("left", "right", "sigma_left_px", "sigma_right_px"):
+            given = getattr(self, key)
+            if self.markers is not None and given is not None and len(given) != count:
+                yield (key,), f"{len(given)} entries for {count} markers"
+        if len(set(self.markers or ())) < len(self.markers or ()):
+            yield ("markers",), "a number stands here twice"
 
 
 class Goal(Section):
@@ -593,14 +632,19 @@ def _beyond_limits(robot: RobotSettings, vector: JointVector, *path: str) -> Ite
 def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator[Finding]:
     if task is None or task.goal.images is None:
         return
-    path = ("task", "goal", "images")
+    path, images = ("task", "goal", "images"), task.goal.images
     if markers is None or markers.face is None:
         yield path, "needs markers.face, whose markers these pixels are"
         return
-    for side, pixels in task.goal.images:
-        if len(pixels) != len(markers.face):
-            what = f"{len(pixels)} pixels for the {len(markers.face)} markers of the face"
+    numbers = images.markers or markers.face
+    yield from markers.unknown(images.markers or (), *path, "markers")
+    for side, pixels in (("left", images.left), ("right", images.right)):
+        if images.markers is None and len(pixels) != len(numbers):
+            what = f"{len(pixels)} pixels for the {len(numbers)} markers of the face"
             yield (*path, side), what
+        seen = [number for number, pixel in zip(numbers, pixels, strict=False) if pixel is not None]
+        if len(pixels) == len(numbers) and (unseen := [n for n in markers.face if n not in seen]):
+            yield (*path, side), f"marker {unseen[0]} of the face is not seen; show the whole face"
 
 
 def _simulated_alone(disturbance: _Disturbance, plant: _PlantSettings) -> Iterator[Finding]:

@@ -29,6 +29,10 @@ def json_schema() -> dict[str, Any]:
         **schema["$defs"]["Control"]["properties"]["laws"]["items"],
         "description": "Short for control.laws with this law alone.",
     }
+    task = schema["$defs"]["TaskSettings"]["properties"]
+    for key in ("start", "goal"):
+        what = f"{task[key].pop('description', 'the goal')}; or the file that projservo teach wrote"
+        task[key] = {"anyOf": [task[key], {"type": "string"}], "description": what}
     return {**schema, "title": "Configuration of projservo"}
 
 

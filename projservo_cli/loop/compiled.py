@@ -10,7 +10,7 @@ from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import RUNNING, WAITING, Command, Instant, Limits, Log, bounded, note, verdict_at
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant, move, observe, put_camera_moved, rig_distance
+from projservo_cli.robots.simulated import Plant, move, observe, rig_distance
 
 
 class Course(NamedTuple):
@@ -31,7 +31,6 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
     of it to be made anew; steps: commands sent; the log has one instant more.
     """
     plant, limits, q_start = course
-    delay = plant.disturbance.delay
     n = q_start.shape[0]
     M = log.M[: plant.M.shape[0]]
     dq = log.scratch[0, :n]
@@ -47,13 +46,10 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
         s = log.s[k]
         in_front = observe(plant, mat(log.H[k]), M, s, log.hidden[k])
         distance = rig_distance(plant, M)
-        if delay > 0:
-            observe(plant, mat(log.H[max(0, k - delay)]), M, s, log.scratch[1])
         for view in range(2):
             for j in range(s.shape[1]):
                 s[view, j, 0] += noise[k, view, j, 0]
                 s[view, j, 1] += noise[k, view, j, 1]
-        put_camera_moved(plant, k, s)
         left = note(log, k, law.task.s_star, plant, limits)
         status = OK
         if in_front:
@@ -77,7 +73,9 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
                         log.path[k, j, i] = state.path[j, i]
         if verdict >= 0:
             return verdict, k
-        move(plant, k + 1, dq, log.H[k : k + 2], log.q[k : k + 2], log.read[k : k + 2])
+        move(plant, dq, log.H[k : k + 2], log.q[k : k + 2])
+        for i in range(n):
+            log.read[k + 1, i] = log.q[k + 1, i]
     return RUNNING, limits.max_steps  # not reached: the last instant has a verdict
 
 

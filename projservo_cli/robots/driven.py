@@ -53,17 +53,18 @@ class Steered:
 
 
 class DrivenRobot:
-    """A robot with its cameras beside the plant that the calibration takes it for.
+    """A robot with its cameras beside its truth, or the plant that the calibration takes it for.
 
     robot : what is driven.
-    plant : calibrated model and face; image size and joint limits.
+    plant : model and face; image size and joint limits.
     shown : (k,) indices of the markers that the loop is shown among those that the robot observes, the face
         first.
     order : (m,) index there of each marker of the calibration, −1 where it is not observed.
     innovation : test of the images against the calibration; None tests nothing.
-    ``q``: (n,) joint readings when last asked for, rad or m. ``H, hidden``: displacement of the face and
-    self-occlusion as the calibration has them there. ``in_front``: a camera sees nothing behind it.
-    ``disturbance``: why the images no longer agree with the calibration, or what failed; else empty.
+    ``q``: (n,) joints when last asked for, rad or m: true ones where the robot tells them, else as read.
+    ``H, hidden``: displacement of the face and self-occlusion as the plant has them there. ``in_front``: a
+    camera sees nothing behind it. ``disturbance``: why the images no longer agree with the calibration, or
+    what failed; else empty.
     """
 
     in_front = True
@@ -89,19 +90,24 @@ class DrivenRobot:
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m, of a new look at robot and images."""
-        self.q = self.steered.look().q
+        read, truth = self.steered.look().q, self.robot.truth()
+        self.q = truth if truth is not None and truth.ndim == 1 else read
         H = forward(self.plant.model, self.q)
         self.H = as_array(H)
         M = np.zeros_like(self.plant.M)
-        observe(self.plant, H, M, np.zeros((2, len(M), 2)), self.hidden)
-        return self.q.copy()
+        observe(self.plant, H, M, np.zeros((2, self.markers, 2)), self.hidden)
+        return read.copy()
 
     def observe(self) -> FloatArray:
         """Pixels (2, k, 2) of the markers shown at the last look, NaN where unseen; all are tested."""
         s = self.steered.reading.s
         if self.innovation is not None:
             known = np.where((self.order < 0)[:, None], np.nan, s[:, self.order])
-            at_once, at_rest, certain = np.stack([self.q, self.q]), np.zeros_like(self.q), np.zeros(2)
+            at_once, at_rest, certain = (
+                np.stack([self.steered.reading.q] * 2),
+                np.zeros_like(self.q),
+                np.zeros(2),
+            )
             self.disturbance = self.innovation.disturbed(
                 at_once, at_rest, certain, known, np.ones(2, dtype=np.bool_)
             )

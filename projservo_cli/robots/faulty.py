@@ -190,7 +190,8 @@ class _Joints:
         parts = max(1, math.ceil((due - begun) / _GRID_S - 1e-6))
         for left in range(parts, 0, -1):
             time = max(begun, due - (due - begun) * (left - 1) / parts)
-            self._advance(time, (target - self._setpoint) / left)
+            share = (target - self._setpoint) / left
+            self._advance(time, self._setpoint + share if left > 1 else target)
 
     def at(self, time: float) -> FloatArray:
         """True joints (n,) at a time so far, s; before the opening they stood still."""
@@ -200,19 +201,18 @@ class _Joints:
         x = (time - self.times[i - 1]) / (self.times[i] - self.times[i - 1])
         return np.asarray((1.0 - x) * self.links[i - 1] + x * self.links[i])
 
-    def _advance(self, time: float, gone: FloatArray) -> None:
-        """To a time, s, while the set-point goes evenly by so much (n,).
+    def _advance(self, time: float, setpoint: FloatArray) -> None:
+        """To a time, s, while the set-point goes evenly to joints (n,).
 
         m' = (u - m) / lag has the solution m = u - v lag + (m_0 - u_0 + v lag) exp(-t / lag) where u goes at
         the pace v; the load of the posture is taken as constant meanwhile.
         """
         faults, passed = self.faults, time - self.times[-1]
         load = self._load(self.links[-1])
-        before = self._setpoint + faults.sag * load
-        self._setpoint = self._setpoint + gone
-        after = self._setpoint + faults.sag * load
+        before, after = self._setpoint + faults.sag * load, setpoint + faults.sag * load
+        self._setpoint = setpoint
         if faults.lag > 0.0 and passed > 0.0:
-            behind = gone * (faults.lag / passed)
+            behind = (after - before) * (faults.lag / passed)
             self.motor = after - behind + (self.motor - before + behind) * math.exp(-passed / faults.lag)
         elif passed > 0.0:
             self.motor = after

@@ -1,7 +1,6 @@
 """The simulated robot and its rig: from published dimensions, and as the compiled loop sees them."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -29,26 +28,6 @@ from projservo_cli.records import FREE, FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
 
 NO_PINS = np.zeros((0, 4))
-NEVER = 2**62
-
-
-class Disturbance(NamedTuple):
-    """What befalls a simulated robot beside noise; instants count from 0, the start."""
-
-    delay: int  # periods by which images are late; the first ones show the start
-    bump_at: int  # instant by which the joints have been knocked; −1 for never
-    bump: FloatArray  # (n,) by how much, rad or m
-    bump_read: bool  # whether the readings follow the bump, or a joint slipped on its encoder
-    frozen: int  # joint whose reading stands still, −1 for none
-    # frozen_at, frozen_until: instant of the reading that stays, and the first that is true again
-    frozen_at: int
-    frozen_until: int
-    moved_at: int  # instant from which images of a camera that was moved are shifted
-    moved: FloatArray  # (2, 2) by how much, both views, px
-
-
-# For any number of joints a configuration may have.
-UNDISTURBED = Disturbance(0, -1, np.zeros(64), True, -1, 0, NEVER, NEVER, np.zeros((2, 2)))
 
 
 class Ends(NamedTuple):
@@ -74,7 +53,6 @@ class Plant(NamedTuple):
     opaque: bool  # whether the face hides its markers from a camera behind it
     # (p, 4) further markers of the body at the reference, m; a camera sees those within its image
     pins: FloatArray = NO_PINS
-    disturbance: Disturbance = UNDISTURBED  # what befalls the robot
 
 
 @internal
@@ -95,26 +73,13 @@ def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: Flo
 
 
 @njit
-def move(plant: Plant, instant: int, dq: FloatArray, H: FloatArray, q: FloatArray, read: FloatArray) -> None:
-    """Move the robot by a joint step, rad or m, and by whatever befalls it, and read its joints.
+def move(plant: Plant, dq: FloatArray, H: FloatArray, q: FloatArray) -> None:
+    """Move the robot by a joint step (n,), rad or m.
 
-    instant : that the step ends at.
-    dq : (n,) the step, to which a knock is added.
-    H, q, read : (2, 4, 4), (2, n), (2, n) displacement of the face, joints and their readings, rad or m,
-        before the step and, on return, after it.
+    H, q : (2, 4, 4) and (2, n), displacement of the face and joints, rad or m, before the step and, on
+        return, after it.
     """
-    disturbance, reading = plant.disturbance, read[1]
-    if instant == disturbance.bump_at:
-        for i in range(dq.shape[0]):
-            dq[i] += disturbance.bump[i]
     put_mat(H[1], pose_after(plant, mat(H[0]), q[0], dq, q[1]))
-    for i in range(dq.shape[0]):
-        reading[i] = q[1, i]
-    if not disturbance.bump_read and 0 <= disturbance.bump_at <= instant:
-        for i in range(dq.shape[0]):
-            reading[i] -= disturbance.bump[i]
-    if disturbance.frozen >= 0 and disturbance.frozen_at < instant < disturbance.frozen_until:
-        reading[disturbance.frozen] = read[0, disturbance.frozen]
 
 
 @njit
@@ -147,16 +112,6 @@ def observe(plant: Plant, H: Mat4, M: FloatArray, s: FloatArray, hidden: FloatAr
             if _put_pixel(camera, lens, A, pixel) and not inside(pixel, plant.image_size):
                 pixel[:] = math.nan
     return in_front
-
-
-@merged
-def put_camera_moved(plant: Plant, instant: int, s: FloatArray) -> None:
-    """Shift the pixels (2, k, 2) of an instant where a camera was moved."""
-    if instant >= plant.disturbance.moved_at:
-        for view in range(2):
-            for k in range(s.shape[1]):
-                for i in range(2):
-                    s[view, k, i] += plant.disturbance.moved[view, i]
 
 
 @merged
@@ -204,16 +159,16 @@ def rig_distance(plant: Plant, M: FloatArray) -> float:
 
 
 class AnalyticPlant:
-    """Simulated robot and rig, with given pixel noise.
+    """Simulated robot and rig without a fault, with given pixel noise.
 
-    plant : the truth, and what befalls it.
+    plant : the truth.
     q_start : (n,) first joints, rad or m.
     noise : (k, 2, markers, 2) added to the pixels of each observation in turn, px.
     ``q, H``: (n,) true joints, rad or m, and (4, 4) displacement of the face. ``in_front``: whether every
     marker was in front of both cameras when last observed. ``markers``: how many are observed, those of the
     face first. ``hidden``: (2,) 1 where the face was self-occluded when last observed. ``disturbance``: why
-    the images no longer agree with what they are tested by, or the law that drove it failed; else empty.
-    ``takes_parts``: it goes straight to the end of each step; the samples are the same.
+    the law that drove it failed; else empty. ``takes_parts``: it goes straight to the end of each step; the
+    samples are the same.
     """
 
     takes_parts = False
@@ -223,44 +178,22 @@ class AnalyticPlant:
         self.noise = noise
         self.q = np.array(q_start, dtype=np.float64)
         self.H = as_array(forward(plant.model, self.q))
-        self.reading = self.q.copy()
-        self.shown: list[FloatArray] = []
         self.observations = 0
         self.M = np.zeros_like(plant.M)
         self.hidden = np.zeros(2)
         self.in_front = True
         self.markers = len(plant.M) + len(plant.pins)
         self.disturbance = ""
-        self._test: Callable[[FloatArray], str] = lambda s: ""
-
-    def tested_by(self, test: Callable[[FloatArray, FloatArray], str], places: IntArray, count: int) -> None:
-        """Test what is observed: by joint readings (n,) and pixels (2, count, 2), NaN where unseen.
-
-        places : (markers,) of the markers that are observed among those of the test.
-        """
-
-        def tested(s: FloatArray) -> str:
-            seen = np.full((2, count, 2), np.nan)
-            seen[:, places] = s
-            return test(self.reading, seen)
-
-        self._test = tested
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
-        return self.reading.copy()
+        return self.q.copy()
 
     def observe(self) -> FloatArray:
-        """Noisy pixels (2, markers, 2), NaN where unseen; of some periods ago where images are late."""
+        """Noisy pixels (2, markers, 2), NaN where unseen."""
         s = np.zeros((2, self.markers, 2))
         self.in_front = observe(self.plant, as_mat(self.H), self.M, s, self.hidden)
-        self.shown.append(self.H)
-        if self.plant.disturbance.delay > 0:
-            late = as_mat(self.shown[max(0, self.observations - self.plant.disturbance.delay)])
-            observe(self.plant, late, np.zeros_like(self.M), s, np.zeros(2))
         s += self.noise[self.observations]
-        put_camera_moved(self.plant, self.observations, s)
-        self.disturbance = self._test(s)
         self.observations += 1
         return s
 
@@ -270,9 +203,10 @@ class AnalyticPlant:
 
     def command(self, step: FloatArray, period: float) -> None:
         """Move by the joint step (n,), rad or m; the simulated robot always arrives."""
-        H, q, read = (np.stack([rows, rows]) for rows in (self.H, self.q, self.reading))
-        move(self.plant, self.observations, step.copy(), H, q, read)
-        self.H, self.q, self.reading = H[1], q[1], read[1]
+        del period
+        H, q = (np.stack([rows, rows]) for rows in (self.H, self.q))
+        move(self.plant, step, H, q)
+        self.H, self.q = H[1], q[1]
 
     def stop(self) -> None:
         """Nothing moves between commands."""

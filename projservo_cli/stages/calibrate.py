@@ -73,7 +73,7 @@ def trial_motions(config: Config) -> FloatArray:
     q = np.array(rows)
     if ideal or settings.method == "closed_form":  # which takes joints that are told to stand still to do so
         return q
-    turn = 2.0 * np.pi / (getattr(config.disturbance, "encoder_ticks", None) or _TICKS)
+    turn = 2.0 * np.pi / (config.disturbance.encoder_ticks or _TICKS)
     tick = np.where([kind == "P" for kind in joints.types], REACH_M / REACH_RAD, 1.0) * turn
     return np.clip(q + tick * rng.uniform(-1.0, 1.0, q.shape), joints.lower, joints.upper)
 

@@ -83,11 +83,10 @@ def search_of(scenario: Scenario) -> JointSearch:
             (tuple(demands.lower), tuple(demands.upper), tuple(demands.image_size)),
             scenario.config.trajectory.search.seed,
         )
-    sigma = scenario.noise_px / math.sqrt(scenario.config.noise.shown_frames)
     joints, closed = scenario.joints, ""
     if scenario.truth is None and not (np.isfinite(joints.lower) & np.isfinite(joints.upper)).all():
         closed = f"nothing tells the limits of all joints: {LIMITS_MISSING}"
-    return JointSearch(joints.acceleration, scenario.q_shown, sigma, spread, closed)
+    return JointSearch(joints.acceleration, scenario.q_shown, scenario.goal_sigma_px, spread, closed)
 
 
 def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:

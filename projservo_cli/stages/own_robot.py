@@ -1,4 +1,4 @@
-"""The robot of ``plant.use``: made, checked against the calibration, driven to given joints, waited for."""
+"""Robots of the contract: made, checked against the calibration, driven to given joints, waited for."""
 
 import math
 from collections import deque
@@ -14,10 +14,12 @@ from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.driven import DrivenRobot, Steered
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import Scenario
+from projservo_cli.stages.simulation import robot_in_the_loop
 from projservo_cli.stages.world import Joints, length_of
 
 # What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
 _STILL, _STILL_PX = 2e-5, 0.02
+_NEVER_LATE_S = 3600.0  # for what a simulated robot answers, which may be compiled first
 _LEAST = 6  # looks that tell noise from motion
 _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
 
@@ -175,15 +177,36 @@ def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.var(means, axis=0, ddof=1), noise / third
 
 
+def simulated_robot(config: Config, joints: Joints, robot: Robot, markers: int) -> ForeignRobot:
+    """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
+    bounds = bounds_of(config, joints)
+    if config.plant.joint_limits == "report":
+        endless = np.full(len(joints.types), math.inf)
+        bounds = bounds._replace(lower=-endless, upper=endless)
+    return ForeignRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
+
+
 def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
-    """The robot, and as the loop of a law sees it: beside the plant that the calibration takes it for."""
-    assert scenario.calibration is not None
-    known, numbers = scenario.calibration.marker.tolist(), scenario.observed
-    face = [known.index(number) for number in scenario.numbers[: scenario.m]]
+    """The robot, and as the loop of a law sees it: beside its truth, or what the calibration takes it for."""
+    config, joints, calibration = scenario.config, scenario.joints, scenario.calibration
+    known, numbers = [] if calibration is None else calibration.marker.tolist(), scenario.observed
     shown = np.array([numbers.index(number) for number in scenario.numbers_of(law)])
-    order = np.array([numbers.index(number) if number in numbers else -1 for number in known])
+    order = np.array([numbers.index(number) if number in numbers else -1 for number in known], dtype=np.int64)
+    if scenario.truth is None:
+        plant, robot = _believed_plant(scenario), foreign_robot(config, joints, len(numbers))
+    else:
+        plant = scenario.plant_of(law)
+        robot = simulated_robot(config, joints, robot_in_the_loop(scenario), len(numbers))
+    return robot, DrivenRobot(robot, plant, shown, order, innovation_of(scenario))
+
+
+def _believed_plant(scenario: Scenario) -> Plant:
+    """What the calibration takes the robot and its face for."""
+    assert scenario.calibration is not None
+    known = scenario.calibration.marker.tolist()
+    face = [known.index(number) for number in scenario.numbers[: scenario.m]]
     task, rig = scenario.ends.by_points().task(scenario.model), scenario.config.rig
-    plant = Plant(
+    return Plant(
         scenario.model,
         np.ascontiguousarray(scenario.calibration.M[face]),
         task.order,
@@ -195,8 +218,6 @@ def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
         scenario.joints.upper,
         False,
     )
-    robot = foreign_robot(scenario.config, scenario.joints, len(numbers))
-    return robot, DrivenRobot(robot, plant, shown, order, innovation_of(scenario))
 
 
 def innovation_of(scenario: Scenario) -> Innovation | None:

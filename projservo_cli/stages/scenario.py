@@ -26,7 +26,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.robots.simulated import METRIC_A_INF, NEVER, NO_PINS, Disturbance, Ends, Plant
+from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
 from projservo_cli.stages.world import (
     Joints,
     Truth,
@@ -41,6 +41,7 @@ from projservo_cli.task.body import NO_BODY, Body, body_of
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import Shown
 
+_UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
 TRIAL_POSES = 6
@@ -114,14 +115,14 @@ class Scenario:
         return truth_of(self.config).model
 
     def plant_of(self, law: str) -> Plant:
-        """The simulated robot as a law sees it, and what befalls it."""
+        """The simulated robot as a law sees it."""
         assert self.truth is not None
         plant = plant_of(self.config, self.truth, self.exact.q_start)
         M = self.truth.of(self.numbers[self.m :]) if law in BODY_LAWS else NO_PINS
-        return plant._replace(pins=M, disturbance=_disturbance(self.config, len(self.exact.q_start)))
+        return plant._replace(pins=M)
 
     def noise_of(self, law: str, seed: int, instants: int) -> FloatArray:
-        """Pixel noise (instants, 2, markers, 2) of a seed as a law observes it, px; NaN where unseen.
+        """Pixel noise (instants, 2, markers, 2) of a seed as a law observes it, px.
 
         It is the same for every law; fewer instants are the first of more.
         """
@@ -133,11 +134,14 @@ class Scenario:
                 if noise[:, :, these].size > 0:
                     drawn = generator(seed, stream).standard_normal(noise[:, :, these].shape)
                     np.multiply(sigma, drawn, out=noise[:, :, these])
-        lost = self.config.disturbance.lost_markers
-        if lost is not None:
-            those = [i for i, number in enumerate(numbers) if lost.markers is None or number in lost.markers]
-            noise[lost.from_step : _end(lost.from_step, lost.steps), :, those] = np.nan
         return noise
+
+    @property
+    def goal_sigma_px(self) -> float:
+        """Standard deviation of a coordinate of the face in the images of the goal, px."""
+        goal = self.config.task.goal if self.config.task is not None else None
+        told = goal.images.sigma_px(self.numbers[: self.m]) if goal is not None and goal.images else None
+        return self.noise_px / math.sqrt(self.config.noise.shown_frames) if told is None else told
 
     def shown_at(self, seed: int) -> Shown:
         """Start and goal as the images of a seed show them, which are averages."""
@@ -290,32 +294,35 @@ def _simulated_ends(
             raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
-    shown, q_goal = _shown(task, types, len(pins), center, images, lambda q: truth.turned(q, task.goal))
+    numbers = tuple(truth.number[i] for i in truth.face), pins
+    shown, q_goal = _shown(task, types, numbers, center, images, lambda q: truth.turned(q, task.goal))
     return shown, _unknown(robot.base_tool) if q_goal is None else truth.ends(q_goal), q_goal
 
 
 def _shown(
     task: TaskSettings,
     types: str,
-    pins: int,
+    numbers: tuple[Sequence[int], Sequence[int]],
     center: int,
     images: Callable[[FloatArray, str], FloatArray],
     turn: Callable[[FloatArray], FloatArray],
 ) -> tuple[Shown, FloatArray | None]:
     """Start and goal of a task, and the joints (n,) at the goal, None where only images tell of it.
 
+    numbers : of the markers of the face and of the pins.
     images : pixels (2, b, 2) at the joints (n,) of a key of the configuration.
     turn : joints (n,) of a goal that is a turn from the joints (n,) of the start.
     """
+    pins, given = len(numbers[1]), task.goal.joints
     q_start = q_from = np.array(task.start.values(types))
     if task.start_offset is not None:
         q_start = q_from + np.array(task.start_offset.values(types))
     s_start = images(q_start, "task.start" if task.start_offset is None else "task.start_offset")
     if task.goal.images is not None:
-        s_star = np.full(s_start.shape, math.nan)
-        s_star[:, : s_start.shape[1] - pins] = task.goal.images.left, task.goal.images.right
+        pixels = task.goal.images.pixels(numbers[0])
+        s_star = np.array([pixels.get(number, _UNSEEN) for number in (*numbers[0], *numbers[1])])
+        s_star = np.ascontiguousarray(np.swapaxes(s_star, 0, 1))
         return Shown(q_start, s_start, s_star, center, pins), None
-    given = task.goal.joints
     q_goal = turn(q_from) if given is None else np.array(given.values(types))
     return Shown(q_start, s_start, images(q_goal, "task.goal"), center, pins), q_goal
 
@@ -350,7 +357,7 @@ def _predicted_ends(
             raise InputError("task.goal.turn_deg needs the model of the robot: give joints or images instead")
         return truth_of(config).turned(q, task.goal)
 
-    shown, q_goal = _shown(task, joints.types, len(numbers) - m, center, images, turn)
+    shown, q_goal = _shown(task, joints.types, (numbers[:m], numbers[m:]), center, images, turn)
     return shown, _unknown(np.full((4, 4), np.nan)), q_goal
 
 
@@ -387,28 +394,3 @@ def _plant(truth: Truth, start_bytes: bytes, opaque: bool) -> Plant:
         truth.robot.upper,
         opaque,
     )
-
-
-def _disturbance(config: Config, n: int) -> Disturbance:
-    """What befalls the joints and the images of a robot of n joints."""
-    given = config.disturbance
-    bump, frozen, camera = given.bump, given.frozen_joint, given.camera_moved
-    step = np.zeros(n)
-    if bump is not None:
-        step[bump.joint - 1] = math.radians(bump.by_deg) if bump.by_deg is not None else bump.by_m
-    return Disturbance(
-        given.delay_periods,
-        -1 if bump is None else bump.at_step,
-        step,
-        bump is None or bump.read,
-        -1 if frozen is None else frozen.joint - 1,
-        0 if frozen is None else frozen.from_step,
-        _end(frozen.from_step, frozen.steps) if frozen is not None else NEVER,
-        NEVER if camera is None else camera.at_step,
-        np.zeros((2, 2)) if camera is None else np.array(camera.by_view()),
-    )
-
-
-def _end(first: int, count: int | None) -> int:
-    """First instant after so many from the first; None for ever."""
-    return NEVER if count is None else first + count

@@ -41,6 +41,7 @@ from projservo_cli.stages.motions import search_of, why_closed
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.ways import Ways
+from projservo_cli.stages.world import is_disturbed
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
 
@@ -216,9 +217,9 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.config.plant.speed_scale
     replans = mode == REPLAN or bool(unplanned)
-    if scenario.truth is None:
+    if scenario.truth is None or is_disturbed(scenario.config):
         assert isinstance(plan, Plan)
-        run = _drive_own_robot(scenario, plan, law, replans)
+        run = _drive_by_contract(scenario, plan, law, replans)
     elif isinstance(plan, Plan) and (
         not _in_compiled_loop(scenario.config, law) or _is_guided(scenario, law, replans)
     ):
@@ -230,12 +231,7 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
 
 def _in_compiled_loop(config: Config, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
-    tested = _is_disturbed(config) and config.stop.innovation_factor > 0.0
-    return law in CODES and config.plant.speed_scale == 1.0 and not tested
-
-
-def _is_disturbed(config: Config) -> bool:
-    return config.disturbance != type(config.disturbance)()
+    return law in CODES and config.plant.speed_scale == 1.0 and not is_disturbed(config)
 
 
 def _is_guided(scenario: Scenario, law: str, replans: bool) -> bool:
@@ -280,20 +276,10 @@ def _drive_compiled(
 
 
 def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
-    """Drive a law on the simulated robot in the Python loop; disturbed images are tested."""
-    config, numbers = scenario.config, scenario.numbers_of(law)
+    """Drive a law on the simulated robot without a fault in the Python loop."""
     controller = _law_for(scenario, plan, law, replans)
-    noise = scenario.noise_of(law, config.seed, scenario.limits.max_steps + 1)
-    innovation = own_robot.innovation_of(scenario) if _is_disturbed(config) else None
+    noise = scenario.noise_of(law, scenario.config.seed, scenario.limits.max_steps + 1)
     simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
-    if innovation is not None:
-        places = [innovation.calibration.marker.tolist().index(number) for number in numbers]
-        at_rest, certain, fresh = np.zeros_like(simulated.q), np.zeros(2), np.ones(2, dtype=np.bool_)
-
-        def tested(q: FloatArray, s: FloatArray) -> str:
-            return innovation.disturbed(np.stack([q, q]), at_rest, certain, s, fresh)
-
-        simulated.tested_by(tested, np.array(places), len(innovation.calibration.marker))
     return _driven_in_python(
         scenario, controller, simulated, _watch(scenario, plan, law, controller, replans)
     )
@@ -317,26 +303,31 @@ def _driven_in_python(
     code, steps, log = run_in_python(law, plant, s_star, gains.period, scenario.limits, scale, watch=watch)
     limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
     anew = () if watch is None else tuple(watch.told)
+    if isinstance(plant, DrivenRobot):  # it goes from sample to sample, whatever was asked for
+        path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
+        log = log._replace(path=path, parts=np.ones_like(log.parts))
     return Outcome(scenario, VERDICTS[code], plant.disturbance, steps, log, limited, plant.plant, anew=anew)
 
 
-def _drive_own_robot(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
-    """Drive the robot of ``plant.use`` to the start of the task and from there under a law.
+def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
+    """Drive a robot of the contract under a law from the start of the task, where a simulated one stands.
 
-    Before the first motion, what the robot sees must agree with the calibration where it stands. The
-    robot is stopped and closed on every way out.
+    That of ``plant.use`` is driven there. Before its first motion, what it sees must agree with the
+    calibration where it stands. The robot is stopped and closed on every way out.
     """
-    if scenario.calibration is None or not scenario.calibration.usable:
+    own = scenario.truth is None
+    if own and (scenario.calibration is None or not scenario.calibration.usable):
         raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
     controller = _law_for(scenario, plan, law, replans)
     robot, driven = own_robot.connected(scenario, law)
     with at_rest_after(robot):
-        wrong = driven.fits()
-        if wrong:
-            raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-        start = scenario.ends.q_start
-        for _ in own_robot.way_to(driven.steered, start, scenario.config, scenario.joints, "servo"):
-            pass
+        if own:
+            wrong = driven.fits()
+            if wrong:
+                raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
+            start = scenario.ends.q_start
+            for _ in own_robot.way_to(driven.steered, start, scenario.config, scenario.joints, "servo"):
+                pass
         watch = _watch(scenario, plan, law, controller, replans)
         return _driven_in_python(scenario, controller, driven, watch)
 

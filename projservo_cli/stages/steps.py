@@ -15,7 +15,7 @@ from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.records import InputError, names_of
 from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
-from projservo_cli.stages.world import has_task
+from projservo_cli.stages.world import FAULTS, has_task
 from projservo_cli.store import SERVO, Result, Run
 
 STAGES = ("calibrate", "plan", "servo", "report")
@@ -28,8 +28,9 @@ _PACE = (
     "control.joint_acceleration_limit_deg_s2",
     "control.prismatic_acceleration_limit_m_s2",
 )
+_RECORDING = tuple(f"disturbance.{name}" for name in FAULTS)
 _DEPENDS_ON: dict[str, tuple[str, ...]] = {
-    "calibrate": ("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start"),
+    "calibrate": ("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start", *_RECORDING),
     "plan": (*_TASK, "trajectory", "control.observation", "plant.use", *_PACE),
     "servo": (*_TASK, "trajectory.delta", "control", "plant", "disturbance", "stop"),
     "report": ("report", "control.must_converge"),

@@ -24,8 +24,8 @@ def reference_of(config: Config) -> JointVector | None:
     return config.calibration.reference or (config.task.start if config.task is not None else None)
 
 
-# Disturbances of joints or of time: what a calibration has to reckon with.
-_FAULTS = (
+# Disturbances of joints or of time, which befall trials as well: what a calibration has to reckon with.
+FAULTS = (
     *("delay_s", "exposure_s", "jitter_s", "frame_rate_hz", "frame_offset_s", "stamps"),
     *("encoder_ticks", "setpoint_ticks", "lag_s", "sag_deg", "flex_deg", "play_deg"),
 )
@@ -34,7 +34,12 @@ _FAULTS = (
 def has_faults(config: Config) -> bool:
     """Whether joints of the simulated robot are read or followed, or images taken, with faults."""
     given, none = config.disturbance, type(config.disturbance)()
-    return any(getattr(given, name, None) != getattr(none, name, None) for name in _FAULTS)
+    return any(getattr(given, name) != getattr(none, name) for name in FAULTS)
+
+
+def is_disturbed(config: Config) -> bool:
+    """Whether anything is wrong with the simulated robot or befalls it."""
+    return config.disturbance != type(config.disturbance)()
 
 
 def is_ideal(config: Config) -> bool:

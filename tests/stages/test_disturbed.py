@@ -1,104 +1,86 @@
-"""What befalls the simulated robot: lost markers, bumps, slips, frozen readings, late images."""
+"""What befalls the simulated robot in the loop: what is read and seen of it, and its truth in the trace."""
 
 import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.control import CODES
-from projservo_cli.loop.python import BuiltInLaw, run_in_python
-from projservo_cli.loop.step import VERDICTS
 from projservo_cli.records import InputError
-from projservo_cli.robots.simulated import AnalyticPlant
+from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.simulation import events_of, faults_of
+from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
-from tests.known import known_scenario
-from tests.loop.test_python_loop import same_logs
-from tests.scene import GAINS, Run, limits, scene, with_pins
 
-BUMP = "disturbance.bump={at_step: 7, joint: 3, by_deg: 3}"
-SLIP = "disturbance.bump={at_step: 7, joint: 3, by_deg: -3, read: false}"
-FROZEN = "disturbance.frozen_joint={joint: 2, from_step: 4, steps: 6}"
-LATE = "disturbance.delay_periods=2"
-LOST = "disturbance.lost_markers={from_step: 3, steps: 2, markers: [1]}"
+UNTESTED = "stop.innovation_factor=0"
 
 
-def config(*overrides):
-    return load_config(ROOT / "configs" / "paper.yaml", list(overrides))
+def config(*overrides, name="hobby"):
+    return load_config(ROOT / "configs" / f"{name}.yaml", list(overrides))
 
 
-def disturbed(*overrides, pins=False):
-    sc = with_pins(scene()) if pins else scene()
-    disturbance = known_scenario(config(*overrides)).plant_of("exact").disturbance
-    return sc._replace(plant=sc.plant._replace(disturbance=disturbance))
+@pytest.fixture(scope="module")
+def driven():
+    """Function that drives the hobby arm, without noise unless told, on one calibration of noisy trials."""
+    calibration = calibrate.run(config())[1]
+    undisturbed = config("noise.servo_px=0")
+    whole = plan.run(undisturbed, calibration)
+
+    def run(*overrides, law="exact_track"):
+        return servo.run(config("noise.servo_px=0", *overrides), calibration, whole, law)
+
+    return run
 
 
-def noise_of(steps, *overrides):
-    """Zero but for lost markers."""
-    return known_scenario(config(*overrides)).noise_of("exact", 1, steps + 1)
+def true_images(trace):
+    truth = truth_of(config())
+    return np.array([truth.images(q, truth.M_face) for q in trace.q])
 
 
-@pytest.mark.parametrize("pins", [False, True], ids=["points", "body"])
-@pytest.mark.parametrize(
-    "overrides", [(BUMP,), (SLIP,), (FROZEN,), (LATE,), (SLIP, FROZEN, LATE, LOST)], ids=len
-)
-def test_both_loops_suffer_alike(overrides, pins):
-    sc = disturbed(*overrides, pins=pins)
-    bounds = limits(max_steps=60, lost_steps=5)
-    noise = noise_of(60, *overrides)
-    if pins:
-        noise = np.concatenate([noise, np.zeros((61, 2, len(sc.plant.pins), 2))], axis=2)
-    task = sc.body_task() if pins else sc.task()
-    compiled = Run(sc, "exact", bounds=bounds, noise=noise, task=task)
-    plant = AnalyticPlant(sc.plant, sc.q_start, noise)
-    law = BuiltInLaw(CODES["exact"], sc.model, task, GAINS._replace(speed=bounds.speed))
-    code, steps, log = run_in_python(law, plant, sc.s_star, GAINS.period, bounds)
-    assert (VERDICTS[code], steps) == (compiled.verdict, compiled.steps)
-    same_logs(log, compiled.full, steps)
+@pytest.mark.volume
+def test_a_robot_that_is_struck_by_nothing_goes_as_the_ideal_one_does(driven):
+    """An event beyond the end of the run takes the loop of robots of the contract, and changes nothing."""
+    late = "disturbance.camera_moved={at_step: 100000, view: left, by_px: 1}"
+    for law in ("exact_track", "direct_three"):
+        ideal, other = driven(law=law), driven(late, law=law)
+        assert (other.verdict, other.steps, other.success) == (ideal.verdict, ideal.steps, ideal.success)
+        assert other.q == pytest.approx(ideal.q, abs=1e-9)
+        assert other.position_error_mm == pytest.approx(ideal.position_error_mm, abs=1e-4)
+        assert other.center_deviation_mm == pytest.approx(ideal.center_deviation_mm, abs=1e-4)
 
 
-def test_a_bump_moves_the_joint_once_and_the_reading_with_it():
-    run = Run(disturbed(BUMP), "exact")
-    step = np.diff(run.log.q, axis=0) - GAINS.period * run.log.q_dot[:-1]
-    knocked = np.zeros_like(step)
-    knocked[6, 2] = np.radians(3.0)
-    assert step == pytest.approx(knocked, abs=1e-14)
-    np.testing.assert_array_equal(run.log.read, run.log.q)
-    assert run.verdict == "converged"
+@pytest.mark.volume
+def test_the_trace_holds_the_truth(driven):
+    """Of a slip, of play and of a link that flexes; and the true images where they are shown at once."""
+    slip = driven("disturbance.bump={at_step: 10, joint: 2, by_deg: 3, read: false}", UNTESTED)
+    assert np.degrees(slip.q - slip.q_read)[10:, 1] == pytest.approx(np.full(slip.steps - 9, 3.0))
+    assert np.abs(slip.s - true_images(slip)).max() < 1e-6
+    loose = driven("disturbance.play_deg=0.5", "disturbance.flex_deg=0.2", UNTESTED)
+    off = np.degrees(np.abs(loose.q - loose.q_read))
+    assert 0.2 < off.max() <= 0.25 + 0.2 + 1e-9
 
 
-def test_a_slip_stays_between_joint_and_reading():
-    run = Run(disturbed(SLIP), "exact")
-    off = run.log.read - run.log.q
-    assert not off[:7].any()
-    assert off[7:, 2] == pytest.approx(np.full(run.steps - 6, np.radians(3.0)), abs=1e-15)
-    assert not np.delete(off, 2, axis=1).any()
-    # The images tell where the face is; readings a little off only bend the way there.
-    assert run.verdict == "converged"
-
-
-def test_a_frozen_reading_stays_for_its_time():
-    run = Run(disturbed(FROZEN), "exact")
-    read, q = run.log.read[:, 1], run.log.q[:, 1]
-    assert (read[4:10] == q[4]).all()
-    assert (np.delete(read, range(5, 10)) == np.delete(q, range(5, 10))).all()
-    assert (np.diff(q[4:10]) != 0).all()
-
-
-@pytest.mark.parametrize("delay", [1, 3])
-def test_late_images_show_what_was(delay):
-    run = Run(disturbed(f"disturbance.delay_periods={delay}"), "exact")
-    for k in range(run.steps + 1):
-        assert run.log.s[k] == pytest.approx(scene().images(run.log.q[max(0, k - delay)]), abs=1e-9)
-
-
-def test_markers_named_are_lost_and_no_others():
-    noise = noise_of(9, LOST)
-    gone = np.isnan(noise)
-    assert gone[3:5, :, 1].all()
-    assert gone.sum() == 2 * 2 * 2
-    for_ever = noise_of(9, "disturbance.lost_markers={from_step: 4}")
-    assert (np.isnan(for_ever).all(axis=(1, 2, 3)) == (np.arange(10) >= 4)).all()
+def test_what_the_configuration_says_befalls_the_robot():
+    given = config(
+        "disturbance.bump={at_step: 3, joint: 2, by_deg: 3, read: false}",
+        "disturbance.frozen_joint={joint: 3, from_step: 10, steps: 20}",
+        "disturbance.camera_moved={at_step: 7, view: right, by_px: [1.5, -1]}",
+        "disturbance.marker_moved={at_step: 9, marker: 5, by_m: [0, 0.003, 0]}",
+        "disturbance.lost_markers={from_step: 4}",
+        "disturbance.delay_s={left: 0.1, right: 0.2}",
+        "disturbance.frame_rate_hz=25",
+        "disturbance.encoder_ticks=4096",
+        "disturbance.sag_deg=0.5",
+    )
+    events, faults = events_of(given, truth_of(given)), faults_of(given)
+    assert (events.bump_at, events.slips, events.marker, events.marker_at) == (3, True, 5, 9)
+    assert np.degrees(events.bump) == pytest.approx([0, 3, 0, 0, 0])
+    assert (events.frozen, events.frozen_at, events.frozen_until) == (2, 10, 30)
+    assert events.camera.tolist() == [[0, 0], [1.5, -1]]
+    assert events.lost == tuple(range(8))
+    assert events.lost_until > 10**9
+    assert (faults.delay, faults.interval, faults.ticks) == ((0.1, 0.2), 0.04, 4096)
+    assert np.degrees(faults.sag) == pytest.approx(0.5)
 
 
 def test_a_robot_of_somebody_else_is_not_disturbed():
     with pytest.raises(InputError, match="disturbs the simulated robot"):
-        config("disturbance.delay_periods=1", "plant=my_robot:Robot")
+        config("disturbance.delay_s=0.1", "plant=my_robot:Robot")
