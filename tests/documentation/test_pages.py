@@ -46,9 +46,9 @@ def put_tags(folder):
     (folder / "readings.csv").write_text("q1,q2\n0.1,0.2\n0.1,0.3\n")
 
 
-def put_sheet(folder):
+def put_sheet(folder, arm="stanford", name="sheet.json"):
     """The simulated robot of a configuration as a data sheet."""
-    truth = truth_of(load_config(folder / "configs" / "stanford.yaml"))
+    truth = truth_of(load_config(folder / "configs" / f"{arm}.yaml"))
     twists = truth.robot.H_hat_0
     sheet = {
         "screws": [{"w": [T[2, 1], T[0, 2], T[1, 0]], "v": T[:3, 3].tolist()} for T in twists],
@@ -58,8 +58,16 @@ def put_sheet(folder):
         "markers_tool": truth.M[:, :3].tolist(),
         "marker_numbers": list(truth.number),
         "T_base_tool_at_reference": np.eye(4).tolist(),
+        "image_size": truth.image_size.tolist(),
     }
-    (folder / "sheet.json").write_text(json.dumps(sheet))
+    (folder / name).write_text(json.dumps(sheet))
+
+
+def put_robot(folder):
+    """What the page takes from README."""
+    (robot,) = (block.text for block in blocks_of(ROOT / "README.md") if "class UR5" in block.text)
+    (folder / "my_robot.py").write_text(robot)
+    put_sheet(folder, "ur5", "truth.json")
 
 
 def check_installation(folder, names, read):
@@ -142,7 +150,12 @@ def check_report(folder, names, read):
     assert Path("both.html").is_file()
 
 
-HAS = {"tables": (put_tags, put_sheet)}
+def check_robot(folder, names, read):
+    """An arm that nobody commands any more stands still, after what two periods let it go."""
+    assert "\n0.000000 rad" in read()
+
+
+HAS = {"tables": (put_tags, put_sheet), "robot": (put_robot,)}
 CHECK = {
     "installation": check_installation,
     "tutorial": check_tutorial,
@@ -152,6 +165,7 @@ CHECK = {
     "report": check_report,
     "api": check_api,
     "guidance": check_guidance,
+    "robot": check_robot,
     "run-file": check_run_file,
 }
 
