@@ -81,7 +81,7 @@ def tasks_of(arm):
 
 
 def task_config(config, arm, seed, taught_px=None):
-    """A configuration with the task of a seed; its goal is taught by images of so much noise, or by joints."""
+    """A configuration with the task of a seed; its goal is taught by images of so much noise, or joints."""
     start, goal = tasks_of(arm)[seed]
     vectors = [JointVector(joints=tuple(q.tolist()), unit="rad") for q in (start, goal)]
     kind = type(config.task.goal)
