@@ -1,5 +1,6 @@
 """Record: drive a robot through trial motions and write what both cameras saw into a table."""
 
+import math
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -14,15 +15,17 @@ from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.driven import Steered
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.calibrate import simulate, trial_motions
-from projservo_cli.stages.own_robot import foreign_robot, new_views, sag_of, way_to
-from projservo_cli.stages.world import Joints, joints_of, limit_passed, truth_of
+from projservo_cli.stages.own_robot import foreign_robot, new_views, sag_of, simulated_robot, way_to
+from projservo_cli.stages.simulation import robot_in_trials
+from projservo_cli.stages.trials import seed_of_trials, simulate, trial_motions
+from projservo_cli.stages.world import FAULTS, Joints, has_faults, joints_of, limit_passed, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
 DEPENDS_ON = (
     *("seed", "robot", "rig", "markers.positions_m", "markers.numbers", "noise.calibration_px"),
-    *("plant.use", "plant.options"),
+    *("plant.use", "plant.options", "plant.frames", "plant.settle_s"),
+    *(f"disturbance.{name}" for name in FAULTS),
 )
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
@@ -63,7 +66,11 @@ class _Recording:
         return float(np.sqrt(squares / freedom)) if freedom > 0.0 else None
 
     def save(self) -> None:
-        """Write all poses that are done, in their order; the file appears whole or not at all.
+        """Write all that is done; the file appears whole or not at all."""
+        write_table(self.observation(), self.path, recording=self.key)
+
+    def observation(self) -> Observation:
+        """All poses that are done, in their order.
 
         Frames on the way follow, with negative numbers of poses, of whole motions spread over all of them.
         """
@@ -76,7 +83,7 @@ class _Recording:
         pose = [*(k for k, _ in rest), *range(-1, -1 - len(way), -1)]
         moving = [*(0 for _ in rest), *(k for k, _ in way)]
         timed = np.isfinite([reading.t_q for reading in rows]).any()
-        observation = Observation(
+        return Observation(
             np.array(pose, dtype=np.int64),
             self.marker,
             np.array([reading.q for reading in rows]),
@@ -85,7 +92,6 @@ class _Recording:
             np.array([reading.t_q for reading in rows]) if timed else None,
             np.array([reading.t_view for reading in rows]) if timed else None,
         )
-        write_table(observation, self.path, recording=self.key)
 
 
 def new_recording(
@@ -146,11 +152,9 @@ def record(
     """Record the pending poses, and keep those that are done however it ends.
 
     robot : what is driven; None takes that of ``plant.use``, or simulates that of the configuration, which
-        stands wherever it is sent.
+        stands wherever it is sent unless something is wrong with it.
     """
-    joints = joints_of(config)
-    if robot is None and config.plant.use is not None:
-        robot = foreign_robot(config, joints, len(recording.marker))
+    joints, robot = joints_of(config), robot or _robot_of(config, recording)
     poses = _simulated(config, recording)
     if robot is not None:
         poses = _recorded(Steered(robot), config, joints, recording)
@@ -167,6 +171,31 @@ def record(
     finally:
         if len(recording.done) > kept:
             recording.save()
+
+
+def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
+    """The robot that is to be driven; None for one that need not be."""
+    joints, markers = joints_of(config), len(recording.marker)
+    if config.plant.use is not None:
+        return foreign_robot(config, joints, markers)
+    if not has_faults(config) or not recording.pending:
+        return None
+    first = recording.targets[recording.pending[0]]
+    robot = robot_in_trials(config, truth_of(config), first, seed_of_trials(config))
+    return simulated_robot(config, joints, robot, markers)
+
+
+def observed(config: Config, *, progress: Progress = silent) -> tuple[Observation, float | None]:
+    """What the trial motions of the simulated robot show, and the noise of its pixels, px, if any."""
+    truth, sigma_px = truth_of(config), config.noise.calibration_px
+    recording = _Recording(Path(), "", trial_motions(config), np.array(truth.number))
+    robot = _robot_of(config, recording)
+    if robot is None:
+        return simulate(config, truth, recording.targets), sigma_px or None
+    with at_rest_after(robot):
+        for _ in _recorded(Steered(robot), config, joints_of(config), recording):
+            progress("trial motions", len(recording.done), len(recording.targets))
+    return recording.observation(), sigma_px / math.sqrt(config.plant.frames) or None
 
 
 def _simulated(config: Config, recording: _Recording) -> Iterator[int]:

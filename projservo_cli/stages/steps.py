@@ -28,7 +28,7 @@ _PACE = (
     "control.joint_acceleration_limit_deg_s2",
     "control.prismatic_acceleration_limit_m_s2",
 )
-_RECORDING = tuple(f"disturbance.{name}" for name in FAULTS)
+_RECORDING = (*(f"disturbance.{name}" for name in FAULTS), "plant.frames", "plant.settle_s")
 _DEPENDS_ON: dict[str, tuple[str, ...]] = {
     "calibrate": ("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start", *_RECORDING),
     "plan": (*_TASK, "trajectory", "control.observation", "plant.use", *_PACE),
