@@ -72,13 +72,11 @@ class _Recording:
     def observation(self) -> Observation:
         """All poses that are done, in their order.
 
-        Frames on the way follow, with negative numbers of poses, of whole motions spread over all of them.
+        Frames on the way follow, with negative numbers of poses, of the longest motions.
         """
         rest = sorted(self.done.items())
-        motions, every = sorted(self.ways), 1
-        while sum(len(self.ways[k]) for k in motions[::every]) > _MOST_MOVING and every < len(motions):
-            every += 1
-        way = [(k, reading) for k in motions[::every] for reading in self.ways[k]][:_MOST_MOVING]
+        motions = sorted(self.ways, key=lambda k: len(self.ways[k]), reverse=True)
+        way = [(k, reading) for k in motions for reading in self.ways[k]][:_MOST_MOVING]
         rows = [reading for _, reading in (*rest, *way)]
         pose = [*(k for k, _ in rest), *range(-1, -1 - len(way), -1)]
         moving = [*(0 for _ in rest), *(k for k, _ in way)]
