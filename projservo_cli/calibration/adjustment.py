@@ -5,10 +5,15 @@ twists, markers end in one), so that all operators are conjugate to rigid motion
 construction. Both cameras are general 3×4 matrices. The frame is a means of writing the constraint down and
 has no claim to truth: how it sits in the world is left to the images as far as they determine it.
 
+Where joint readings err, the true joints of each pose are unknowns too, held to the readings by their noise.
+They are eliminated from each step pose by pose (Schur complement), exactly: W. A. Fuller, "Measurement error
+models", Wiley 1987, section 3.2; B. Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
+
 Levenberg–Marquardt with geodesic acceleration and a gauge penalty: M. Transtrum, J. Sethna,
 "Improvements to the Levenberg–Marquardt algorithm", arXiv:1201.5885.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -64,6 +69,8 @@ class LeastSquares:
     """Images to explain, and where each parameter stands: both cameras, joints, markers, then both lenses.
 
     The derivative of the images is compact: (2, N, 2, c) for each reading by the c parameters it depends on.
+    Offsets of joint readings come after the ``size`` parameters, (K, n) in units of ``tau``, in which their
+    squares weigh as those of pixels.
     """
 
     readings: Readings  # what was seen
@@ -73,6 +80,8 @@ class LeastSquares:
     lens: int  # first parameter of the lenses; ``size`` where none is sought
     size: int  # number of parameters
     columns: IntArray  # (2, N, c) parameters that a reading depends on
+    # (n,) noise of joint readings over that of pixels, rad/px or m/px; None where readings are exact
+    tau: FloatArray | None = None
 
     @classmethod
     def of(cls, readings: Readings, q_reference: FloatArray, lens: bool = False) -> "LeastSquares":
@@ -95,10 +104,25 @@ class LeastSquares:
         q = readings.q - q_reference
         return cls(readings, q, q_reference, joint, first, first + 2 * count, columns)
 
+    def joints(self, scene: Scene) -> FloatArray:
+        """Joint values (K, n) from the reference, rad or m; where they have noise with a scene's offsets."""
+        return self.q if self.tau is None or scene.offsets is None else self.q + scene.offsets
+
+    def strain(self, scene: Scene) -> FloatArray:
+        """Offsets (K, n) of a scene in units of their noise, times that of pixels: px; none without noise."""
+        if self.tau is None or scene.offsets is None:
+            return np.zeros((0, len(self.q_reference)))
+        return np.asarray(scene.offsets / self.tau)
+
+    def with_noise(self, tau: FloatArray | None) -> "LeastSquares":
+        """The same problem with other noise of joints (n,) over that of pixels, rad/px or m/px."""
+        return dataclasses.replace(self, tau=tau)
+
     def pixels(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Predicted pixels (2, N, 2) of every sighting and their depths (2, N)."""
         readings = self.readings
-        m = image_points(scene.P, scene.carried(self.q, readings.pose_of, readings.marker_of)[1][0])
+        points = scene.carried(self.joints(scene), readings.pose_of, readings.marker_of)[1][0]
+        m = image_points(scene.P, points)
         pixels = m[..., :2] / m[..., 2:]
         return pixels if scene.lens is None else bent(scene.lens[:, None], pixels), m[..., 2]
 
@@ -114,7 +138,8 @@ class LeastSquares:
         D_i (B Y_i − E_i B Y_{i+1}), where D_i E_i is D_{i+1}.
         """
         readings = self.readings
-        pixels, Y, by_camera, D, by_lens = scene.images(self.q, readings.pose_of, readings.marker_of)
+        q = self.joints(scene)
+        pixels, Y, by_camera, D, by_lens = scene.images(q, readings.pose_of, readings.marker_of)
         blocks = [by_camera]
         for i, B in enumerate(_generators(scene)):
             near, far = (D[k] @ np.einsum("bij,Nj->Nib", B, Y[k]) for k in (i, i + 1))
@@ -126,12 +151,13 @@ class LeastSquares:
 
     def joint_derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values, [RH00] eqs. (7), (19)."""
-        images = scene.images(self.q, self.readings.pose_of, self.readings.marker_of)
+        images = scene.images(self.joints(scene), self.readings.pose_of, self.readings.marker_of)
         velocity = images.points[:-1] @ scene.H_hat.swapaxes(1, 2)
         return images.pixels, np.einsum("ivNrc,iNc->vNri", images.by_point[:-1], velocity)
 
     def retract(self, scene: Scene, x: FloatArray) -> Scene:
-        """Scene after a step x (size,); screws move as rigid bodies and keep their constraints."""
+        """Scene after a step x (size or more,); screws move as rigid bodies and keep their constraints."""
+        x, further = x[: self.size], x[self.size :]
         steps = np.split(x[self.joint[0] : self.joint[-1]], self.joint[1:-1] - self.joint[0])
         twists = [np.tensordot(step, B, axes=1) for step, B in zip(steps, _generators(scene), strict=True)]
         motion = expm(np.array(twists))
@@ -153,7 +179,11 @@ class LeastSquares:
         if lens is not None:
             lens = lens.copy()
             lens[:, FIRST:] += x[self.lens :].reshape(2, LENS)
-        return Scene(scene.P + x[: 2 * CAMERA].reshape(2, 3, 4), H_hat, scene.prismatic, M, lens)
+        offsets = scene.offsets
+        if self.tau is not None and further.size:
+            offsets = (0.0 if offsets is None else offsets) + self.tau * further.reshape(self.q.shape)
+        P = scene.P + x[: 2 * CAMERA].reshape(2, 3, 4)
+        return Scene(P, H_hat, scene.prismatic, M, lens, offsets)
 
     def gauge(self, scene: Scene) -> FloatArray:
         """Directions (size, g) of the parameters that change no image, of unit norm each.
@@ -198,14 +228,48 @@ class LeastSquares:
         return g
 
     def change(self, J: FloatArray, x: FloatArray) -> FloatArray:
-        """J times a step: first-order change (2, N, 2) of the images."""
+        """J times a step (size,): first-order change (2, N, 2) of the images."""
         return np.asarray((J @ x[self.columns][..., None])[..., 0])
+
+    def at_poses(self, values: FloatArray) -> FloatArray:
+        """Sums (K, …) over the sightings of each pose of values (N, …)."""
+        result: FloatArray = np.zeros((len(self.q), *values.shape[1:]))
+        np.add.at(result, self.readings.pose_of, values)
+        return result
+
+    def coupling(self, J: FloatArray, G: FloatArray, weight: FloatArray) -> FloatArray:
+        """Jᵀ W G (size, K n) with G (2, N, 2, n) the derivative by offsets of each pose."""
+        weighted = weight[..., None, None] * G
+        B = np.zeros((len(self.q), self.size, G.shape[-1]))
+        for v, rows, columns in self._blocks():
+            # A pose sees a marker once: no two rows of a block are of one pose.
+            block = np.swapaxes(J[v, rows], 1, 2) @ weighted[v, rows]
+            B[self.readings.pose_of[rows, None], columns] += block
+        return np.swapaxes(B, 0, 1).reshape(self.size, -1)
+
+    def offset_normal(self, G: FloatArray, weight: FloatArray) -> FloatArray:
+        """Gᵀ W G (K, n, n) of each pose."""
+        return self.at_poses((np.swapaxes(G, 2, 3) @ (weight[..., None, None] * G)).sum(axis=0))
 
     def dense(self, J: FloatArray, mask: BoolArray) -> FloatArray:
         """The whole derivative (4 N, size), zero outside a mask (2, N), for what needs more than JᵀJ."""
         result = np.zeros((*J.shape[:3], self.size))
         np.put_along_axis(result, self.columns[:, :, None], J * mask[..., None, None], axis=3)
         return result.reshape(-1, self.size)
+
+    def whitened(self, scene: Scene, rows: FloatArray, mask: BoolArray) -> FloatArray:
+        """S^-½ times rows (4 N, c) of coordinates in a mask (2, N), S = I + G τ² Gᵀ of each pose."""
+        if self.tau is None:
+            return rows
+        G = self.joint_derivative(scene)[1] * (self.tau * mask[..., None, None])
+        rows, pose_of = rows.reshape(*G.shape[:3], -1).copy(), self.readings.pose_of
+        for k in np.unique(pose_of):
+            here = rows[:, pose_of == k]
+            U, s, _ = np.linalg.svd(G[:, pose_of == k].reshape(-1, G.shape[-1]), full_matrices=False)
+            flat = here.reshape(len(U), -1)
+            less = U @ ((1.0 - 1.0 / np.sqrt(1.0 + s**2))[:, None] * (U.T @ flat))
+            rows[:, pose_of == k] = (flat - less).reshape(here.shape)
+        return rows.reshape(-1, rows.shape[-1])
 
 
 # Largest ratio of second-order to first-order step, and the probe of the second derivative, as by the source.
@@ -230,6 +294,31 @@ class _Fit:
     cost: float  # weighted sum of squares, px²
 
 
+class _Offsets:
+    """First order of the images about a scene by offsets of joint readings, (K, n) in units of tau."""
+
+    def __init__(self, problem: LeastSquares, scene: Scene, weight: FloatArray) -> None:
+        assert problem.tau is not None
+        self.problem, self.weight = problem, weight
+        self.G = problem.joint_derivative(scene)[1] * problem.tau
+        normal = problem.offset_normal(self.G, weight)
+        self.inverse = np.linalg.inv(normal + np.eye(normal.shape[-1]))
+        self.strain = np.zeros_like(problem.q) if scene.offsets is None else problem.strain(scene)
+
+    def gradient(self, change: FloatArray, strain: FloatArray) -> FloatArray:
+        """Gradient (K, n) of a change (2, N, 2) of the images and of a strain (K, n)."""
+        weighted = (self.weight[..., None] * change)[..., None, :] @ self.G
+        return strain + self.problem.at_poses(weighted[..., 0, :].sum(axis=0))
+
+    def solved(self, g: FloatArray) -> FloatArray:
+        """Offsets (K, n) of a gradient (K, n)."""
+        return np.asarray((self.inverse @ g[..., None])[..., 0])
+
+    def change(self, offsets: FloatArray) -> FloatArray:
+        """First-order change (2, N, 2) of the images by offsets (K, n)."""
+        return np.asarray((self.G @ offsets[self.problem.readings.pose_of][..., None])[..., 0])
+
+
 class _Expansion:
     """First order of the images about a scene, with weights (2, N), by the parameters from a first one on."""
 
@@ -239,7 +328,13 @@ class _Expansion:
         self.problem, self.scene, self.residual, self.weight = problem, scene, residual, weight
         first = problem.size - len(least)
         self.J = problem.derivative(scene)[1]
-        A = problem.normal(self.J, weight)[first:, first:]
+        A = problem.normal(self.J, weight)
+        self.offsets = None if problem.tau is None else _Offsets(problem, scene, weight)
+        if self.offsets is not None:
+            self.B = problem.coupling(self.J, self.offsets.G, weight)
+            by_pose = self.B.reshape(problem.size, *problem.q.shape).swapaxes(0, 1) @ self.offsets.inverse
+            A -= by_pose.swapaxes(0, 1).reshape(self.B.shape) @ self.B.T
+        A = A[first:, first:]
         # Units in which the diagonal is at most one, and the gauge tied.
         self.scale = np.maximum(least, np.sqrt(np.maximum(np.diagonal(A), 1e-300)))
         self.A = A / np.outer(self.scale, self.scale)
@@ -248,31 +343,47 @@ class _Expansion:
             self.A += G @ G.T
 
     def step(self, damping: float) -> FloatArray | None:
-        """Damped step (size,) with geodesic acceleration; None where the second order outweighs the first."""
+        """Damped step (size or more,) with geodesic acceleration; None where second outweighs first order."""
         try:
             factor = cho_factor(self.A + damping * np.eye(len(self.A)))
         except np.linalg.LinAlgError:
             return None
-        problem, held = self.problem, np.zeros(self.problem.size - len(self.A))
+        problem, offsets, count = self.problem, self.offsets, len(self.A)
+        held = np.zeros(problem.size - count)
 
-        def descent(change: FloatArray) -> FloatArray:
-            """Step in units of the scale that undoes a change (2, N, 2) of the images."""
-            g = problem.gradient(self.J, self.weight[..., None] * change)[len(held) :] / self.scale
-            return np.asarray(-cho_solve(factor, g))
+        def descent(change: FloatArray, strain: FloatArray) -> FloatArray:
+            """Step in units of the scale that undoes a change (2, N, 2) of the images and a strain (K, n)."""
+            g = problem.gradient(self.J, self.weight[..., None] * change)
+            if offsets is None:
+                return np.asarray(-cho_solve(factor, g[len(held) :] / self.scale))
+            by_offsets = offsets.gradient(change, strain)
+            g -= self.B @ offsets.solved(by_offsets).ravel()
+            step = -cho_solve(factor, g[len(held) :] / self.scale)
+            x = np.concatenate([held, step / self.scale])
+            further = offsets.solved(by_offsets + (x @ self.B).reshape(problem.q.shape))
+            return np.concatenate([step, -further.ravel()])
 
         def whole(step: FloatArray) -> FloatArray:
-            """Step of all parameters, (size,)."""
-            return np.concatenate([held, step / self.scale])
+            """Step of all parameters, (size,), and of offsets in units of tau."""
+            return np.concatenate([held, step[:count] / self.scale, step[count:]])
 
-        velocity = descent(self.residual)
+        none = np.zeros_like(problem.q)
+        velocity = descent(self.residual, none if offsets is None else offsets.strain)
         probe = problem.residual(problem.retract(self.scene, _PROBE * whole(velocity)))
-        bend = (2.0 / _PROBE) * ((probe - self.residual) / _PROBE - problem.change(self.J, whole(velocity)))
+        bend = (2.0 / _PROBE) * ((probe - self.residual) / _PROBE - self.change(whole(velocity)))
         if not np.isfinite(bend).all():
             return None
-        acceleration = descent(bend)
-        if np.linalg.norm(acceleration) > _BEND * np.linalg.norm(velocity):
+        acceleration = descent(bend, none)
+        if np.linalg.norm(acceleration[:count]) > _BEND * np.linalg.norm(velocity[:count]):
             return None
         return whole(velocity + 0.5 * acceleration)
+
+    def change(self, x: FloatArray) -> FloatArray:
+        """First-order change (2, N, 2) of the images by a step (size or more,)."""
+        change = self.problem.change(self.J, x[: self.problem.size])
+        if self.offsets is None:
+            return change
+        return change + self.offsets.change(x[self.problem.size :].reshape(self.problem.q.shape))
 
 
 def minimize(
@@ -300,15 +411,15 @@ def minimize(
     for _ in range(most):
         if fresh:
             here = _Expansion(problem, scene, residual, weight, scale)
-            scale, cost = here.scale, _cost(weight, residual)
+            scale, cost = here.scale, _cost(weight, residual, problem.strain(scene))
             fresh = False
         x = here.step(damping)
         if x is not None:
             candidate = problem.retract(scene, x)
             new_residual = problem.residual(candidate)
-            new_cost = _cost(weight, new_residual)
+            new_cost = _cost(weight, new_residual, problem.strain(candidate))
             fresh = bool(np.isfinite(new_cost)) and new_cost <= cost
-            moved = _cost(weight, problem.change(here.J, x))
+            moved = _cost(weight, here.change(x))
             settled = moved <= least_change * max(cost, _LEAST_RESIDUAL**2 * float(weight.sum()))
         if fresh:
             scene, residual, weight = candidate, new_residual, _weights(new_residual, rows, robust)
@@ -319,7 +430,25 @@ def minimize(
             damping *= 10.0
         if settled or damping > _MOST_DAMPING:
             break
-    return _Fit(scene, residual, _cost(weight, residual))
+    return _Fit(scene, residual, _cost(weight, residual, problem.strain(scene)))
+
+
+_SETTLING = 8
+
+
+def settled(problem: LeastSquares, scene: Scene) -> Scene:
+    """The scene with the offsets of each pose that explain its images best, under a Cauchy loss.
+
+    Of poses that count and of those that do not, alike: whether they should is asked of what that leaves.
+    """
+    seen = problem.readings.seen
+    for _ in range(_SETTLING if problem.tau is not None else 0):
+        residual = problem.residual(scene)
+        weight = _weights(residual, seen, robust=True)
+        offsets = _Offsets(problem, scene, weight)
+        step = offsets.solved(offsets.gradient(residual, offsets.strain))
+        scene = problem.retract(scene, np.concatenate([np.zeros(problem.size), -step.ravel()]))
+    return scene
 
 
 def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
@@ -331,6 +460,7 @@ def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
     return np.where(rows, 1.0 / (1.0 + (distance / width) ** 2), 0.0)
 
 
-def _cost(weight: FloatArray, residual: FloatArray) -> float:
-    """Weighted sum of squares of residuals (2, N, 2), px²."""
-    return float((weight[..., None] * residual**2).sum())
+def _cost(weight: FloatArray, residual: FloatArray, strain: FloatArray | None = None) -> float:
+    """Weighted sum of squares of residuals (2, N, 2), and that of strains (K, n) if any, px²."""
+    images = float((weight[..., None] * residual**2).sum())
+    return images if strain is None else images + float((strain**2).sum())

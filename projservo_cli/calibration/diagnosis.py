@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import fdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
 from projservo_cli.calibration.fit import Misfit, Solution, fit_from
 from projservo_cli.calibration.forward import LENS, Scene
@@ -58,7 +58,8 @@ class Outliers:
             pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
             if int(pose.seen.any(axis=0).sum()) < 3:
                 continue
-            joints = _wrong_joints(LeastSquares.of(pose, problem.q_reference), scene, sigma)
+            alone = LeastSquares.of(pose, problem.q_reference).with_noise(problem.tau)
+            joints = _wrong_joints(alone, scene, sigma)
             suspects += [(int(k), i) for i in joints]
             if joints:
                 explained[:, here] |= out[:, here]
@@ -70,7 +71,7 @@ class Outliers:
 def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
     """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N)."""
     readings = problem.readings
-    predicted = scene.seen(problem.q)
+    predicted = scene.seen(problem.joints(settled(problem, scene)))
     rows = np.flatnonzero(out.any(axis=0))
     distance = np.linalg.norm(
         predicted[readings.pose_of[rows]] - readings.pixels[:, rows].transpose(1, 0, 2)[:, :, None], axis=3
@@ -101,15 +102,21 @@ def _wrong_joints(pose: LeastSquares, scene: Scene, sigma: float) -> tuple[int, 
 
 
 def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma: float) -> float:
-    """Median residual after some joints of a pose are fitted to its images, nearly by least distances, px."""
-    seen = pose.readings.seen
+    """Median residual after some joints of a pose are fitted to its images, nearly by least distances, px.
+
+    The others may be off by their noise.
+    """
+    seen, n = pose.readings.seen, pose.q.shape[1]
+    others = np.setdiff1d(np.arange(n) if pose.tau is not None else joints, joints)
+    moved = np.eye(n)[[*joints, *others]]
 
     def residual(x: FloatArray) -> FloatArray:
-        q = pose.q + x @ np.eye(pose.q.shape[1])[joints]
-        return dataclasses.replace(pose, q=q).residual(scene)[seen].ravel()
+        images = dataclasses.replace(pose, q=pose.q + x @ moved).residual(scene)[seen].ravel()
+        return images if pose.tau is None else np.concatenate([images, x[len(joints) :] / pose.tau[others]])
 
-    found = least_squares(residual, np.zeros(len(joints)), loss="soft_l1", f_scale=sigma)
-    return float(np.median(np.linalg.norm(found.fun.reshape(-1, 2), axis=1)))
+    found = least_squares(residual, np.zeros(len(moved)), loss="soft_l1", f_scale=sigma)
+    images = found.fun[: 2 * int(seen.sum())]
+    return float(np.median(np.linalg.norm(images.reshape(-1, 2), axis=1)))
 
 
 def _require_explained(readings: Readings, used: BoolArray, found: Outliers, epipolar: Epipolar) -> None:
@@ -253,7 +260,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     if d + 1 >= K:
         return 0.0
     columns = _cleared_columns(solution, frame)
-    scores = (columns * solution.residual).sum(axis=(1, 3))
+    scores = (columns * solution.whitened_residual).sum(axis=(1, 3))
     by_pose = np.stack([np.bincount(readings.pose_of, score)[poses] for score in scores])
     total = by_pose.sum(axis=1)
     flat = columns.reshape(d, -1)
@@ -270,9 +277,10 @@ def _undistorted(frame: ImageFrame) -> FloatArray:
 
 def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
     """Change of the images by k1, k2 of both views (4, 2, N, 2), less what other parameters can undo."""
-    problem = LeastSquares.of(solution.problem.readings, solution.problem.q_reference, lens=True)
+    exact = LeastSquares.of(solution.problem.readings, solution.problem.q_reference, lens=True)
+    problem = exact.with_noise(solution.problem.tau)
     scene = dataclasses.replace(solution.scene, lens=_undistorted(frame))
-    J = problem.dense(problem.derivative(scene)[1], solution.used)
+    J = problem.whitened(scene, problem.dense(problem.derivative(scene)[1], solution.used), solution.used)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     others, lenses = J[:, : problem.lens], J[:, problem.lens :]
     left = lenses - others @ np.linalg.lstsq(others, lenses, rcond=None)[0]

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.diagnosis import Outliers, blamed_joint, listed, share_explained, with_lens
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
-from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve
+from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve, with_joint_noise
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, judged
 from projservo_cli.calibration.readings import Readings, require_images, require_motion
@@ -42,6 +42,7 @@ def calibrate(
     seed: int = 0,
     lens: bool = False,
     init: Nominal | None = None,
+    joint_noise: float | None = 0.0,
     fitted: Callable[[Solution, float], None] | None = None,
     tell: Tell = lambda what, done, total: None,
 ) -> Calibration:
@@ -58,6 +59,8 @@ def calibrate(
     seed : of the random starts.
     lens : whether to estimate two coefficients of radial distortion a camera, about the image centre.
     init : robot and rig to try first as a start of ``refined``; the search follows where that misses.
+    joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad), for ``refined``;
+        None estimates it, and takes 0 unless the images show it.
     fitted : told the solution of ``refined`` and its noise, px, for what needs more than the record.
     tell : told how far ``refined`` is: what it does, how much of it is done, and of how much.
 
@@ -78,6 +81,8 @@ def calibrate(
         raise InputError(f"image size {image_size!r}: give a positive width and height, px")
     if seed < 0:
         raise InputError(f"seed {seed!r}: give a whole number that is not negative")
+    if joint_noise is not None and not 0.0 <= joint_noise < np.inf:
+        raise InputError(f"joint noise {joint_noise!r}: give a number that is not negative, or none")
     if lens and method != "refined":
         raise InputError(
             f"calibration method {method!r} estimates no lens: choose refined, or calibrate without"
@@ -100,7 +105,7 @@ def calibrate(
             result = _closed_form(readings, epipolar, expected)
         else:
             problem = LeastSquares.of(readings, readings.reference())
-            search = Search(problem, epipolar, ImageFrame.of(readings, image_size), rng, tell)
+            search = Search(problem, epipolar, ImageFrame.of(readings, image_size), rng, tell, joint_noise)
             solution, expected, result = _most_likely(search, expect, lens, init)
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
@@ -131,6 +136,7 @@ def _most_likely(
             search.tell("calibration, lens", 0, 1)
             solution, epipolar = with_lens(solution, search)
             expected = expect(epipolar)
+        solution = with_joint_noise(solution, expected, search.joint_noise)
         result = _refined(solution, epipolar, expected, search.frame)
     except Misfit as refused:
         # The joints of a simulation are as configured: their types and readings are not to blame.
@@ -227,7 +233,9 @@ def _record(
     counts = (len(outlier), len(found.suspect), len(found.swapped))
     verdict = judged(solution, spread, expected, counts, suspicion)
     operator_defect, trace_defect, plane_defect = result.defects()
-    used_rows = solution.used.any(axis=0)
+    used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
+    # More than noise, as far as the readings tell.
+    over = solution.sigma_px**2 - expected.sigma_px**2 if expected.warns(solution) else 0.0
     return Calibration(
         method=method,
         source="",
@@ -265,4 +273,9 @@ def _record(
         predicted_rms_px=None if verdict.error is None else verdict.error[0],
         predicted_p99_px=None if verdict.error is None else verdict.error[1],
         lens=scene.lens,
+        sigma_q=None if joint_noise is None else joint_noise.sigma_q,
+        sigma_q_interval=None
+        if joint_noise is None or joint_noise.interval is None
+        else np.array(joint_noise.interval),
+        model_px=float(np.sqrt(over)),
     )

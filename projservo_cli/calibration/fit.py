@@ -8,9 +8,10 @@ from itertools import islice
 import numpy as np
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares, minimize
+from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise, quantile
 from projservo_cli.calibration.readings import RAYLEIGH
 from projservo_cli.calibration.start import Nominal, Search, starts
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
@@ -36,11 +37,28 @@ class Solution:
     residual: FloatArray  # (2, N, 2) predicted minus seen, px
     used: BoolArray  # (2, N) readings that count; the rest of those seen are outliers
     dof: int  # degrees of freedom
+    joint_noise: JointNoise | None = None  # of joint readings; None where it was not asked for
 
     @property
     def chi2(self) -> float:
-        """Sum of squares of the readings used, px²."""
-        return float((self.residual[self.used] ** 2).sum())
+        """Sum of squares of the readings used, px²; joints as far off as their noise allows count too."""
+        return float((self.residual[self.used] ** 2).sum() + (self.problem.strain(self.scene) ** 2).sum())
+
+    @property
+    def whitened_residual(self) -> FloatArray:
+        """S^-½ times what is left of the images at the joints as read, (2, N, 2), px."""
+        if self.problem.tau is None:
+            return self.residual
+        raw = self.problem.with_noise(None).residual(self.scene) * self.used[..., None]
+        return self.problem.whitened(self.scene, raw.reshape(-1, 1), self.used).reshape(raw.shape)
+
+    @property
+    def joint_effect_px(self) -> float:
+        """By how much joints that are off move a coordinate of the images, rms, px."""
+        if self.problem.tau is None:
+            return 0.0
+        G = self.problem.joint_derivative(self.scene)[1][self.used] * self.problem.tau
+        return self.sigma_px * float(np.sqrt((G**2).sum(axis=-1).mean()))
 
     @property
     def sigma_px(self) -> float:
@@ -49,8 +67,9 @@ class Solution:
 
     @property
     def rms_px(self) -> float:
-        """Root mean square of the Euclidean residual per marker and view, px."""
-        return float(np.sqrt(self.chi2 / max(int(self.used.sum()), 1)))
+        """Root mean square of the Euclidean residual per marker and view at the joints as read, px."""
+        residual = self.problem.with_noise(None).residual(self.scene)
+        return float(np.sqrt((residual[self.used] ** 2).sum() / max(int(self.used.sum()), 1)))
 
     @property
     def typical_px(self) -> float:
@@ -66,19 +85,20 @@ class Solution:
             return self, keep
         rows = keep[readings.marker_of]
         smaller = LeastSquares.of(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
+        smaller = smaller.with_noise(problem.tau)
         scene = dataclasses.replace(scene, M=scene.M[keep])
         used = self.used[:, rows]
         dof = _degrees_of_freedom(smaller, scene, used)
-        return Solution(smaller, scene, self.residual[:, rows], used, dof), keep
+        return Solution(smaller, scene, self.residual[:, rows], used, dof, self.joint_noise), keep
 
     def spread_factor(self) -> FloatArray:
-        """Factor L of the inverse information, L Lᵀ = (JᵀJ)⁺, on the directions that the readings determine.
+        """Factor L of the inverse information, L Lᵀ = (JᵀS⁻¹J)⁺, on the directions that readings determine.
 
         Singular values of J itself keep the weakest direction, which the normal matrix would lose.
         At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
         """
         problem, scene = self.problem, self.scene
-        J = problem.dense(problem.derivative(scene)[1], self.used)
+        J = problem.whitened(scene, problem.dense(problem.derivative(scene)[1], self.used), self.used)
         scale = np.linalg.norm(J, axis=0)
         # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
         scale = np.where(scale > 0.0, scale, scale.max())
@@ -150,6 +170,8 @@ def chi2_band(dof: int) -> tuple[float, float]:
 
 
 _MASK_ROUNDS = 4
+# Chance with which noise alone makes the readings of a pose count for nothing.
+_POSE_TAIL = 1e-7
 # Least share of the readings of a marker that must count for it to be part of the model.
 _LEAST_SHARE = 0.25
 # A start that leaves this many times the epipolar noise after the robust search is a wrong one.
@@ -205,7 +227,7 @@ def fit_inliers(
     if epipolar is not None and sigma > _HOPELESS * epipolar.noise_px:
         dof = _degrees_of_freedom(problem, scene, seen)
         return Solution(problem, scene, residual, seen, dof) if dof > 0 else None
-    within = _within(problem, residual, OUTLIER * max(sigma, 1e-9))
+    within = _within(problem, scene, OUTLIER * max(sigma, 1e-9))
     for _ in range(_MASK_ROUNDS):
         used = within
         fit = minimize(problem, scene, used, robust=False)
@@ -213,7 +235,7 @@ def fit_inliers(
         dof = _degrees_of_freedom(problem, scene, used)
         if dof <= 0:
             return None
-        within = _within(problem, fit.residual, OUTLIER * max(float(np.sqrt(fit.cost / dof)), 1e-9))
+        within = _within(problem, scene, OUTLIER * max(float(np.sqrt(fit.cost / dof)), 1e-9))
         if np.array_equal(used, within):
             break
     _, depth = problem.pixels(scene)
@@ -230,17 +252,82 @@ def _sides(depth: FloatArray) -> tuple[FloatArray, BoolArray]:
     return sign, np.sign(depth) == sign[:, None]
 
 
-def _within(problem: LeastSquares, residual: FloatArray, limit: float) -> BoolArray:
-    """Readings (2, N) within a limit, px, at poses where at least half of those seen are."""
-    readings = problem.readings
+def _within(problem: LeastSquares, scene: Scene, limit: float) -> BoolArray:
+    """Readings (2, N) within a limit, px, at poses where at least half of those seen are.
+
+    And where joints have noise, at poses that it explains: a wrong reading hides among many small errors.
+    """
+    readings, scene = problem.readings, settled(problem, scene)
+    residual = problem.residual(scene)
     good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
     most = readings.count_at(good) >= 0.5 * readings.count_at(readings.seen)
+    if problem.tau is not None:
+        strain = problem.strain(scene)
+        square = problem.at_poses((residual**2 * good[..., None]).sum(axis=(0, 2))) + (strain**2).sum(axis=1)
+        allowed = chdtri(np.maximum(2 * readings.count_at(good), 1), _POSE_TAIL) * (limit / OUTLIER) ** 2
+        most &= (np.abs(strain) <= limit).all(axis=1) & (square <= allowed)
     return np.asarray(good & most[readings.pose_of])
 
 
 def _degrees_of_freedom(problem: LeastSquares, scene: Scene, used: BoolArray) -> int:
     """Coordinates used minus the rank of their derivative."""
     return 2 * int(np.count_nonzero(used)) - problem.size + len(problem.gauge(scene).T)
+
+
+_NOISE_ROUNDS, _NOISE_SETTLED = 5, 0.01
+
+
+def with_joint_noise(exact: Solution, expected: Expected, given: float | None) -> Solution:
+    """A fit adjusted anew with joint readings that err, by so much, rad, or as is most likely for None.
+
+    The fit itself where they do not, as far as the images show, or no noise of joints explains them.
+    """
+    if given == 0.0 or exact.joint_noise is not None:
+        return exact
+    sigma_px, solution = expected.sigma_px if expected.known else None, exact
+    for _ in range(_NOISE_ROUNDS):
+        before = solution.joint_noise
+        if given is not None:
+            noise = JointNoise(given, None, given / expected.sigma_px)
+        else:
+            noise = JointNoise.estimated(solution.problem, solution.scene, solution.used, sigma_px)
+        if noise.sigma_q == 0.0 or not noise.believable:
+            return dataclasses.replace(exact, joint_noise=noise if noise.believable else NO_JOINT_NOISE)
+        if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
+            break
+        problem = exact.problem.with_noise(noise.tau(exact.problem.readings.prismatic))
+        found = fit_inliers(problem, solution.scene, noise.sigma_q / noise.over_pixels)
+        if found is None:
+            return exact
+        solution = dataclasses.replace(found, joint_noise=noise)
+        if given is None and before is None and _contradicted(exact, solution):
+            return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
+    return solution
+
+
+# What both fits may differ by: so many times what they stay below in 999 of 1,000 cases.
+_CHANCE, _LENIENT = 0.999, 2.0
+
+
+def _contradicted(exact: Solution, weighted: Solution) -> bool:
+    """Whether fits without and with noise of joints predict images that noise alone does not set apart.
+
+    Both are right where what is left is noise, and the first only wastes some of the data. Where the model
+    errs, as for links that flex, they are off by different amounts: J. A. Hausman, "Specification tests in
+    econometrics", Econometrica 46(6), 1978. The variance of their difference is that of their variances.
+    """
+    both, problem = exact.used & weighted.used, weighted.problem
+    assert problem.tau is not None
+    J = exact.problem.dense(exact.problem.derivative(exact.scene)[1], both)
+    Q = J @ exact.spread_factor()
+    R = Q.T @ (J @ weighted.spread_factor())
+    G = problem.joint_derivative(weighted.scene)[1] * (problem.tau * both[..., None, None])
+    rows = (np.swapaxes(G, 2, 3) @ Q.reshape(*G.shape[:3], -1)).sum(axis=0)  # Gᵀ Q of each sighting
+    moved = problem.at_poses(rows).reshape(-1, Q.shape[1])
+    variance = Q.T @ Q + moved.T @ moved - R @ R.T
+    variances = weighted.sigma_px**2 * np.maximum(np.linalg.eigvalsh(variance), 0.0)
+    apart = (problem.with_noise(None).residual(weighted.scene) - exact.residual)[both]
+    return float((apart**2).sum()) > _LENIENT * quantile(variances, _CHANCE)
 
 
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a
@@ -269,8 +356,10 @@ def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[
     pixels, depth = problem.pixels(scene)
     if np.isfinite(pixels).all() and _sides(depth)[1][problem.readings.seen].all():
         found = fit_from(problem, scene, search.epipolar)
-    if found is not None and expected.agrees(found):
-        return found, ""
+    if found is not None:
+        explained = with_joint_noise(found, expected, search.joint_noise)
+        if expected.agrees(explained):
+            return explained, ""
     try:
         searched = _solve_from_images(search, expected)
     except WorkFailed:
@@ -313,13 +402,17 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
                     return best
                 continue
             levels.append(level)
-            found = fit_inliers(problem, scene, level / RAYLEIGH, epipolar)
+            hopeful = epipolar if search.joint_noise == 0.0 else None
+            found = fit_inliers(problem, scene, level / RAYLEIGH, hopeful)
             if found is None:
                 continue
-            if expected.agrees(found):
-                return found
             if best is None or found.typical_px < best.typical_px:
                 best = found
+                explained = with_joint_noise(found, expected, search.joint_noise)
+                if expected.agrees(explained):
+                    return explained
+                if explained.problem.tau is None:  # which need not be found again
+                    best = explained
             if factors != _FOCAL_FACTORS[0] and expected.refusal(best) is None:
                 return best
         if best is not None:

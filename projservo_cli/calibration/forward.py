@@ -86,6 +86,8 @@ class Scene:
     prismatic: BoolArray  # (n,) whether the joint is prismatic
     M: FloatArray  # (m, 4) markers at the reference
     lens: FloatArray | None = None  # (2, 5) lenses, None without
+    # (K, n) true joints less their readings at the poses of a problem, rad or m; None where they are exact
+    offsets: FloatArray | None = None
 
     def seen(self, q: FloatArray) -> FloatArray:
         """Pixels (K, 2, m, 2) of all markers at joints (K, n), [RH00] eqs. (1), (6).

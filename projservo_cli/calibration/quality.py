@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
-from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
+from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import distance_statistics
 from projservo_cli.calibration.readings import (
     MOST_REACHES,
@@ -128,20 +128,7 @@ def _predicted_error(sure: _Uncertainty) -> tuple[float, float]:
         poses = 0.5 * (poses + q_reference)
     spread = sure.spread(poses, shown)
     variances = np.linalg.eigvalsh(spread.T @ spread) / max(int(shown.sum()), 1)
-    return float(np.sqrt(variances.sum())), float(np.sqrt(_quantile(variances, _SURE)))
-
-
-def _quantile(variances: FloatArray, probability: float) -> float:
-    """Quantile of a sum of squares of independent normal variables of variances (r,), by its three moments.
-
-    Source: M. J. Buckley, G. K. Eagleson, "An approximation to the distribution of quadratic forms in
-    normal random variables", Australian Journal of Statistics 30A, 1988.
-    """
-    mean, square, cube = (float((variances**power).sum()) for power in (1, 2, 3))
-    if cube == 0.0:
-        return mean
-    freedom = square**3 / cube**2
-    return mean + float(np.sqrt(square / freedom) * (chdtri(freedom, 1.0 - probability) - freedom))
+    return float(np.sqrt(variances.sum())), float(np.sqrt(quantile(variances, _SURE)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,6 +193,15 @@ def judged(
             advice.append("look for joint readings that lag behind the images")
     outliers, suspects, swaps = left_out
     limit = "noise"
+    if words := _joint_words(solution):
+        reason = f"{reason}, with joint readings off by {words}"
+        if solution.joint_effect_px > solution.sigma_px:
+            limit = "joint readings"
+            advice.append(
+                f"joint readings off by {words} move images by {solution.joint_effect_px:.3g} px, more than "
+                f"pixel noise of {solution.sigma_px:.3g} px: finer or stiffer joints would help, not better "
+                "pixels"
+            )
     if warned or suspicion == "lens":
         limit = suspicion
     elif (weak := noise > WEAK_NOISE).any():
@@ -222,6 +218,14 @@ def judged(
     if swaps:
         advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
     return _Judgement(span, noise, error, True, f"{reason}; limited by {limit}", tuple(advice))
+
+
+def _joint_words(solution: Solution) -> str:
+    """How far joint readings are off; empty where they are not, as far as the images show."""
+    noise = solution.joint_noise
+    if noise is None or noise.sigma_q == 0.0:
+        return ""
+    return f"{np.degrees(noise.sigma_q):.2g}° rms" + (" (ticks that were counted)" if noise.ticks else "")
 
 
 def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
@@ -343,7 +347,8 @@ def _predicted(
     training = whole.of_poses(~held_out)
     known = training.count_of(training.seen) > 0
     lens = solution.scene.lens is not None
-    problem = LeastSquares.of(training.of_markers(known), q_reference, lens)
+    tau = solution.problem.tau
+    problem = LeastSquares.of(training.of_markers(known), q_reference, lens).with_noise(tau)
     require_motion(problem.readings)
     scene = dataclasses.replace(solution.scene, M=solution.scene.M[known])
     found = fit_inliers(problem, scene, solution.sigma_px)
@@ -358,6 +363,8 @@ def _predicted(
     # A direction the other poses leave open would stay where the whole fit put it.
     if np.sqrt(variance[test.readings.seen].mean()) > _UNDETERMINED_NOISE:
         raise WorkFailed(_OPEN)
+    if tau is not None:  # the joints of a pose held out are off by their own noise
+        variance += ((test.joint_derivative(found.scene)[1] * tau) ** 2).sum(axis=-1)
     difference, error = np.zeros((2, *whole.seen.shape, 2))
     difference[:, place], error[:, place] = test.readings.pixels - pixels, sigma_px * np.sqrt(1.0 + variance)
     return solution.used & place, difference, error

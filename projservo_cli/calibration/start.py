@@ -37,6 +37,7 @@ class Search:
     frame: ImageFrame
     rng: np.random.Generator
     tell: Tell  # told what is done, how much of it, and of how much
+    joint_noise: float | None = 0.0  # rms of joint readings less true joints, rad; None to estimate it
 
 
 # Shared markers that carry an alignment: four resist one wrong marker, three are the least.

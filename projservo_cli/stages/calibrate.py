@@ -21,8 +21,16 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed
 from projservo_cli.stages.scenario import SUGGESTIONS, generator
 from projservo_cli.stages.trials import seed_of_trials
-from projservo_cli.stages.world import image_size_of, joints_of
+from projservo_cli.stages.world import image_size_of, is_ideal, joints_of
 from projservo_cli.tables import read_table, to_csv
+
+
+def _joint_noise(config: Config) -> float | None:
+    """Deviation of joint readings, rad; None where it is to be estimated."""
+    given = config.calibration.joint_noise_deg
+    if given is not None:
+        return float(np.radians(given))
+    return 0.0 if is_ideal(config) and not config.recorded else None
 
 
 def run(
@@ -59,6 +67,7 @@ def run(
         seed=seed,
         lens=settings.lens,
         init=init,
+        joint_noise=_joint_noise(config),
         fitted=hold_out if settings.cross_validate is not None else None,
         tell=progress,
     )

@@ -71,9 +71,7 @@ def test_predictions_refuse_other_joints_and_what_is_no_number(calibration, func
 
 
 def test_arguments_are_left_as_they_were():
-    before = {
-        field.name: getattr(OBSERVATION, field.name).copy() for field in dataclasses.fields(OBSERVATION)
-    }
+    before = {name: value.copy() for name, value in vars(OBSERVATION).items() if value is not None}
     for name in before:
         getattr(OBSERVATION, name).setflags(write=False)
     for method in ("refined", "closed_form"):

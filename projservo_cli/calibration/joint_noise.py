@@ -1,0 +1,194 @@
+"""How far joint readings are off: errors in variables, by restricted maximum likelihood, or counted in ticks.
+
+What is left of the images of pose k is r = J x + G δ + ε, with ε ~ N(0, σ² I) and δ ~ N(0, σ_q² I), the true
+joints less their readings: of covariance S = σ² I + σ_q² G Gᵀ. Errors of pixels scatter from marker to
+marker, those of joints move all markers of a pose together, which is how they are told apart.
+
+Source of the restricted likelihood: H. D. Patterson, R. Thompson, "Recovery of inter-block information when
+block sizes are unequal", Biometrika 58(3), 1971; of the test at the border of the parameters: S. G. Self,
+K.-Y. Liang, "Asymptotic properties of maximum likelihood estimators and likelihood ratio tests under
+nonstandard conditions", JASA 82, 1987.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import brentq, minimize_scalar
+from scipy.special import chdtri
+
+from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.readings import REACH_M, REACH_RAD
+from projservo_cli.records import BoolArray, FloatArray
+
+# What a prismatic joint errs where a revolute one errs by one rad, m.
+M_PER_RAD = REACH_M / REACH_RAD
+# Noise of joints that is looked for, rad: of the best encoders, and beyond any robot.
+_LEAST, _MOST = 1e-6, np.radians(1.0)
+_GRID, _FARTHER, _NEVER = 33, 5.0, 1e30
+_SHARE = 0.005  # of what is left without noise of joints, that pixels may be to blame for, at least
+# Twice the gain of the logarithm of the likelihood by chance: in 1 of 100 at the border; 95 % of an interval.
+_SIGNIFICANT, _INTERVAL = 5.412, 3.841
+# Ticks are no finer than this, rad or m; readings lie on them to this share.
+_LEAST_TICK, _ON_TICK = 1e-5, 0.01
+
+
+def unit_noise(prismatic: BoolArray) -> FloatArray:
+    """Noise (n,) of joints where that of revolute ones is one rad, rad or m."""
+    return np.where(prismatic, M_PER_RAD, 1.0)
+
+
+@dataclass(frozen=True)
+class JointNoise:
+    """Deviation of joint readings from the true joints, rad; of prismatic joints × 0.3 m/rad."""
+
+    sigma_q: float
+    interval: tuple[float, float] | None  # of 95 %; None where it was given or explains nothing
+    over_pixels: float  # sigma_q over the noise of pixels, rad/px
+    ticks: bool = False  # whether it is that of counted ticks
+
+    @classmethod
+    def estimated(
+        cls, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None
+    ) -> "JointNoise":
+        """What is most likely by the images used (2, N), at a noise of pixels, or of any for None.
+
+        Zero where chance may do as well. Where readings lie on ticks and the interval holds what these make,
+        that is taken.
+        """
+        likelihood = _Likelihood(problem, scene, used, sigma_px)
+        # Ratios of both noises, rad/px, as logarithms: even steps from the least that matters to the most,
+        # at which pixels may be left with far less noise.
+        sigma = likelihood.sigma(0.0)
+        ends = _LEAST / sigma, _MOST / (sigma if likelihood.given is not None else _SHARE * sigma)
+        places = np.log(np.geomspace(*ends, _GRID))
+        values = [likelihood.deviance(np.exp(place)) for place in places]
+        best = int(np.argmin(values))
+        near = places[max(best - 1, 0)], places[min(best + 1, _GRID - 1)]
+        found = minimize_scalar(lambda x: likelihood.deviance(np.exp(x)), bounds=near, method="bounded")
+        place, least, none = float(found.x), float(found.fun), likelihood.deviance(0.0)
+
+        def beyond(at: float) -> float:
+            """How far a place is beyond the interval."""
+            return likelihood.deviance(np.exp(at)) - least - _INTERVAL
+
+        def told(at: float) -> float:
+            """Noise of joints at a place, with that of pixels which goes with it, rad."""
+            return float(np.exp(at) * likelihood.sigma(np.exp(at)))
+
+        low = 0.0 if none - least <= _INTERVAL else told(brentq(beyond, places[0] - _FARTHER, place))
+        high = told(brentq(beyond, place, places[-1])) if beyond(places[-1]) > 0.0 else _MOST
+        if none - least <= _SIGNIFICANT:
+            return cls(0.0, (0.0, high), 0.0)
+        sigma_q, ratio = told(place), float(np.exp(place))
+        counted = tick_noise(problem.readings.q, problem.readings.prismatic)
+        if low <= counted <= high:
+            return cls(counted, (low, high), ratio * counted / sigma_q, True)
+        return cls(sigma_q, (low, high), ratio)
+
+    @property
+    def believable(self) -> bool:
+        """Whether it is noise: a model that is wrong asks for any amount of it."""
+        return self.interval is None or self.interval[1] < _MOST
+
+    def tau(self, prismatic: BoolArray) -> FloatArray:
+        """Noise (n,) of joints over that of pixels, rad/px or m/px."""
+        return self.over_pixels * unit_noise(prismatic)
+
+
+NO_JOINT_NOISE = JointNoise(0.0, None, 0.0)  # where it does not explain what is left
+
+
+class _Likelihood:
+    """Restricted likelihood of what is left of the images about a scene, at any ratio of both noises."""
+
+    def __init__(self, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None) -> None:
+        self.given, weight = sigma_px, used.astype(np.float64)
+        J = problem.derivative(scene)[1]
+        unit = unit_noise(problem.readings.prismatic)
+        G = problem.joint_derivative(scene)[1] * unit
+        residual = problem.residual(scene)
+        if problem.tau is not None and scene.offsets is not None:  # as the readings left them
+            residual = residual - (G @ (scene.offsets / unit)[problem.readings.pose_of][..., None])[..., 0]
+        residual = weight[..., None] * residual
+        A = problem.normal(J, weight)
+        scale = np.sqrt(np.maximum(np.diagonal(A), 1e-300))
+        free = np.linalg.qr(scale[:, None] * problem.gauge(scene), mode="complete")[0]
+        self.free = free[:, problem.gauge(scene).shape[1] :] / scale[:, None]
+        self.dof = 2 * int(np.count_nonzero(used)) - self.free.shape[1]
+        B = problem.coupling(J, G, weight).reshape(problem.size, *problem.q.shape).swapaxes(0, 1)
+        self.eigenvalue, V = np.linalg.eigh(problem.offset_normal(G, weight))
+        self.eigenvalue = np.maximum(self.eigenvalue, 0.0)
+        # The parts of each pose along the eigenvectors of its GᵀG, in the free directions of the parameters.
+        self.B = np.swapaxes(self.free.T @ (B @ V), 0, 1).reshape(self.free.shape[1], -1)
+        h = problem.at_poses((residual[..., None, :] @ G)[..., 0, :].sum(axis=0))
+        self.h = np.einsum("kij,ki->kj", V, h).ravel()
+        self.A = self.free.T @ A @ self.free
+        self.g = self.free.T @ problem.gradient(J, residual)
+        self.square = float((residual**2).sum())
+
+    def _parts(self, ratio: float) -> tuple[float, float]:
+        """Squares that are left, px², and logarithms of determinants, at a ratio of the noises, rad/px."""
+        w = (ratio**2 / (1.0 + ratio**2 * self.eigenvalue)).ravel()
+        A = self.A - (self.B * w) @ self.B.T
+        g = self.g - self.B @ (w * self.h)
+        scale = np.sqrt(np.maximum(np.diagonal(A), 1e-300))
+        factor = cho_factor(A / np.outer(scale, scale))
+        left: float = self.square - float(w @ self.h**2) - float((g / scale) @ cho_solve(factor, g / scale))
+        logs = 2.0 * float(np.log(scale).sum() + np.log(np.diagonal(factor[0])).sum())
+        return max(left, 1e-300), logs + float(np.log1p(ratio**2 * self.eigenvalue).sum())
+
+    def deviance(self, ratio: float) -> float:
+        """Twice the negative logarithm of the likelihood, up to a constant; of the best noise of pixels."""
+        try:
+            left, logs = self._parts(ratio)
+        except np.linalg.LinAlgError:  # of joints that may be anywhere nothing is left to tell the robot by
+            return _NEVER
+        if self.given is not None:
+            return left / self.given**2 + logs
+        return float(self.dof * np.log(left) + logs)
+
+    def sigma(self, ratio: float) -> float:
+        """Noise of pixels at a ratio: as given, else the most likely one, px."""
+        if self.given is not None:
+            return self.given
+        return float(np.sqrt(self._parts(ratio)[0] / max(self.dof, 1)))
+
+
+def tick_noise(q: FloatArray, prismatic: BoolArray) -> float:
+    """Deviation of readings (K, n) of whole ticks from the true joints, rms of the joints, rad; 0 without."""
+    ticks = np.array([_tick(column) for column in q.T])
+    if (ticks == 0.0).any():
+        return 0.0
+    return float(np.sqrt(np.mean((ticks / unit_noise(prismatic)) ** 2) / 12.0))
+
+
+def _tick(values: FloatArray) -> float:
+    """The step of which all distances of values (K,) are multiples; 0 where there is none."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 0.1 * _LEAST_TICK]
+    if len(steps) < 2:
+        return 0.0
+    tick = float(steps[0])
+    for step in steps[1:]:  # Euclid's algorithm, on numbers that are rounded
+        a, b = max(tick, float(step)), min(tick, float(step))
+        while b > _ON_TICK * _LEAST_TICK:
+            a, b = b, abs(a - b * round(a / b))
+        tick = a
+        if tick < _LEAST_TICK:
+            return 0.0
+    return float(np.median(steps / np.round(steps / tick)))
+
+
+def quantile(variances: FloatArray, probability: float) -> float:
+    """Quantile of a sum of squares of independent normal variables of variances (r,), by its three moments.
+
+    Source: M. J. Buckley, G. K. Eagleson, "An approximation to the distribution of quadratic forms in
+    normal random variables", Australian Journal of Statistics 30A, 1988.
+    """
+    mean, square, cube = (float((variances**power).sum()) for power in (1, 2, 3))
+    if cube == 0.0:
+        return mean
+    freedom = square**3 / cube**2
+    return mean + float(np.sqrt(square / freedom) * (chdtri(freedom, 1.0 - probability) - freedom))
