@@ -343,7 +343,7 @@ def test_a_robot_with_faults_is_recorded_at_rest_and_on_the_way_as_calibrate_see
     assert off.std() == pytest.approx(0.5, rel=0.2)  # half a tick is 0.4 px here
     moving = seen.rows(seen.moving > 0)
     assert 10 < len(moving.q) <= 200
-    first = moving.rows(moving.moving == moving.moving[-1])
+    first = moving.rows(moving.moving == moving.moving[0])
     shown = np.array([[np.interp(t - 0.12, first.t_q, q) for q in first.q.T] for t in first.t_q])
     late = np.array([truth.images(q, truth.M) for q in shown])[first.t_q > first.t_q[0] + 0.12]
     behind = first.images[first.t_q > first.t_q[0] + 0.12] - late
