@@ -26,8 +26,8 @@ _LEAST_ERROR = 1e-6
 _METRES_PER_RAD = 0.3
 # A direction counts where it keeps this share of its size beside the others; what is added for solving.
 _RANK, _RIDGE = 1e-6, 1e-9
-# Share of a large disturbance that the first order leaves out: its cause need not explain more.
-_BENT = 0.03
+# Share of what a look is off that the first order leaves out: the cause need not explain more.
+_BENT = 0.2
 # Advantage over the next cause, twice the logarithm of odds, at which one is named; looks that are waited for
 # that; share of what a cause explains that, left to others, shows that there are several.
 _CLEAR, _PATIENCE, _LEFT = 2.0 * np.log(100.0), 12, 0.25
@@ -162,8 +162,8 @@ class Innovation:
         self._delay_sigma = np.maximum(delay_sigma, _LEAST_ERROR)
         look = self._look(q, q_dot, np.where(fresh[:, None, None], images, np.nan))
         self._readings.append(q[0])
-        beyond = self._beyond_chance(look)
-        self._pending.append((beyond, self._added(look)))
+        beyond, off = self._beyond_chance(look)
+        self._pending.append((beyond, self._added(look, off)))
         if not beyond.any():
             self._keep(self._pending[-1][1])
             self._pending.clear()
@@ -223,8 +223,8 @@ class Innovation:
         e = self._factor.shape[1]
         return np.asarray(np.linalg.cholesky(np.eye(e) + sums.normal[:e, :e]))
 
-    def _beyond_chance(self, look: _Look) -> BoolArray:
-        """Whether χ² of what is seen of each view and each marker is beyond what chance allows, (2 + m,)."""
+    def _beyond_chance(self, look: _Look) -> tuple[BoolArray, float]:
+        """Whether χ² of what is seen of each view and marker is beyond chance, (2 + m,); rms of all, px."""
         e, m = self._factor.shape[1], look.seen.shape[1]
         both = np.concatenate([look.B.T, self._sums[-1].normal[:e, -1:]], axis=1)
         both = solve_triangular(self._error_root(self._sums[-1]), both, lower=True, check_finite=False)
@@ -236,12 +236,13 @@ class Innovation:
             count = seen[part].sum(axis=1)
             most = self._most_once[count] + self._floor * np.sqrt(count)
             beyond.append(_gains(S, r, part, 0.0)[0] > most**2)
-        return np.concatenate(beyond)
+        return np.concatenate(beyond), float(np.sqrt(r @ r / max(1, seen.sum())))
 
-    def _added(self, look: _Look) -> _Sums:
-        """What one look adds to the sums."""
+    def _added(self, look: _Look, off: float) -> _Sums:
+        """What one look adds to the sums, off the prediction by so many px rms."""
         rows = np.concatenate([look.B, look.F, look.r[:, None]], axis=1)
-        rows = solve_triangular(np.linalg.cholesky(look.R), rows, lower=True, check_finite=False)
+        root = np.linalg.cholesky(look.R + (_BENT * off) ** 2 * np.eye(len(look.R)))
+        rows = solve_triangular(root, rows, lower=True, check_finite=False)
         return _Sums(len(self._readings), rows.T @ rows, 2.0 * look.seen.astype(np.float64))
 
     def _keep(self, new: _Sums) -> None:
@@ -261,23 +262,39 @@ class Innovation:
         """
         e, n = self._factor.shape[1], len(self._sigma_q)
         across = (total.normal - since.normal)[:, e:]
+        across[:, n : 2 * n] -= since.looks * across[:, :n]  # looks are counted from the onset
+        across[e + n : e + 2 * n] -= since.looks * across[e : e + n]
         least = _RIDGE * across[e:].diagonal()
         across[:e, -1] = total.normal[:e, -1]
         W = solve_triangular(self._error_root(total), across[:e], lower=True, check_finite=False)
         normal = across[e:] - W.T @ W
-        beside = np.concatenate([np.arange(n), 2 * n + np.arange(2), *held])
-        prior = (_LASTING * np.append(self._sigma_q, self._delay_sigma)) ** -2.0
-        weight = np.diag(np.append(prior, least[beside[n + 2 :]]))
+        beside = np.concatenate([np.arange(2 * n + 2), *held])
+        weight = np.diag(least[beside])
+        weight[: 2 * n + 2, : 2 * n + 2] = self._lasting(total.looks - since.looks)
         information = normal[np.ix_(beside, beside)] + weight
         solved = np.linalg.solve(information, normal[beside])
         lasting = float(normal[beside, -1] @ solved[:, -1])
-        cost = float(np.linalg.slogdet(information)[1] - np.log(weight.diagonal()).sum())
+        cost = float(np.linalg.slogdet(information)[1] - np.linalg.slogdet(weight)[1])
         normal -= normal[:, beside] @ solved
         gain, amount = np.zeros(len(self._causes)), np.zeros((len(self._causes), self._sizes.max()))
         for which, columns in self._by_size:
             gain[which], amount[which, : columns.shape[1]] = _gains(normal, normal[:, -1], columns, least)
         count = (total.seen - since.seen).ravel()
         return _Evidence(since, lasting, cost, gain, amount, self._touches @ count, float(count.sum()))
+
+    def _lasting(self, looks: int) -> FloatArray:
+        """Information (2 n + 2, 2 n + 2) on errors of joints, their drift from look to look, and of instants.
+
+        Over so many looks joints are off by a straight line, its middle and its slope by what lasts.
+        """
+        n = len(self._sigma_q)
+        weight = np.diag(
+            (_LASTING * np.concatenate([self._sigma_q, self._sigma_q, self._delay_sigma])) ** -2.0
+        )
+        line = np.eye(2 * n + 2)
+        line[:n, n : 2 * n] = 0.5 * (looks + 1) * np.eye(n)
+        line[n : 2 * n, n : 2 * n] = looks / np.sqrt(12.0) * np.eye(n)
+        return np.asarray(line.T @ weight @ line)
 
     def _beyond(self, evidence: _Evidence) -> BoolArray:
         """Which causes (h,) are beyond what chance and errors of the model allow; what stands still must."""
@@ -331,22 +348,21 @@ class Innovation:
             return []
         gain = np.array([evidence.lasting + evidence.gain for evidence in found])
         penalty = [evidence.prior + self._sizes * np.log(evidence.rows) for evidence in found]
-        scale = 1.0 + _BENT**2 * float(gain[possible].max())
-        score = np.where(possible, gain / scale - penalty, -np.inf)
+        score = np.where(possible, gain - penalty, -np.inf)
         best = score.argmax(axis=0)
         blamed = [_Blame(score[t, i], [i], found[t]) for i, t in enumerate(best) if possible[t, i]]
         markers = [blame for blame in blamed if self._causes[blame.causes[0]].kind == "marker"]
         if not markers:
             return blamed
-        together = self._with_others(max(markers, key=lambda blame: blame.score), total, scale)
+        together = self._with_others(max(markers, key=lambda blame: blame.score), total)
         return [together, *(blame for blame in blamed if blame.causes[0] not in together.causes)]
 
-    def _with_others(self, blame: _Blame, total: _Sums, scale: float) -> _Blame:
+    def _with_others(self, blame: _Blame, total: _Sums) -> _Blame:
         """A marker and those that moved too, one after the other, up to half of them."""
         markers = np.array([cause.kind == "marker" for cause in self._causes])
         while len(blame.causes) < markers.sum() // 2:
             left = self._evidence(blame.evidence.since, total, *self._columns(blame))
-            more = left.gain / scale - self._sizes * np.log(left.rows)
+            more = left.gain - self._sizes * np.log(left.rows)
             more[~(self._beyond(left) & markers)] = 0.0
             i = int(np.argmax(more))
             if more[i] <= 0.0:
@@ -432,8 +448,8 @@ def _table_of(n: int, m: int, d: int) -> tuple[list[_Cause], int]:
     at_marker = at_camera + 2 * free
     at_tool = at_marker + 3 * m
     causes = [_Cause("slipped", i, np.array([i]), everything) for i in range(n)]
-    causes += [_Cause("frozen", i, np.array([i, n + i]), everything) for i in range(n)]
-    causes.append(_Cause("frozen", -1, np.arange(2 * n), everything))
+    causes += [_Cause("frozen", i, np.array([n + i]), everything) for i in range(n)]
+    causes.append(_Cause("frozen", -1, n + np.arange(n), everything))
     for v in (0, 1):
         causes.append(_Cause("late", v, np.array([2 * n + v]), views[v]))
         causes.append(_Cause("camera", v, at_camera + v * free + np.arange(free), views[v]))
