@@ -499,6 +499,17 @@ class Trace:
         about="why the images of a robot that is not simulated were not tested against the calibration",
         default="",
     )
+    overruns: int | None = _scalar(
+        about="periods that reading and thinking did not fit into; none for the ideal simulated robot",
+        default=None,
+    )
+    delay: FloatArray | None = _array(
+        "instant",
+        "view",
+        units="s",
+        about="instant of the joint reading less that of the image, as followed",
+        default=None,
+    )
     q_read: FloatArray | None = _array(
         "instant",
         "joint",

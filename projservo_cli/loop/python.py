@@ -11,6 +11,7 @@ from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
 from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.mechanisms import span_of
+from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import (
     DISTURBED,
     FAILED,
@@ -164,12 +165,14 @@ def run_in_python(
     scale: float = 1.0,
     *,
     watch: _Watch | None = None,
+    standing: Standing | None = None,
 ) -> tuple[int, int, Log]:
     """Drive a law on a plant to its verdict.
 
     plant : any; it is stopped however the run ends.
     s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
-    watch : asked at every instant what becomes of its verdict.
+    watch : asked at every instant what becomes of its verdict; standing : asked before, of a robot that need
+        not follow what it is sent.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
     if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
     fails before the first instant is complete.
@@ -183,6 +186,8 @@ def run_in_python(
         while verdict < 0:
             try:
                 verdict, q_dot = _instant(law, plant, s_star, limits, log, k)
+                if standing is not None:
+                    verdict = standing.ruled(log, k, verdict)
                 if watch is not None:
                     verdict = watch.ruled(log, k, verdict, q_dot)
                 if verdict == RUNNING:

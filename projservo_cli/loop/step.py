@@ -18,6 +18,10 @@ While markers are lost the robot is held where it is for up to ``lost_steps`` pe
 goes on when they are seen again. ``disturbed`` is what the loop of a robot that is not simulated ends
 in, before all others, where the images no longer agree with the calibration; ``failed`` where a robot or a
 law of somebody else raises, is late or answers nonsense once the run has begun.
+
+A robot that need not follow what it is sent has ``converged`` once it stands as far as images tell; until
+then it is held. Where it stands still away from the goal, ``plateau`` ends the run at once, and ``not
+following`` where a joint stays short of a set-point as far ahead as that may be.
 """
 
 import math
@@ -34,7 +38,7 @@ from projservo_cli.robots.simulated import Plant, inside
 RUNNING = -1
 WAITING = -3  # for lost markers; no verdict of a run
 BEHIND_CAMERA, LEFT_IMAGE, MARKERS_LOST, CONVERGED, DIVERGED, SINGULAR_VERDICT = range(6)
-PLATEAU, MAX_STEPS, JOINT_LIMIT, DISTURBED, FAILED = range(6, 11)
+PLATEAU, MAX_STEPS, JOINT_LIMIT, DISTURBED, FAILED, NOT_FOLLOWING = range(6, 12)
 VERDICTS = (
     "behind camera",
     "left image",
@@ -47,6 +51,7 @@ VERDICTS = (
     "joint limit",
     "disturbed",
     "failed",
+    "not following",
 )
 _PLATEAU_FALL = 0.01
 # Joint steps below this, rad or m, are none.

@@ -14,11 +14,13 @@ from typing import Protocol
 import numpy as np
 
 from projservo_cli.loop.python import BuiltInLaw
+from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import (
     CONVERGED,
     DIVERGED,
     JOINT_LIMIT,
     MARKERS_LOST,
+    PLATEAU,
     RUNNING,
     SINGULAR_VERDICT,
     WAITING,
@@ -54,14 +56,22 @@ class Watch:
     law : that is driven, on a plan; follow : the task with a plan as the law is given it.
     ways : to the goal; searches : how often one may be searched anew.
     limits : of the run.
+    standing : judge of a robot that need not follow what it is sent; None for one that does.
     ``told``: why a way was searched anew each time, and when, in words.
     """
 
     def __init__(
-        self, law: BuiltInLaw, follow: Callable[[Plan], Task], ways: _Ways, searches: int, limits: Limits
+        self,
+        law: BuiltInLaw,
+        follow: Callable[[Plan], Task],
+        ways: _Ways,
+        searches: int,
+        limits: Limits,
+        standing: Standing | None = None,
     ) -> None:
         self.law, self.follow, self.ways, self.left, self.limits = law, follow, ways, searches, limits
         self.told: list[str] = []
+        self._standing = standing
         self._shunned: list[FloatArray] = []
         self._goes_back = False
         self._alone = 0  # instants since the law is without a plan
@@ -83,13 +93,18 @@ class Watch:
                 verdict = RUNNING  # a way may lead away from the goal
             return self._on_the_way(log, k, verdict, way[int(clock) :])
         self._alone += 1
-        window = self.limits.plateau_steps
-        still = on_plateau(log.judged, k, window) and on_plateau(log.judged, k, window // 2)
-        stalls = verdict == RUNNING and self._alone > window and still
-        if verdict not in STOPPED and not stalls:
+        if verdict not in STOPPED and not self._stalls(log, k, verdict):
             return verdict
         self._shunned += [way[-1].copy(), log.read[k].copy()]
         return self._anew(log, k, verdict, f"{STOPPED.get(verdict, 'no progress')} at the goal")
+
+    def _stalls(self, log: Log, k: int, verdict: int) -> bool:
+        """Whether the law that ends the motion comes no nearer."""
+        if self._standing is not None:
+            return verdict == PLATEAU and self._standing.minimum
+        window = self.limits.plateau_steps
+        still = on_plateau(log.judged, k, window) and on_plateau(log.judged, k, window // 2)
+        return verdict == RUNNING and self._alone > window and still
 
     def _on_the_way(self, log: Log, k: int, verdict: int, ahead: FloatArray) -> int:
         """What becomes of a verdict with joints (s, n) ahead."""

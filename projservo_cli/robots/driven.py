@@ -1,4 +1,8 @@
-"""A robot of the contract as the loop drives it: set-points integrated, pace kept, images tested."""
+"""A robot of the contract as the loop drives it: set-points at its pace, images as it will come to rest."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -7,111 +11,137 @@ from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.records import FloatArray, IntArray
 from projservo_cli.robots.contract import ForeignRobot, Reading
+from projservo_cli.robots.instants import DelayPrior, Delays, History
+from projservo_cli.robots.set_point import Servo, SetPoint
 from projservo_cli.robots.simulated import Plant, observe
 
 
 class Steered:
     """A robot that is sent absolute set-points, the sum of the steps asked for, one a period.
 
-    The set-point never leads the last reading by more than ``bounds.lead``, so that a robot that is held does
-    not gather a way to make up for. The robot itself accumulates nothing.
+    The robot itself accumulates nothing.
 
-    ``reading``: of the last look. ``target``: (n,) the set-point, at first where the robot is read to stand,
-    rad or m. ``overruns``: periods that reading and thinking did not fit into.
+    robot : what is driven; servo : what is taken of its servos.
+    ``reading``: of the last look. ``history``: joint readings of all looks. ``set_point``: where it is sent,
+    at first where it is read to stand. ``overruns``: periods that reading and thinking did not fit into.
     """
 
     reading: Reading
+    set_point: SetPoint
 
-    def __init__(self, robot: ForeignRobot) -> None:
-        self.robot = robot
-        self.target: FloatArray | None = None
+    def __init__(self, robot: ForeignRobot, servo: Servo) -> None:
+        self.robot, self.servo, self.history = robot, servo, History()
         self.overruns = 0
         self._due: float | None = None
+
+    @property
+    def target(self) -> FloatArray:
+        """The set-point (n,), rad or m."""
+        return self.set_point.target
 
     def look(self) -> Reading:
         """Read joints and images."""
         self.reading = self.robot.read()
-        if self.target is None:
-            self.target = self.reading.q.copy()
+        t, q = self.reading.t_q, self.reading.q
+        if self.history:
+            self.set_point.read(q, t - self.history.last[0])
+        else:
+            self.set_point = SetPoint(self.robot.bounds, self.servo, q)
+        self.history.add(t, q)
         return self.reading
 
     def command(self, step: FloatArray, period: float) -> None:
         """Move the set-point by a step (n,), rad or m, and wait until the period, s, is over."""
-        assert self.target is not None
-        q, bounds, now = self.reading.q, self.robot.bounds, self.robot.now()
+        now = self.robot.now()
         due = (now if self._due is None else self._due) + period
         if now > due:  # thinking took too long, and no set-point must be due in the past
             due = now + period
             self.overruns += 1
-        target = np.clip(self.target + step, q - bounds.lead, q + bounds.lead)
-        target = np.clip(target, np.minimum(bounds.lower, q), np.maximum(bounds.upper, q))
-        speed = np.clip((target - self.target) / period, -bounds.speed, bounds.speed)
-        self.robot.command(target, speed, due)
-        self.target, self._due = target, due
+        self.robot.command(*self.set_point.step(step, period), due)
+        self._due = due
         if self.robot.wait_until(due):
             self.overruns += 1
 
 
+class Known(NamedTuple):
+    """What is known of a robot and its images before it is driven."""
+
+    # pixels (k, 2, m, 2) of the markers of the calibration at joints (k, n), rad or m
+    predicted: Callable[[FloatArray], FloatArray]
+    shown: IntArray  # (k,) markers that the loop is shown among those that the robot observes, the face first
+    order: IntArray  # (m,) index there of each marker of the calibration, −1 where it is not observed
+    sigma_px: float  # noise of the pixels
+    sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 where none shows
+    delays: DelayPrior
+    servo: Servo
+    timeout_s: float  # longest that an image may stand still while joints move, s
+
+
 class DrivenRobot:
-    """A robot with its cameras beside its truth, or the plant that the calibration takes it for.
+    """A robot with its cameras beside the plant that it is taken for.
+
+    A law is given the joints at which the arm comes to rest if nothing more is sent, and images as they will
+    be there: each pixel is carried by predict(q) − predict(q_then) from when it was taken. Lag and delay so
+    vanish from its loop.
 
     robot : what is driven.
-    plant : model and face; image size and joint limits.
-    shown : (k,) indices of the markers that the loop is shown among those that the robot observes, the face
-        first.
-    order : (m,) index there of each marker of the calibration, −1 where it is not observed.
-    innovation : test of the images against the calibration; None tests nothing.
-    ``q``: (n,) joints when last asked for, rad or m: true ones where the robot tells them, else as read.
-    ``H, hidden``: displacement of the face and self-occlusion as the plant has them there. ``in_front``: a
-    camera sees nothing behind it. ``disturbance``: why the images no longer agree with the calibration, or
-    what failed; else empty.
+    plant : face; image size and joint limits: of the calibration, or the true ones of a robot that tells its
+        true joints.
+    known : of robot and images.
+    innovation : test of the raw images against the calibration; None tests nothing.
+    ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
+    of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
+    the images no longer agree with the calibration, or what failed; else empty. ``delays``: of both views as
+    followed, (2,) s of each look, and ``readings`` of the joints, (n,).
     """
 
     in_front = True
     takes_parts = True
 
     def __init__(
-        self,
-        robot: ForeignRobot,
-        plant: Plant,
-        shown: IntArray,
-        order: IntArray,
-        innovation: Innovation | None,
+        self, robot: ForeignRobot, plant: Plant, known: Known, innovation: Innovation | None
     ) -> None:
-        self.robot, self.steered = robot, Steered(robot)
-        self.plant = plant
-        self.shown, self.order = shown, order
-        self.markers = len(shown)
-        self.innovation = innovation
+        self.robot, self.steered, self.plant = robot, Steered(robot, known.servo), plant
+        self.known, self.innovation = known, innovation
+        self.markers = len(known.shown)
+        self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.shown])
+        self._instants = Delays(known.predicted, known.delays, known.sigma_px, known.timeout_s)
+        self._carried = np.zeros((2, self.markers, 2))
         self.q = np.zeros(len(plant.lower))
         self.H = np.eye(4)
         self.hidden = np.zeros(2)
         self.disturbance = ""
+        self.delays: list[FloatArray] = []
+        self.readings: list[FloatArray] = []
 
     def joints(self) -> FloatArray:
-        """Joint readings (n,), rad or m, of a new look at robot and images."""
+        """Joints (n,), rad or m, at which the arm comes to rest, after a new look at robot and images."""
         read, truth = self.steered.look().q, self.robot.truth()
-        self.q = truth if truth is not None and truth.ndim == 1 else read
+        self.q = read if truth is None or truth.ndim > 1 else truth
         H = forward(self.plant.model, self.q)
         self.H = as_array(H)
         M = np.zeros_like(self.plant.M)
-        observe(self.plant, H, M, np.zeros((2, self.markers, 2)), self.hidden)
-        return read.copy()
+        observe(self.plant, H, M, np.zeros((2, len(M) + len(self.plant.pins), 2)), self.hidden)
+        self.readings.append(read)
+        return self.steered.set_point.at_rest
 
     def observe(self) -> FloatArray:
-        """Pixels (2, k, 2) of the markers shown at the last look, NaN where unseen; all are tested."""
-        s = self.steered.reading.s
+        """Pixels (2, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
+        reading, history, order = self.steered.reading, self.steered.history, self.known.order
+        images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
+        frames = self._instants.look(reading.t_view, images, history)
+        q_then = history.at(frames.t)
         if self.innovation is not None:
-            known = np.where((self.order < 0)[:, None], np.nan, s[:, self.order])
-            at_once, at_rest, certain = (
-                np.stack([self.steered.reading.q] * 2),
-                np.zeros_like(self.q),
-                np.zeros(2),
-            )
-            self.disturbance = self.innovation.disturbed(
-                at_once, at_rest, certain, known, np.ones(2, dtype=np.bool_)
-            )
-        return np.ascontiguousarray(s[:, self.shown])
+            q_dot = history.speed_at(float(frames.t.mean()))
+            wrong = self.innovation.disturbed(q_then, q_dot, frames.sigma, images, frames.fresh)
+            self.disturbance = wrong or self.disturbance
+        q = self.steered.set_point.at_rest
+        there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]
+        for view in range(2):
+            carries = not np.array_equal(q, q_then[view])
+            self._carried[view] = there[view] - then[view][view] if carries else 0.0
+        self.delays.append(self._instants.mean.copy())
+        return np.ascontiguousarray(reading.s[:, self.known.shown]) + self._carried
 
     def fits(self) -> str:
         """What is wrong with the images where the robot stands; empty where nothing is."""
@@ -121,6 +151,20 @@ class DrivenRobot:
             self.observe()
             looks += 1
         return self.disturbance
+
+    @property
+    def carried_px(self) -> float:
+        """How far the face is from where it comes to rest, px rms per marker and view."""
+        face = self._carried[:, : len(self.plant.M)]
+        return math.sqrt(2.0 * float(np.nanmean(face**2)))
+
+    def settled(self, within_px: float) -> bool:
+        """Whether the arm stands as far as images to so many px rms, or its readings, can tell."""
+        q, face = self.steered.set_point.at_rest, self._place[: len(self.plant.M)]
+        if self.known.sigma_q.any():
+            s = self.known.predicted(np.concatenate([q[None], q + np.diag(self.known.sigma_q)]))[:, :, face]
+            within_px = max(within_px, math.sqrt(float(np.nansum((s[1:] - s[0]) ** 2)) / (2 * len(face))))
+        return self.carried_px <= within_px
 
     def distance(self) -> float:
         """No distance is known without a metric: nothing ever recedes."""

@@ -2,16 +2,19 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
-from projservo_cli.calibration import WINDOW, Innovation
+from projservo_cli.calibration import WINDOW, Innovation, predict
 from projservo_cli.config import Config
-from projservo_cli.records import FloatArray, InputError, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
-from projservo_cli.robots.driven import DrivenRobot, Steered
+from projservo_cli.robots.driven import DrivenRobot, Known, Steered
+from projservo_cli.robots.instants import NOTHING_KNOWN, UNKNOWN_S, DelayPrior
+from projservo_cli.robots.set_point import Servo
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.simulation import robot_in_the_loop
@@ -21,6 +24,8 @@ from projservo_cli.stages.world import Joints, length_of
 _STILL, _STILL_PX = 2e-5, 0.02
 _NEVER_LATE_S = 3600.0  # for what a simulated robot answers, which may be compiled first
 _LEAST = 6  # looks that tell noise from motion
+# Least deviation of a delay and of single frames, s; a 95 % interval is so many deviations wide.
+_LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
 _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
 
 
@@ -37,6 +42,11 @@ def bounds_of(config: Config, joints: Joints) -> Bounds:
 def sag_of(config: Config, joints: Joints) -> FloatArray:
     """How far (n,) a joint may stay from where it was sent, rad or m."""
     return length_of(config.plant.sag_deg, joints)
+
+
+def servo_of(config: Config, joints: Joints) -> Servo:
+    """What is taken of the servos of a robot."""
+    return Servo(config.plant.lag_s, sag_of(config, joints))
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
@@ -188,16 +198,13 @@ def simulated_robot(config: Config, joints: Joints, robot: Robot, markers: int) 
 
 def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
     """The robot, and as the loop of a law sees it: beside its truth, or what the calibration takes it for."""
-    config, joints, calibration = scenario.config, scenario.joints, scenario.calibration
-    known, numbers = [] if calibration is None else calibration.marker.tolist(), scenario.observed
-    shown = np.array([numbers.index(number) for number in scenario.numbers_of(law)])
-    order = np.array([numbers.index(number) if number in numbers else -1 for number in known], dtype=np.int64)
+    config, joints, markers = scenario.config, scenario.joints, len(scenario.observed)
     if scenario.truth is None:
-        plant, robot = _believed_plant(scenario), foreign_robot(config, joints, len(numbers))
+        plant, robot = _believed_plant(scenario), foreign_robot(config, joints, markers)
     else:
         plant = scenario.plant_of(law)
-        robot = simulated_robot(config, joints, robot_in_the_loop(scenario), len(numbers))
-    return robot, DrivenRobot(robot, plant, shown, order, innovation_of(scenario))
+        robot = simulated_robot(config, joints, robot_in_the_loop(scenario), markers)
+    return robot, DrivenRobot(robot, plant, known_of(scenario, law), innovation_of(scenario))
 
 
 def _believed_plant(scenario: Scenario) -> Plant:
@@ -218,6 +225,47 @@ def _believed_plant(scenario: Scenario) -> Plant:
         scenario.joints.upper,
         False,
     )
+
+
+def known_of(scenario: Scenario, law: str) -> Known:
+    """What is known of a robot and its images before a law drives it."""
+    config, calibration, numbers = scenario.config, scenario.calibration, scenario.observed
+    sigma_q = 0.0 if calibration is None else calibration.sigma_q or 0.0
+    known = numbers if calibration is None else tuple(calibration.marker.tolist())
+    return Known(
+        _predicted(scenario),
+        np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
+        np.array([numbers.index(number) if number in numbers else -1 for number in known]),
+        scenario.noise_px,
+        length_of(math.degrees(sigma_q), scenario.joints),
+        _delays_of(config, calibration),
+        servo_of(config, scenario.joints),
+        config.plant.timeout_s,
+    )
+
+
+def _predicted(scenario: Scenario) -> Callable[[FloatArray], FloatArray]:
+    """Pixels (k, 2, m, 2) at joints (k, n) by the calibration, or by the truth where laws are given that."""
+    truth = scenario.truth
+    if scenario.calibration is not None:
+        return partial(predict, scenario.calibration)
+    assert truth is not None
+    return lambda q: np.stack([truth.images(row, truth.M) for row in q])
+
+
+def _delays_of(config: Config, calibration: Calibration | None) -> DelayPrior:
+    """What is known of the delays of both views: given, calibrated, or nothing."""
+    given, jitter = config.plant.delay_s, NOTHING_KNOWN.jitter
+    if calibration is not None and calibration.delay_jitter_s is not None:
+        jitter = np.maximum(calibration.delay_jitter_s, _LEAST_JITTER_S)
+    if given is not None:
+        return DelayPrior(np.array([given.left, given.right]), np.zeros(2), jitter)
+    if calibration is None or calibration.delay_s is None:
+        return NOTHING_KNOWN._replace(jitter=jitter)
+    sigma = np.full(2, UNKNOWN_S)
+    if calibration.delay_interval_s is not None:
+        sigma = np.ptp(calibration.delay_interval_s, axis=1) / _INTERVAL
+    return DelayPrior(calibration.delay_s.copy(), np.maximum(sigma, _LEAST_JITTER_S), jitter)
 
 
 def innovation_of(scenario: Scenario) -> Innovation | None:

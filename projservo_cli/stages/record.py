@@ -15,7 +15,7 @@ from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.driven import Steered
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.own_robot import foreign_robot, new_views, sag_of, simulated_robot, way_to
+from projservo_cli.stages.own_robot import foreign_robot, new_views, sag_of, servo_of, simulated_robot, way_to
 from projservo_cli.stages.simulation import robot_in_trials
 from projservo_cli.stages.trials import seed_of_trials, simulate, trial_motions
 from projservo_cli.stages.world import FAULTS, Joints, has_faults, joints_of, limit_passed, truth_of
@@ -155,7 +155,7 @@ def record(
     joints, robot = joints_of(config), robot or _robot_of(config, recording)
     poses = _simulated(config, recording)
     if robot is not None:
-        poses = _recorded(Steered(robot), config, joints, recording)
+        poses = _recorded(Steered(robot, servo_of(config, joints)), config, joints, recording)
     kept, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
@@ -191,7 +191,8 @@ def observed(config: Config, *, progress: Progress = silent) -> tuple[Observatio
     if robot is None:
         return simulate(config, truth, recording.targets), sigma_px or None
     with at_rest_after(robot):
-        for _ in _recorded(Steered(robot), config, joints_of(config), recording):
+        joints = joints_of(config)
+        for _ in _recorded(Steered(robot, servo_of(config, joints)), config, joints, recording):
             progress("trial motions", len(recording.done), len(recording.targets))
     return recording.observation(), sigma_px / math.sqrt(config.plant.frames) or None
 

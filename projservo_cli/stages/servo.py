@@ -16,6 +16,7 @@ from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span, span_of
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
+from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.loop.summary import MM, Ended, Summary, path_deviation, summarize
 from projservo_cli.loop.watch import Watch
@@ -62,6 +63,8 @@ class Outcome:
     planned_s: float | None = None  # when the plan that it followed arrives, s
     unplanned: str = ""  # why it went without the plan that it was to follow
     anew: tuple[str, ...] = ()  # when and why a way was searched anew
+    driven: DrivenRobot | None = None  # what was driven, where that is a robot of the contract
+    held: str = ""  # what held a robot that stood still away from the goal
 
     @cached_property
     def summary(self) -> Summary:
@@ -93,6 +96,9 @@ class Outcome:
         s_star = scenario.ends.by_points().s_star
         simulated = scenario.truth is not None
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
+        driven = self.driven
+        if driven is not None:  # what the log has as read is where the robot was to come to rest
+            read = np.array(driven.readings[-rows:])
         told = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
         numbers: dict[str, Any] = {n: None if math.isnan(told[n]) else told[n] for n in _TOLD}
         if simulated:
@@ -134,6 +140,8 @@ class Outcome:
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
             untested="" if simulated else untested(scenario),
+            overruns=None if driven is None else driven.steered.overruns,
+            delay=None if driven is None else np.array(driven.delays[-rows:]),
         )
 
 
@@ -173,8 +181,11 @@ def _reason(run: Outcome, joint: int, remaining: tuple[float | None, float | Non
     ]
     return {
         "converged": f"image error {error:.3g} px is within {within:.3g} px",
-        "plateau": f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
+        "plateau": f"the robot stands still at an image error of {error:.3g} px: {run.held}"
+        if run.held
+        else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
         f"{limits.plateau_steps} steps: a local minimum",
+        "not following": f"{run.held}; {' and '.join(left)} are left",
         "max steps": f"no step left; image error {error:.3g} px was still changing",
         "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
         f"{limits.diverged_factor:g}-fold",
@@ -280,33 +291,63 @@ def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) ->
     controller = _law_for(scenario, plan, law, replans)
     noise = scenario.noise_of(law, scenario.config.seed, scenario.limits.max_steps + 1)
     simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
-    return _driven_in_python(
-        scenario, controller, simulated, _watch(scenario, plan, law, controller, replans)
-    )
+    watch = _watch(scenario, plan, law, controller, replans=replans)
+    return _driven_in_python(scenario, controller, simulated, watch)
 
 
-def _watch(scenario: Scenario, plan: Plan, law: str, controller: LoopLaw, replans: bool) -> Watch | None:
+def _watch(
+    scenario: Scenario,
+    plan: Plan,
+    law: str,
+    controller: LoopLaw,
+    *,
+    replans: bool,
+    standing: Standing | None = None,
+) -> Watch | None:
     """What watches over a run that is guided."""
     if not _is_guided(scenario, law, replans) or not isinstance(controller, BuiltInLaw):
         return None
     follow = partial(_task_for, scenario, law=law, replans=False, model=controller.law.model)
     searches = scenario.config.control.searches_anew
-    return Watch(controller, follow, Ways(scenario, plan), searches, scenario.limits)
+    return Watch(controller, follow, Ways(scenario, plan), searches, scenario.limits, standing)
 
 
 def _driven_in_python(
-    scenario: Scenario, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, watch: Watch | None
+    scenario: Scenario,
+    law: LoopLaw,
+    plant: AnalyticPlant | DrivenRobot,
+    watch: Watch | None,
+    standing: Standing | None = None,
 ) -> Outcome:
     """Drive any law on any plant, every command scaled."""
-    gains, scale = scenario.gains, scenario.config.plant.speed_scale
-    s_star = scenario.ends.by_points().s_star
-    code, steps, log = run_in_python(law, plant, s_star, gains.period, scenario.limits, scale, watch=watch)
+    gains, limits, scale = scenario.gains, scenario.limits, scenario.config.plant.speed_scale
+    code, steps, log = run_in_python(
+        law,
+        plant,
+        scenario.ends.by_points().s_star,
+        gains.period,
+        limits,
+        scale,
+        watch=watch,
+        standing=standing,
+    )
     limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
-    anew = () if watch is None else tuple(watch.told)
-    if isinstance(plant, DrivenRobot):  # it goes from sample to sample, whatever was asked for
+    driven = plant if isinstance(plant, DrivenRobot) else None
+    if driven is not None:  # it goes from sample to sample, whatever was asked for
         path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
         log = log._replace(path=path, parts=np.ones_like(log.parts))
-    return Outcome(scenario, VERDICTS[code], plant.disturbance, steps, log, limited, plant.plant, anew=anew)
+    return Outcome(
+        scenario,
+        VERDICTS[code],
+        plant.disturbance,
+        steps,
+        log,
+        limited,
+        plant.plant,
+        anew=() if watch is None else tuple(watch.told),
+        driven=driven,
+        held="" if standing is None else standing.why,
+    )
 
 
 def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
@@ -328,8 +369,9 @@ def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) 
             start = scenario.ends.q_start
             for _ in own_robot.way_to(driven.steered, start, scenario.config, scenario.joints, "servo"):
                 pass
-        watch = _watch(scenario, plan, law, controller, replans)
-        return _driven_in_python(scenario, controller, driven, watch)
+        standing = Standing(driven, scenario.gains.period, scenario.limits)
+        watch = _watch(scenario, plan, law, controller, replans=replans, standing=standing)
+        return _driven_in_python(scenario, controller, driven, watch, standing)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from projservo_cli.config import load_config
 from projservo_cli.robots.contract import ForeignRobot, at_rest_after
 from projservo_cli.robots.driven import Steered
 from projservo_cli.robots.faulty import Events, Faults, FaultyRobot, World
-from projservo_cli.stages.own_robot import bounds_of, way_to
+from projservo_cli.stages.own_robot import bounds_of, servo_of, way_to
 from projservo_cli.stages.world import joints_of, truth_of
 from tests.documentation.blocks import DOCS, ROOT, blocks_of
 from tests.documentation.test_pages import put_robot
@@ -76,9 +76,10 @@ def steered(robot):
     for name in ("open", "read", "command", "stop", "close"):
         noted(name)
     config = load_config(CONFIG, ["plant.sag_deg=1.5"])
-    foreign = ForeignRobot(robot, "robot", 10, bounds_of(config, joints_of(config)), 5.0, 5.0)
+    joints = joints_of(config)
+    foreign = ForeignRobot(robot, "robot", 10, bounds_of(config, joints), 5.0, 5.0)
     with at_rest_after(foreign):
-        steered = Steered(foreign)
+        steered = Steered(foreign, servo_of(config, joints))
         steered.look()
         yield steered
     assert {*threads} == {"open", "read", "command", "stop", "close"}

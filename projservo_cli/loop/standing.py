@@ -1,0 +1,128 @@
+"""Whether a robot has arrived, or stands still away from its goal, judged while it runs.
+
+A robot that need not follow what it is sent has arrived once it stands. Joints that lag or sag, and images
+that are late, show at the goal what they have not shown on the way.
+"""
+
+import math
+
+import numpy as np
+
+from projservo_cli.loop.step import (
+    CONVERGED,
+    NOT_FOLLOWING,
+    PLATEAU,
+    RUNNING,
+    WAITING,
+    Limits,
+    Log,
+    tolerance,
+)
+from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.robots.driven import DrivenRobot
+
+# Share of the tolerance that a robot which stands may still move.
+_SETTLED = 0.5
+# At the goal the law goes on for so many periods, then the robot is held until it stands. It is moved again
+# where the error is beyond so many tolerances, or beyond one at so many looks in a row.
+_MORE, _GROWN, _LOOKS = 10, 3.0, 5
+# Progress is an image error that falls by this share below its least so far.
+_FALL = 0.01
+# Joints stand that move by less than so many deviations of their readings, or than this, rad or m.
+_DEVIATIONS, _LEAST = 4.0, 3e-4
+# Windows without progress after which a robot that moves to and fro is given up.
+_PATIENCE = 8
+# A window lasts so many times as long as images and servos are late.
+_TIMES_LATE = 4.0
+
+
+class Standing:
+    """Judge of a run of a robot that need not follow what it is sent.
+
+    robot : what is driven; period : of the loop, s; limits : of the run.
+    ``why``: what holds the robot, once that was found. ``minimum``: whether that is the law alone.
+    """
+
+    def __init__(self, robot: DrivenRobot, period: float, limits: Limits) -> None:
+        self._robot, self._limits = robot, limits
+        known = robot.known
+        late = known.servo.lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
+        self._window = max(limits.plateau_steps, math.ceil(_TIMES_LATE * late / period))
+        self._still = np.maximum(_DEVIATIONS * known.sigma_q, _LEAST)
+        self._best, self._since = math.inf, 0
+        self._read: list[FloatArray] = []
+        self._sent: list[FloatArray] = []
+        self._short: list[BoolArray] = []
+        self._more = self._looks = 0  # periods and looks that are left at the goal
+        self.why, self.minimum = "", False
+
+    def ruled(self, log: Log, k: int, verdict: int) -> int:
+        """What becomes of the verdict of an instant."""
+        steered = self._robot.steered
+        self._read.append(steered.reading.q)
+        self._sent.append(steered.target)
+        self._short.append(steered.set_point.short)
+        error = float(log.judged[k])
+        # What the law has left, and what is still to come: the sag that is not yet learnt, too.
+        left = error + self._robot.carried_px
+        if left < (1.0 - _FALL) * self._best:
+            self._best, self._since = left, k
+        ends = verdict not in (RUNNING, WAITING, CONVERGED)
+        if ends or k == self._limits.max_steps or math.isnan(error):
+            return verdict
+        verdict = self._arrived(verdict, error, tolerance(self._limits, log.fit[k, 2]))
+        return verdict if verdict == CONVERGED else self._stuck(k, verdict)
+
+    def _arrived(self, verdict: int, error: float, within: float) -> int:
+        """``CONVERGED`` where the robot stands at the goal; until then the law goes on, then waits."""
+        if verdict == CONVERGED and not self._looks:
+            self._looks, self._more = _LOOKS, _MORE
+        if not self._looks or error > _GROWN * within:
+            self._looks = 0
+            return verdict
+        if not self._robot.settled(_SETTLED * within):
+            self._more -= 1
+            return RUNNING if self._more >= 0 else WAITING
+        self._looks -= 1
+        return verdict if verdict == CONVERGED or not self._looks else WAITING
+
+    def _stuck(self, k: int, verdict: int) -> int:
+        """``PLATEAU`` or ``NOT_FOLLOWING`` where the robot makes no progress; else the verdict as it is."""
+        idle, window = k - self._since, self._window
+        if idle < window:
+            return verdict
+        moved, sent = (np.ptp(rows[-window:], axis=0) for rows in (self._read, self._sent))
+        short: BoolArray = np.all(self._short[-window:], axis=0)
+        stands = bool((moved <= self._still).all())
+        if stands and short.any():
+            self._say_who_stays(short)
+            return NOT_FOLLOWING
+        if stands and (sent <= self._still).all():
+            self.why, self.minimum = "the law asks for no motion there, a local minimum", True
+            return PLATEAU
+        to_and_fro = (moved <= np.maximum(self._robot.known.servo.sag, self._still)).all()
+        if to_and_fro and idle >= _PATIENCE * window:
+            self._say_what_holds(*(np.ptp(rows[self._since :], axis=0) for rows in (self._read, self._sent)))
+            return PLATEAU
+        return verdict
+
+    def _say_who_stays(self, short: BoolArray) -> None:
+        """A joint stays where it is however far ahead its set-point is."""
+        gap = np.abs(self._sent[-1] - self._read[-1]) * short
+        i = int(np.argmax(gap))
+        self.why = (
+            f"joint {i + 1} stands at {self._read[-1][i]:.6g}, {gap[i]:.3g} (rad or m) short of a set-point "
+            "that may lead no farther: look whether it is blocked, braked or in a protective stop, or raise "
+            "plant.sag_deg or plant.lead_deg"
+        )
+
+    def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:
+        """What a robot that moves to and fro without coming nearer is held by."""
+        i = int(np.argmax(sent / self._still))
+        what = (
+            f"set-points of joint {i + 1} moved by {sent[i]:.3g}, its readings by {moved[i]:.3g} (rad or m)"
+        )
+        if moved[i] <= 0.5 * sent[i]:
+            self.why = f"{what}: it does not follow such small steps; coarse set-points, or friction"
+        else:
+            self.why = f"{what}, and images show no gain: play in the joints, or coarse set-points"

@@ -1,0 +1,97 @@
+"""A robot that stands still away from its goal is judged while it runs; one at its goal is waited for."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from projservo_cli.loop.standing import Standing
+from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
+from projservo_cli.robots.instants import NOTHING_KNOWN
+from projservo_cli.robots.set_point import Servo
+from tests.scene import limits
+
+PERIOD, TICK = 0.1, 1.5e-3
+LIMITS = limits(2, image_px=1.0, max_steps=1000)
+
+
+class Robot:
+    """Readings, set-points and what is carried, as a test says."""
+
+    def __init__(self):
+        self.known = SimpleNamespace(
+            servo=Servo(0.15, np.full(2, 0.017)), delays=NOTHING_KNOWN, sigma_q=np.full(2, TICK / 12**0.5)
+        )
+        point = SimpleNamespace(short=np.zeros(2, dtype=bool))
+        self.steered = SimpleNamespace(reading=None, target=None, set_point=point)
+        self.carried_px = 0.0
+
+    def settled(self, within_px):
+        return self.carried_px <= within_px
+
+
+def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=lambda k: 0.0, most=900):
+    """Verdict of a run, why, and when; of what is a function of the instant."""
+    robot, log = Robot(), new_log(2, 4, 1000, 5)
+    standing = Standing(robot, PERIOD, LIMITS)
+    for k in range(most):
+        log.judged[k] = error(k)
+        robot.steered.reading = SimpleNamespace(q=np.array(read(k), dtype=float))
+        robot.steered.target = np.array(sent(k), dtype=float)
+        robot.steered.set_point.short = np.array(short)
+        robot.carried_px = carried(k)
+        told = CONVERGED if log.judged[k] <= LIMITS.image_px else verdict
+        ruled = standing.ruled(log, k, told)
+        if ruled not in (RUNNING, WAITING):
+            return ruled, standing, k
+    return RUNNING, standing, most
+
+
+def test_a_law_that_asks_for_nothing_is_at_a_local_minimum():
+    ruled, standing, k = judged(lambda k: 30.0 + 20.0 * 0.9**k, lambda k: (0.5, 0.1), lambda k: (0.5, 0.1))
+    assert (ruled, standing.minimum) == (PLATEAU, True)
+    assert k < 100
+
+
+def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
+    ruled, standing, k = judged(
+        lambda k: 50.0, lambda k: (0.5, 0.1), lambda k: (0.9, min(0.1 + 0.01 * k, 0.4)), short=(True, False)
+    )
+    assert ruled == NOT_FOLLOWING
+    assert standing.why.startswith("joint 1 stands at 0.5, 0.4 (rad or m) short")
+    assert k < 60
+
+
+@pytest.mark.parametrize(
+    ("read", "what"),
+    [(lambda k: 0.2, "coarse set-points, or friction"), (lambda k: 0.2 + 0.004 * (k % 20 > 9), "play")],
+)
+def test_a_robot_that_gains_nothing_is_given_up_with_a_cause(read, what):
+    ruled, standing, k = judged(
+        lambda k: 5.0 + (k % 7) / 7, lambda k: (read(k), 0.0), lambda k: (0.2 + 0.005 * (k % 20 > 9), 0.0)
+    )
+    assert (ruled, standing.minimum) == (PLATEAU, False)
+    assert what in standing.why
+    assert k < 300
+
+
+def test_a_robot_that_moves_or_comes_nearer_or_sees_nothing_goes_on():
+    far = lambda k: (0.01 * k, 0.0)  # noqa: E731
+    assert judged(lambda k: 50.0, far, far)[0] == RUNNING
+    still = lambda k: (0.1, 0.0)  # noqa: E731
+    assert judged(lambda k: 5.0 + 900.0 * 0.995**k, still, still, most=800)[0] == RUNNING
+    assert judged(lambda k: np.nan, still, still, verdict=WAITING)[0] == RUNNING
+
+
+def test_arrival_is_believed_once_the_robot_stands():
+    still = lambda k: (0.1, 0.0)  # noqa: E731
+    ruled, _, k = judged(lambda k: 0.4, still, still, carried=lambda k: 8.0 * 0.8**k)
+    assert ruled == CONVERGED
+    assert k == 13  # 8 px fall below half a pixel
+    assert judged(lambda k: 0.4, still, still)[2] == 0
+    # An arm that is off once it stands is driven on.
+    ruled, _, k = judged(
+        lambda k: 0.9 if k < 20 else 1.5 * 0.9 ** (k - 20), still, still, carried=lambda k: 8.0 * (k < 20)
+    )
+    assert ruled == CONVERGED
+    assert k == 24
