@@ -150,10 +150,9 @@ class LeastSquares:
         return pixels, np.concatenate(blocks, axis=3)
 
     def joint_derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
-        """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values, [RH00] eqs. (7), (19)."""
+        """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values."""
         images = scene.images(self.joints(scene), self.readings.pose_of, self.readings.marker_of)
-        velocity = images.points[:-1] @ scene.H_hat.swapaxes(1, 2)
-        return images.pixels, np.einsum("ivNrc,iNc->vNri", images.by_point[:-1], velocity)
+        return images.pixels, images.by_joint(scene.H_hat)
 
     def retract(self, scene: Scene, x: FloatArray) -> Scene:
         """Scene after a step x (size or more,); screws move as rigid bodies and keep their constraints."""

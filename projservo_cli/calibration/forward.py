@@ -76,6 +76,11 @@ class _Images(NamedTuple):
     by_point: FloatArray  # (n + 1, 2, N, 2, 4) by ``points``, the joints before it held
     by_lens: FloatArray | None  # (2, N, 2, 2) by k1 and k2, if there is a lens
 
+    def by_joint(self, H_hat: FloatArray) -> FloatArray:
+        """Derivative (2, N, 2, n) by the joints of operators (n, 4, 4), [RH00] eqs. (7), (19)."""
+        velocity = self.points[:-1] @ H_hat.swapaxes(1, 2)
+        return np.asarray(np.einsum("ivNrc,iNc->vNri", self.by_point[:-1], velocity))
+
 
 @dataclass(frozen=True, eq=False)
 class Scene:

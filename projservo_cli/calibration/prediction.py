@@ -99,6 +99,13 @@ def prediction_derivative(calibration: Calibration, q: FloatArray) -> FloatArray
     return scene.derivative(q)
 
 
+def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
+    """Derivative (K, 2, m, 2, n) of predicted pixels by joints (K, n), px per rad or m."""
+    scene, q = _scene(calibration, q)
+    J = scene.everywhere(q).by_joint(scene.H_hat)
+    return np.asarray(J.reshape(2, len(q), len(scene.M), *J.shape[2:]).swapaxes(0, 1))
+
+
 def covariance_root(covariance: FloatArray) -> FloatArray:
     """Λ (d, r) with Λ Λᵀ the covariance (d, d); the gauge, and what no robot can do, have no spread."""
     spread, basis = np.linalg.eigh(covariance)
