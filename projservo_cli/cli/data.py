@@ -1,5 +1,6 @@
-"""Observation tables on the command line: ``record``, ``detect`` and ``validate``."""
+"""What robots and cameras tell on the command line: ``record``, ``teach``, ``detect`` and ``validate``."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,118 @@ def _tell_recording(console: Console, recording: Any) -> None:
     if recording.spread_px is not None:
         words.append("  spread of the images of a pose: {spread_px:.3g} px per coordinate")
     console.tell(value, [*(text.format_map(value) for text in words), f"table: {recording.path}"])
+
+
+@main.command("teach", epilog="Example: projservo teach results/mine -c mine.yaml -o goal.yaml")
+@click.argument("run", required=False, type=option.PATH)
+@option.configuration(help="Configuration (YAML). Default: paper.yaml.")
+@option.override
+@option.output(metavar="FILE", help="File to write (YAML). Default: goal.yaml, with --start start.yaml.")
+@click.option("--start", is_flag=True, help="It is a start that is taught: task.start.")
+@click.option(
+    "--frames",
+    metavar="N",
+    type=click.IntRange(1, 1000),
+    default=10,
+    show_default=True,
+    help="Images of each camera that are averaged.",
+)
+@click.option("--at", metavar="Q1,...,QN", help="Joints that a simulated robot is put to.")
+@click.option(
+    "--at-unit", type=click.Choice(["deg", "rad"]), default="rad", help="Unit of --at. Default: rad."
+)
+@option.force(help="Replace the file if there is one.")
+@option.told
+def _teach(
+    console: Console,
+    *,
+    run: Path | None,
+    config: str | None,
+    output: Path | None,
+    start: bool,
+    frames: int,
+    at: str | None,
+    at_unit: str,
+    force: bool,
+    **options: Any,
+) -> None:
+    """Write what both cameras see as a goal or a start.
+
+    Looks where somebody has moved the robot to, with the hands away, averages --frames images and writes
+    their pixels, with their uncertainty and the joint readings: task.goal takes the file, task.start its
+    joints. A robot that can let go of its arm does so first, and holds it again when it was moved. A
+    simulated robot is put to --at.
+
+    Checks it against the calibration in RUN, by default that of the configuration's name in results, where
+    there is one: markers that are off, and whether any joints show it. A goal that none do ends in exit
+    code 1.
+    """
+    from projservo_cli.config.robot import JointVector
+    from projservo_cli.files import write_whole
+    from projservo_cli.records import InputError, WorkFailed
+    from projservo_cli.stages import teach as stage
+    from projservo_cli.stages.world import joints_of
+
+    output = output or Path("start.yaml" if start else "goal.yaml")
+    option.require_new(output, force=force)
+    settings = option.configured(config, options)
+    put = None
+    if at is not None:
+        try:
+            values = tuple(float(value) for value in at.split(","))
+            put = JointVector(joints=values, unit=at_unit).values(joints_of(settings).types)
+        except ValueError as error:
+            raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
+    calibration = option.calibration_of(run, settings)
+    taught = stage.teach(settings, frames, put, console.wait)
+    if not start:
+        stage.require_face(settings, taught)
+    check = None if calibration is None or start else stage.checked(settings, calibration, taught)
+    write_whole(output, stage.as_text(taught))
+    _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")
+    if check is not None and not check.reached:
+        raise WorkFailed(f"{output}: by the calibration, {check.reason}")
+
+
+def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: str) -> None:
+    value = {
+        "file": path.resolve(),
+        "markers": taught.marker,
+        "joints": taught.q,
+        "frames": taught.frames,
+        "sigma_px": taught.sigma,
+        "unseen": taught.unseen,
+        "moved": taught.moved,
+        "off_px": None if check is None else check.off,
+        "far": None if check is None else check.far,
+        "reached": None if check is None else check.reached,
+        "reason": None if check is None else check.reason,
+    }
+    console.tell(value, _words_of_taught(path, taught, check, key))
+
+
+def _words_of_taught(path: Path, taught: Any, check: Any, key: str) -> Iterator[str]:
+    import numpy as np
+
+    left, right = taught.frames
+    yield f"teach: {len(taught.marker)} markers, {left} images left and {right} right"
+    if np.isfinite(taught.sigma).any():
+        yield f"  standard deviation of their means: {np.nanmax(taught.sigma):.3g} px at most"
+    if taught.moved is not None:
+        i = int(np.abs(taught.moved).argmax())
+        yield f"  when it was held again, joint {i + 1} moved by {taught.moved[i]:.3g} (rad or m)"
+    if taught.unseen:
+        listed = ", ".join(f"{number} ({side})" for number, side in taught.unseen)
+        yield wrapped(f"unseen: {listed}", "  ")
+    if check is None:
+        yield "  not checked against a calibration" + ("" if key == "task.start" else ": name its run")
+    else:
+        yield wrapped(check.reason, "  ")
+        rms = np.sqrt(np.nanmean(check.off**2))
+        far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
+        beyond = f"; beyond noise: {far}" if far else ", none beyond noise"
+        yield wrapped(f"markers are {rms:.3g} px rms off what the calibration shows there{beyond}", "  ")
+    yield f"set {key}: {path}"
 
 
 @main.command(

@@ -14,6 +14,7 @@ from projservo_cli.cli.output import Console
 
 if TYPE_CHECKING:
     from projservo_cli.config import Config, Override
+    from projservo_cli.records import Calibration
     from projservo_cli.store import Run
 
 _Function = Callable[..., Any]
@@ -136,6 +137,14 @@ def configured(config: str | None, options: Mapping[str, Any]) -> "Config":
     from projservo_cli.config import load_config
 
     return load_config(config or _shipped(), _overrides(options))
+
+
+def calibration_of(run: Path | None, config: "Config") -> "Calibration | None":
+    """The calibration of a run, by default of that of the configuration's name; None where none is."""
+    found = _stored(run or _RESULTS / config.name)
+    if found is None and run is not None:
+        raise click.UsageError(f"{run}: there is no run; calibrate first, or leave it out")
+    return found.calibration if found is not None and "calibrate" in found.results else None
 
 
 def resolve(options: Mapping[str, Any]) -> tuple["Config", "Run"]:

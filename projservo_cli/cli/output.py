@@ -108,6 +108,13 @@ class Console:
             self.say("not confirmed: nothing was moved")
             raise KeyboardInterrupt
 
+    def wait(self, text: str) -> None:
+        """Tell somebody to do something, and wait for the Enter key, where there is anybody."""
+        self._finish()
+        click.echo(wrapped(f"{text}; then press Enter"), err=True)
+        if sys.stdin.isatty():
+            sys.stdin.readline()
+
     def progress(self, what: str, done: int, total: int) -> None:
         """Move a progress bar; silent where standard error is not a terminal."""
         if self.quiet or not sys.stderr.isatty():

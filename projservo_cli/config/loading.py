@@ -323,7 +323,11 @@ def _validated(model: type[_Model], document: _Document) -> _Model:
 
 def to_yaml(config: Config) -> str:
     """The whole configuration, defaults written out, as YAML that loads to an equal one."""
-    values = _without_unset(config)
+    return plain_yaml(_without_unset(config))
+
+
+def plain_yaml(values: Any) -> str:
+    """Plain values as YAML."""
     return yaml.dump(
         values, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100
     )

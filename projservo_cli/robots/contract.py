@@ -45,9 +45,11 @@ class Bounds(NamedTuple):
 class Robot(Protocol):
     """A robot with its two cameras.
 
-    A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken; and, if
-    it is a simulator, ``truth()``, the pose (4, 4) of the tool in its base frame, m, or its joints (n,), for
-    results alone. A simulator's time passes in ``command`` alone, which moves it to ``due``.
+    A class may also have ``now() -> float``, its clock, s, without which ``time.monotonic`` is taken;
+    ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
+    teach``, and hold it again; and, if it is a simulator, ``truth()``, the pose (4, 4) of the tool in its
+    base frame, m, or its joints (n,), for results alone. A simulator's time passes in ``command`` alone,
+    which moves it to ``due``.
     """
 
     def open(self) -> None:
@@ -131,6 +133,18 @@ class ForeignRobot:
         answer = self._ask("truth", tell)
         shape = (4, 4) if np.ndim(answer) == 2 else (self._joints,)
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
+
+    def release(self) -> bool:
+        """Let go of the arm, so that somebody can move it; whether the robot can."""
+        release, hold = (getattr(self.robot, name, None) for name in ("release", "hold"))
+        if release is None or hold is None:
+            return False
+        self._ask("release", release)
+        return True
+
+    def hold(self) -> None:
+        """Hold the arm again where it is."""
+        self._ask("hold", self.robot.hold)  # type: ignore[attr-defined]  # there is one where it was released
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""

@@ -21,7 +21,7 @@ from projservo_cli.records import InputError, WorkFailed
 
 GROUPS = {"plant": "projservo.plants", "law": "projservo.laws"}
 _METHODS = {"plant": ("open", "read", "command", "stop", "close"), "law": ("__call__",)}
-_OPTIONAL = {"plant": ("now", "truth"), "law": ()}
+_OPTIONAL = {"plant": ("now", "truth", "release", "hold"), "law": ()}
 DOTTED = r"[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)*"
 # How alike two names are of which one is a slip, from 0 to 1: of a letter in four or five.
 _ALIKE = 0.8

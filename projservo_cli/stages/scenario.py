@@ -44,7 +44,7 @@ from projservo_cli.task.target import Shown
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
-TRIAL_POSES = 6
+TRIAL_POSES, TAUGHT_NOISE = 6, 7
 
 
 def generator(seed: int, stream: int) -> np.random.Generator:

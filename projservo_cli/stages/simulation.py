@@ -11,8 +11,12 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.faulty import NEVER, Events, Faults, FaultyRobot, World
 from projservo_cli.robots.simulated import Plant, observe
-from projservo_cli.stages.scenario import CALIBRATION_NOISE, SERVO_NOISE, Scenario
+from projservo_cli.stages.scenario import CALIBRATION_NOISE, SERVO_NOISE, TAUGHT_NOISE, Scenario, generator
 from projservo_cli.stages.world import Truth
+
+# From how far, rad or m, a robot comes to where it is put, and how long it then rests, s.
+_BESIDE, _AT_REST_S = 0.02, 3
+_Numbers = Callable[[int, int], np.random.Generator]
 
 
 def robot_in_the_loop(scenario: Scenario) -> FaultyRobot:
@@ -34,20 +38,39 @@ def robot_in_the_loop(scenario: Scenario) -> FaultyRobot:
 
 def robot_in_trials(config: Config, truth: Truth, q_start: FloatArray, seed: int) -> FaultyRobot:
     """The simulated robot at joints (n,), rad or m, whose trials are recorded; nothing befalls it there."""
+    numbers = _numbers_of_frames(seed, CALIBRATION_NOISE)
+    return _by_itself(config, truth, q_start, config.noise.calibration_px, numbers)
+
+
+def robot_at(config: Config, truth: Truth, q: FloatArray) -> FaultyRobot:
+    """The simulated robot at rest at joints (n,), rad or m, come to from beside, so that play tells."""
+    aside = generator(config.seed, TAUGHT_NOISE).choice((-_BESIDE, _BESIDE), len(q))
+    beside = np.clip(q + aside, truth.robot.lower, truth.robot.upper)
+    numbers = _numbers_of_frames(config.seed, TAUGHT_NOISE)
+    robot = _by_itself(config, truth, beside, config.noise.servo_px, numbers)
+    for second in range(1, 1 + _AT_REST_S):
+        robot.command(q, np.zeros_like(q), float(second))
+    return robot
+
+
+def _by_itself(
+    config: Config, truth: Truth, q_start: FloatArray, sigma_px: float, numbers: _Numbers
+) -> FaultyRobot:
+    """The simulated robot at joints (n,), rad or m, that nothing befalls and whose images have borders."""
     world = World(
         truth.robot,
         q_start,
         truth.M,
         lambda H, M: project(truth.P, M @ H.T),
-        config.noise.calibration_px,
+        sigma_px,
         config.control.period_s,
-        _numbers_of_frames(seed, CALIBRATION_NOISE),
+        numbers,
         (float(truth.image_size[0]), float(truth.image_size[1])),
     )
     return FaultyRobot(world, faults_of(config), Events())
 
 
-def _numbers_of_frames(seed: int, stream: int) -> Callable[[int, int], np.random.Generator]:
+def _numbers_of_frames(seed: int, stream: int) -> _Numbers:
     """Random numbers of a frame of a view, by both their numbers."""
     return lambda view, k: np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream, view, k)))
 

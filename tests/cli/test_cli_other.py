@@ -5,6 +5,7 @@ import importlib
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import projservo_cli.calibration
@@ -99,3 +100,25 @@ def test_the_register_names_tests_and_functions_that_are_there_and_name_the_equa
         file, name = test.split("::")
         tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
         assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}, test
+
+
+def test_a_goal_is_taught_and_told(projservo, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "3")
+    hobby = ("teach", "-c", ROOT / "configs" / "hobby.yaml")
+    answer = projservo(*hobby, *at, "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["frames"] == [3, 3]
+    assert np.degrees(answer.json["joints"]) == pytest.approx([20, -5, 5, -10, 80])
+    assert (answer.json["reached"], answer.json["far"], answer.json["unseen"]) == (None, None, [])
+    text = (tmp_path / "goal.yaml").read_text()
+    again = projservo(*hobby, *at)
+    assert (again.code, "goal.yaml: exists already" in again.err) == (2, True)
+    assert projservo(*hobby, *at, "--force", "-q").code == 0
+    assert (tmp_path / "goal.yaml").read_text() == text
+    start = projservo(*hobby, *at, "--start")
+    assert (start.code, "set task.start: start.yaml" in start.out) == (0, True)
+    for wrong, told in ((("--at", "1,2"), "a number for each joint"), ((), "give the joints")):
+        refused = projservo(*hobby, *wrong, "-o", "other.yaml")
+        assert (refused.code, told in refused.err) == (2, True)
+    assert not (tmp_path / "other.yaml").exists()

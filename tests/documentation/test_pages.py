@@ -29,7 +29,7 @@ def folder(tmp_path, monkeypatch):
     """A folder with the shipped configurations and what a reader is said to have."""
     (tmp_path / "configs").symlink_to(ROOT / "configs")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     return tmp_path
 
@@ -65,8 +65,9 @@ def put_sheet(folder, arm="stanford", name="sheet.json"):
 
 def put_robot(folder):
     """What the page takes from README."""
-    (robot,) = (block.text for block in blocks_of(ROOT / "README.md") if "class UR5" in block.text)
-    (folder / "my_robot.py").write_text(robot)
+    for file, mark in (("my_robot.py", "class UR5"), ("mine.yaml", "name: mine")):
+        (text,) = (block.text for block in blocks_of(ROOT / "README.md") if mark in block.text)
+        (folder / file).write_text(text)
     put_sheet(folder, "ur5", "truth.json")
 
 
@@ -151,8 +152,9 @@ def check_report(folder, names, read):
 
 
 def check_robot(folder, names, read):
-    """An arm that nobody commands any more stands still, after what two periods let it go."""
-    assert "\n0.000000 rad" in read()
+    """An arm that nobody commands any more stands still after two periods more; a goal is taught."""
+    assert names["robot"].q == pytest.approx(names["gone"], abs=1e-6)
+    assert len(load_config("mine.yaml", ["task.goal=goal.yaml"]).task.goal.images.markers) == 10
 
 
 HAS = {"tables": (put_tags, put_sheet), "robot": (put_robot,)}

@@ -1,0 +1,112 @@
+"""Teaching: what a robot shows where it was moved to, checked, written, and taken as a goal or a start."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.config import load_config
+from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.teach import as_text, checked, teach
+from projservo_cli.stages.world import truth_of
+from tests.conftest import ROOT
+
+HOBBY = ROOT / "configs" / "hobby.yaml"
+SHARP = ("noise.calibration_px=0.05", "noise.servo_px=0.05")
+PLAY = (*SHARP, "disturbance.play_deg=0.5")
+AT = np.radians([20.0, -5.0, 5.0, -10.0, 80.0])
+
+
+def config(*overrides):
+    return load_config(HOBBY, [*SHARP, *overrides])
+
+
+@pytest.fixture(scope="module")
+def calibration():
+    return calibrate.run(config())[1]
+
+
+def test_frames_are_averaged_and_their_scatter_is_told():
+    given = config("noise.servo_px=0.5")
+    taught, truth = teach(given, 40, AT), truth_of(given)
+    off = taught.s - truth.images(AT, truth.M)
+    assert taught.frames == (40, 40)
+    assert taught.q == pytest.approx(AT)
+    assert off.std() == pytest.approx(0.5 / np.sqrt(40), rel=0.35)
+    assert np.sqrt(np.mean(taught.sigma**2)) == pytest.approx(0.5 / np.sqrt(40), rel=0.15)
+    once = teach(given, 1, AT)
+    assert np.isnan(once.sigma).all()
+    assert "sigma_left_px" not in once.as_goal()["images"]
+
+
+def test_with_play_a_taught_goal_is_met_where_joints_would_miss_it(calibration, tmp_path):
+    """By what the true pose shows: several times nearer than joints that play in their bearings."""
+    given = config(*PLAY)
+    path = tmp_path / "goal.yaml"
+    path.write_text(as_text(teach(given, 20, AT)), encoding="utf-8")
+    asked = load_config(HOBBY, [*SHARP, f"task.goal={path}", f"task.start={path}"])
+    assert asked.task.start.values("RRRRR") == pytest.approx(AT)
+    taught = config(*PLAY, f"task.goal={path}", "stop.innovation_factor=0")
+    assert len(taught.task.goal.images.markers) == 8
+    trace = servo.run(taught, calibration, plan.run(taught, calibration), "exact_track")
+    assert trace.verdict == "converged"
+    truth, where = truth_of(given), np.array(taught.task.goal.images.left)
+    by_images, by_joints = (truth.images(q, truth.M)[0] - where for q in (trace.q[-1], AT))
+    assert np.abs(by_images).max() < 0.4
+    assert np.abs(by_joints).max() > 1.5
+
+
+def test_what_does_not_fit_the_calibration_is_told(calibration):
+    taught = teach(config(), 10, AT)
+    good = checked(config(), calibration, taught)
+    assert (good.reached, good.far) == (True, [])
+    taught.s[0, 5] += [3.0, 0.0]
+    moved = checked(config(), calibration, taught)
+    assert moved.reached
+    assert [(number, side) for number, side, _ in moved.far] == [(5, "left")]
+    assert moved.far[0][2] == pytest.approx(3.0, abs=0.3)
+    taught.s[0, :4] += [40.0, 25.0]
+    nowhere = checked(config(), calibration, taught)
+    assert not nowhere.reached
+    assert nowhere.reason
+    taught.s[1, 2] = np.nan
+    with pytest.raises(WorkFailed, match="right camera does not see marker 2 of the face"):
+        checked(config(), calibration, taught)
+
+
+def test_a_file_that_was_not_taught_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"task\.goal: .*ur5\.yaml: is no file that projservo teach wrote"):
+        config("task.goal=ur5.yaml")
+    path = tmp_path / "goal.yaml"
+    path.write_text("images: {markers: [0, 1, 2, 3], left: [[1, 2]], right: [[1, 2]]}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"task\.goal\.images\.left: 1 entries for 4 markers"):
+        config(f"task.goal={path}")
+    with pytest.raises(InputError, match=r"task\.start: .*tells no joints"):
+        config(f"task.start={path}")
+
+
+def test_a_robot_that_can_let_go_is_held_again_before_it_is_looked_at(tmp_path, monkeypatch):
+    (tmp_path / "by_hand.py").write_text(
+        "import numpy as np\n"
+        "class Arm:\n"
+        "    def __init__(self): self.q, self.calls = np.zeros(5), []\n"
+        "    def open(self): pass\n"
+        "    def read(self): return self.q, np.full((2, 8, 2), 100.0 + 10 * self.q[0])\n"
+        "    def command(self, target, speed, due): raise RuntimeError('nobody may move it')\n"
+        "    def stop(self): pass\n"
+        "    def close(self): pass\n"
+        "    def release(self): self.q = self.q + 0.3\n"
+        "    def hold(self): self.q = self.q - 0.01\n",
+        encoding="utf-8",
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    given = config("plant=by_hand:Arm", "control.period_s=0.001", "control.gain=1")
+    told = []
+    taught = teach(given, 3, None, told.append)
+    assert taught.q == pytest.approx(np.full(5, 0.29))
+    assert taught.moved == pytest.approx(np.full(5, -0.01))
+    assert taught.frames == (1, 1)  # the same image comes again
+    assert "hands away" in told[0]
+    with pytest.raises(InputError, match="move yours by hand"):
+        teach(given, 3, AT)
+    with pytest.raises(InputError, match="give the joints"):
+        teach(config(), 3)
