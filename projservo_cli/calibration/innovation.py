@@ -31,6 +31,10 @@ _BENT = 0.2
 # Advantage over the next cause, twice the logarithm of odds, at which one is named; looks that are waited for
 # that; share of what a cause explains that, left to others, shows that there are several.
 _CLEAR, _PATIENCE, _LEFT = 2.0 * np.log(100.0), 12, 0.25
+# Frames of both views so near to each other, s, are one look; so many are kept for those of the other view.
+_TOGETHER_S, _WAITING = 0.025, 25
+# Joints that differ by no more stand still, rad or m: as they were read, and since the first look.
+_STILL, _AT_REST = 1e-9, 1e-3
 
 
 class _Cause(NamedTuple):
@@ -40,6 +44,16 @@ class _Cause(NamedTuple):
     which: int  # joint, view or marker; −1 all of them
     columns: IntArray  # its regressors
     touches: BoolArray  # (2, m) images that it changes
+
+
+class _Frame(NamedTuple):
+    """An image of one view."""
+
+    t: float  # when it was taken, s
+    q: FloatArray  # (n,) joint readings then, rad or m
+    q_dot: FloatArray  # (n,) and their velocities
+    sigma: float  # uncertainty of the instant, s
+    image: FloatArray  # (m, 2) px, NaN where unseen
 
 
 class _Look(NamedTuple):
@@ -140,6 +154,10 @@ class Innovation:
         self._pending: list[tuple[BoolArray, _Sums]] = []
         self._readings: list[FloatArray] = []
         self._doubtful = 0
+        self._waiting: tuple[list[_Frame], list[_Frame]] = ([], [])
+        self._reached = np.full(2, -np.inf)
+        self._first: FloatArray | None = None
+        self._at_rest = True
 
     @property
     def doubtful(self) -> bool:
@@ -147,20 +165,57 @@ class Innovation:
         return self._doubtful > 0
 
     def disturbed(
-        self, q: FloatArray, q_dot: FloatArray, delay_sigma: FloatArray, images: FloatArray, fresh: BoolArray
+        self,
+        t: FloatArray,
+        q: FloatArray,
+        q_dot: FloatArray,
+        delay_sigma: FloatArray,
+        images: FloatArray,
+        fresh: BoolArray,
     ) -> str:
         """What is wrong, in words; empty while nothing is, or while it is not clear what.
 
-        q : (2, n) joint readings at the instants of both frames, rad or m.
-        q_dot : (n,) joint velocities, rad/s or m/s.
+        Frames are looked at in the order in which they were taken: those of a view that comes earlier wait
+        for those of the other one, so that both show what happens at once.
+
+        t : (2,) instants of both frames, s.
+        q : (2, n) joint readings then, rad or m; q_dot : (2, n) their velocities, rad/s or m/s.
         delay_sigma : (2,) uncertainty of these instants, of the delay and its jitter together, s.
         images : (2, m, 2) raw pixels of the markers of the calibration, NaN where unseen.
         fresh : (2,) whether the frame of a view is new; one that comes twice is no second measurement.
         """
-        if not fresh.any():
-            return ""
-        self._delay_sigma = np.maximum(delay_sigma, _LEAST_ERROR)
-        look = self._look(q, q_dot, np.where(fresh[:, None, None], images, np.nan))
+        self._first = q[0] if self._first is None else self._first
+        if self._at_rest:
+            self._at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
+        for v in np.flatnonzero(fresh):
+            frame = _Frame(float(t[v]), q[v], q_dot[v], max(float(delay_sigma[v]), _LEAST_ERROR), images[v])
+            self._waiting[v].append(frame)
+        self._reached = np.maximum(self._reached, t)
+        said = ""
+        while not said and any(frames := self._next()):
+            said = self._tested(frames)
+        return said
+
+    def _next(self) -> list[_Frame | None]:
+        """Frames to be looked at together, left and right; none where a view has none at that time."""
+        left, right = (frames[0].t if frames else np.inf for frames in self._waiting)
+        first = int(right < left)
+        due = self._at_rest or len(self._waiting[first]) > _WAITING or max(left, right) < np.inf
+        due |= min(left, right) + _TOGETHER_S < self._reached[1 - first]
+        together = self._at_rest or abs(left - right) <= _TOGETHER_S
+        return [
+            frames.pop(0) if frames and due and (together or v == first) else None
+            for v, frames in enumerate(self._waiting)
+        ]
+
+    def _tested(self, frames: list[_Frame | None]) -> str:
+        """What is wrong by frames of one time."""
+        one = frames[0] or frames[1]
+        assert one is not None
+        both = [frame or one._replace(image=np.full_like(one.image, np.nan)) for frame in frames]
+        self._delay_sigma = np.array([frame.sigma for frame in both])
+        q, q_dot, images = (np.stack([frame[i] for frame in both]) for i in (1, 2, 4))
+        look = self._look(q, q_dot, images)
         self._readings.append(q[0])
         beyond, off = self._beyond_chance(look)
         self._pending.append((beyond, self._added(look, off)))
@@ -190,7 +245,7 @@ class Innovation:
         F = F.reshape(rows, -1)
         new = F[:, [*range(n), 2 * n, 2 * n + 1]] * np.append(self._sigma_q, self._delay_sigma)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
-        bend = 0.5 * np.abs(q_dot).sum() * (new[:, n:] @ self._delay_sigma)
+        bend = 0.5 * np.abs(q_dot).sum(axis=1).max() * (new[:, n:] @ self._delay_sigma)
         R = new @ new.T + np.diag(self._sigma**2 + bend**2)
         return _Look(seen, r.ravel(), B.reshape(rows, -1), F, R)
 
@@ -208,7 +263,7 @@ class Innovation:
         F[..., :n], F[..., n : 2 * n] = J_q, J_q * len(self._readings)
         by_marker, first = D[n] @ self._directions.T, 2 * n + 2
         for v in (0, 1):
-            F[v, ..., 2 * n + v] = -J_q[v] @ q_dot
+            F[v, ..., 2 * n + v] = -J_q[v] @ q_dot[v]
             F[v, ..., first : first + CAMERA - 1] = by_camera[v] @ self._cameras[v]
             first += CAMERA - 1
         for j in range(m):
@@ -300,7 +355,7 @@ class Innovation:
         """Which causes (h,) are beyond what chance and errors of the model allow; what stands still must."""
         possible = np.sqrt(evidence.gain) > self._most + self._floor * np.sqrt(evidence.touched)
         if possible.any():
-            still = np.ptp(self._readings[evidence.since.looks :], axis=0) == 0.0
+            still = np.ptp(self._readings[evidence.since.looks :], axis=0) <= _STILL
             for i, cause in enumerate(self._causes):
                 if cause.kind == "frozen":
                     possible[i] &= still.all() if cause.which < 0 else still[cause.which] and not still.all()

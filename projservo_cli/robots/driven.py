@@ -132,8 +132,8 @@ class DrivenRobot:
         frames = self._instants.look(reading.t_view, images, history)
         q_then = history.at(frames.t)
         if self.innovation is not None:
-            q_dot = history.speed_at(float(frames.t.mean()))
-            wrong = self.innovation.disturbed(q_then, q_dot, frames.sigma, images, frames.fresh)
+            q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
+            wrong = self.innovation.disturbed(frames.t, q_then, q_dot, frames.sigma, images, frames.fresh)
             self.disturbance = wrong or self.disturbance
         q = self.steered.set_point.at_rest
         there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]

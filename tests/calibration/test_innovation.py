@@ -73,7 +73,8 @@ def first_alarm(arm, read, s, q_dot=None, delay_sigma=0.0, fresh=None, sigma=SIG
     for k in range(len(read)):
         speed = np.zeros(read.shape[1]) if q_dot is None else q_dot[k]
         new = np.ones(2, dtype=bool) if fresh is None else fresh[k]
-        said = test.disturbed(np.stack([read[k]] * 2), speed, np.full(2, delay_sigma), s[k], new)
+        at_once, t = (np.stack([row] * 2) for row in (read[k], speed)), np.full(2, PERIOD * k)
+        said = test.disturbed(t, *at_once, np.full(2, delay_sigma), s[k], new)
         if said:
             return k, said
     return None, ""
@@ -158,6 +159,22 @@ def test_a_frame_that_comes_twice_is_no_second_measurement(arm):
     fresh[21:26, 0] = False
     assert first_alarm(arm, q, s, fresh=fresh) == (None, "")
     assert "left camera" in first_alarm(arm, q, s)[1]
+
+
+def test_what_one_camera_shows_later_is_no_fault_of_the_other(arm):
+    """A slip, seen by the right camera five looks after the left one: no camera was moved."""
+    q, q_dot = arm.way(5)
+    true = q.copy()
+    true[20:, 2] += np.radians(3.0)
+    s, late = noisy(arm.images(at_once(true)), 5), 5
+    test = Innovation(arm.calibration, SIGMA, LOOKS)
+    for k in range(late, len(q)):
+        rows = [k, k - late]
+        t, shown = PERIOD * np.array(rows), np.stack([s[k, 0], s[k - late, 1]])
+        if said := test.disturbed(t, q[rows], q_dot[rows], np.zeros(2), shown, np.ones(2, dtype=bool)):
+            break
+    assert "joint 3 slipped" in said
+    assert 20 + late < k < 20 + late + 2 * WINDOW
 
 
 def slipped(joint):
