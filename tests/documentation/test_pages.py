@@ -201,3 +201,16 @@ def test_every_block_is_run_or_excused(page):
     assert {block.language for block in blocks} <= LANGUAGES
     assert sum(1 for block in blocks if block.excuse) == NOT_RUN.get(page.stem, 0)
     assert all(block.excuse or block.file for block in blocks if block.language == "yaml")
+
+
+def test_what_is_said_on_a_real_robot_is_what_the_program_says():
+    """The middle column of the page is quoted from the messages, pieces between the numbers and names."""
+    sources = " ".join(
+        path.read_text(encoding="utf-8") for path in sorted((ROOT / "projservo_cli").rglob("*.py"))
+    )
+    joined = re.sub(r'["\']\s*(?:\+ )?f?["\']', "", sources)
+    rows = [line.split("|") for line in (DOCS / "real.md").read_text(encoding="utf-8").splitlines()]
+    said = [piece for row in rows if len(row) == 5 for piece in re.findall(r"`([^`]*)`", row[2])]
+    pieces = [part.strip() for piece in said for part in piece.split("…") if part.strip()]
+    assert len(pieces) > 20
+    assert [piece for piece in pieces if piece not in joined and piece != "overruns"] == []
