@@ -427,7 +427,9 @@ class Trace:
     steps: int = _scalar(about="commands sent")
     period: float = _scalar(units="s", about="control period")
     observation: str = _scalar(about="how the face is measured: points or body")
-    position_error_mm: float | None = _scalar(units="mm", about="true centre to true goal at the end")
+    position_error_mm: float | None = _scalar(
+        units="mm", about="true centre to true goal at the end; of the tool where a robot tells its truth"
+    )
     rotation_error_deg: float | None = _scalar(units="deg", about="true rotation to the goal at the end")
     translation_left: float | None = _scalar(
         about="share of the translation left at the end, as the law measures it"

@@ -91,8 +91,9 @@ class DrivenRobot:
     innovation : test of the raw images against the calibration; None tests nothing.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
-    the images no longer agree with the calibration, or what failed; else empty. ``delays``: of both views as
-    followed, (2,) s of each look, and ``readings`` of the joints, (n,).
+    the images no longer agree with the calibration, or what failed; else empty. Of each look since ``begin``:
+    ``delays`` of both views as followed, (2,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
+    that tells them, joints (n,) or the pose (4, 4) of its tool.
     """
 
     in_front = True
@@ -111,8 +112,14 @@ class DrivenRobot:
         self.H = np.eye(4)
         self.hidden = np.zeros(2)
         self.disturbance = ""
+        self.begin()
+
+    def begin(self) -> None:
+        """Keep what is told of a run from here on."""
         self.delays: list[FloatArray] = []
         self.readings: list[FloatArray] = []
+        self.truths: list[FloatArray] = []
+        self.steered.overruns = 0
 
     def joints(self) -> FloatArray:
         """Joints (n,), rad or m, at which the arm comes to rest, after a new look at robot and images."""
@@ -123,6 +130,7 @@ class DrivenRobot:
         M = np.zeros_like(self.plant.M)
         observe(self.plant, H, M, np.zeros((2, len(M) + len(self.plant.pins), 2)), self.hidden)
         self.readings.append(read)
+        self.truths += [] if truth is None else [truth]
         return self.steered.set_point.at_rest
 
     def observe(self) -> FloatArray:

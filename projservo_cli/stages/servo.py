@@ -2,7 +2,7 @@
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from typing import Any
@@ -42,7 +42,7 @@ from projservo_cli.stages.motions import search_of, why_closed
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.ways import Ways
-from projservo_cli.stages.world import is_disturbed
+from projservo_cli.stages.world import arm_of, is_disturbed
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
 
@@ -98,8 +98,12 @@ class Outcome:
         center = np.asarray(H @ np.array(center_of(self.plant.M, self.plant.center)))[:, :3]
         driven = self.driven
         if driven is not None:  # what the log has as read is where the robot was to come to rest
-            read = np.array(driven.readings[-rows:])
+            read = _whole(driven.readings, rows)
         told = self.summary._asdict() | {"center_deviation_mm": self.deviation_mm()}
+        pose, goal_pose = H @ scenario.true_ends.base_tool, scenario.true_ends.goal_pose
+        if driven is not None and driven.truths and not simulated:
+            pose, goal_pose = _told_poses(scenario, _whole(driven.truths, rows))
+            told |= _pose_errors(pose[-1], goal_pose)
         numbers: dict[str, Any] = {n: None if math.isnan(told[n]) else told[n] for n in _TOLD}
         if simulated:
             numbers["success"] = told["success"] == 1.0
@@ -135,18 +139,47 @@ class Outcome:
             q_dot=log.q_dot[:steps],
             speed_factor=log.factor[:steps],
             self_occluded=log.hidden[:rows] > 0.5,
-            pose=H @ scenario.true_ends.base_tool,
-            goal_pose=scenario.true_ends.goal_pose,
+            pose=pose,
+            goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
             untested="" if simulated else untested(scenario),
             overruns=None if driven is None else driven.steered.overruns,
-            delay=None if driven is None else np.array(driven.delays[-rows:]),
+            delay=None if driven is None else _whole(driven.delays, rows),
         )
 
 
 # Numbers of a trace that are those of the summary of its run, and one more.
 _TOLD = [field.name for field in fields(Trace) if field.name in {*Summary._fields, "center_deviation_mm"}]
+
+
+def _whole(told: Sequence[FloatArray], rows: int) -> FloatArray:
+    """What was told of each instant of a run, (rows, ...); NaN where it ended before."""
+    missing = np.full_like(told[0], np.nan)
+    return np.array([*told, *[missing] * (rows - len(told))])
+
+
+def _told_poses(scenario: Scenario, truths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses (k, 4, 4) of the tool as a robot tells them, and at the goal (4, 4), m; NaN where unknown.
+
+    truths : the poses, or joints (k, n), which tell them where the arm is configured.
+    """
+    arm, goal = arm_of(scenario.config), np.full((4, 4), np.nan)
+    if arm is not None and len(scenario.q_shown):
+        goal = arm.pose(scenario.q_shown[0])
+    if truths.ndim == 3:
+        return truths, goal
+    return np.array([goal * np.nan if arm is None else arm.pose(q) for q in truths]), goal
+
+
+def _pose_errors(pose: FloatArray, goal: FloatArray) -> dict[str, float]:
+    """Position and rotation that are left from a pose of the tool to another, (4, 4), m; NaN if unknown."""
+    R = pose[:3, :3].T @ goal[:3, :3]
+    turn = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return {
+        "position_error_mm": MM * float(np.linalg.norm(goal[:3, 3] - pose[:3, 3])),
+        "rotation_error_deg": math.degrees(math.atan2(float(np.linalg.norm(turn)), float(np.trace(R)) - 1.0)),
+    }
 
 
 def _told_anew(anew: tuple[str, ...]) -> list[str]:
@@ -369,6 +402,7 @@ def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) 
             start = scenario.ends.q_start
             for _ in own_robot.way_to(driven.steered, start, scenario.config, scenario.joints, "servo"):
                 pass
+        driven.begin()
         standing = Standing(driven, scenario.gains.period, scenario.limits)
         watch = _watch(scenario, plan, law, controller, replans=replans, standing=standing)
         return _driven_in_python(scenario, controller, driven, watch, standing)

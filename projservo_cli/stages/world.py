@@ -231,6 +231,11 @@ def _built(described: RobotSettings, rig: Rig, markers: Markers) -> Truth:
     )
 
 
+def arm_of(config: Config) -> Arm | None:
+    """The arm of a configuration; None where its kinematics are not given."""
+    return None if config.arm is None else _robot_of(config.arm)
+
+
 def _twist(w: Sequence[float], v: Sequence[float]) -> FloatArray:
     """4×4 twist of an angular velocity w (rad) and a velocity v of the origin (m)."""
     return np.array([[0.0, -w[2], w[1], v[0]], [w[2], 0.0, -w[0], v[1]], [-w[1], w[0], 0.0, v[2]], [0.0] * 4])

@@ -50,6 +50,17 @@ class Sound:
         CALLS.append("close")
 
 
+class Telling(Sound):
+    """Tells where its tool truly is, or its joints."""
+
+    def __init__(self, config, joints=False):
+        super().__init__(config)
+        self.tells_joints = joints
+
+    def truth(self):
+        return self.q if self.tells_joints else self.world.robot.pose(self.q)
+
+
 class Faulty(Sound):
     """Goes wrong in a way of its own after so many looks."""
 
