@@ -23,9 +23,10 @@ from projservo_cli.robots.driven import DrivenRobot
 
 # Share of the tolerance that a robot which stands may still move.
 _SETTLED = 0.5
-# At the goal the law goes on for so many periods, then the robot is held until it stands. It is moved again
-# where the error is beyond so many tolerances, or beyond one at so many looks in a row.
-_MORE, _GROWN, _LOOKS = 10, 3.0, 5
+# At the goal, which one noisy look may show too soon, the law goes on for so many periods; then the robot is
+# held until it stands. It is moved again where the error is beyond so many tolerances, or beyond one at so
+# many looks in a row.
+_MORE, _GROWN, _LOOKS = 15, 3.0, 5
 # Progress is an image error that falls by this share below its least so far.
 _FALL = 0.01
 # Joints stand that move by less than so many deviations of their readings, or than this, rad or m.
@@ -76,13 +77,15 @@ class Standing:
     def _arrived(self, verdict: int, error: float, within: float) -> int:
         """``CONVERGED`` where the robot stands at the goal; until then the law goes on, then waits."""
         if verdict == CONVERGED and not self._looks:
-            self._looks, self._more = _LOOKS, _MORE
+            self._looks, self._more = _LOOKS, _MORE if self._limits.noise_px > 0.0 else 0
         if not self._looks or error > _GROWN * within:
             self._looks = 0
             return verdict
-        if not self._robot.settled(_SETTLED * within):
+        if self._more:
             self._more -= 1
-            return RUNNING if self._more >= 0 else WAITING
+            return RUNNING
+        if not self._robot.settled(_SETTLED * within):
+            return WAITING
         self._looks -= 1
         return verdict if verdict == CONVERGED or not self._looks else WAITING
 

@@ -148,7 +148,7 @@ class DrivenRobot:
         for view in range(2):
             carries = not np.array_equal(q, q_then[view])
             self._carried[view] = there[view] - then[view][view] if carries else 0.0
-        self.delays.append(self._instants.mean.copy())
+        self.delays.append(self._instants.mean)
         return np.ascontiguousarray(reading.s[:, self.known.shown]) + self._carried
 
     def fits(self) -> str:

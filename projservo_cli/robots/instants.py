@@ -6,7 +6,6 @@ where it has one, which may be of another clock or of its arrival, else of the r
 """
 
 import math
-from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -15,21 +14,19 @@ import numpy as np
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 VIEWS = ("left", "right")
-# Deviation of a delay of which nothing is known, s.
-UNKNOWN_S = 0.3
-# Deviation of a single frame where no calibration tells it: of arrival, and of stamps of the exposure, s.
-_JITTER_S = 0.012
+# Deviation of a delay of which nothing is known, and of a single frame where no calibration tells it, s.
+UNKNOWN_S, _JITTER_S = 0.3, 0.012
 # Readings that are kept, and how far beyond the last one joints are taken to move on, s.
-_KEPT = 256
-_AHEAD_S = 0.1
-# Images older than that are not reckoned with, s.
-_OLDEST_S = 1.0
-# Images are compared with those predicted so long before and after, and searched for in such steps, s.
-_APART_S, _SEARCH_S = 0.02, 0.01
-# A frame farther from its instant than so many deviations is none of this delay; nor are so many in a row.
-_GATE, _STRAYS = 4.0, 3
-# An instant fits this much better, in squares, before another one than expected is believed.
-_CLEARLY = 9.0
+_KEPT, _AHEAD_S = 256, 0.1
+# Delays that are reckoned with while little is known, s.
+_DELAYS = np.arange(-0.1, 1.0, 0.01)
+# An image is compared with those predicted so long before and after; a delay known as well is followed, s.
+_APART_S = 0.02
+# Markers err alike: they count as so many coordinates. What no image excludes.
+_COUNTED, _LEAST_CHANCE = 8.0, 1e-9
+# A frame farther from its instant than so many deviations is none of this delay, nor are so many in a row; it
+# fits so much better elsewhere, in squares.
+_GATE, _STRAYS, _CLEARLY = 4.0, 3, 9.0
 # How fast a delay may change, s for each frame that tells it.
 _DRIFT_S = 0.5e-3
 # What the model is off at least where it tells the instant of a frame, px.
@@ -42,28 +39,26 @@ class History:
     """Joint readings of the past; before the first one the robot was at rest."""
 
     def __init__(self) -> None:
-        self._t: deque[float] = deque(maxlen=_KEPT)
-        self._q: deque[FloatArray] = deque(maxlen=_KEPT)
+        self._t, self._q = np.zeros(0), np.zeros((0, 0))
 
     def __bool__(self) -> bool:
-        return bool(self._t)
+        return len(self._t) > 0
 
     def add(self, t: float, q: FloatArray) -> None:
         """Take in joints (n,), rad or m, of an instant, s; another reading of an instant replaces it."""
-        if self._t and t == self._t[-1]:
-            self._t.pop()
-            self._q.pop()
-        self._t.append(t)
-        self._q.append(q.copy())
+        first = max(0, len(self._t) + 1 - _KEPT)
+        last = len(self._t) - int(len(self._t) > 0 and t == self._t[-1])
+        self._t = np.append(self._t[first:last], t)
+        self._q = np.concatenate([self._q[first:last].reshape(-1, len(q)), q[None]])
 
     @property
     def last(self) -> tuple[float, FloatArray]:
         """The last instant, s, and its joints (n,), rad or m."""
-        return self._t[-1], self._q[-1]
+        return float(self._t[-1]), self._q[-1]
 
     def at(self, t: FloatArray) -> FloatArray:
         """Joints (k, n) at instants (k,), s; those of a reading to the bit, a little beyond the last one."""
-        times, q = np.array(self._t), np.array(self._q)
+        times, q = self._t, self._q
         if len(times) == 1:
             return np.repeat(q, len(t), axis=0)
         t = np.clip(t, times[0], times[-1] + _AHEAD_S)
@@ -97,17 +92,10 @@ class Frames(NamedTuple):
 
 
 class Delays:
-    """The delay of each view, followed by a Kalman filter, and the instants of frames.
-
-    While the joints move, an image tells when it was taken: r = s − ŝ(t) = ṡ (t′ − t), to first order and
-    after a search where little is known. The state is the mean delay; single frames stray from it by jitter.
+    """The delays of both views, and the instants of frames.
 
     predicted : pixels (k, 2, m, 2) at joints (k, n).
     prior : of the delays; sigma_px : pixel noise; timeout_s : longest that an image may stand still, s.
-    ``mean``: (2,) s, delays as followed.
-
-    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
-    Navigation", Wiley 2001, sections 5.2 (filter) and 6.? (gate).
     """
 
     def __init__(
@@ -117,15 +105,13 @@ class Delays:
         sigma_px: float,
         timeout_s: float,
     ) -> None:
-        self._predicted, self._prior, self._timeout_s = predicted, prior, timeout_s
-        self._sigma_px = math.hypot(sigma_px, _MODEL_PX)
-        self.mean, self._variance = prior.mean.copy(), prior.sigma**2
-        self._strays = [0, 0]
-        self._stamp = np.full(2, math.nan)
-        self._offset = np.zeros(2)  # of the clocks that stamp frames
-        self._images: list[FloatArray | None] = [None, None]
-        self._t = np.full(2, -math.inf)  # when the last images were taken
-        self._moved_at = np.full(2, math.nan)  # when joints began to leave them
+        error_px = math.hypot(sigma_px, _MODEL_PX)
+        self._views = [_View(view, predicted, prior, error_px, timeout_s) for view in range(2)]
+
+    @property
+    def mean(self) -> FloatArray:
+        """Delays (2,) as followed, s: of images from their readings, or from their stamps."""
+        return np.array([view.mean for view in self._views])
 
     def look(self, t_view: FloatArray, images: FloatArray, history: History) -> Frames:
         """Instants of both images of a look.
@@ -134,113 +120,164 @@ class Delays:
         history : of the readings, that of this look the last.
         Raises WorkFailed if the clock of a camera jumped, or its image stands still while the joints move.
         """
-        sigma = np.sqrt(self._variance + self._prior.jitter**2)
-        fresh = np.zeros(2, dtype=np.bool_)
-        t = np.empty(2)
-        for view in range(2):
-            nominal = self._nominal(view, float(t_view[view]), history.last[0])
-            t[view] = nominal - self.mean[view]
-            if not np.isfinite(images[view]).any():
-                continue
-            fresh[view] = self._is_fresh(view, float(t_view[view]), images[view])
-            if not fresh[view]:
-                t[view] = self._t[view]
-                self._require_motion(view, history)
-                continue
-            self._require_age(view, history.last[0] - t[view], float(sigma[view]))
-            self._t[view] = t[view] = self._followed(view, images[view], nominal, float(sigma[view]), history)
-            self._moved_at[view] = math.nan
-        return Frames(t, sigma, fresh)
+        found = [
+            view.look(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
+        ]
+        t, sigma, fresh = zip(*found, strict=True)
+        return Frames(np.array(t), np.array(sigma), np.array(fresh))
 
-    def _nominal(self, view: int, stamp: float, t_q: float) -> float:
+
+class _View:
+    """The delay of one view, and the instants of its frames.
+
+    While the joints move, an image tells when it was taken. Where little is known of the delay, the chance of
+    each is kept; else a Kalman filter follows the mean, from which single frames stray by jitter:
+    s − ŝ(t) = ṡ (t′ − t), to first order.
+
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+    Navigation", Wiley 2001, section 5.2.
+    """
+
+    def __init__(
+        self,
+        view: int,
+        predicted: Callable[[FloatArray], FloatArray],
+        prior: DelayPrior,
+        error_px: float,
+        timeout_s: float,
+    ) -> None:
+        self._view, self._predicted, self._error_px, self._timeout_s = view, predicted, error_px, timeout_s
+        mean, sigma, jitter = (float(both[view]) for both in prior)
+        self.mean, self._variance, self._jitter, self._follows = mean, sigma**2, jitter, sigma > 0.0
+        blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / jitter) ** 2)
+        self._blur = blur / blur.sum(axis=1, keepdims=True)
+        self._log_chance = self._open(mean, sigma)
+        self._strays = 0
+        self._stamp, self._offset = math.nan, 0.0  # of the last frame; of the clock that stamps it
+        self._image: FloatArray | None = None
+        self._t = -math.inf  # when the last image was taken
+        self._moved_at = math.nan  # when joints began to leave it
+
+    def look(self, stamp: float, image: FloatArray, history: History) -> tuple[float, float, bool]:
+        """Instant of an image (m, 2), s, how well it was known before, s, and whether the image is new."""
+        nominal = self._nominal(stamp, history.last[0])
+        expected, sigma = nominal - self.mean, math.sqrt(self._variance + self._jitter**2)
+        if not np.isfinite(image).any():
+            return expected, sigma, False
+        if not self._is_fresh(stamp, image):
+            self._require_motion(history)
+            return self._t, sigma, False
+        self._require_age(history.last[0] - expected, sigma)
+        self._moved_at = math.nan
+        self._t = (self._followed if self._log_chance is None else self._searched)(image, nominal, history)
+        return self._t, sigma, True
+
+    @staticmethod
+    def _open(mean: float, sigma: float) -> FloatArray | None:
+        """Logarithm of the chance of each delay where little is known; None where it need not be kept."""
+        return None if sigma <= _APART_S else -0.5 * ((_DELAYS - mean) / sigma) ** 2
+
+    def _nominal(self, stamp: float, t_q: float) -> float:
         """The instant, s, that a delay is the offset of: of the stamp, else of the reading."""
-        if math.isnan(stamp):
+        if math.isnan(stamp) or not self._follows:
             return t_q
-        if math.isnan(self._stamp[view]):  # clocks that have nothing in common start together
-            age = t_q - stamp + self.mean[view]
-            apart = not -_AHEAD_S <= age <= self._timeout_s
-            self._offset[view] = stamp - t_q if apart else 0.0
-        return stamp - float(self._offset[view])
+        if math.isnan(self._stamp) and not -_AHEAD_S <= t_q - stamp + self.mean <= self._timeout_s:
+            # Clocks that have nothing in common, or not as when it was calibrated, start together.
+            self._offset, self.mean, self._variance = stamp - t_q, 0.0, UNKNOWN_S**2
+            self._log_chance = self._open(0.0, UNKNOWN_S)
+        return stamp - self._offset
 
-    def _is_fresh(self, view: int, stamp: float, image: FloatArray) -> bool:
+    def _is_fresh(self, stamp: float, image: FloatArray) -> bool:
         """Whether an image is another one than the last."""
-        last, before = self._images[view], float(self._stamp[view])
-        if last is not None and (stamp == before or np.array_equal(image, last, equal_nan=True)):
+        if self._image is not None and (
+            stamp == self._stamp or np.array_equal(image, self._image, equal_nan=True)
+        ):
             return False
-        self._images[view], self._stamp[view] = image.copy(), stamp
+        self._image, self._stamp = image.copy(), stamp
         return True
 
-    def _require_age(self, view: int, age: float, sigma: float) -> None:
+    def _require_age(self, age: float, sigma: float) -> None:
         """Refuse a stamp that makes an image far too old, or one of the future."""
         slack = _AHEAD_S + _GATE * sigma
         if not -slack <= age <= self._timeout_s + slack:
             raise WorkFailed(
-                f"the stamp of a {VIEWS[view]} image makes it {age:.3g} s old: the clock that stamps it "
-                "jumped, or images come that late"
+                f"the stamp of a {VIEWS[self._view]} image makes it {age:.3g} s old: the clock that stamps "
+                "it jumped, or images come that late"
             )
 
-    def _require_motion(self, view: int, history: History) -> None:
+    def _require_motion(self, history: History) -> None:
         """Refuse an image that has stood still for too long while the joints moved."""
         now = history.last[0]
-        here, then = self._predicted(history.at(np.array([now, self._t[view]])))[:, view]
+        here, then = self._seen(history, np.array([now, self._t]))
         if not float(np.nanmax(np.abs(here - then), initial=0.0)) > _STILL_PX:
-            self._moved_at[view] = math.nan
+            self._moved_at = math.nan
             return
-        if math.isnan(self._moved_at[view]):
-            self._moved_at[view] = now
-        if now - self._moved_at[view] > self._timeout_s:
+        if math.isnan(self._moved_at):
+            self._moved_at = now
+        if now - self._moved_at > self._timeout_s:
             raise WorkFailed(
-                f"the {VIEWS[view]} image has stood still for {now - self._moved_at[view]:.3g} s while the "
+                f"the {VIEWS[self._view]} image has stood still for {now - self._moved_at:.3g} s while the "
                 "joints moved: look whether its camera still runs"
             )
 
-    def _followed(
-        self, view: int, image: FloatArray, nominal: float, sigma: float, history: History
-    ) -> float:
+    def _seen(self, history: History, t: FloatArray) -> FloatArray:
+        """Predicted pixels (k, m, 2) of the view at instants (k,)."""
+        return np.asarray(self._predicted(history.at(t))[:, self._view])
+
+    def _misfit(self, image: FloatArray, t: FloatArray, history: History) -> FloatArray:
+        """Mean squares (k,) by which an image is off those predicted at instants (k,), px²."""
+        off = (image - self._seen(history, t)) ** 2
+        known = np.isfinite(off)
+        square = np.where(known, off, 0.0).sum(axis=(1, 2)) / np.maximum(known.sum(axis=(1, 2)), 1)
+        return np.where(known.any(axis=(1, 2)), square, math.inf)
+
+    def _searched(self, image: FloatArray, nominal: float, history: History) -> float:
+        """Instant of a fresh image, s, among all; each delay has its chance."""
+        assert self._log_chance is not None
+        misfit = self._misfit(image, nominal - _DELAYS, history)
+        least = max(float(misfit.min()), self._error_px**2)
+        chance = np.exp(-0.5 * _COUNTED * np.maximum(misfit / least - 1.0, 0.0))
+        before = self._blur @ np.exp(self._log_chance - self._log_chance.max())
+        t = nominal - float(_DELAYS[np.argmax(chance * before)])
+        self._log_chance += np.log(self._blur @ chance + _LEAST_CHANCE)
+        weight = np.exp(self._log_chance - self._log_chance.max())
+        self.mean = float(np.average(_DELAYS, weights=weight))
+        self._variance = float(np.average((_DELAYS - self.mean) ** 2, weights=weight))
+        if self._variance < _APART_S**2 / 4.0:
+            self._log_chance = None
+        shift, _ = self._shift(image, t, history)
+        return t + float(np.clip(shift, -_APART_S, _APART_S))
+
+    def _followed(self, image: FloatArray, nominal: float, history: History) -> float:
         """Instant of a fresh image, s, by what was known and what it shows; the delay is followed."""
-        expected = nominal - float(self.mean[view])
-        t, sigma_seen = self._told(view, image, expected, sigma, history)
-        if not math.isfinite(sigma_seen):
+        expected, variance = nominal - self.mean, self._variance + self._jitter**2
+        shift, sigma = self._shift(image, expected, history)
+        if not math.isfinite(sigma):
             return expected
-        gap, total = t - expected, sigma**2 + sigma_seen**2
-        follows = self._prior.sigma[view] > 0.0
-        if gap**2 > _GATE**2 * total:
-            self._strays[view] += sigma_seen < float(self._prior.jitter[view])
-            if follows and self._strays[view] >= _STRAYS:
-                self._variance[view] = UNKNOWN_S**2
+        if abs(shift) > max(_APART_S, _GATE * math.sqrt(variance + sigma**2)):
+            self._stray(image, nominal, history)
             return expected
-        self._strays[view] = 0
-        if follows:
-            variance = float(self._variance[view])
-            gain = variance / (variance + float(self._prior.jitter[view]) ** 2 + sigma_seen**2)
-            self.mean[view] -= gain * gap
-            self._variance[view] = (1.0 - gain) * variance + _DRIFT_S**2
-        return expected + sigma**2 / total * gap
+        self._strays = 0
+        if self._follows:
+            gain = self._variance / (variance + sigma**2)
+            self.mean -= gain * shift
+            self._variance = (1.0 - gain) * self._variance + _DRIFT_S**2
+        return expected + variance / (variance + sigma**2) * shift
 
-    def _told(
-        self, view: int, image: FloatArray, expected: float, sigma: float, history: History
-    ) -> tuple[float, float]:
-        """When an image was taken by what it shows, and the deviation of that, s; infinite for none."""
-        shift, sigma_seen = self._shift(view, image, expected, history)
-        if sigma <= _APART_S and abs(shift) <= _APART_S:
-            return expected + shift, sigma_seen
-        now, known = history.last[0], max(sigma, UNKNOWN_S)
-        t = np.arange(now - _OLDEST_S, now + _AHEAD_S, _SEARCH_S)
-        off = np.nanmean((image - self._predicted(history.at(t))[:, view]) ** 2, axis=(1, 2))
-        least = max(float(off.min()), self._sigma_px**2)
-        nearest = float(t[np.argmin(off / least + ((t - expected) / known) ** 2)])
-        if sigma <= _APART_S and not np.interp(expected, t, off) > _CLEARLY * least:
-            return expected, math.inf  # the model is off, not the instant
-        shift, sigma_seen = self._shift(view, image, nearest, history)
-        return nearest + float(np.clip(shift, -_APART_S, _APART_S)), sigma_seen
+    def _stray(self, image: FloatArray, nominal: float, history: History) -> None:
+        """A frame that is far from its instant is another delay's, where it clearly fits that."""
+        here, *others = self._misfit(image, nominal - np.append(self.mean, _DELAYS), history)
+        self._strays += here > _CLEARLY * max(min(others), self._error_px**2)
+        if self._follows and self._strays >= _STRAYS:
+            self._strays, self._variance = 0, UNKNOWN_S**2
+            self._log_chance = self._open(self.mean, UNKNOWN_S)
 
-    def _shift(self, view: int, image: FloatArray, t: float, history: History) -> tuple[float, float]:
+    def _shift(self, image: FloatArray, t: float, history: History) -> tuple[float, float]:
         """How much later than t an image was taken, to first order, and the deviation of that, s.
 
-        An image tells its instant only where the joints moved both before and after it. Markers err alike, so
-        they count as one.
+        An image tells its instant only where the joints moved both before and after it.
         """
-        predicted = self._predicted(history.at(t + _APART_S * np.array([-1.0, 0.0, 1.0])))[:, view]
+        predicted = self._seen(history, t + _APART_S * np.array([-1.0, 0.0, 1.0]))
         known = np.isfinite(image[:, 0]) & np.isfinite(predicted[..., 0]).all(axis=0)
         before, after = np.diff(predicted[:, known], axis=0) / _APART_S
         least = min(float(np.mean(before**2)), float(np.mean(after**2))) if known.any() else 0.0
@@ -249,4 +286,4 @@ class Delays:
         off, speed = image[known] - predicted[1, known], 0.5 * (before + after)
         shift = float(np.sum(speed * off) / max(np.sum(speed**2), least))
         left = float(np.sqrt(np.mean((off - shift * speed) ** 2)))
-        return shift, max(self._sigma_px, left) / math.sqrt(least)
+        return shift, max(self._error_px, left) / math.sqrt(least)
