@@ -197,11 +197,15 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
 
 def _joint_noise(value: dict[str, Any]) -> str:
     """How far joint readings are off, in degrees (of prismatic joints × 0.3 m/rad)."""
-    found = f"off by {math.degrees(value['sigma_q']):.3g}° rms" if value["sigma_q"] else "no noise shows"
-    if value["sigma_q_interval"] is None:
-        return f"{found}, as given" if value["sigma_q"] else "their noise explains nothing of what is left"
-    low, high = (math.degrees(end) for end in value["sigma_q_interval"])
-    return f"{found} (95 %: {low:.3g} to {high:.3g})"
+    sigma, interval = math.degrees(value["sigma_q"]), value["sigma_q_interval"]
+    if interval is None:
+        return (
+            f"off by {sigma:.3g}° rms, as given" if sigma else "their noise explains nothing of what is left"
+        )
+    low, high = (math.degrees(end) for end in interval)
+    if sigma == 0.0:
+        return f"no noise shows (95 %: below {high:.2g}°)"
+    return f"off by {sigma:.3g}° rms (95 %: {low:.3g}° to {high:.3g}°)"
 
 
 def _delays(value: dict[str, Any]) -> str:

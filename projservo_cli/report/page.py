@@ -274,9 +274,20 @@ def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
         ("poses", found["merged_poses"], ""),
         ("markers", found["merged_markers"], ""),
         *lens,
+        *_joints_and_time(found),
         ("time", found["seconds"], "s"),
     ]
     return found | {"words": list(_calibration_words(found, estimated=estimated)), "numbers": numbers}
+
+
+def _joints_and_time(found: dict[str, Any]) -> Iterator[tuple[str, Any, str]]:
+    """How far joint readings are off and images late, where that was asked: label, number, unit."""
+    if found["sigma_q"] is not None:
+        yield "joint readings off by, rms", np.degrees(found["sigma_q"]), "°"
+    if found["delay_s"] is not None:
+        for view, delay, jitter in zip(VIEWS, found["delay_s"], found["delay_jitter_s"], strict=True):
+            yield f"images of the {view} camera late by", 1e3 * delay, "ms"
+            yield f"single images of the {view} camera differ by, rms", 1e3 * jitter, "ms"
 
 
 def _visibility(plan: Plan) -> dict[str, Any]:
