@@ -13,8 +13,11 @@ from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
 # Looks in a row that must agree on a gross disturbance: one may be blurred, or a marker taken for another.
 WINDOW = 3
-# Chance that a run of undisturbed looks is called disturbed, at most.
-_FALSE_ALARM = 1e-3
+# Chance that a run of undisturbed looks is called disturbed, if all windows were independent. They overlap:
+# it comes to a twentieth of that. More of it is spent on the first looks.
+_FALSE_ALARM, _SOON = 1e-2, 10.0
+# Windows in which an onset is looked for, one longer than the other by this factor.
+_LONGER = 1.5
 # What the first order leaves out of a prediction's error, at most, as a share of the calibration's own noise:
 # nearer than that no image need come to what is predicted, however good the detector.
 _BEYOND_FIRST_ORDER = 0.02
@@ -147,7 +150,7 @@ class Innovation:
         ]
         self._touches = np.array([cause.touches.ravel() for cause in self._causes], dtype=np.float64)
         tail = _FALSE_ALARM / observations
-        self._most = np.sqrt(chdtri(self._sizes, tail / len(self._sizes)))
+        self._chance = _FALSE_ALARM / np.log1p(observations / _SOON)
         self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (2 + m)))
         c = self._factor.shape[1] + self._f + 1
         self._sums = [_Sums(0, np.zeros((c, c)), np.zeros((2, m)))]
@@ -353,7 +356,9 @@ class Innovation:
 
     def _beyond(self, evidence: _Evidence) -> BoolArray:
         """Which causes (h,) are beyond what chance and errors of the model allow; what stands still must."""
-        possible = np.sqrt(evidence.gain) > self._most + self._floor * np.sqrt(evidence.touched)
+        tail = self._chance / (len(self._readings) + _SOON) / len(self._sizes)
+        most = np.sqrt(chdtri(self._sizes, tail)) + self._floor * np.sqrt(evidence.touched)
+        possible = np.sqrt(evidence.gain) > most
         if possible.any():
             still = np.ptp(self._readings[evidence.since.looks :], axis=0) <= _STILL
             for i, cause in enumerate(self._causes):
@@ -362,12 +367,12 @@ class Innovation:
         return np.asarray(possible)
 
     def _significant(self) -> bool:
-        """Whether anything is beyond chance since an onset: at every other look, for windows in turn."""
+        """Whether anything is beyond chance since an onset: at each look for a window of another length."""
         total = self._sums[-1]
-        lengths = [WINDOW << i for i in range((total.looks // WINDOW).bit_length())]
-        if self._pending or not lengths or total.looks % 2:
+        if self._pending or total.looks < WINDOW:
             return False
-        length = lengths[total.looks // 2 % len(lengths)]
+        lengths = WINDOW * _LONGER ** np.arange(1 + int(np.log(total.looks / WINDOW) / np.log(_LONGER)))
+        length = lengths[total.looks % len(lengths)]
         since = min(self._sums, key=lambda sums: abs(total.looks - length - sums.looks))
         return bool(self._beyond(self._evidence(since, total)).any())
 

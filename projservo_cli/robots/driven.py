@@ -167,7 +167,12 @@ class DrivenRobot:
         return math.sqrt(2.0 * float(np.nanmean(face**2)))
 
     def settled(self, within_px: float) -> bool:
-        """Whether the arm stands as far as images to so many px rms, or its readings, can tell."""
+        """Whether the arm stands as far as images to so many px rms, or its readings, can tell.
+
+        Not while it is about to be said what is wrong with the images.
+        """
+        if self.innovation is not None and self.innovation.doubtful:
+            return False
         q, face = self.steered.set_point.at_rest, self._place[: len(self.plant.M)]
         if self.known.sigma_q.any():
             s = self.known.predicted(np.concatenate([q[None], q + np.diag(self.known.sigma_q)]))[:, :, face]
