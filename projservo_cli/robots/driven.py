@@ -62,6 +62,11 @@ class Steered:
         if self.robot.wait_until(due):
             self.overruns += 1
 
+    def hold(self, period: float) -> Reading:
+        """Hold the set-point for a period, s, and look."""
+        self.command(np.zeros_like(self.reading.q), period)
+        return self.look()
+
 
 class Known(NamedTuple):
     """What is known of a robot and its images before it is driven."""

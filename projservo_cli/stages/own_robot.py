@@ -9,7 +9,7 @@ import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation, predict
 from projservo_cli.config import Config
-from projservo_cli.records import Calibration, FloatArray, InputError, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.driven import DrivenRobot, Known, Steered
@@ -27,6 +27,7 @@ _LEAST = 6  # looks that tell noise from motion
 # Least deviation of a delay and of single frames, s; a 95 % interval is so many deviations wide.
 _LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
 _PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
+_WAITED = 5  # looks for each image that is wanted, where the same one comes again
 
 
 def bounds_of(config: Config, joints: Joints) -> Bounds:
@@ -82,7 +83,7 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
         if (away > bounds.lead).any() or (stands and held.any()):
             break
     else:
-        yield from _at_rest(robot, config, what)
+        yield from at_rest(robot.reading, partial(robot.hold, period), config, what)
     gap = np.abs(q - robot.reading.q)
     i = int(np.argmax(gap / np.maximum(sag_of(config, joints), _STILL)))
     if gap[i] > max(sag_of(config, joints)[i], _STILL) or (q != robot.target).any():
@@ -96,18 +97,48 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
         )
 
 
-def _at_rest(robot: Steered, config: Config, what: str) -> Iterator[Reading]:
-    """Hold the set-point until joints and images stand still, and yield what is read meanwhile."""
-    still = Standstill(config.plant.settle_s)
-    first = robot.reading.t_q
-    while not still.all(robot.reading):
-        if robot.reading.t_q > first + config.plant.settle_s + _PATIENCE_S:
+def at_rest(reading: Reading, look: Callable[[], Reading], config: Config, what: str) -> Iterator[Reading]:
+    """Look, a period after the other, until joints and images stand still, and yield what is read."""
+    still, first = Standstill(config.plant.settle_s), reading.t_q
+    while not still.all(reading):
+        if reading.t_q > first + config.plant.settle_s + _PATIENCE_S:
             raise WorkFailed(
                 f"{what}: {still.moving or 'the robot'} does not come to rest within {_PATIENCE_S:g} s: look "
                 "for what vibrates, creeps or flickers"
             )
-        robot.command(np.zeros_like(robot.reading.q), config.control.period_s)
-        yield robot.look()
+        reading = look()
+        yield reading
+
+
+def averaged(
+    reading: Reading, look: Callable[[], Reading], wanted: int
+) -> tuple[Reading, FloatArray, FloatArray]:
+    """The mean of looks at a robot at rest, of which each view shows so many frames, each frame once.
+
+    Markers that most of the frames of a view do not show are NaN. Returns the mean; sums (2, m) of the
+    squares by which pixels are off it, px²; how many frames (2, m) show a marker, 0 where it is NaN.
+    """
+    looks, frames = [reading], [[view] for view in reading.s]
+    for _ in range(_WAITED * wanted):
+        if min(map(len, frames)) >= wanted:
+            break
+        looks.append(look())
+        for view, new in enumerate(new_views(*looks[:-3:-1])):
+            if new and len(frames[view]) < wanted:
+                frames[view].append(looks[-1].s[view])
+    s, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
+    q = looks[0].q + np.mean([seen.q - looks[0].q for seen in looks], axis=0)
+    return looks[-1]._replace(q=q, s=s), squares, count
+
+
+def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Mean (m, 2) of frames of one view, px, squares (m,) by which they are off it, and their count (m,)."""
+    seen = np.array(frames)
+    count = np.isfinite(seen[..., 0]).sum(axis=0)
+    count[2 * count <= len(seen)] = 0
+    mean: FloatArray = np.nansum(seen, axis=0) / np.maximum(count, 1)[:, None]
+    mean[count == 0] = np.nan
+    return mean, np.nansum((seen - mean) ** 2, axis=(0, 2)), count
 
 
 class Standstill:

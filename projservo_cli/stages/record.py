@@ -15,7 +15,15 @@ from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.driven import Steered
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.own_robot import foreign_robot, new_views, sag_of, servo_of, simulated_robot, way_to
+from projservo_cli.stages.own_robot import (
+    averaged,
+    foreign_robot,
+    new_views,
+    sag_of,
+    servo_of,
+    simulated_robot,
+    way_to,
+)
 from projservo_cli.stages.simulation import robot_in_trials
 from projservo_cli.stages.trials import seed_of_trials, simulate, trial_motions
 from projservo_cli.stages.world import FAULTS, Joints, has_faults, joints_of, limit_passed, truth_of
@@ -30,7 +38,6 @@ DEPENDS_ON = (
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
 _MOST_MOVING = 200  # frames on the way in a table
-_WAITED = 5  # looks for each image that is wanted, where the same one comes again
 
 
 @dataclass
@@ -226,30 +233,13 @@ def _moving(seen: list[Reading], settle_s: float) -> list[Reading]:
 
 
 def _look(robot: Steered, config: Config, recording: _Recording) -> Reading:
-    """The mean of as many images as configured, each frame once, of a robot at rest, and of their readings.
+    """The mean of as many images as configured of a robot at rest, and of its readings."""
 
-    Markers that most of the frames of a view do not show are NaN.
-    """
-    wanted, looks = config.plant.frames, [robot.reading]
-    frames = [[view] for view in robot.reading.s]
-    for _ in range(_WAITED * wanted):
-        if min(map(len, frames)) >= wanted:
-            break
-        robot.command(np.zeros_like(robot.reading.q), config.control.period_s)
-        looks.append(robot.look())
+    def look() -> Reading:
+        """A look after a period."""
         recording.commands += 1
-        for view, new in enumerate(new_views(*looks[:-3:-1])):
-            if new and len(frames[view]) < wanted:
-                frames[view].append(looks[-1].s[view])
-    s = np.stack([_mean(np.array(rows), recording.scatter) for rows in frames])
-    q = looks[0].q + np.mean([look.q - looks[0].q for look in looks], axis=0)
-    return looks[-1]._replace(q=q, s=s)
+        return robot.hold(config.control.period_s)
 
-
-def _mean(frames: FloatArray, scatter: FloatArray) -> FloatArray:
-    """Mean (m, 2) of frames (k, m, 2) of one view, px; how they scatter is added to ``scatter``."""
-    count = np.isfinite(frames[..., 0]).sum(axis=0)
-    mean: FloatArray = np.nansum(frames, axis=0) / np.maximum(count, 1)[:, None]
-    mean[2 * count <= len(frames)] = np.nan
-    scatter += np.nansum((frames - mean) ** 2), 2.0 * np.sum(count[2 * count > len(frames)] - 1)
+    mean, squares, count = averaged(robot.reading, look, config.plant.frames)
+    recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
     return mean

@@ -93,7 +93,8 @@ def key_of(config: Config, stage: str, **before: Any) -> str:
 
 def affects(key: str, stage: str) -> bool:
     """Whether a stage depends on a key of the configuration."""
-    return any(f"{key}.".startswith(f"{part}.") for part in _DEPENDS_ON[stage])
+    parts = [f"{part}." for part in _DEPENDS_ON[stage]]
+    return any(part.startswith(f"{key}.") or f"{key}.".startswith(part) for part in parts)
 
 
 def _needed(config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]) -> Iterator[Step]:

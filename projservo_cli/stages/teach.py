@@ -12,14 +12,13 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Config, plain_yaml
 from projservo_cli.config.models import TaskSettings
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
-from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
+from projservo_cli.robots.contract import Reading, at_rest_after
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.own_robot import foreign_robot, new_views, simulated_robot
+from projservo_cli.stages.own_robot import at_rest, averaged, foreign_robot, simulated_robot
 from projservo_cli.stages.simulation import robot_at
 from projservo_cli.stages.verdicts import VIEWS
 from projservo_cli.stages.world import face_numbers, joints_of, limit_passed, truth_of
 
-_LOOKS = 5  # for each frame that is wanted, where the same one comes again
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
 
@@ -32,7 +31,7 @@ class Taught:
     q: FloatArray  # (n,) mean of the joint readings, rad or m
     s: FloatArray  # (2, m, 2) mean of the pixels, NaN where most frames do not show a marker
     sigma: FloatArray  # (2, m) standard deviation of a coordinate of that mean, px; NaN where nobody knows
-    frames: tuple[int, int]  # how many there were of each view
+    frames: IntArray  # (2,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
 
     @property
@@ -88,55 +87,34 @@ def teach(
         robot = simulated_robot(config, joints, put, len(numbers))
     period, moved = config.control.period_s, None
 
-    def pause() -> None:
-        """Let a period pass; a simulated robot holds where it was put to."""
+    def look() -> Reading:
+        """A look after a period, in which a simulated robot holds where it was put to."""
         if at is None:
             time.sleep(period)
         else:
             robot.command(np.array(at), np.zeros(len(at)), robot.now() + period)
+        return robot.read()
 
     with at_rest_after(robot):
+        before = robot.read()
         if wait is not None and robot.release():
             wait("the robot is released: move it, and take your hands away")
-            before = robot.read().q
+            before = robot.read()
             robot.hold()
-            moved = _looks(robot, pause, frames)[-1].q - before
-        readings = _looks(robot, pause, frames)
-    q = np.mean([reading.q for reading in readings], axis=0)
-    means = [_mean([r.s[view] for r in _of_view(readings, view)[:frames]]) for view in range(2)]
-    s, sigma = (np.stack(both) for both in zip(*means, strict=True))
-    count = tuple(min(frames, len(_of_view(readings, view))) for view in range(2))
-    return Taught(np.array(numbers, dtype=np.int64), q, s, sigma, (count[0], count[1]), moved)
-
-
-def _looks(robot: ForeignRobot, pause: Callable[[], None], frames: int) -> list[Reading]:
-    """What is read of a robot at rest, with pauses, until there are so many frames of each view."""
-    readings = [robot.read()]
-    while len(readings) < _LOOKS * frames and min(len(_of_view(readings, v)) for v in range(2)) < frames:
-        pause()
-        readings.append(robot.read())
-    return readings
-
-
-def _of_view(readings: list[Reading], view: int) -> list[Reading]:
-    """Those with a frame of a view that is not that of the reading before."""
-    before = [None, *readings[:-1]]
-    return [now for now, last in zip(readings, before, strict=True) if new_views(now, last)[view]]
-
-
-def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Mean (m, 2) of frames of a view, px, and the standard deviation (m,) of a coordinate of it.
-
-    Markers that most frames do not show are NaN; so are deviations of those seen but once.
-    """
-    all_of_them = np.array(frames)
-    count = np.isfinite(all_of_them[..., 0]).sum(axis=0)
-    mean = np.nansum(all_of_them, axis=0) / np.maximum(count, 1)[:, None]
-    mean[2 * count <= len(frames)] = np.nan
-    squares = 0.5 * np.nansum((all_of_them - mean) ** 2, axis=(0, 2))
-    known = np.isfinite(mean[:, 0]) & (count > 1)
-    sigma = np.sqrt(squares / np.maximum(count * (count - 1), 1))
-    return mean, np.where(known, sigma, np.nan)
+            moved = before.q
+        reading = look()
+        if reading.t_q > before.t_q:  # else it is a simulator, whose time passes in its commands alone
+            reading = [reading, *at_rest(reading, look, config, "teach")][-1]
+        mean, squares, count = averaged(reading, look, frames)
+    sigma = np.sqrt(squares / np.maximum(2 * count * (count - 1), 1))
+    return Taught(
+        np.array(numbers, dtype=np.int64),
+        mean.q,
+        mean.s,
+        np.where(count > 1, sigma, np.nan),
+        count.max(axis=1),
+        None if moved is None else mean.q - moved,
+    )
 
 
 def checked(config: Config, calibration: Calibration, taught: Taught) -> Checked:
