@@ -379,7 +379,8 @@ class Innovation:
     def _named(self, look: _Look, gross: bool) -> str:
         """The cause in words, once it is clear or has been waited for; empty until then."""
         total = self._sums[-1]
-        for _, added in self._pending if gross else ():
+        half = len(self._pending) > WINDOW  # it may have happened while the first look of them was taken
+        for _, added in self._pending[half:] if gross else ():
             total = _with(total, added)
         blamed = self._blamed(total)
         if not blamed:
