@@ -1,5 +1,6 @@
 """What robots and cameras tell on the command line: ``record``, ``teach``, ``detect`` and ``validate``."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -139,8 +140,8 @@ def _teach(
 
     Looks where somebody has moved the robot to, with the hands away, averages --frames images and writes
     their pixels, with their uncertainty and the joint readings: task.goal takes the file, task.start its
-    joints. A robot that can let go of its arm does so first, and holds it again when it was moved. A
-    simulated robot is put to --at.
+    joints. A robot that can let go of its arm does so first, where somebody is at the terminal to move it,
+    and then holds it again. A simulated robot is put to --at.
 
     Checks it against the calibration in RUN, by default that of the configuration's name in results, where
     there is one: markers that are off, and whether any joints show it. A goal that none do ends in exit
@@ -163,7 +164,8 @@ def _teach(
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
     calibration = option.calibration_of(run, settings)
-    taught = stage.teach(settings, frames, put, console.wait)
+    asks = settings.plant.use is not None and sys.stdin.isatty()
+    taught = stage.teach(settings, frames, put, console.wait if asks else None)
     if not start:
         stage.require_face(settings, taught)
     check = None if calibration is None or start else stage.checked(settings, calibration, taught)
@@ -194,23 +196,17 @@ def _words_of_taught(path: Path, taught: Any, check: Any, key: str) -> Iterator[
     import numpy as np
 
     left, right = taught.frames
-    yield f"teach: {len(taught.marker)} markers, {left} images left and {right} right"
-    if np.isfinite(taught.sigma).any():
-        yield f"  standard deviation of their means: {np.nanmax(taught.sigma):.3g} px at most"
+    certain = f", to {np.nanmax(taught.sigma):.3g} px" if np.isfinite(taught.sigma).any() else ""
+    yield f"teach: {len(taught.marker)} markers from {left} images left and {right} right{certain}"
     if taught.moved is not None:
         i = int(np.abs(taught.moved).argmax())
-        yield f"  when it was held again, joint {i + 1} moved by {taught.moved[i]:.3g} (rad or m)"
+        yield f"  since it is held, joint {i + 1} moved by {taught.moved[i]:.3g} (rad or m)"
     if taught.unseen:
-        listed = ", ".join(f"{number} ({side})" for number, side in taught.unseen)
-        yield wrapped(f"unseen: {listed}", "  ")
-    if check is None:
-        yield "  not checked against a calibration" + ("" if key == "task.start" else ": name its run")
-    else:
-        yield wrapped(check.reason, "  ")
-        rms = np.sqrt(np.nanmean(check.off**2))
+        yield wrapped("unseen: " + ", ".join(f"{number} ({side})" for number, side in taught.unseen), "  ")
+    if check is not None:
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
-        beyond = f"; beyond noise: {far}" if far else ", none beyond noise"
-        yield wrapped(f"markers are {rms:.3g} px rms off what the calibration shows there{beyond}", "  ")
+        yield wrapped(check.reason, "  ")
+        yield wrapped(f"markers off what the calibration shows there: {far or 'none'}", "  ")
     yield f"set {key}: {path}"
 
 

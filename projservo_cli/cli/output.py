@@ -109,11 +109,10 @@ class Console:
             raise KeyboardInterrupt
 
     def wait(self, text: str) -> None:
-        """Tell somebody to do something, and wait for the Enter key, where there is anybody."""
+        """Tell somebody at the terminal to do something, and wait for the Enter key."""
         self._finish()
-        click.echo(wrapped(f"{text}; then press Enter"), err=True)
-        if sys.stdin.isatty():
-            sys.stdin.readline()
+        click.echo(wrapped(f"{text}, then press Enter"), err=True)
+        sys.stdin.readline()
 
     def progress(self, what: str, done: int, total: int) -> None:
         """Move a progress bar; silent where standard error is not a terminal."""

@@ -134,17 +134,18 @@ class ForeignRobot:
         shape = (4, 4) if np.ndim(answer) == 2 else (self._joints,)
         return self._numbers("truth() gave numbers", answer, shape, finite=True)
 
-    def release(self) -> bool:
-        """Let go of the arm, so that somebody can move it; whether the robot can."""
-        release, hold = (getattr(self.robot, name, None) for name in ("release", "hold"))
-        if release is None or hold is None:
-            return False
-        self._ask("release", release)
-        return True
+    @property
+    def lets_go(self) -> bool:
+        """Whether the arm can be released, and held again."""
+        return all(callable(getattr(self.robot, name, None)) for name in ("release", "hold"))
+
+    def release(self) -> None:
+        """Let go of the arm, so that somebody can move it."""
+        self._ask("release", self.robot.release)  # type: ignore[attr-defined]  # only if it lets go
 
     def hold(self) -> None:
         """Hold the arm again where it is."""
-        self._ask("hold", self.robot.hold)  # type: ignore[attr-defined]  # there is one where it was released
+        self._ask("hold", self.robot.hold)  # type: ignore[attr-defined]
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""

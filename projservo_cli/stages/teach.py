@@ -67,7 +67,8 @@ def teach(
     """Look where the robot stands, and average so many frames of each camera.
 
     at : joints (n,) that a simulated robot is put to, rad or m.
-    wait : tells somebody to move the arm, and returns when that is done; None where nobody can be asked.
+    wait : tells somebody what to do, and returns when that is done; None where nobody can be asked, so that
+        the arm is not released.
     Raises InputError if the configuration lacks a part of it; WorkFailed if the robot fails.
     """
     numbers = config.markers.known if config.markers is not None else None
@@ -96,14 +97,16 @@ def teach(
         return robot.read()
 
     with at_rest_after(robot):
-        before = robot.read()
-        if wait is not None and robot.release():
-            wait("the robot is released: move it, and take your hands away")
-            before = robot.read()
+        if wait is not None and robot.lets_go:
+            wait("take hold of the arm: it will be released")
+            robot.release()
+            wait("move it to where it is to be: it will be held there")
+            moved = robot.read().q
             robot.hold()
-            moved = before.q
-        reading = look()
-        if reading.t_q > before.t_q:  # else it is a simulator, whose time passes in its commands alone
+        if wait is not None:
+            wait("take your hands away")
+        first, reading = robot.read(), look()
+        if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
             reading = [reading, *at_rest(reading, look, config, "teach")][-1]
         mean, squares, count = averaged(reading, look, frames)
     sigma = np.sqrt(squares / np.maximum(2 * count * (count - 1), 1))
