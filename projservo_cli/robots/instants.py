@@ -27,8 +27,8 @@ _COUNTED, _LEAST_CHANCE = 8.0, 1e-9
 # A frame farther from its instant than so many deviations is none of this delay, nor are so many in a row; it
 # fits so much better elsewhere, in squares.
 _GATE, _STRAYS, _CLEARLY = 4.0, 3, 9.0
-# How fast a delay may change, s for each frame that tells it.
-_DRIFT_S = 0.5e-3
+# How fast a delay may change, s for each frame that tells it; so many frames in a row err alike, by the model.
+_DRIFT_S, _ALIKE = 0.2e-3, 10.0
 # What the model is off at least where it tells the instant of a frame, px.
 _MODEL_PX = 0.3
 # Images should have moved so far, px, before one that stands still is a fault.
@@ -259,7 +259,7 @@ class _View:
             return expected
         self._strays = 0
         if self._follows:
-            gain = self._variance / (variance + sigma**2)
+            gain = self._variance / (variance + _ALIKE * sigma**2)
             self.mean -= gain * shift
             self._variance = (1.0 - gain) * self._variance + _DRIFT_S**2
         return expected + variance / (variance + sigma**2) * shift
@@ -275,15 +275,15 @@ class _View:
     def _shift(self, image: FloatArray, t: float, history: History) -> tuple[float, float]:
         """How much later than t an image was taken, to first order, and the deviation of that, s.
 
-        An image tells its instant only where the joints moved both before and after it.
+        An image tells its instant only where it moved the same way before and after.
         """
         predicted = self._seen(history, t + _APART_S * np.array([-1.0, 0.0, 1.0]))
         known = np.isfinite(image[:, 0]) & np.isfinite(predicted[..., 0]).all(axis=0)
         before, after = np.diff(predicted[:, known], axis=0) / _APART_S
-        least = min(float(np.mean(before**2)), float(np.mean(after**2))) if known.any() else 0.0
-        if least == 0.0:
+        square = float(np.mean(before * after)) if known.any() else 0.0
+        if not square > 0.0:
             return 0.0, math.inf
         off, speed = image[known] - predicted[1, known], 0.5 * (before + after)
-        shift = float(np.sum(speed * off) / max(np.sum(speed**2), least))
+        shift = float(np.sum(speed * off) / np.sum(speed**2))
         left = float(np.sqrt(np.mean((off - shift * speed) ** 2)))
-        return shift, max(self._error_px, left) / math.sqrt(least)
+        return shift, max(self._error_px, left) / math.sqrt(square)

@@ -296,7 +296,7 @@ def _delays_of(config: Config, calibration: Calibration | None) -> DelayPrior:
     sigma = np.full(2, UNKNOWN_S)
     if calibration.delay_interval_s is not None:
         sigma = np.ptp(calibration.delay_interval_s, axis=1) / _INTERVAL
-    return DelayPrior(calibration.delay_s.copy(), np.maximum(sigma, _LEAST_JITTER_S), jitter)
+    return DelayPrior(calibration.delay_s.copy(), np.maximum(sigma, 0.5 * _LEAST_JITTER_S), jitter)
 
 
 def innovation_of(scenario: Scenario) -> Innovation | None:
