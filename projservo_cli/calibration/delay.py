@@ -17,9 +17,8 @@ from projservo_cli.calibration.prediction import joint_derivative, predict
 from projservo_cli.calibration.readings import MAD
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 
-# Delays that are looked for, s, and their steps; frames among which they are looked for, the fastest.
-_EARLIEST, _LATEST, _STEP = -0.1, 0.6, 0.01
-_LOOKED_AT = 60
+# Delays that are looked for, s, and their steps; a pixel of what no camera sees, px.
+_EARLIEST, _LATEST, _STEP, _NOWHERE = -0.1, 0.6, 0.01, 1e4
 # Steps to the delay of a frame, the farthest of it from that of all, s, and the half step of its velocity.
 _ROUNDS, _FARTHEST, _HALF = 6, 0.15, 1e-3
 # A frame whose own noise would let it be off by more tells nothing, s; least of frames, and of their markers.
@@ -111,9 +110,10 @@ def _frames(calibration: Calibration, observation: Observation, view: int) -> _F
     t = t_q[rows]
     if t_view is not None and len(rows) and np.isfinite(t_view[rows, view]).all():
         stamps = t_view[rows, view]
-        _, first = np.unique(stamps, return_index=True)
-        rows, t, stamps = rows[np.sort(first)], t[np.sort(first)], stamps[np.sort(first)]
-        t = stamps + np.mean(t - stamps)  # by the clock of the readings, as late as is typical
+        if np.ptp(t - stamps) < _LATEST - _EARLIEST:  # both clocks went on
+            first = np.sort(np.unique(stamps, return_index=True)[1])
+            rows, t, stamps = rows[first], t[first], stamps[first]
+            t = stamps + np.mean(t - stamps)  # by the clock of the readings, as late as is typical
     return _Frames(moving[rows], t, s[rows])
 
 
@@ -143,16 +143,13 @@ def _joints(ways: dict[int, _Way], frames: _Frames, t: FloatArray) -> FloatArray
 
 def _common(calibration: Calibration, ways: dict[int, _Way], frames: _Frames, view: int) -> float:
     """The one delay with which most frames are best predicted, roughly, s."""
-    moved = _joints(ways, frames, frames.t + _HALF) - _joints(ways, frames, frames.t - _STEP)
-    travel = [np.abs(np.diff(ways[int(way)].q, axis=0)).max() for way in frames.way]
-    fastest = np.argsort(-np.array(travel) - np.abs(moved).max(axis=1), kind="stable")[:_LOOKED_AT]
-    few = frames.some(np.sort(fastest))
     delays = np.arange(_EARLIEST, _LATEST + 0.5 * _STEP, _STEP)
     off = []
     for delay in delays:
-        predicted = predict(calibration, _joints(ways, few, few.t - delay))[:, view]
-        distance = np.nanmedian(np.linalg.norm(predicted - few.s, axis=-1), axis=1)
-        off.append(np.mean(np.log(distance + 0.1 * calibration.sigma_px)))
+        predicted = predict(calibration, _joints(ways, frames, frames.t - delay))[:, view]
+        predicted = np.where(np.isfinite(predicted), predicted, _NOWHERE)
+        distance = np.nanmedian(np.linalg.norm(predicted - frames.s, axis=-1), axis=1)
+        off.append(np.mean(np.log(distance + calibration.sigma_px)))
     return float(delays[int(np.argmin(off))])
 
 

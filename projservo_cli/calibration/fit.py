@@ -275,6 +275,8 @@ def _degrees_of_freedom(problem: LeastSquares, scene: Scene, used: BoolArray) ->
 
 
 _NOISE_ROUNDS, _NOISE_SETTLED = 5, 0.01
+# Relative difference of residuals below which two fits have ended at one place.
+_SAME_LEVEL = 1e-3
 
 
 def with_joint_noise(exact: Solution, expected: Expected, given: float | None) -> Solution:
@@ -298,9 +300,17 @@ def with_joint_noise(exact: Solution, expected: Expected, given: float | None) -
         problem = exact.problem.with_noise(noise.tau(exact.problem.readings.prismatic))
         found = fit_inliers(problem, solution.scene, noise.sigma_q / noise.over_pixels)
         if found is None:
-            return exact
+            return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)
         if given is None and before is None and _contradicted(exact, solution):
+            return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
+    if given is not None:
+        return solution
+    # Joints that may err lead out of some wrong fits, beside which anything would do.
+    back = fit_inliers(exact.problem, dataclasses.replace(solution.scene, offsets=None), exact.sigma_px)
+    if back is not None and back.sigma_px < (1.0 - _SAME_LEVEL) * exact.sigma_px:
+        exact = back
+        if _contradicted(exact, solution):
             return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
     return solution
 
@@ -337,8 +347,6 @@ _FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
 _SPOILT = 8.0
 # Most searches a pass: data that fit no robot are refused within seconds.
 _SEARCHES = 5
-# Relative difference of robust residuals below which two starts have ended at one place.
-_SAME_LEVEL = 1e-3
 
 
 def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[Solution, str]:

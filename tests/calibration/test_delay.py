@@ -75,7 +75,7 @@ def on_the_way(robot, cameras, rng, *, stamped=False, tick=0.0):
     return dataclasses.replace(seen, t_view=stamps if stamped else None), np.array([np.mean(d) for d in late])
 
 
-@pytest.mark.parametrize("late", [0.0, 0.04, 0.3])
+@pytest.mark.parametrize("late", [0.0, 0.3])
 @pytest.mark.parametrize("free", [False, True])
 @pytest.mark.parametrize("stamped", [False, True])
 def test_delay_of_each_view_is_within_5_ms_and_its_interval(known, late, free, stamped):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from projservo_cli.calibration import calibrate, chi2_band, predict, prediction_variance
+from projservo_cli.calibration import calibrate, chi2_band, cross_validate, predict, prediction_variance
 from projservo_cli.calibration.joint_noise import tick_noise
 from tests.calibration.bound import derivative, images, parameters, spread
 from tests.calibration.simulated_robot import around, random_robot, trials
@@ -120,3 +120,17 @@ def test_ticks_are_counted():
     assert found.sigma_q == pytest.approx(tick / np.sqrt(12.0))
     assert "ticks" in found.reason
     assert tick_noise(q, np.zeros(4, dtype=bool)) == 0.0
+
+
+def test_poses_held_out_err_as_predicted():
+    _, _, seen = recorded(8, normal)
+    held_out = []
+    calibrate(
+        seen,
+        TYPES,
+        source="recorded",
+        joint_noise=None,
+        fitted=lambda *fit: held_out.append(cross_validate(*fit, folds=4, seed=0)),
+    )
+    assert held_out[0].rms_px == pytest.approx(held_out[0].predicted_rms_px, rel=0.15)
+    assert held_out[0].predicted_rms_px > 1.3 * np.sqrt(2.0) * SIGMA
