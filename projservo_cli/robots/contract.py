@@ -18,8 +18,9 @@ from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
 STOP_S = 10.0
-# Share of a bound by which rounding may exceed it, and of a period to which an instant is kept.
-_ROUND_OFF, _LATE = 1e-9, 1e-3
+# Share of a bound by which rounding may exceed it, and of a period by which an instant may be missed: the
+# time steps of a simulator seldom end where a command is due.
+_ROUND_OFF, _LATE = 1e-9, 0.1
 
 
 class Reading(NamedTuple):
@@ -156,7 +157,7 @@ class ForeignRobot:
         self._sent, self._due = target.copy(), due
 
     def wait_until(self, due: float) -> bool:
-        """Wait until the clock shows an instant, s, to a thousandth of a period; whether that was past."""
+        """Wait until the clock shows an instant, s, to a tenth of a period; whether that was past."""
         before, asleep = self.now(), time.monotonic()
         now, slack = before, _LATE * self.bounds.period
         while now < due - slack:
@@ -164,8 +165,8 @@ class ForeignRobot:
             now = self.now()
             if now == before and time.monotonic() > asleep + self.timeout_s:
                 raise WorkFailed(
-                    f"{self.name}: its clock stands still at {now:.6g} s: now() must go on by itself, or "
-                    "command() move it to when it is due"
+                    f"{self.name}: its clock stands still at {now:.6g} s, before {due:.6g} s: now() must go "
+                    "on by itself, or command() move it to when it is due"
                 )
         return before > due + slack
 
