@@ -73,6 +73,7 @@ class _Sums(NamedTuple):
     """Normal equations of looks."""
 
     looks: int  # number of the last of them
+    t: float  # and when it was taken, s from the first one
     normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
     seen: FloatArray  # (2, m) coordinates seen of each marker
 
@@ -153,13 +154,15 @@ class Innovation:
         self._chance = _FALSE_ALARM / np.log1p(observations / _SOON)
         self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (2 + m)))
         c = self._factor.shape[1] + self._f + 1
-        self._sums = [_Sums(0, np.zeros((c, c)), np.zeros((2, m)))]
+        self._sums = [_Sums(0, 0.0, np.zeros((c, c)), np.zeros((2, m)))]
         self._pending: list[tuple[BoolArray, _Sums]] = []
         self._readings: list[FloatArray] = []
         self._doubtful = 0
         self._waiting: tuple[list[_Frame], list[_Frame]] = ([], [])
         self._reached = np.full(2, -np.inf)
         self._first: FloatArray | None = None
+        self._start: float | None = None
+        self._t = np.zeros(2)
         self._at_rest = True
 
     @property
@@ -217,6 +220,8 @@ class Innovation:
         assert one is not None
         both = [frame or one._replace(image=np.full_like(one.image, np.nan)) for frame in frames]
         self._delay_sigma = np.array([frame.sigma for frame in both])
+        self._start = one.t if self._start is None else self._start
+        self._t = np.array([frame.t for frame in both]) - self._start
         q, q_dot, images = (np.stack([frame[i] for frame in both]) for i in (1, 2, 4))
         look = self._look(q, q_dot, images)
         self._readings.append(q[0])
@@ -263,7 +268,8 @@ class Innovation:
         F, d = np.zeros((2, m, 2, self._f)), len(self._twists)
         velocity = Y[:n] @ self._scene.H_hat[:, None].swapaxes(2, 3)
         J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
-        F[..., :n], F[..., n : 2 * n] = J_q, J_q * len(self._readings)
+        t = self._t[:, None, None, None]
+        F[..., :n], F[..., n : 2 * n], F[..., -n:] = J_q, J_q * t, J_q * t**2
         by_marker, first = D[n] @ self._directions.T, 2 * n + 2
         for v in (0, 1):
             F[v, ..., 2 * n + v] = -J_q[v] @ q_dot[v]
@@ -273,7 +279,7 @@ class Innovation:
             F[:, j, :, first : first + 3] = by_marker[:, j]
             first += 3
         F[..., first : first + d] = D[n] @ np.moveaxis(self._scene.M @ self._twists.swapaxes(1, 2), 0, -1)
-        F[..., first + d :] = D[0] @ np.moveaxis(Y[0] @ self._twists[:, None].swapaxes(2, 3), 0, -1)
+        F[..., first + d : -n] = D[0] @ np.moveaxis(Y[0] @ self._twists[:, None].swapaxes(2, 3), 0, -1)
         return F
 
     def _error_root(self, sums: _Sums) -> FloatArray:
@@ -301,7 +307,8 @@ class Innovation:
         rows = np.concatenate([look.B, look.F, look.r[:, None]], axis=1)
         root = np.linalg.cholesky(look.R + (_BENT * off) ** 2 * np.eye(len(look.R)))
         rows = solve_triangular(root, rows, lower=True, check_finite=False)
-        return _Sums(len(self._readings), rows.T @ rows, 2.0 * look.seen.astype(np.float64))
+        t = float(self._t.mean())
+        return _Sums(len(self._readings), t, rows.T @ rows, 2.0 * look.seen.astype(np.float64))
 
     def _keep(self, new: _Sums) -> None:
         """Add a look; of earlier sums those are kept that tell an onset to a quarter of its age."""
@@ -320,15 +327,16 @@ class Innovation:
         """
         e, n = self._factor.shape[1], len(self._sigma_q)
         across = (total.normal - since.normal)[:, e:]
-        across[:, n : 2 * n] -= since.looks * across[:, :n]  # looks are counted from the onset
-        across[e + n : e + 2 * n] -= since.looks * across[e : e + n]
+        for part in (across.T, across[e:]):  # time is from the onset
+            part[-1 - n : -1] += since.t * (since.t * part[:n] - 2.0 * part[n : 2 * n])
+            part[n : 2 * n] -= since.t * part[:n]
         least = _RIDGE * across[e:].diagonal()
         across[:e, -1] = total.normal[:e, -1]
         W = solve_triangular(self._error_root(total), across[:e], lower=True, check_finite=False)
         normal = across[e:] - W.T @ W
         beside = np.concatenate([np.arange(2 * n + 2), *held])
         weight = np.diag(least[beside])
-        weight[: 2 * n + 2, : 2 * n + 2] = self._lasting(total.looks - since.looks)
+        weight[: 2 * n + 2, : 2 * n + 2] = self._lasting(total.t - since.t)
         information = normal[np.ix_(beside, beside)] + weight
         solved = np.linalg.solve(information, normal[beside])
         lasting = float(normal[beside, -1] @ solved[:, -1])
@@ -340,18 +348,18 @@ class Innovation:
         count = (total.seen - since.seen).ravel()
         return _Evidence(since, lasting, cost, gain, amount, self._touches @ count, float(count.sum()))
 
-    def _lasting(self, looks: int) -> FloatArray:
-        """Information (2 n + 2, 2 n + 2) on errors of joints, their drift from look to look, and of instants.
+    def _lasting(self, seconds: float) -> FloatArray:
+        """Information (2 n + 2, 2 n + 2) on errors of joints, their drift with time, and of instants.
 
-        Over so many looks joints are off by a straight line, its middle and its slope by what lasts.
+        Over that time joints are off by a straight line, its middle and its slope by what lasts.
         """
         n = len(self._sigma_q)
         weight = np.diag(
             (_LASTING * np.concatenate([self._sigma_q, self._sigma_q, self._delay_sigma])) ** -2.0
         )
         line = np.eye(2 * n + 2)
-        line[:n, n : 2 * n] = 0.5 * (looks + 1) * np.eye(n)
-        line[n : 2 * n, n : 2 * n] = looks / np.sqrt(12.0) * np.eye(n)
+        line[:n, n : 2 * n] = 0.5 * seconds * np.eye(n)
+        line[n : 2 * n, n : 2 * n] = max(seconds, _LEAST_ERROR) / np.sqrt(12.0) * np.eye(n)
         return np.asarray(line.T @ weight @ line)
 
     def _beyond(self, evidence: _Evidence) -> BoolArray:
@@ -360,7 +368,9 @@ class Innovation:
         most = np.sqrt(chdtri(self._sizes, tail)) + self._floor * np.sqrt(evidence.touched)
         possible = np.sqrt(evidence.gain) > most
         if possible.any():
-            still = np.ptp(self._readings[evidence.since.looks :], axis=0) <= _STILL
+            # It may have begun while the first look of them was taken.
+            rows = self._readings[min(evidence.since.looks + 1, len(self._readings) - 1) :]
+            still = np.ptp(rows, axis=0) <= _STILL
             for i, cause in enumerate(self._causes):
                 if cause.kind == "frozen":
                     possible[i] &= still.all() if cause.which < 0 else still[cause.which] and not still.all()
@@ -388,6 +398,8 @@ class Innovation:
             return ""
         self._doubtful += 1
         best, *others = sorted(blamed, key=lambda blame: -blame.score)
+        who = self._causes[best.causes[0]][:2]
+        others = [blame for blame in others if self._causes[blame.causes[0]][:2] != who]
         clear = not others or best.score - others[0].score >= _CLEAR
         if not clear and self._doubtful < _PATIENCE:
             return ""
@@ -476,7 +488,7 @@ class Innovation:
 
 def _with(sums: _Sums, new: _Sums) -> _Sums:
     """Sums and a look more."""
-    return _Sums(new.looks, sums.normal + new.normal, sums.seen + new.seen)
+    return _Sums(new.looks, new.t, sums.normal + new.normal, sums.seen + new.seen)
 
 
 def _gains(
@@ -501,7 +513,8 @@ def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray)
 def _table_of(n: int, m: int, d: int) -> tuple[list[_Cause], int]:
     """All causes, and how many regressors they have.
 
-    Those are: joints, joints times looks, delays, cameras, markers, rigid motions of the tool and of the rig.
+    Those are: joints, joints that go on, delays, cameras, markers, rigid motions of the tool and of the rig,
+    joints that go on ever faster.
     """
     everything = np.ones((2, m), dtype=np.bool_)
     views = [everything & (np.arange(2)[:, None] == v) for v in (0, 1)]
@@ -509,7 +522,10 @@ def _table_of(n: int, m: int, d: int) -> tuple[list[_Cause], int]:
     at_marker = at_camera + 2 * free
     at_tool = at_marker + 3 * m
     causes = [_Cause("slipped", i, np.array([i]), everything) for i in range(n)]
-    causes += [_Cause("frozen", i, np.array([n + i]), everything) for i in range(n)]
+    at_faster = at_tool + 2 * d
+    for i in range(n):
+        causes.append(_Cause("frozen", i, np.array([n + i]), everything))
+        causes.append(_Cause("frozen", i, np.array([i, n + i, at_faster + i]), everything))
     causes.append(_Cause("frozen", -1, n + np.arange(n), everything))
     for v in (0, 1):
         causes.append(_Cause("late", v, np.array([2 * n + v]), views[v]))
@@ -520,4 +536,4 @@ def _table_of(n: int, m: int, d: int) -> tuple[list[_Cause], int]:
         causes.append(_Cause("marker", j, columns, everything & (np.arange(m) == j)))
     causes.append(_Cause("tool", -1, at_tool + np.arange(d), everything))
     causes.append(_Cause("rig", -1, at_tool + d + np.arange(d), everything))
-    return causes, at_tool + 2 * d
+    return causes, at_faster + n

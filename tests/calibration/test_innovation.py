@@ -232,7 +232,7 @@ FAULTS = [
 ]
 
 
-@pytest.mark.parametrize("seed", [5, 6])
+@pytest.mark.parametrize("seed", [5, 8])
 @pytest.mark.parametrize(("strikes", "name"), FAULTS, ids=[name for _, name in FAULTS])
 def test_each_fault_is_named_soon(arm, strikes, name, seed):
     """With 4,096 ticks; struck at a third of the way."""
