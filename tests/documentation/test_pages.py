@@ -104,8 +104,8 @@ def check_commands(folder, names, read):
     assert {"name", "type", "excitation", "weak"} <= set(found["calibrate"]["joints"][0])
     assert told["plan"] - {"least", "mu"} <= set(found["plan"])
     assert {"least", "mu"} == set(found["plan"]["margins"]["joints"])
-    assert cli.run(["record", "-c", "configs/ur5.yaml", "--output", "trials.csv"]) == 0
-    read()
+    assert cli.run(["record", "-c", "configs/ur5.yaml", "--output", "trials.csv", "--json"]) == 0
+    assert told["record"] == set(json.loads(read()))
     assert cli.run(["validate", "results/ur5", "--data", "trials.csv", "--json"]) == 0
     assert told["validate"] | {"run"} == set(json.loads(read()))
 
