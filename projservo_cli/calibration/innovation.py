@@ -36,6 +36,8 @@ _BENT = 0.2
 _CLEAR, _PATIENCE, _LEFT = 2.0 * np.log(100.0), 12, 0.25
 # Frames of both views so near to each other, s, are one look; so many are kept for those of the other view.
 _TOGETHER_S, _WAITING = 0.025, 25
+# Frames that are so near show joints of one reading.
+_AT_ONCE_S = 1e-4
 # Joints that differ by no more stand still, rad or m: as they were read, and since the first look.
 _STILL, _AT_REST = 1e-9, 1e-3
 
@@ -106,7 +108,7 @@ class Innovation:
         r = J δ + J_q δq + (J_q q̇) δd + ε
 
     to first order: δ ~ N(0, Σ), errors of the calibration, the same all along; δq of the joint readings, the
-    same in both views; δd of the instant of each frame; ε ~ N(0, σ² I), pixel noise. Errors of joints and
+    same in both views of one instant; δd of the instant of each frame; ε ~ N(0, σ² I), pixel noise. Errors of joints and
     instants are taken to be new in each look *and* to last, by a part that is constant since an onset: they
     do not average away. Nor does an error of the model, which may add to the root of a statistic what it
     can if it is ``model_px`` everywhere.
@@ -252,8 +254,12 @@ class Innovation:
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
         new = F[:, [*range(n), 2 * n, 2 * n + 1]] * np.append(self._sigma_q, self._delay_sigma)
+        late = new[:, n:]
+        if abs(self._t[0] - self._t[1]) > _AT_ONCE_S:  # joints were read anew for the other view
+            left = np.arange(rows)[:, None] < rows // 2
+            new = np.concatenate([new * left, new * ~left], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
-        bend = 0.5 * np.abs(q_dot).sum(axis=1).max() * (new[:, n:] @ self._delay_sigma)
+        bend = 0.5 * np.abs(q_dot).sum(axis=1).max() * (late @ self._delay_sigma)
         R = new @ new.T + np.diag(self._sigma**2 + bend**2)
         return _Look(seen, r.ravel(), B.reshape(rows, -1), F, R)
 
