@@ -38,6 +38,7 @@ def test_frames_are_averaged_and_their_scatter_is_told():
     assert "sigma_left_px" not in once.as_goal()["images"]
 
 
+@pytest.mark.volume
 def test_with_play_a_taught_goal_is_met_where_joints_would_miss_it(calibration, tmp_path):
     """By what the true pose shows: several times nearer than joints that play in their bearings."""
     given = config(*PLAY)
@@ -55,6 +56,7 @@ def test_with_play_a_taught_goal_is_met_where_joints_would_miss_it(calibration, 
     assert np.abs(by_joints).max() > 1.5
 
 
+@pytest.mark.volume
 def test_what_does_not_fit_the_calibration_is_told(calibration):
     taught = teach(config(), 10, AT)
     good = checked(config(), calibration, taught)
