@@ -172,9 +172,9 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
             f"({terms['center_px'][0]:.4g}, {terms['center_px'][1]:.4g})"
         )
     if value["sigma_q"] is not None:
-        yield f"  joint readings: {_joint_noise(value)}"
+        yield wrapped(f"joint readings: {_joint_noise(value)}", "  ")
     if value["delay_s"] is not None:
-        yield f"  images late by {_delays(value)}"
+        yield wrapped(f"images late by {_delays(value)}", "  ")
     weak = ", ".join(joint["name"] for joint in value["joints"] if joint["weak"])
     found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in LISTS if value[name]]
     if weak or found:
