@@ -108,10 +108,10 @@ class Innovation:
         r = J δ + J_q δq + (J_q q̇) δd + ε
 
     to first order: δ ~ N(0, Σ), errors of the calibration, the same all along; δq of the joint readings, the
-    same in both views of one instant; δd of the instant of each frame; ε ~ N(0, σ² I), pixel noise. Errors of joints and
-    instants are taken to be new in each look *and* to last, by a part that is constant since an onset: they
-    do not average away. Nor does an error of the model, which may add to the root of a statistic what it
-    can if it is ``model_px`` everywhere.
+    same in both views of one instant; δd of the instant of each frame; ε ~ N(0, σ² I), pixel noise. Errors of
+    joints and instants are taken to be new in each look *and* to last, those of joints along a straight line
+    since an onset: they do not average away. Nor does an error of the model, which may add to the root of a
+    statistic what it can if it is ``model_px`` everywhere.
 
     All looks add up in one normal matrix. From it follow the likelihood ratios of all causes for any onset,
     beside δ and the lasting errors with their priors. Each look is first tested by itself, each view and each
@@ -395,8 +395,8 @@ class Innovation:
     def _named(self, look: _Look, gross: bool) -> str:
         """The cause in words, once it is clear or has been waited for; empty until then."""
         total = self._sums[-1]
-        half = len(self._pending) > WINDOW  # it may have happened while the first look of them was taken
-        for _, added in self._pending[half:] if gross else ():
+        # It may have happened while the first look of them was taken, which then shows half of it.
+        for _, added in self._pending[1:] if gross else ():
             total = _with(total, added)
         blamed = self._blamed(total)
         if not blamed:
