@@ -319,6 +319,30 @@ def test_a_robot_that_does_not_arrive_is_reported_and_the_rest_kept(kind, messag
         assert read_table("t.csv").at_rest.pose.tolist() == list(range(len(recording.done)))
 
 
+class Leaving(Arm):
+    """An arm that is gone after some time."""
+
+    def moved(self):
+        if self.time > 8.0:
+            raise ConnectionError("no route to the arm")
+
+
+def test_a_recording_that_failed_goes_on_with_what_is_missing():
+    config = load_config(UR5, TEN)
+    begun = stage.new_recording(config, Path("t.csv"))
+    with pytest.raises(WorkFailed, match="no route to the arm"):
+        stage.record(config, begun, driven(config, Leaving(config, lag=0.05)))
+    assert 3 < len(begun.done) < 10
+    before = read_table("t.csv")
+    recording = stage.new_recording(config, Path("t.csv"))
+    assert recording.found == len(begun.done)
+    stage.record(config, recording, driven(config, Arm(config, lag=0.05)))
+    table = read_table("t.csv")
+    assert table.at_rest.pose.tolist() == list(range(13))
+    np.testing.assert_array_equal(table.images[: recording.found], before.at_rest.images)
+    assert {*before.moving} < {*table.moving}
+
+
 def test_a_recorded_configuration_without_robot_says_which_key_to_set(projservo):
     Path("mine.yaml").write_text("data: {table: t.csv}\n")
     answer = projservo("record", "-c", "mine.yaml", "-o", "u.csv")
