@@ -72,8 +72,7 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
     the images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
     """
     period, bounds = config.control.period_s, robot.robot.bounds
-    begun, still = robot.look().q, Standstill(config.plant.settle_s)
-    assert robot.target is not None
+    begun, still = robot.look().q, _Standstill(config.plant.settle_s)
     while (gap := q - robot.target).any():
         robot.command(gap / np.max(np.abs(gap) / (bounds.speed * period), initial=1.0), period)
         stands = still.joints(robot.look())
@@ -99,7 +98,7 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
 
 def at_rest(reading: Reading, look: Callable[[], Reading], config: Config, what: str) -> Iterator[Reading]:
     """Look, a period after the other, until joints and images stand still, and yield what is read."""
-    still, first = Standstill(config.plant.settle_s), reading.t_q
+    still, first = _Standstill(config.plant.settle_s), reading.t_q
     while not still.all(reading):
         if reading.t_q > first + config.plant.settle_s + _PATIENCE_S:
             raise WorkFailed(
@@ -141,7 +140,7 @@ def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
     return mean, np.nansum((seen - mean) ** 2, axis=(0, 2)), count
 
 
-class Standstill:
+class _Standstill:
     """Whether a robot has stood still for a time, s, as one look after the other shows.
 
     Over that time, and no fewer than six looks, the means of its thirds differ by no more than noise
