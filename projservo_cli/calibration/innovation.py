@@ -409,7 +409,7 @@ class Innovation:
         clear = not others or best.score - others[0].score >= _CLEAR
         if not clear and self._doubtful < _PATIENCE:
             return ""
-        rms = np.sqrt(np.square(look.r).sum() / (2.0 * look.seen.sum()))
+        rms = np.sqrt(np.square(look.r).sum() / max(2.0 * look.seen.sum(), 1.0))
         fit = f"images are {rms:.3g} px rms per coordinate off what the calibration predicts"
         left = self._evidence(best.evidence.since, total, *self._columns(best))
         share = np.where(self._beyond(left), left.gain, 0.0) / best.evidence.gain[best.causes].sum()
@@ -450,6 +450,7 @@ class Innovation:
         return blame
 
     def _columns(self, blame: _Blame) -> list[IntArray]:
+        """Regressors of a cause, or of markers together."""
         return [self._causes[i].columns for i in blame.causes]
 
     def _said(self, blame: _Blame, look: _Look) -> str:
@@ -469,9 +470,7 @@ class Innovation:
             return f"the reading of {which} stands still while the arm moves; look at its encoder and cable"
         if kind == "late":
             ms = " and ".join(f"{1e3 * value:+.3g}" for value in amount[: self._sizes[first]])
-            return (
-                f"images of {side} come later than was taken, by {ms} ms; give plant.delay_s, or recalibrate"
-            )
+            return f"images of {side} come {ms} ms later than was taken; give plant.delay_s, or recalibrate"
         if kind == "camera":
             return f"{side} was moved, by {px:.2g} px; put it back, or recalibrate"
         if kind == "marker":
