@@ -27,7 +27,8 @@ M_PER_RAD = REACH_M / REACH_RAD
 # Noise of joints that is looked for, rad: of the best encoders, and beyond any robot.
 _LEAST, _MOST = 1e-6, np.radians(1.0)
 _GRID, _FARTHER, _NEVER = 33, 5.0, 1e30
-_SHARE = 0.005  # of what is left without noise of joints, that pixels may be to blame for, at least
+_SHARE = 0.001  # of what is left without noise of joints, that pixels may be to blame for, at least
+_OPEN = 1e-12  # information of a direction that images leave open, over that of the best known one
 # Twice the gain of the logarithm of the likelihood by chance: in 1 of 100 at the border; 95 % of an interval.
 _SIGNIFICANT, _INTERVAL = 5.412, 3.841
 # Ticks are no finer than this, rad or m; readings lie on them to this share.
@@ -115,7 +116,10 @@ class _Likelihood:
         A = problem.normal(J, weight)
         scale = np.sqrt(np.maximum(np.diagonal(A), 1e-300))
         free = np.linalg.qr(scale[:, None] * problem.gauge(scene), mode="complete")[0]
-        self.free = free[:, problem.gauge(scene).shape[1] :] / scale[:, None]
+        free = free[:, problem.gauge(scene).shape[1] :] / scale[:, None]
+        # A robot of one or two joints leaves more open than the gauge.
+        values, basis = np.linalg.eigh(free.T @ A @ free)
+        self.free = free @ basis[:, values > _OPEN * values[-1]]
         self.dof = 2 * int(np.count_nonzero(used)) - self.free.shape[1]
         B = problem.coupling(J, G, weight).reshape(problem.size, *problem.q.shape).swapaxes(0, 1)
         self.eigenvalue, V = np.linalg.eigh(problem.offset_normal(G, weight))

@@ -134,3 +134,13 @@ def test_poses_held_out_err_as_predicted():
     )
     assert held_out[0].rms_px == pytest.approx(held_out[0].predicted_rms_px, rel=0.15)
     assert held_out[0].predicted_rms_px > 1.3 * np.sqrt(2.0) * SIGMA
+
+
+def test_what_a_robot_of_one_joint_leaves_open_does_no_harm():
+    rng = np.random.default_rng(1)
+    robot = random_robot("R", rng, 6)
+    seen = robot.observe(trials(robot, frames=16), SIGMA, rng)
+    assert calibrate(seen, "R", source="recorded", joint_noise=None).sigma_q == 0.0
+    seen.q[:] += SIGMA_Q * rng.standard_normal(seen.q.shape)
+    low, high = calibrate(seen, "R", source="recorded", joint_noise=None).sigma_q_interval
+    assert 0.0 < low < SIGMA_Q < high
