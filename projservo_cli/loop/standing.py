@@ -29,8 +29,11 @@ _SETTLED = 0.5
 _MORE, _GROWN, _LOOKS = 15, 3.0, 5
 # Progress is an image error that falls by this share below its least so far.
 _FALL = 0.01
-# Joints stand that move by less than so many deviations of their readings, or than this, rad or m.
+# Joints stand that move by less than so many deviations of their readings, or than this, rad or m; set-points
+# do by the latter.
 _DEVIATIONS, _LEAST = 4.0, 3e-4
+# A joint does not follow that stays while its set-point moves by so many times its sag.
+_STAYS = 2.0
 # Windows without progress after which a robot that moves to and fro is given up.
 _PATIENCE = 8
 # A window lasts so many times as long as images and servos are late.
@@ -95,28 +98,29 @@ class Standing:
         if idle < window:
             return verdict
         moved, sent = (np.ptp(rows[-window:], axis=0) for rows in (self._read, self._sent))
-        short: BoolArray = np.all(self._short[-window:], axis=0)
-        stands = bool((moved <= self._still).all())
-        if stands and short.any():
-            self._say_who_stays(short)
+        moved_since, sent_since = (np.ptp(rows[self._since :], axis=0) for rows in (self._read, self._sent))
+        stands, sag = bool((moved <= self._still).all()), self._robot.known.servo.sag
+        short: BoolArray = np.all(self._short[-window:], axis=0) & stands
+        stays = (moved_since <= self._still) & (sent_since > _STAYS * np.maximum(sag, self._still)) | short
+        if stays.any():
+            self._say_who_stays(stays)
             return NOT_FOLLOWING
-        if stands and (sent <= self._still).all():
+        if stands and (sent <= _LEAST).all():
             self.why, self.minimum = "the law asks for no motion there, a local minimum", True
             return PLATEAU
-        to_and_fro = (moved <= np.maximum(self._robot.known.servo.sag, self._still)).all()
-        if to_and_fro and idle >= _PATIENCE * window:
-            self._say_what_holds(*(np.ptp(rows[self._since :], axis=0) for rows in (self._read, self._sent)))
+        if (moved <= np.maximum(sag, self._still)).all() and idle >= _PATIENCE * window:
+            self._say_what_holds(moved_since, sent_since)
             return PLATEAU
         return verdict
 
-    def _say_who_stays(self, short: BoolArray) -> None:
-        """A joint stays where it is however far ahead its set-point is."""
-        gap = np.abs(self._sent[-1] - self._read[-1]) * short
+    def _say_who_stays(self, stays: BoolArray) -> None:
+        """A joint stays where it is however far its set-point goes."""
+        gap = np.abs(self._sent[-1] - self._read[-1]) * stays
         i = int(np.argmax(gap))
         self.why = (
-            f"joint {i + 1} stands at {self._read[-1][i]:.6g}, {gap[i]:.3g} (rad or m) short of a set-point "
-            "that may lead no farther: look whether it is blocked, braked or in a protective stop, or raise "
-            "plant.sag_deg or plant.lead_deg"
+            f"joint {i + 1} stands at {self._read[-1][i]:.6g}, {gap[i]:.3g} (rad or m) off its set-point: "
+            "look whether it is blocked, braked or in a protective stop, or raise plant.sag_deg or "
+            "plant.lead_deg"
         )
 
     def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:

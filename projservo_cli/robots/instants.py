@@ -27,7 +27,7 @@ _COUNTED, _LEAST_CHANCE = 8.0, 1e-9
 # A frame farther from its instant than so many deviations is none of this delay, nor are so many in a row; it
 # fits so much better elsewhere, in squares.
 _GATE, _STRAYS, _CLEARLY = 4.0, 3, 9.0
-# How fast a delay may change, s for each frame that tells it; so many frames in a row err alike, by the model.
+# How fast a delay may change, s for each frame that tells it; so many in a row err alike, by the model.
 _DRIFT_S, _ALIKE = 0.2e-3, 10.0
 # What the model is off at least where it tells the instant of a frame, px.
 _MODEL_PX = 0.3

@@ -92,7 +92,10 @@ class Faulty(Sound):
         return q, s
 
     def command(self, target, speed, due):
+        before = self.q
         super().command(target, speed, due)
+        if self.wrong and self.fault == "blocked":
+            self.q = np.where(np.arange(len(before)) == 2, before, target)
         if self.wrong and self.fault == "command raises":
             raise RuntimeError("protective stop")
 

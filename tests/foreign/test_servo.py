@@ -160,6 +160,17 @@ def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, messag
     assert np.isfinite(trace.s[-1]).all() == fault.startswith("command")
 
 
+def test_a_joint_that_is_blocked_is_named_while_the_run_goes_on(servo):
+    answer = servo(*faulty("blocked", 80), "--json", law="exact")
+    (told,) = answer.json["laws"]
+    assert told["verdict"] == "not following"
+    assert told["overruns"] == 0
+    trace = load("run").traces["exact"]
+    assert trace.reason.startswith("joint 3 stands at ")
+    assert trace.steps < 300
+    assert np.ptp(trace.q[-40:, 2]) == 0.0
+
+
 def test_after_a_failure_no_other_law_drives_the_robot(servo):
     answer = servo(*faulty("raises", 100), "--law", "exact", "--json")
     assert answer.code == 1

@@ -58,7 +58,7 @@ def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
         lambda k: 50.0, lambda k: (0.5, 0.1), lambda k: (0.9, min(0.1 + 0.01 * k, 0.4)), short=(True, False)
     )
     assert ruled == NOT_FOLLOWING
-    assert standing.why.startswith("joint 1 stands at 0.5, 0.4 (rad or m) short")
+    assert standing.why.startswith("joint 1 stands at 0.5, 0.4 (rad or m) off")
     assert k < 60
 
 
