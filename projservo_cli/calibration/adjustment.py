@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
+from scipy.sparse import csr_array
 
 from projservo_cli.calibration.forward import CAMERA, LENS, Scene, image_points
 from projservo_cli.calibration.readings import RAYLEIGH, Readings
@@ -110,9 +111,9 @@ class LeastSquares:
 
     def strain(self, scene: Scene) -> FloatArray:
         """Offsets (K, n) of a scene in units of their noise, times that of pixels: px; none without noise."""
-        if self.tau is None or scene.offsets is None:
+        if self.tau is None:
             return np.zeros((0, len(self.q_reference)))
-        return np.asarray(scene.offsets / self.tau)
+        return np.zeros_like(self.q) if scene.offsets is None else np.asarray(scene.offsets / self.tau)
 
     def with_noise(self, tau: FloatArray | None) -> "LeastSquares":
         """The same problem with other noise of joints (n,) over that of pixels, rad/px or m/px."""
@@ -236,20 +237,6 @@ class LeastSquares:
         np.add.at(result, self.readings.pose_of, values)
         return result
 
-    def coupling(self, J: FloatArray, G: FloatArray, weight: FloatArray) -> FloatArray:
-        """Jᵀ W G (size, K n) with G (2, N, 2, n) the derivative by offsets of each pose."""
-        weighted = weight[..., None, None] * G
-        B = np.zeros((len(self.q), self.size, G.shape[-1]))
-        for v, rows, columns in self._blocks():
-            # A pose sees a marker once: no two rows of a block are of one pose.
-            block = np.swapaxes(J[v, rows], 1, 2) @ weighted[v, rows]
-            B[self.readings.pose_of[rows, None], columns] += block
-        return np.swapaxes(B, 0, 1).reshape(self.size, -1)
-
-    def offset_normal(self, G: FloatArray, weight: FloatArray) -> FloatArray:
-        """Gᵀ W G (K, n, n) of each pose."""
-        return self.at_poses((np.swapaxes(G, 2, 3) @ (weight[..., None, None] * G)).sum(axis=0))
-
     def dense(self, J: FloatArray, mask: BoolArray) -> FloatArray:
         """The whole derivative (4 N, size), zero outside a mask (2, N), for what needs more than JᵀJ."""
         result = np.zeros((*J.shape[:3], self.size))
@@ -258,17 +245,46 @@ class LeastSquares:
 
     def whitened(self, scene: Scene, rows: FloatArray, mask: BoolArray) -> FloatArray:
         """S^-½ times rows (4 N, c) of coordinates in a mask (2, N), S = I + G τ² Gᵀ of each pose."""
-        if self.tau is None:
-            return rows
-        G = self.joint_derivative(scene)[1] * (self.tau * mask[..., None, None])
-        rows, pose_of = rows.reshape(*G.shape[:3], -1).copy(), self.readings.pose_of
-        for k in np.unique(pose_of):
-            here = rows[:, pose_of == k]
-            U, s, _ = np.linalg.svd(G[:, pose_of == k].reshape(-1, G.shape[-1]), full_matrices=False)
-            flat = here.reshape(len(U), -1)
-            less = U @ ((1.0 - 1.0 / np.sqrt(1.0 + s**2))[:, None] * (U.T @ flat))
-            rows[:, pose_of == k] = (flat - less).reshape(here.shape)
-        return rows.reshape(-1, rows.shape[-1])
+        return rows if self.tau is None else JointErrors(self, scene, mask, self.tau).whitened(rows)
+
+
+class JointErrors:
+    """First order of the images about a scene by errors of joint readings, (K, n) in units (n,), rad or m.
+
+    Of each pose √w G = U s Vᵀ, with weights w (2, N) and derivatives G (2, N, 2, n); the covariance of the
+    images by errors of unit variance is I + G Gᵀ.
+    """
+
+    def __init__(self, problem: LeastSquares, scene: Scene, weight: FloatArray | BoolArray, unit: FloatArray):
+        (K, n), self.pose_of = problem.q.shape, problem.readings.pose_of
+        root = np.sqrt(weight)[..., None, None]
+        self.G = problem.joint_derivative(scene)[1] * unit
+        weighted = root * self.G
+        self.V = np.linalg.eigh(problem.at_poses((np.swapaxes(weighted, 2, 3) @ weighted).sum(axis=0)))[1]
+        along = weighted @ self.V[self.pose_of]
+        self.square: FloatArray = problem.at_poses((along**2).sum(axis=(0, 2)))  # (K, n): s²
+        rows = root * along / np.sqrt(np.maximum(self.square, 1e-300))[self.pose_of][:, None]
+        columns = np.broadcast_to(n * self.pose_of[:, None, None] + np.arange(n), rows.shape)
+        starts = np.arange(0, rows.size + 1, n)
+        self._U = csr_array((rows.ravel(), columns.ravel(), starts), shape=(rows.size // n, K * n))
+
+    def parts(self, rows: FloatArray) -> FloatArray:
+        """Uᵀ √w rows (4 N, …): (K n, …)."""
+        return np.asarray(self._U.T @ rows)
+
+    def whitened(self, rows: FloatArray) -> FloatArray:
+        """(I + G Gᵀ)^-½ rows (4 N, c), for weights of zero and one, in coordinates that count."""
+        share = 1.0 - 1.0 / np.sqrt(1.0 + self.square.reshape(-1, 1))
+        return np.asarray(rows - self._U @ (share * self.parts(rows)))
+
+    def undoing(self, change: FloatArray) -> FloatArray:
+        """The errors (K, n) of unit variance that best undo a change (2, N, 2) of the images."""
+        parts = self.parts(change.ravel()).reshape(self.square.shape)
+        return -np.asarray((self.V @ (np.sqrt(self.square) / (1.0 + self.square) * parts)[..., None])[..., 0])
+
+    def change(self, errors: FloatArray) -> FloatArray:
+        """Change (2, N, 2) of the images by errors (K, n)."""
+        return np.asarray((self.G @ errors[self.pose_of][..., None])[..., 0])
 
 
 # Largest ratio of second-order to first-order step, and the probe of the second derivative, as by the source.
@@ -293,31 +309,6 @@ class _Fit:
     cost: float  # weighted sum of squares, px²
 
 
-class _Offsets:
-    """First order of the images about a scene by offsets of joint readings, (K, n) in units of tau."""
-
-    def __init__(self, problem: LeastSquares, scene: Scene, weight: FloatArray) -> None:
-        assert problem.tau is not None
-        self.problem, self.weight = problem, weight
-        self.G = problem.joint_derivative(scene)[1] * problem.tau
-        normal = problem.offset_normal(self.G, weight)
-        self.inverse = np.linalg.inv(normal + np.eye(normal.shape[-1]))
-        self.strain = np.zeros_like(problem.q) if scene.offsets is None else problem.strain(scene)
-
-    def gradient(self, change: FloatArray, strain: FloatArray) -> FloatArray:
-        """Gradient (K, n) of a change (2, N, 2) of the images and of a strain (K, n)."""
-        weighted = (self.weight[..., None] * change)[..., None, :] @ self.G
-        return strain + self.problem.at_poses(weighted[..., 0, :].sum(axis=0))
-
-    def solved(self, g: FloatArray) -> FloatArray:
-        """Offsets (K, n) of a gradient (K, n)."""
-        return np.asarray((self.inverse @ g[..., None])[..., 0])
-
-    def change(self, offsets: FloatArray) -> FloatArray:
-        """First-order change (2, N, 2) of the images by offsets (K, n)."""
-        return np.asarray((self.G @ offsets[self.problem.readings.pose_of][..., None])[..., 0])
-
-
 class _Expansion:
     """First order of the images about a scene, with weights (2, N), by the parameters from a first one on."""
 
@@ -328,11 +319,14 @@ class _Expansion:
         first = problem.size - len(least)
         self.J = problem.derivative(scene)[1]
         A = problem.normal(self.J, weight)
-        self.offsets = None if problem.tau is None else _Offsets(problem, scene, weight)
-        if self.offsets is not None:
-            self.B = problem.coupling(self.J, self.offsets.G, weight)
-            by_pose = self.B.reshape(problem.size, *problem.q.shape).swapaxes(0, 1) @ self.offsets.inverse
-            A -= by_pose.swapaxes(0, 1).reshape(self.B.shape) @ self.B.T
+        self.errors, self.strain, self.raw = None, np.zeros(0), residual
+        if problem.tau is not None:
+            self.errors, self.strain = JointErrors(problem, scene, weight, problem.tau), problem.strain(scene)
+            self.raw = residual - self.errors.change(self.strain)  # at the joints as read
+            B = self.errors.parts(problem.dense(self.J, np.ones_like(problem.readings.seen)))
+            share = self.errors.square / (1.0 + self.errors.square)
+            self.by_errors = B.T * share.ravel()
+            A -= self.by_errors @ B
         A = A[first:, first:]
         # Units in which the diagonal is at most one, and the gauge tied.
         self.scale = np.maximum(least, np.sqrt(np.maximum(np.diagonal(A), 1e-300)))
@@ -347,32 +341,31 @@ class _Expansion:
             factor = cho_factor(self.A + damping * np.eye(len(self.A)))
         except np.linalg.LinAlgError:
             return None
-        problem, offsets, count = self.problem, self.offsets, len(self.A)
+        problem, errors, count = self.problem, self.errors, len(self.A)
         held = np.zeros(problem.size - count)
 
-        def descent(change: FloatArray, strain: FloatArray) -> FloatArray:
-            """Step in units of the scale that undoes a change (2, N, 2) of the images and a strain (K, n)."""
+        def descent(change: FloatArray) -> FloatArray:
+            """Step in units of the scale, and errors of joints, that undo a change (2, N, 2) of images."""
             g = problem.gradient(self.J, self.weight[..., None] * change)
-            if offsets is None:
-                return np.asarray(-cho_solve(factor, g[len(held) :] / self.scale))
-            by_offsets = offsets.gradient(change, strain)
-            g -= self.B @ offsets.solved(by_offsets).ravel()
+            if errors is not None:
+                g -= self.by_errors @ errors.parts(change.ravel())
             step = -cho_solve(factor, g[len(held) :] / self.scale)
-            x = np.concatenate([held, step / self.scale])
-            further = offsets.solved(by_offsets + (x @ self.B).reshape(problem.q.shape))
-            return np.concatenate([step, -further.ravel()])
+            if errors is None:
+                return np.asarray(step)
+            left = change + problem.change(self.J, np.concatenate([held, step / self.scale]))
+            return np.concatenate([step, errors.undoing(left).ravel()])
 
         def whole(step: FloatArray) -> FloatArray:
             """Step of all parameters, (size,), and of offsets in units of tau."""
             return np.concatenate([held, step[:count] / self.scale, step[count:]])
 
-        none = np.zeros_like(problem.q)
-        velocity = descent(self.residual, none if offsets is None else offsets.strain)
+        velocity = descent(self.raw)
+        velocity[count:] -= self.strain.ravel()
         probe = problem.residual(problem.retract(self.scene, _PROBE * whole(velocity)))
         bend = (2.0 / _PROBE) * ((probe - self.residual) / _PROBE - self.change(whole(velocity)))
         if not np.isfinite(bend).all():
             return None
-        acceleration = descent(bend, none)
+        acceleration = descent(bend)
         if np.linalg.norm(acceleration[:count]) > _BEND * np.linalg.norm(velocity[:count]):
             return None
         return whole(velocity + 0.5 * acceleration)
@@ -380,9 +373,9 @@ class _Expansion:
     def change(self, x: FloatArray) -> FloatArray:
         """First-order change (2, N, 2) of the images by a step (size or more,)."""
         change = self.problem.change(self.J, x[: self.problem.size])
-        if self.offsets is None:
+        if self.errors is None:
             return change
-        return change + self.offsets.change(x[self.problem.size :].reshape(self.problem.q.shape))
+        return change + self.errors.change(x[self.problem.size :].reshape(self.problem.q.shape))
 
 
 def minimize(
@@ -440,13 +433,14 @@ def settled(problem: LeastSquares, scene: Scene) -> Scene:
 
     Of poses that count and of those that do not, alike: whether they should is asked of what that leaves.
     """
-    seen = problem.readings.seen
-    for _ in range(_SETTLING if problem.tau is not None else 0):
+    if problem.tau is None:
+        return scene
+    for _ in range(_SETTLING):
         residual = problem.residual(scene)
-        weight = _weights(residual, seen, robust=True)
-        offsets = _Offsets(problem, scene, weight)
-        step = offsets.solved(offsets.gradient(residual, offsets.strain))
-        scene = problem.retract(scene, np.concatenate([np.zeros(problem.size), -step.ravel()]))
+        weight = _weights(residual, problem.readings.seen, robust=True)
+        errors = JointErrors(problem, scene, weight, problem.tau)
+        offsets = problem.tau * errors.undoing(residual - errors.change(problem.strain(scene)))
+        scene = dataclasses.replace(scene, offsets=offsets)
     return scene
 
 

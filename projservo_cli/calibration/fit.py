@@ -11,7 +11,7 @@ from scipy.special import chdtri
 from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise, quantile
+from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise, unit_noise
 from projservo_cli.calibration.readings import RAYLEIGH
 from projservo_cli.calibration.start import Nominal, Search, starts
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
@@ -293,51 +293,16 @@ def with_joint_noise(exact: Solution, expected: Expected, given: float | None) -
             noise = JointNoise(given, None, given / expected.sigma_px)
         else:
             noise = JointNoise.estimated(solution.problem, solution.scene, solution.used, sigma_px)
-        if noise.sigma_q == 0.0 or not noise.believable:
-            return dataclasses.replace(exact, joint_noise=noise if noise.believable else NO_JOINT_NOISE)
+        if noise.sigma_q == 0.0:
+            return dataclasses.replace(exact, joint_noise=noise)
         if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
             break
-        problem = exact.problem.with_noise(noise.tau(exact.problem.readings.prismatic))
+        problem = exact.problem.with_noise(noise.over_pixels * unit_noise(exact.problem.readings.prismatic))
         found = fit_inliers(problem, solution.scene, noise.sigma_q / noise.over_pixels)
         if found is None:
             return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)
-        if given is None and before is None and _contradicted(exact, solution):
-            return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
-    if given is not None:
-        return solution
-    # Joints that may err lead out of some wrong fits, beside which anything would do.
-    back = fit_inliers(exact.problem, dataclasses.replace(solution.scene, offsets=None), exact.sigma_px)
-    if back is not None and back.sigma_px < (1.0 - _SAME_LEVEL) * exact.sigma_px:
-        exact = back
-        if _contradicted(exact, solution):
-            return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
     return solution
-
-
-# What both fits may differ by: so many times what they stay below in 999 of 1,000 cases.
-_CHANCE, _LENIENT = 0.999, 2.0
-
-
-def _contradicted(exact: Solution, weighted: Solution) -> bool:
-    """Whether fits without and with noise of joints predict images that noise alone does not set apart.
-
-    Both are right where what is left is noise, and the first only wastes some of the data. Where the model
-    errs, as for links that flex, they are off by different amounts: J. A. Hausman, "Specification tests in
-    econometrics", Econometrica 46(6), 1978. The variance of their difference is that of their variances.
-    """
-    both, problem = exact.used & weighted.used, weighted.problem
-    assert problem.tau is not None
-    J = exact.problem.dense(exact.problem.derivative(exact.scene)[1], both)
-    Q = J @ exact.spread_factor()
-    R = Q.T @ (J @ weighted.spread_factor())
-    G = problem.joint_derivative(weighted.scene)[1] * (problem.tau * both[..., None, None])
-    rows = (np.swapaxes(G, 2, 3) @ Q.reshape(*G.shape[:3], -1)).sum(axis=0)  # Gᵀ Q of each sighting
-    moved = problem.at_poses(rows).reshape(-1, Q.shape[1])
-    variance = Q.T @ Q + moved.T @ moved - R @ R.T
-    variances = weighted.sigma_px**2 * np.maximum(np.linalg.eigvalsh(variance), 0.0)
-    apart = (problem.with_noise(None).residual(weighted.scene) - exact.residual)[both]
-    return float((apart**2).sum()) > _LENIENT * quantile(variances, _CHANCE)
 
 
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a

@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares
+from projservo_cli.calibration.adjustment import JointErrors, LeastSquares
 from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.records import BoolArray, FloatArray
@@ -31,6 +31,8 @@ _SHARE = 0.001  # of what is left without noise of joints, that pixels may be to
 _OPEN = 1e-12  # information of a direction that images leave open, over that of the best known one
 # Twice the gain of the logarithm of the likelihood by chance: in 1 of 100 at the border; 95 % of an interval.
 _SIGNIFICANT, _INTERVAL = 5.412, 3.841
+# What fits without and with noise may differ by: so many times what they stay below in 999 of 1,000 cases.
+_CHANCE, _LENIENT = 0.999, 1.5
 # Ticks are no finer than this, rad or m; readings lie on them to this share.
 _LEAST_TICK, _ON_TICK = 1e-5, 0.01
 
@@ -80,68 +82,76 @@ class JointNoise:
 
         low = 0.0 if none - least <= _INTERVAL else told(brentq(beyond, places[0] - _FARTHER, place))
         high = told(brentq(beyond, place, places[-1])) if beyond(places[-1]) > 0.0 else _MOST
+        if high >= _MOST:  # no noise: a model that is wrong asks for any amount of it
+            return NO_JOINT_NOISE
         if none - least <= _SIGNIFICANT:
             return cls(0.0, (0.0, high), 0.0)
         sigma_q, ratio = told(place), float(np.exp(place))
+        if likelihood.contradicted(ratio):
+            return NO_JOINT_NOISE
         counted = tick_noise(problem.readings.q, problem.readings.prismatic)
         if low <= counted <= high:
             return cls(counted, (low, high), ratio * counted / sigma_q, True)
         return cls(sigma_q, (low, high), ratio)
 
-    @property
-    def believable(self) -> bool:
-        """Whether it is noise: a model that is wrong asks for any amount of it."""
-        return self.interval is None or self.interval[1] < _MOST
 
-    def tau(self, prismatic: BoolArray) -> FloatArray:
-        """Noise (n,) of joints over that of pixels, rad/px or m/px."""
-        return self.over_pixels * unit_noise(prismatic)
-
-
-NO_JOINT_NOISE = JointNoise(0.0, None, 0.0)  # where it does not explain what is left
+NO_JOINT_NOISE = JointNoise(0.0, None, 0.0)  # where none explains what is left
 
 
 class _Likelihood:
     """Restricted likelihood of what is left of the images about a scene, at any ratio of both noises."""
 
     def __init__(self, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None) -> None:
-        self.given, weight = sigma_px, used.astype(np.float64)
-        J = problem.derivative(scene)[1]
-        unit = unit_noise(problem.readings.prismatic)
-        G = problem.joint_derivative(scene)[1] * unit
-        residual = problem.residual(scene)
-        if problem.tau is not None and scene.offsets is not None:  # as the readings left them
-            residual = residual - (G @ (scene.offsets / unit)[problem.readings.pose_of][..., None])[..., 0]
-        residual = weight[..., None] * residual
-        A = problem.normal(J, weight)
+        self.given = sigma_px
+        unit, J = unit_noise(problem.readings.prismatic), problem.derivative(scene)[1]
+        A = problem.normal(J, used.astype(np.float64))
+        errors, residual = JointErrors(problem, scene, used, unit), problem.residual(scene)
+        if problem.tau is not None:  # at the joints as read
+            residual = residual - errors.change(problem.strain(scene) * problem.tau / unit)
+        residual = used[..., None] * residual
         scale = np.sqrt(np.maximum(np.diagonal(A), 1e-300))
-        free = np.linalg.qr(scale[:, None] * problem.gauge(scene), mode="complete")[0]
-        free = free[:, problem.gauge(scene).shape[1] :] / scale[:, None]
-        # A robot of one or two joints leaves more open than the gauge.
+        gauge = scale[:, None] * problem.gauge(scene)
+        free = np.linalg.qr(gauge, mode="complete")[0][:, gauge.shape[1] :] / scale[:, None]
         values, basis = np.linalg.eigh(free.T @ A @ free)
-        self.free = free @ basis[:, values > _OPEN * values[-1]]
-        self.dof = 2 * int(np.count_nonzero(used)) - self.free.shape[1]
-        B = problem.coupling(J, G, weight).reshape(problem.size, *problem.q.shape).swapaxes(0, 1)
-        self.eigenvalue, V = np.linalg.eigh(problem.offset_normal(G, weight))
-        self.eigenvalue = np.maximum(self.eigenvalue, 0.0)
-        # The parts of each pose along the eigenvectors of its GᵀG, in the free directions of the parameters.
-        self.B = np.swapaxes(self.free.T @ (B @ V), 0, 1).reshape(self.free.shape[1], -1)
-        h = problem.at_poses((residual[..., None, :] @ G)[..., 0, :].sum(axis=0))
-        self.h = np.einsum("kij,ki->kj", V, h).ravel()
-        self.A = self.free.T @ A @ self.free
-        self.g = self.free.T @ problem.gradient(J, residual)
+        # A robot of one or two joints leaves more open than the gauge. In units in which A is the identity.
+        known = values > _OPEN * values[-1]
+        free = free @ (basis[:, known] / np.sqrt(values[known]))
+        self.dof = 2 * int(np.count_nonzero(used)) - free.shape[1]
+        self.eigenvalue = errors.square.ravel()
+        self.B = errors.parts(problem.dense(J, used) @ free)
+        self.h = errors.parts(residual.ravel())
+        self.g = free.T @ problem.gradient(J, residual)
         self.square = float((residual**2).sum())
+
+    def _normal(self, ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal equations A, g in the free directions at a ratio of both noises, and shares of joints."""
+        share = ratio**2 * self.eigenvalue / (1.0 + ratio**2 * self.eigenvalue)
+        A = np.eye(len(self.g)) - (self.B.T * share) @ self.B
+        return A, self.g - self.B.T @ (share * self.h), share
 
     def _parts(self, ratio: float) -> tuple[float, float]:
         """Squares that are left, px², and logarithms of determinants, at a ratio of the noises, rad/px."""
-        w = (ratio**2 / (1.0 + ratio**2 * self.eigenvalue)).ravel()
-        A = self.A - (self.B * w) @ self.B.T
-        g = self.g - self.B @ (w * self.h)
-        scale = np.sqrt(np.maximum(np.diagonal(A), 1e-300))
-        factor = cho_factor(A / np.outer(scale, scale))
-        left: float = self.square - float(w @ self.h**2) - float((g / scale) @ cho_solve(factor, g / scale))
-        logs = 2.0 * float(np.log(scale).sum() + np.log(np.diagonal(factor[0])).sum())
+        A, g, share = self._normal(ratio)
+        factor = cho_factor(A)
+        left = self.square - float(share @ self.h**2) - float(g @ cho_solve(factor, g))
+        logs = 2.0 * float(np.log(np.diagonal(factor[0])).sum())
         return max(left, 1e-300), logs + float(np.log1p(ratio**2 * self.eigenvalue).sum())
+
+    def contradicted(self, ratio: float) -> bool:
+        """Whether fits without and with noise of joints predict images that noise alone does not set apart.
+
+        Both are right where what is left is noise, and the first only wastes some of the data. Where the
+        model errs, as for links that flex, they are off by different amounts: J. A. Hausman, "Specification
+        tests in econometrics", Econometrica 46(6), 1978. Both are taken to first order about the scene,
+        so that no fit is made for nothing. The second is the most precise one where there is such noise,
+        so that the variance of the difference is the difference of the variances.
+        """
+        A, g, _ = self._normal(ratio)
+        inverse = np.linalg.inv(A)
+        apart = self.g - inverse @ g
+        variance = np.eye(len(A)) + (self.B.T * (ratio**2 * self.eigenvalue)) @ self.B - inverse
+        variances = self.sigma(ratio) ** 2 * np.maximum(np.linalg.eigvalsh(variance), 0.0)
+        return float(apart @ apart) > _LENIENT * quantile(variances, _CHANCE)
 
     def deviance(self, ratio: float) -> float:
         """Twice the negative logarithm of the likelihood, up to a constant; of the best noise of pixels."""
