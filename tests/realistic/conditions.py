@@ -58,7 +58,7 @@ CONDITIONS = {
 FIRST_ROW = (*LATE, "4,096 ticks", "lag 50 ms", "sag 0.5 deg", "all at 120 ms")
 RECORDED = (*FIRST_ROW, "free-running")
 TAUGHT = "play, taught images"
-_GUIDED = ("trajectory.profile=auto", "control.mode=track", "plant.joint_limits=stop")
+_GUIDED = ("noise.shown_frames=8", "trajectory.profile=auto", "control.mode=track", "plant.joint_limits=stop")
 
 
 def base_of(arm, condition):
