@@ -58,6 +58,7 @@ CONDITIONS = {
 FIRST_ROW = (*LATE, "4,096 ticks", "lag 50 ms", "sag 0.5 deg", "all at 120 ms")
 RECORDED = (*FIRST_ROW, "free-running")
 TAUGHT = "play, taught images"
+# Goals are shown by eight images, as somebody who teaches them would; an arm is held at its limits.
 _GUIDED = ("noise.shown_frames=8", "trajectory.profile=auto", "control.mode=track", "plant.joint_limits=stop")
 
 
@@ -106,7 +107,7 @@ def recorded_config(arm, condition, number):
 @contextmanager
 def watched():
     """Joint noise, rad, and delay (2,), s, of simulated robots meanwhile, in truth; filled in at the end."""
-    errors, ages, last = [], [], None
+    errors, ages, last, taken = [], [], None, np.full(2, np.nan)
     read = FaultyRobot.read
 
     def noted(self):
@@ -115,7 +116,9 @@ def watched():
         if last is not None and np.array_equal(last, truth):
             errors.append(answer[0] - truth)
         last = truth
-        ages.append(self.now() - self.taken)
+        fresh = self.taken != taken  # a frame that comes twice is no second one
+        ages.append(np.where(fresh, self.now() - self.taken, np.nan))
+        taken[:] = self.taken
         return answer
 
     found = {}
@@ -123,7 +126,7 @@ def watched():
         patch.setattr(FaultyRobot, "read", noted)
         yield found
     found["sigma_q"] = float(np.sqrt(np.mean(np.square(errors)))) if errors else 0.0
-    found["delay"] = np.mean(ages, axis=0) if ages else np.zeros(2)
+    found["delay"] = np.nanmean(ages, axis=0) if ages else np.zeros(2)
 
 
 def drawn(arm):
