@@ -6,7 +6,8 @@ tells its own d, and their mean and spread are that of the view: no noise has to
 carry stamps, a constant is estimated likewise, by which their clock is off that of the readings.
 """
 
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import brentq
@@ -15,7 +16,7 @@ from scipy.special import stdtrit
 from projservo_cli.calibration.joint_noise import unit_noise
 from projservo_cli.calibration.prediction import joint_derivative, predict
 from projservo_cli.calibration.readings import MAD
-from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
+from projservo_cli.records import Calibration, FloatArray, IntArray, Observation
 
 # Delays that are looked for, s, and their steps; a pixel of what no camera sees, px.
 _EARLIEST, _LATEST, _STEP, _NOWHERE = -0.1, 0.6, 0.01, 1e4
@@ -29,58 +30,94 @@ _STRAIGHT = 0.025
 _OUTLIER, _BEFORE = 4.0, 0.5
 
 
-class Delay(NamedTuple):
-    """Delays of both views, s: instant of a joint reading less the middle of the exposure of its frame."""
+@dataclass(frozen=True, eq=False)
+class _Frames:
+    """Frames of one view on the way, each once."""
 
-    mean: FloatArray  # (2,)
-    interval: FloatArray  # (2, 2) of 95 %
-    jitter: FloatArray  # (2,) deviation of single frames, beyond what pixels and joints explain
-
-
-class _Way(NamedTuple):
-    """Joints over time, as they were read on one motion."""
-
-    t: FloatArray  # (k,) s, rising
-    q: FloatArray  # (k, n) rad or m
-
-    def at(self, t: FloatArray) -> FloatArray:
-        """Joints (…, n) at instants (…,), between readings in a straight line; at rest before and after."""
-        return np.stack([np.interp(t, self.t, column) for column in self.q.T], axis=-1)
-
-
-class _Frames(NamedTuple):
-    """Frames of one view, each once."""
-
-    way: IntArray  # (f,) the motion of each
+    calibration: Calibration
+    view: int
+    ways: dict[int, tuple[FloatArray, FloatArray]]  # of each motion, instants (k,), s, and joints (k, n) then
+    way: IntArray  # (f,) the motion of each frame
     t: FloatArray  # (f,) s, of the clock of the readings: an instant which it is late after
     s: FloatArray  # (f, m, 2) px, markers as in the calibration, NaN where unseen
 
-    def some(self, which: IntArray | BoolArray) -> "_Frames":
-        """Some of them."""
-        return _Frames(self.way[which], self.t[which], self.s[which])
+    @classmethod
+    def of(
+        cls, calibration: Calibration, observation: Observation, view: int, moving: IntArray, t_q: FloatArray
+    ) -> "_Frames":
+        """Frames of a view; those that come twice only when they first came."""
+        ways = _ways(observation.q, moving, t_q)
+        known = observation.marker.tolist()
+        columns = [known.index(number) if number in known else -1 for number in calibration.marker.tolist()]
+        s = np.where(np.array(columns)[:, None] >= 0, observation.images[:, view, columns], np.nan)
+        seen = np.isfinite(s[..., 0]).sum(axis=1) >= min(_LEAST_MARKERS, s.shape[1])
+        rows = np.flatnonzero(np.isin(moving, list(ways)) & np.isfinite(t_q) & seen)
+        rows = rows[np.lexsort((t_q[rows], moving[rows]))]
+        again = [row for last, row in pairwise(rows) if np.array_equal(s[last], s[row], equal_nan=True)]
+        rows = rows[~np.isin(rows, again)]
+        t = t_q[rows]
+        if observation.t_view is not None and len(rows):
+            stamps, first = np.unique(observation.t_view[rows, view], return_index=True)
+            late = t[first] - stamps
+            if np.isfinite(late).all() and np.ptp(late) < _LATEST - _EARLIEST:  # both clocks went on
+                rows, t = rows[first], stamps + late.mean()  # by the clock of the readings
+        return cls(calibration, view, ways, moving[rows], t, s[rows])
+
+    def joints(self, delay: FloatArray | float) -> FloatArray:
+        """Joints (f, n) of each frame at a delay of its own, s: straight between readings, else at rest."""
+        at, q = self.t - delay, np.empty((len(self.t), len(self.calibration.H_hat_0)))
+        for number, (t, read) in self.ways.items():
+            here = self.way == number
+            q[here] = np.stack([np.interp(at[here], t, column) for column in read.T], axis=-1)
+        return q
+
+    def common(self) -> float:
+        """The one delay with which most frames are best predicted, roughly, s."""
+        delays = np.arange(_EARLIEST, _LATEST + 0.5 * _STEP, _STEP)
+        off = []
+        for delay in delays:
+            predicted = predict(self.calibration, self.joints(delay))[:, self.view]
+            predicted = np.where(np.isfinite(predicted), predicted, _NOWHERE)
+            distance = np.nanmedian(np.linalg.norm(predicted - self.s, axis=-1), axis=1)
+            off.append(np.mean(np.log(distance + self.calibration.sigma_px)))
+        return float(delays[int(np.argmin(off))])
+
+    def steps(self, delay: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Step (f,) of the delay of each frame to its weighted least squares, s, and its variance, s²."""
+        found, q = self.calibration, self.joints(delay)
+        q_dot = (self.joints(delay - _HALF) - self.joints(delay + _HALF)) / (2.0 * _HALF)
+        J, r = joint_derivative(found, q)[:, self.view], self.s - predict(found, q)[:, self.view]
+        unseen = np.isnan(r).any(axis=-1)
+        J[unseen], r[unseen] = 0.0, 0.0
+        J, r = J.reshape(len(q), -1, q.shape[1]), r.reshape(len(q), -1, 1)
+        velocity = -J @ q_dot[..., None]
+        prismatic = np.array([letter == "P" for letter in found.joint_types])
+        G = J * ((found.sigma_q or 0.0) * unit_noise(prismatic))
+        S = max(found.sigma_px, found.sigma_fitted_px) ** 2 * np.eye(r.shape[1]) + G @ np.swapaxes(G, 1, 2)
+        weighted = np.swapaxes(velocity, 1, 2) @ np.linalg.solve(S, np.concatenate([velocity, r], axis=2))
+        information = np.maximum(weighted[:, 0, 0], 1e-300)  # of a robot that stands still there is none
+        return weighted[:, 0, 1] / information, 1.0 / information
 
 
-def delay_of(calibration: Calibration, observation: Observation) -> Delay | None:
-    """Delay of each view by the poses in motion; None where they do not tell it.
+def with_delay(calibration: Calibration, observation: Observation) -> Calibration:
+    """The calibration with the delay of each view, its interval and jitter, where poses in motion tell them.
 
     calibration : what predicts images.
-    observation : with poses in motion, times in s.
+    observation : perhaps with poses in motion, times in s.
     """
-    if observation.moving is None or observation.t_q is None:
-        return None
-    ways = _ways(observation)
-    found = [_of_view(calibration, ways, _frames(calibration, observation, view), view) for view in (0, 1)]
-    if None in found:
-        return None
-    mean, interval, jitter = (np.array(values) for values in zip(*filter(None, found), strict=True))
-    return Delay(mean, interval, jitter)
-
-
-def _ways(observation: Observation) -> dict[int, _Way]:
-    """Joints over time of each motion, from where it was at rest just before, if that was read."""
     moving, t_q = observation.moving, observation.t_q
-    assert moving is not None
-    assert t_q is not None
+    if moving is None or t_q is None:
+        return calibration
+    views = [_Frames.of(calibration, observation, view, moving, t_q) for view in (0, 1)]
+    found = [told for told in map(_delay, views) if told is not None]
+    if len(found) < len(views):
+        return calibration
+    mean, interval, jitter = (np.array(values) for values in zip(*found, strict=True))
+    return replace(calibration, delay_s=mean, delay_interval_s=interval, delay_jitter_s=jitter)
+
+
+def _ways(q: FloatArray, moving: IntArray, t_q: FloatArray) -> dict[int, tuple[FloatArray, FloatArray]]:
+    """Joints over time of each motion, from where it was at rest just before, if that was read."""
     ways = {}
     for number in np.unique(moving[moving > 0]):
         rows = np.flatnonzero((moving == number) & np.isfinite(t_q))
@@ -88,94 +125,25 @@ def _ways(observation: Observation) -> dict[int, _Way]:
         before = np.flatnonzero((moving == 0) & (t_q < first) & (t_q >= first - _BEFORE))
         rows = np.concatenate([before[np.argsort(t_q[before])][-1:], rows])
         order = rows[np.unique(t_q[rows], return_index=True)[1]]
-        ways[int(number)] = _Way(t_q[order], observation.q[order])
+        if len(order) > 1:
+            ways[int(number)] = t_q[order], q[order]
     return ways
 
 
-def _frames(calibration: Calibration, observation: Observation, view: int) -> _Frames:
-    """Frames of a view in motion; those that come twice only when they first came."""
-    moving, t_q, t_view = observation.moving, observation.t_q, observation.t_view
-    assert moving is not None
-    assert t_q is not None
-    known = observation.marker.tolist()
-    columns = [known.index(number) if number in known else -1 for number in calibration.marker.tolist()]
-    s = np.where(np.array(columns)[:, None] >= 0, observation.images[:, view, columns], np.nan)
-    seen = np.isfinite(s[..., 0]).sum(axis=1) >= min(_LEAST_MARKERS, s.shape[1])
-    rows = np.flatnonzero((moving > 0) & np.isfinite(t_q) & seen)
-    rows = rows[np.lexsort((t_q[rows], moving[rows]))]
-    same = np.zeros(len(rows), dtype=np.bool_)
-    for i in range(1, len(rows)):
-        same[i] = np.array_equal(s[rows[i]], s[rows[i - 1]], equal_nan=True)
-    rows = rows[~same]
-    t = t_q[rows]
-    if t_view is not None and len(rows) and np.isfinite(t_view[rows, view]).all():
-        stamps = t_view[rows, view]
-        if np.ptp(t - stamps) < _LATEST - _EARLIEST:  # both clocks went on
-            first = np.sort(np.unique(stamps, return_index=True)[1])
-            rows, t, stamps = rows[first], t[first], stamps[first]
-            t = stamps + np.mean(t - stamps)  # by the clock of the readings, as late as is typical
-    return _Frames(moving[rows], t, s[rows])
-
-
-def _of_view(
-    calibration: Calibration, ways: dict[int, _Way], frames: _Frames, view: int
-) -> tuple[float, FloatArray, float] | None:
+def _delay(frames: _Frames) -> tuple[float, FloatArray, float] | None:
     """Delay, interval (2,) and jitter of a view, s; None where too few frames tell it."""
-    frames = frames.some(np.array([len(ways[int(way)].t) > 1 for way in frames.way], dtype=np.bool_))
     if len(frames.t) < _LEAST_FRAMES:
         return None
-    common = _common(calibration, ways, frames, view)
+    common = frames.common()
     delay = np.full(len(frames.t), common)
     for _ in range(_ROUNDS):
-        step, variance = _steps(calibration, ways, frames, view, delay)
+        step, variance = frames.steps(delay)
         delay = np.clip(delay + step, common - _FARTHEST, common + _FARTHEST)
-    telling = np.isfinite(variance) & (variance < _VAGUE**2)
+    telling = variance < _VAGUE**2
     if np.count_nonzero(telling) < _LEAST_FRAMES:
         return None
-    between = float(np.median(np.concatenate([np.diff(way.t) for way in ways.values()])))
+    between = float(np.median(np.concatenate([np.diff(t) for t, _ in frames.ways.values()])))
     return _mean(delay[telling], variance[telling], _STRAIGHT * between)
-
-
-def _joints(ways: dict[int, _Way], frames: _Frames, t: FloatArray) -> FloatArray:
-    """Joints (f, n) of each frame at an instant (f,) of its own."""
-    return np.array([ways[int(way)].at(at) for way, at in zip(frames.way, t, strict=True)])
-
-
-def _common(calibration: Calibration, ways: dict[int, _Way], frames: _Frames, view: int) -> float:
-    """The one delay with which most frames are best predicted, roughly, s."""
-    delays = np.arange(_EARLIEST, _LATEST + 0.5 * _STEP, _STEP)
-    off = []
-    for delay in delays:
-        predicted = predict(calibration, _joints(ways, frames, frames.t - delay))[:, view]
-        predicted = np.where(np.isfinite(predicted), predicted, _NOWHERE)
-        distance = np.nanmedian(np.linalg.norm(predicted - frames.s, axis=-1), axis=1)
-        off.append(np.mean(np.log(distance + calibration.sigma_px)))
-    return float(delays[int(np.argmin(off))])
-
-
-def _steps(
-    calibration: Calibration, ways: dict[int, _Way], frames: _Frames, view: int, delay: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Step (f,) of the delay of each frame to its weighted least squares, s, and its variance, s²."""
-    q = _joints(ways, frames, frames.t - delay)
-    after, before = (_joints(ways, frames, frames.t - delay + half) for half in (_HALF, -_HALF))
-    q_dot = (after - before) / (2.0 * _HALF)
-    J = joint_derivative(calibration, q)[:, view]
-    residual = frames.s - predict(calibration, q)[:, view]
-    sigma_q = (calibration.sigma_q or 0.0) * unit_noise(
-        np.array([letter == "P" for letter in calibration.joint_types])
-    )
-    sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
-    step, variance = np.zeros(len(q)), np.full(len(q), np.inf)
-    every: BoolArray = np.asarray(np.isfinite(residual).all(axis=-1))
-    for k, seen in enumerate(every):
-        r, by_joint = residual[k, seen].ravel(), J[k, seen].reshape(-1, q.shape[1])
-        velocity, G = -by_joint @ q_dot[k], by_joint * sigma_q
-        weighted = np.linalg.solve(sigma**2 * np.eye(len(r)) + G @ G.T, np.stack([velocity, r], axis=1))
-        information = float(velocity @ weighted[:, 0])
-        if information > 0.0:
-            step[k], variance[k] = float(velocity @ weighted[:, 1]) / information, 1.0 / information
-    return step, variance
 
 
 def _mean(delay: FloatArray, variance: FloatArray, least: float) -> tuple[float, FloatArray, float]:
@@ -193,15 +161,15 @@ def _mean(delay: FloatArray, variance: FloatArray, least: float) -> tuple[float,
     delay, variance = delay[kept], variance[kept]
     freedom = len(delay) - 1
 
-    def left(square: float) -> float:
-        """Squares that are left beyond what a square of the deviation explains."""
+    def consensus(square: float) -> tuple[float, float, float]:
+        """Sum of weights, mean, and weighted squares about it, at a square of the deviation."""
         weight = 1.0 / (variance + square)
-        mean = weight @ delay / weight.sum()
-        return float(weight @ (delay - mean) ** 2) - freedom
+        mean = float(weight @ delay / weight.sum())
+        return float(weight.sum()), mean, float(weight @ (delay - mean) ** 2)
 
-    square = 0.0 if left(0.0) <= 0.0 else float(brentq(left, 0.0, _FARTHEST**2 + float(np.ptp(delay)) ** 2))
-    weight = 1.0 / (variance + square)
-    mean = float(weight @ delay / weight.sum())
-    error = float(np.sqrt((weight @ (delay - mean) ** 2) / (freedom * weight.sum())))
-    half = float(np.hypot(stdtrit(freedom, 0.975) * error, least))
+    square, most = 0.0, _FARTHEST**2 + float(np.ptp(delay)) ** 2
+    if consensus(0.0)[2] > freedom:
+        square = float(brentq(lambda square: consensus(square)[2] - freedom, 0.0, most))
+    total, mean, squares = consensus(square)
+    half = float(np.hypot(stdtrit(freedom, 0.975) * np.sqrt(squares / (freedom * total)), least))
     return mean, np.array([mean - half, mean + half]), float(np.sqrt(square))

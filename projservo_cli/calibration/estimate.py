@@ -10,7 +10,7 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.delay import delay_of
+from projservo_cli.calibration.delay import with_delay
 from projservo_cli.calibration.diagnosis import Outliers, blamed_joint, listed, share_explained, with_lens
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve, with_joint_noise
@@ -111,11 +111,8 @@ def calibrate(
         seconds = time.perf_counter() - begin
         if solution is not None and fitted is not None:
             fitted(solution, expected.noise_px(solution))
-        late = delay_of(result, observation) if method == "refined" else None
-    if late is not None:
-        result = dataclasses.replace(
-            result, delay_s=late.mean, delay_interval_s=late.interval, delay_jitter_s=late.jitter
-        )
+        if method == "refined":
+            result = with_delay(result, observation)
     return dataclasses.replace(result, source=source, seconds=seconds)
 
 

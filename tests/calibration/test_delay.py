@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate
-from projservo_cli.calibration.delay import delay_of
+from projservo_cli.calibration.delay import with_delay
 from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -83,13 +83,13 @@ def test_delay_of_each_view_is_within_5_ms_and_its_interval(known, late, free, s
     rng = np.random.default_rng([int(1e3 * late), free, stamped])
     cameras = Cameras(late, *((1.0 / 30.0, 0.008) if free else (None, 0.0)), rng)
     seen, truth = on_the_way(robot, cameras, rng, stamped=stamped)
-    found = delay_of(calibration, seen)
-    assert found.mean == pytest.approx(truth, abs=5e-3)
-    assert ((found.interval[:, 0] <= truth) & (truth <= found.interval[:, 1])).all()
-    assert np.ptp(found.interval, axis=1).max() < 0.008
+    found = with_delay(calibration, seen)
+    assert found.delay_s == pytest.approx(truth, abs=5e-3)
+    assert ((found.delay_interval_s[:, 0] <= truth) & (truth <= found.delay_interval_s[:, 1])).all()
+    assert np.ptp(found.delay_interval_s, axis=1).max() < 0.008
     # Frames of cameras that run freely are up to an interval late; stamps tell by how much each is.
     deviation = np.hypot(0.008, 1.0 / 30.0 / np.sqrt(12.0)) if free and not stamped else 0.0
-    assert found.jitter == pytest.approx(deviation, abs=2.5e-3)
+    assert found.delay_jitter_s == pytest.approx(deviation, abs=2.5e-3)
 
 
 def test_ticks_wrong_frames_and_lost_markers_do_no_harm(known):
@@ -99,15 +99,15 @@ def test_ticks_wrong_frames_and_lost_markers_do_no_harm(known):
     wrong = rng.choice(len(seen.q), len(seen.q) // 20, replace=False)
     seen.images[wrong] = seen.images[rng.permutation(wrong)] + 30.0
     seen.images[rng.random(seen.images.shape[:3]) < 0.3] = np.nan
-    found = delay_of(dataclasses.replace(calibration, sigma_q=4.4e-4), seen)
-    assert found.mean == pytest.approx(truth, abs=2e-3)
+    found = with_delay(dataclasses.replace(calibration, sigma_q=4.4e-4), seen)
+    assert found.delay_s == pytest.approx(truth, abs=2e-3)
 
 
 def test_without_frames_that_tell_it_there_is_no_delay(known):
     robot, calibration = known
     rng = np.random.default_rng(4)
     seen, _ = on_the_way(robot, Cameras(0.1, None, 0.0, rng), rng)
-    assert delay_of(calibration, dataclasses.replace(seen, moving=None)) is None
-    assert delay_of(calibration, seen.rows(seen.moving == 99)) is None
+    assert with_delay(calibration, dataclasses.replace(seen, moving=None)) is calibration
+    assert with_delay(calibration, seen.rows(seen.moving == 99)) is calibration
     still = np.linalg.norm(seen.q - robot.q_reference, axis=1) < 1e-6
-    assert delay_of(calibration, seen.rows(still)) is None
+    assert with_delay(calibration, seen.rows(still)) is calibration
