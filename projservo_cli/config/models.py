@@ -39,7 +39,7 @@ from projservo_cli.records import LAWS, REPLAN
 from projservo_cli.robots import plugins
 
 
-class _LostMarkers(Section):
+class LostMarkers(Section):
     """Markers that neither camera sees for a while; all of them where none is named."""
 
     from_step: Whole = Field(description="first step at which they are unseen")
@@ -64,7 +64,7 @@ class _Bump(Section):
             yield (), "give exactly one of by_deg and by_m"
 
 
-class _FrozenJoint(Section):
+class FrozenJoint(Section):
     """A joint whose reading stands still while it moves."""
 
     joint: Count = Field(description="the joint, counted from 1")
@@ -105,7 +105,7 @@ def _of_both(value: Any) -> Any:
     return {"left": value, "right": value} if isinstance(value, int | float) else value
 
 
-class _Disturbance(Section):
+class Disturbance(Section):
     """What is wrong with the simulated robot, and what befalls it and its images."""
 
     delay_s: Annotated[_Delays, BeforeValidator(_of_both, json_schema_input_type=NotNegative | _Delays)] = (
@@ -136,9 +136,9 @@ class _Disturbance(Section):
     )
     flex_deg: NotNegative = Field(0.0, description="the same of a link beyond its encoder, which is not read")
     play_deg: NotNegative = Field(0.0, description="play between each encoder and its link, from end to end")
-    lost_markers: _LostMarkers | None = None
+    lost_markers: LostMarkers | None = None
     bump: _Bump | None = None
-    frozen_joint: _FrozenJoint | None = None
+    frozen_joint: FrozenJoint | None = None
     camera_moved: _CameraMoved | None = None
     marker_moved: _MarkerMoved | None = None
 
@@ -314,23 +314,10 @@ class _GoalImages(Section):
 
     def sigma_px(self, face: Sequence[int]) -> float | None:
         """Standard deviation of a coordinate of the markers of the face, rms; None where it is not told."""
-        numbers = self.markers or face
-        told = [
-            dict(zip(numbers, side or (), strict=False)) for side in (self.sigma_left_px, self.sigma_right_px)
-        ]
-        values = [side.get(number) for side in told for number in face]
-        known = [value**2 for value in values if value is not None]
-        return math.sqrt(sum(known) / len(known)) if len(known) == len(values) else None
-
-    def contradictions(self) -> Iterator[Finding]:
-        """Lists that are not of the same markers."""
-        count = len(self.markers or self.left)
-        for key in ("left", "right", "sigma_left_px", "sigma_right_px"):
-            given = getattr(self, key)
-            if self.markers is not None and given is not None and len(given) != count:
-                yield (key,), f"{len(given)} entries for {count} markers"
-        if len(set(self.markers or ())) < len(self.markers or ()):
-            yield ("markers",), "a number stands here twice"
+        numbers, sides = self.markers or face, (self.sigma_left_px, self.sigma_right_px)
+        told = [side[numbers.index(number)] for side in sides if side is not None for number in face]
+        known = [sigma**2 for sigma in told if sigma is not None]
+        return math.sqrt(sum(known) / len(known)) if len(known) == 2 * len(face) else None
 
 
 class Goal(Section):
@@ -638,21 +625,24 @@ def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator
         return
     numbers = images.markers or markers.face
     yield from markers.unknown(images.markers or (), *path, "markers")
-    for side, pixels in (("left", images.left), ("right", images.right)):
-        if images.markers is None and len(pixels) != len(numbers):
-            what = f"{len(pixels)} pixels for the {len(numbers)} markers of the face"
-            yield (*path, side), what
-        seen = [number for number, pixel in zip(numbers, pixels, strict=False) if pixel is not None]
-        if len(pixels) == len(numbers) and (unseen := [n for n in markers.face if n not in seen]):
-            yield (*path, side), f"marker {unseen[0]} of the face is not seen; show the whole face"
+    if len(set(numbers)) < len(numbers):
+        yield (*path, "markers"), "a number stands here twice"
+    for key in ("left", "right", "sigma_left_px", "sigma_right_px"):
+        given = getattr(images, key)
+        if given is not None and len(given) != len(numbers):
+            yield (*path, key), f"{len(given)} entries for {len(numbers)} markers"
+        elif key in ("left", "right"):
+            seen = [number for number, pixel in zip(numbers, given, strict=True) if pixel is not None]
+            for number in [number for number in markers.face if number not in seen][:1]:
+                yield (*path, key), f"marker {number} of the face is not seen; show the whole face"
 
 
-def _simulated_alone(disturbance: _Disturbance, plant: _PlantSettings) -> Iterator[Finding]:
-    if plant.use is not None and disturbance != _Disturbance():
+def _simulated_alone(disturbance: Disturbance, plant: _PlantSettings) -> Iterator[Finding]:
+    if plant.use is not None and disturbance != Disturbance():
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
 
 
-def _disturbed_joints(disturbance: _Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
+def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
     if robot is None or not robot.joints:
         return
     types, bump = robot.joint_types, disturbance.bump
@@ -666,7 +656,7 @@ def _disturbed_joints(disturbance: _Disturbance, robot: RobotSettings | None) ->
             yield ("disturbance", "bump"), f"joint {bump.joint} is of type {letter}: give {fitting}"
 
 
-def _disturbed_markers(disturbance: _Disturbance, markers: Markers | None) -> Iterator[Finding]:
+def _disturbed_markers(disturbance: Disturbance, markers: Markers | None) -> Iterator[Finding]:
     lost, moved = disturbance.lost_markers, disturbance.marker_moved
     if lost is not None and lost.markers is not None and markers is not None:
         yield from markers.unknown(lost.markers, "disturbance", "lost_markers", "markers")
@@ -747,7 +737,7 @@ class Config(Root):
     trajectory: Trajectory = Trajectory()
     control: _Control = _Control()
     plant: _PlantSettings = _PlantSettings()
-    disturbance: _Disturbance = _Disturbance()
+    disturbance: Disturbance = Disturbance()
     stop: _Stop = _Stop()
     report: _ReportSettings = _ReportSettings()
 

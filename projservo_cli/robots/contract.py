@@ -140,13 +140,9 @@ class ForeignRobot:
         """Whether the arm can be released, and held again."""
         return all(callable(getattr(self.robot, name, None)) for name in ("release", "hold"))
 
-    def release(self) -> None:
-        """Let go of the arm, so that somebody can move it."""
-        self._ask("release", self.robot.release)  # type: ignore[attr-defined]  # only if it lets go
-
-    def hold(self) -> None:
-        """Hold the arm again where it is."""
-        self._ask("hold", self.robot.hold)  # type: ignore[attr-defined]
+    def by_hand(self, what: str) -> None:
+        """``release`` the arm, so that somebody can move it, or ``hold`` it again where it is."""
+        self._ask(what, getattr(self.robot, what))
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""

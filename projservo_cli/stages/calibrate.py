@@ -19,9 +19,8 @@ from projservo_cli.config import Config
 from projservo_cli.files import write_whole
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
 from projservo_cli.stages import Progress, silent
-from projservo_cli.stages.record import observed
+from projservo_cli.stages.record import observed, seed_of_trials
 from projservo_cli.stages.scenario import SUGGESTIONS, generator
-from projservo_cli.stages.trials import seed_of_trials
 from projservo_cli.stages.world import image_size_of, is_ideal, joints_of
 from projservo_cli.tables import read_table, to_csv
 

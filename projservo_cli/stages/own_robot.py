@@ -9,15 +9,16 @@ import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation, predict
 from projservo_cli.config import Config
+from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.driven import DrivenRobot, Known, Steered
 from projservo_cli.robots.instants import NOTHING_KNOWN, UNKNOWN_S, DelayPrior
 from projservo_cli.robots.set_point import Servo
-from projservo_cli.robots.simulated import Plant
-from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.simulation import robot_in_the_loop
+from projservo_cli.robots.simulated import Plant, observe
+from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
+from projservo_cli.stages.simulation import FaultyRobot, World
 from projservo_cli.stages.world import Joints, length_of
 
 # What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
@@ -217,23 +218,41 @@ def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.var(means, axis=0, ddof=1), noise / third
 
 
-def simulated_robot(config: Config, joints: Joints, robot: Robot, markers: int) -> ForeignRobot:
+def simulated_robot(config: Config, joints: Joints, robot: FaultyRobot) -> ForeignRobot:
     """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
     bounds = bounds_of(config, joints)
     if config.plant.joint_limits == "report":
         endless = np.full(len(joints.types), math.inf)
         bounds = bounds._replace(lower=-endless, upper=endless)
+    markers = len(robot.world.number)
     return ForeignRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
+
+
+def _in_the_loop(scenario: Scenario) -> FaultyRobot:
+    """The simulated robot of a scenario at the start of the task, which observes all markers."""
+    config, truth, plant = scenario.config, scenario.truth, scenario.plant_of("exact")
+    assert truth is not None
+    face, others, workspace = list(truth.face), list(truth.pins), np.zeros_like(plant.M)
+
+    def see(H: FloatArray, M: FloatArray) -> FloatArray:
+        """What both cameras see of markers (m, 4) after a displacement (4, 4), as the loop has it."""
+        s, ordered = np.zeros((2, len(M), 2)), np.zeros((2, len(M), 2))
+        observe(plant._replace(M=M[face], pins=M[others]), as_mat(H), workspace, ordered, np.zeros(2))
+        s[:, face + others] = ordered
+        return s
+
+    start, sigma_px, period = scenario.exact.q_start, config.noise.servo_px, config.control.period_s
+    world = World(truth.robot, start, truth.M, truth.number, see, sigma_px, period, config.seed, SERVO_NOISE)
+    return FaultyRobot(world, config.disturbance)
 
 
 def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
     """The robot, and as the loop of a law sees it: beside its truth, or what the calibration takes it for."""
-    config, joints, markers = scenario.config, scenario.joints, len(scenario.observed)
+    config, joints = scenario.config, scenario.joints
     if scenario.truth is None:
-        plant, robot = _believed_plant(scenario), foreign_robot(config, joints, markers)
+        plant, robot = _believed_plant(scenario), foreign_robot(config, joints, len(scenario.observed))
     else:
-        plant = scenario.plant_of(law)
-        robot = simulated_robot(config, joints, robot_in_the_loop(scenario), markers)
+        plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
     return robot, DrivenRobot(robot, plant, known_of(scenario, law), innovation_of(scenario))
 
 
@@ -263,7 +282,7 @@ def known_of(scenario: Scenario, law: str) -> Known:
     sigma_q = 0.0 if calibration is None else calibration.sigma_q or 0.0
     known = numbers if calibration is None else tuple(calibration.marker.tolist())
     return Known(
-        _predicted(scenario),
+        partial(predict, calibration) if calibration is not None else _true_images(scenario),
         np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
         np.array([numbers.index(number) if number in numbers else -1 for number in known]),
         scenario.noise_px,
@@ -274,11 +293,9 @@ def known_of(scenario: Scenario, law: str) -> Known:
     )
 
 
-def _predicted(scenario: Scenario) -> Callable[[FloatArray], FloatArray]:
-    """Pixels (k, 2, m, 2) at joints (k, n) by the calibration, or by the truth where laws are given that."""
+def _true_images(scenario: Scenario) -> Callable[[FloatArray], FloatArray]:
+    """Pixels (k, 2, m, 2) at joints (k, n) by the truth, for laws that are given that."""
     truth = scenario.truth
-    if scenario.calibration is not None:
-        return partial(predict, scenario.calibration)
     assert truth is not None
     return lambda q: np.stack([truth.images(row, truth.M) for row in q])
 

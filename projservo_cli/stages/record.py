@@ -1,4 +1,4 @@
-"""Record: drive a robot through trial motions and write what both cameras saw into a table."""
+"""Record: trial motions, what a robot shows there, and the table of it."""
 
 import math
 import time
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from projservo_cli.calibration import REACH_M, REACH_RAD
 from projservo_cli.config import Config, digest
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
@@ -24,9 +25,18 @@ from projservo_cli.stages.own_robot import (
     simulated_robot,
     way_to,
 )
-from projservo_cli.stages.simulation import robot_in_trials
-from projservo_cli.stages.trials import seed_of_trials, simulate, trial_motions
-from projservo_cli.stages.world import FAULTS, Joints, has_faults, joints_of, limit_passed, truth_of
+from projservo_cli.stages.scenario import CALIBRATION_NOISE, TRIAL_POSES, generator
+from projservo_cli.stages.simulation import robot_by_itself
+from projservo_cli.stages.world import (
+    FAULTS,
+    Truth,
+    has_faults,
+    is_ideal,
+    joints_of,
+    limit_passed,
+    reference_of,
+    truth_of,
+)
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
@@ -38,6 +48,12 @@ DEPENDS_ON = (
 SAVE_EVERY = 1.0  # s; what an interruption without warning may cost
 _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where the pose was to be
 _MOST_MOVING = 200  # frames on the way in a table
+
+# Random poses where not given; how far trials are spread, rad, so that no reading repeats its error:
+# a tick of a coarse encoder, 4,096 a turn. Draws of one pose, of which each reaches less far, and the share
+# of markers that both cameras must see.
+_RANDOM_POSES, _TICKS = 12, 4096
+_DRAWS, _SHRINKING, _LEAST_SEEN = 100, 0.98, 0.75
 
 
 @dataclass
@@ -97,6 +113,89 @@ class _Recording:
             np.array([reading.t_q for reading in rows]) if timed else None,
             np.array([reading.t_view for reading in rows]) if timed else None,
         )
+
+
+def trial_motions(config: Config) -> FloatArray:
+    """Joint readings (k, n) of the reference and of all trials, rad or m.
+
+    Every joint alone; then, where joints may be read or images taken with faults, all joints at once, and
+    the trials are spread by fractions of an encoder's tick.
+    """
+    settings = config.calibration
+    vector = reference_of(config)
+    if vector is None:
+        raise InputError("trial motions need a reference: set calibration.reference or task.start")
+    joints = joints_of(config)
+    reference = np.array(vector.values(joints.types))
+    amplitude = np.array(
+        [settings.amplitude_m if kind == "P" else np.radians(settings.amplitude_deg) for kind in joints.types]
+    )
+    rows = [reference]
+    for i, farthest in enumerate(amplitude):
+        for offset in np.linspace(-farthest, farthest, settings.frames_per_joint):
+            q = reference.copy()
+            q[i] += offset
+            if wrong := limit_passed(q, joints.lower, joints.upper):
+                raise InputError(
+                    f"calibration: in a trial {wrong}: choose another calibration.reference or a smaller "
+                    "amplitude"
+                )
+            rows.append(q)
+    ideal, rng = is_ideal(config), generator(seed_of_trials(config), TRIAL_POSES)
+    count = settings.random_poses
+    if count is None:
+        count = 0 if ideal or settings.method == "closed_form" else _RANDOM_POSES
+    rows += [_random_pose(config, reference, amplitude, rng) for _ in range(count)]
+    q = np.array(rows)
+    if ideal or settings.method == "closed_form":  # which takes joints that are told to stand still to do so
+        return q
+    turn = 2.0 * np.pi / (config.disturbance.encoder_ticks or _TICKS)
+    tick = np.where([kind == "P" for kind in joints.types], REACH_M / REACH_RAD, 1.0) * turn
+    return np.clip(q + tick * rng.uniform(-1.0, 1.0, q.shape), joints.lower, joints.upper)
+
+
+def _random_pose(
+    config: Config, reference: FloatArray, amplitude: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Joints (n,) within the amplitudes and the limits, which show the markers of a simulated robot."""
+    joints, truth = joints_of(config), truth_of(config) if config.plant.use is None else None
+    for draw in range(_DRAWS):
+        q = reference + amplitude * _SHRINKING**draw * rng.uniform(-1.0, 1.0, len(reference))
+        if limit_passed(q, joints.lower, joints.upper):
+            continue
+        if truth is None:
+            return q
+        images = images_at(truth, q, np.zeros((2, len(truth.M), 2)))
+        if np.isfinite(images).all(axis=(0, 2)).mean() >= _LEAST_SEEN:
+            return q
+    return reference
+
+
+def seed_of_trials(config: Config) -> int:
+    """Seed of the trial motions and of all that is random in their evaluation."""
+    return config.seed if config.calibration.seed is None else config.calibration.seed
+
+
+def trial_noise(config: Config, poses: int, markers: int) -> FloatArray:
+    """Pixel noise (poses, 2, markers, 2) of the trial motions, px."""
+    drawn = generator(seed_of_trials(config), CALIBRATION_NOISE).standard_normal((poses, 2, markers, 2))
+    return config.noise.calibration_px * drawn
+
+
+def simulate(config: Config, truth: Truth, q: FloatArray | None = None) -> Observation:
+    """Noisy images of all markers at poses (k, n), by default the trial motions; unseen outside an image."""
+    q = trial_motions(config) if q is None else q
+    noise = trial_noise(config, len(q), len(truth.number))
+    images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
+    return Observation(np.arange(len(q)), np.array(truth.number), q, images)
+
+
+def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
+    """Pixels (2, m, 2) of all markers at the joints q (n,), rad or m, with noise; NaN outside an image."""
+    images = truth.images(q, truth.M) + noise
+    inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)
+    images[~inside] = np.nan
+    return images
 
 
 def new_recording(
@@ -159,10 +258,8 @@ def record(
     robot : what is driven; None takes that of ``plant.use``, or simulates that of the configuration, which
         stands wherever it is sent unless something is wrong with it.
     """
-    joints, robot = joints_of(config), robot or _robot_of(config, recording)
-    poses = _simulated(config, recording)
-    if robot is not None:
-        poses = _recorded(Steered(robot, servo_of(config, joints)), config, joints, recording)
+    robot = robot or _robot_of(config, recording)
+    poses = _simulated(config, recording) if robot is None else _recorded(robot, config, recording)
     kept, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
@@ -180,14 +277,15 @@ def record(
 
 def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
     """The robot that is to be driven; None for one that need not be."""
-    joints, markers = joints_of(config), len(recording.marker)
+    joints = joints_of(config)
     if config.plant.use is not None:
-        return foreign_robot(config, joints, markers)
+        return foreign_robot(config, joints, len(recording.marker))
     if not has_faults(config) or not recording.pending:
         return None
-    first = recording.targets[recording.pending[0]]
-    robot = robot_in_trials(config, truth_of(config), first, seed_of_trials(config))
-    return simulated_robot(config, joints, robot, markers)
+    first, sigma_px = recording.targets[recording.pending[0]], config.noise.calibration_px
+    seed = seed_of_trials(config)
+    robot = robot_by_itself(config, truth_of(config), first, sigma_px, seed, CALIBRATION_NOISE)
+    return simulated_robot(config, joints, robot)
 
 
 def observed(config: Config, *, progress: Progress = silent) -> tuple[Observation, float | None]:
@@ -198,8 +296,7 @@ def observed(config: Config, *, progress: Progress = silent) -> tuple[Observatio
     if robot is None:
         return simulate(config, truth, recording.targets), sigma_px or None
     with at_rest_after(robot):
-        joints = joints_of(config)
-        for _ in _recorded(Steered(robot, servo_of(config, joints)), config, joints, recording):
+        for _ in _recorded(robot, config, recording):
             progress("trial motions", len(recording.done), len(recording.targets))
     return recording.observation(), sigma_px / math.sqrt(config.plant.frames) or None
 
@@ -212,12 +309,21 @@ def _simulated(config: Config, recording: _Recording) -> Iterator[int]:
         yield pose
 
 
-def _recorded(robot: Steered, config: Config, joints: Joints, recording: _Recording) -> Iterator[int]:
+def _recorded(robot: ForeignRobot, config: Config, recording: _Recording) -> Iterator[int]:
     """Drive to one pending pose after the other and look; the number of each that was recorded."""
+    joints = joints_of(config)
+    steered = Steered(robot, servo_of(config, joints))
+
+    def look() -> Reading:
+        """A look after a period."""
+        recording.commands += 1
+        return steered.hold(config.control.period_s)
+
     for pose in recording.pending:
-        seen = list(way_to(robot, recording.targets[pose], config, joints, "record"))
+        seen = list(way_to(steered, recording.targets[pose], config, joints, "record"))
         recording.commands += len(seen)
-        recording.done[pose] = _look(robot, config, recording)
+        recording.done[pose], squares, count = averaged(steered.reading, look, config.plant.frames)
+        recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
         recording.ways[pose + 1] = _moving(seen, config.plant.settle_s)
         yield pose
 
@@ -230,16 +336,3 @@ def _moving(seen: list[Reading], settle_s: float) -> list[Reading]:
         if new.any() and reading.t_q < seen[-1].t_q - settle_s:
             found.append(reading._replace(s=np.where(new[:, None, None], reading.s, np.nan)))
     return found
-
-
-def _look(robot: Steered, config: Config, recording: _Recording) -> Reading:
-    """The mean of as many images as configured of a robot at rest, and of its readings."""
-
-    def look() -> Reading:
-        """A look after a period."""
-        recording.commands += 1
-        return robot.hold(config.control.period_s)
-
-    mean, squares, count = averaged(robot.reading, look, config.plant.frames)
-    recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
-    return mean

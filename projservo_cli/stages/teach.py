@@ -15,12 +15,15 @@ from projservo_cli.records import Calibration, FloatArray, InputError, IntArray,
 from projservo_cli.robots.contract import Reading, at_rest_after
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.own_robot import at_rest, averaged, foreign_robot, simulated_robot
-from projservo_cli.stages.simulation import robot_at
+from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
+from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself
 from projservo_cli.stages.verdicts import VIEWS
 from projservo_cli.stages.world import face_numbers, joints_of, limit_passed, truth_of
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
+# From how far, rad or m, a simulated robot comes to where it is put, and how long it then rests, s.
+_BESIDE, _AT_REST_S = 0.02, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +87,7 @@ def teach(
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
         if wrong := limit_passed(np.array(at), joints.lower, joints.upper):
             raise InputError(f"--at: {wrong}: choose others")
-        put = robot_at(config, truth_of(config), np.array(at))
-        robot = simulated_robot(config, joints, put, len(numbers))
+        robot = simulated_robot(config, joints, _put_to(config, np.array(at)))
     period, moved = config.control.period_s, None
 
     def look() -> Reading:
@@ -99,10 +101,10 @@ def teach(
     with at_rest_after(robot):
         if wait is not None and robot.lets_go:
             wait("take hold of the arm: it will be released")
-            robot.release()
+            robot.by_hand("release")
             wait("move it to where it is to be: it will be held there")
             moved = robot.read().q
-            robot.hold()
+            robot.by_hand("hold")
         if wait is not None:
             wait("take your hands away")
         first, reading = robot.read(), look()
@@ -118,6 +120,17 @@ def teach(
         count.max(axis=1),
         None if moved is None else mean.q - moved,
     )
+
+
+def _put_to(config: Config, q: FloatArray) -> FaultyRobot:
+    """The simulated robot at rest at joints (n,), rad or m, come to from beside, so that play tells."""
+    truth = truth_of(config)
+    aside = generator(config.seed, TAUGHT_NOISE).choice((-_BESIDE, _BESIDE), len(q))
+    beside = np.clip(q + aside, truth.robot.lower, truth.robot.upper)
+    robot = robot_by_itself(config, truth, beside, config.noise.servo_px, config.seed, TAUGHT_NOISE)
+    for second in range(1, 1 + _AT_REST_S):
+        robot.command(q, np.zeros_like(q), float(second))
+    return robot
 
 
 def checked(config: Config, calibration: Calibration, taught: Taught) -> Checked:

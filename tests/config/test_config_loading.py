@@ -119,7 +119,7 @@ INCONSISTENT = [
     ("task.goal={joints: {joints: [1, 0], unit: deg}, perturbation: {}}", "task.goal.perturbation",
      "belongs to a goal given by turn_deg"),
     ("task.goal={images: {left: [[1, 2]], right: [[1, 2], [3, 4], [5, 6]]}}", "task.goal.images.left",
-     "1 pixels for the 3 markers"),
+     "1 entries for 3 markers"),
     ("markers.face=[0, 1, 9]", "markers.face.2", "there is no marker 9"),
     ("markers.face=[0, 1, 1]", "markers.face", "twice"),
     ("markers.center=3", "markers.center", "not on the face"),

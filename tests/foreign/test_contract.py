@@ -10,13 +10,12 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.robots.contract import ForeignRobot, at_rest_after
 from projservo_cli.robots.driven import Steered
-from projservo_cli.robots.faulty import Events, Faults, FaultyRobot, World
 from projservo_cli.stages.own_robot import bounds_of, servo_of, way_to
+from projservo_cli.stages.simulation import robot_by_itself
 from projservo_cli.stages.world import joints_of, truth_of
 from tests.documentation.blocks import DOCS, ROOT, blocks_of
 from tests.documentation.test_pages import put_robot
 from tests.foreign.robots import Sound
-from tests.samples import pixels
 
 CONFIG = ROOT / "configs" / "ur5.yaml"
 PERIOD = 0.04
@@ -26,18 +25,10 @@ DOCUMENTED = {"my_robot": "UR5", "position": "Position", "velocity": "Velocity",
 
 def faulty():
     """An arm that is late, lags, sags and plays, with coarse encoders."""
-    truth = truth_of(load_config(CONFIG))
-    world = World(
-        truth.robot,
-        np.array([3.66, -1.68, -1.85, 0.28, 1.16, 3.53]),
-        truth.M,
-        lambda H, M: pixels(truth.P, M @ H.T),
-        0.5,
-        PERIOD,
-        lambda view, k: np.random.default_rng([view, k]),
-    )
-    wrong = {"ticks": 4096, "lag": 0.05, "sag": 0.008, "play": 0.008, "interval": 1 / 30}
-    return FaultyRobot(world, Faults(delay=(0.12, 0.1), **wrong), Events())
+    wrong = ("delay_s=0.12", "encoder_ticks=4096", "lag_s=0.05", "sag_deg=0.5", "play_deg=0.5")
+    config = load_config(CONFIG, [*(f"disturbance.{key}" for key in wrong), "disturbance.frame_rate_hz=30"])
+    start = np.array([3.66, -1.68, -1.85, 0.28, 1.16, 3.53])
+    return robot_by_itself(config, truth_of(config), start, 0.5, 1, 0)
 
 
 @pytest.fixture(params=[*DOCUMENTED, "sound", "faulty"])

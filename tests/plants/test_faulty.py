@@ -5,18 +5,21 @@ import math
 import numpy as np
 import pytest
 
+from projservo_cli.config.models import Disturbance
 from projservo_cli.records import REVOLUTE
-from projservo_cli.robots.faulty import Events, Faults, FaultyRobot, World, full_reach
 from projservo_cli.robots.simulated import Arm
+from projservo_cli.stages.simulation import FaultyRobot, World, full_reach
 from tests.samples import displacement, pixels, revolute, rig
 
 PERIOD = 0.04
 M = np.array([[0.7, 0.05, 0.02, 1], [0.72, -0.05, 0.03, 1], [0.68, 0.0, -0.05, 1]])
 CAMERAS = rig() @ np.linalg.inv(displacement([0, 0, 0], [0.7, 0, -1.5]))  # 1.5 m below the tool, looking up
-WARPED = Events(
-    bump_at=6, bump=np.array([0.0, 0.02]), camera_at=4, camera=np.array([[2.0, -1.0], [0.0, 0.0]]),
-    marker_at=9, marker=1, marker_by=(0.01, 0.0, 0.0), lost_at=2, lost_until=4, lost=(2,),
-)  # fmt: skip
+WARPED = {
+    "bump": {"at_step": 6, "joint": 2, "by_deg": math.degrees(0.02)},
+    "camera_moved": {"at_step": 4, "view": "left", "by_px": (2.0, -1.0)},
+    "marker_moved": {"at_step": 9, "marker": 1, "by_m": (0.01, 0.0, 0.0)},
+    "lost_markers": {"from_step": 2, "steps": 2, "markers": (2,)},
+}
 
 
 def arm():
@@ -35,15 +38,12 @@ def images(q, M=M):
     return pixels(CAMERAS, M @ displaced(q).T)
 
 
-def robot(events=None, sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **faults):
-    def random(view, k):
-        return np.random.default_rng([seed, view, k])
-
+def robot(sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **disturbance):
     def see(H, M):
         return pixels(CAMERAS, M @ H.T)
 
-    world = World(arm(), np.array(q_start), M, see, sigma_px, PERIOD, random)
-    return FaultyRobot(world, Faults(**faults), events or Events())
+    world = World(arm(), np.array(q_start), M, (0, 1, 2), see, sigma_px, PERIOD, seed)
+    return FaultyRobot(world, Disturbance.model_validate(disturbance))
 
 
 def driven(plant, targets):
@@ -67,7 +67,7 @@ def test_an_ideal_robot_is_where_it_was_sent_and_shows_it():
 
 
 def test_a_servo_lags_as_a_system_of_first_order_does():
-    plant, lag, pace = robot(lag=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
+    plant, lag, pace = robot(lag_s=0.05), 0.05, np.array([0.02, -0.01]) / PERIOD
     q, _ = driven(plant, [*WAY, *[WAY[-1]] * 5])
     for k, row in enumerate(q, 1):
         t, end = k * PERIOD, 25 * PERIOD
@@ -81,7 +81,7 @@ def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
     for q in ([0.0, 0.0], [-0.5, 0.2], [-math.pi / 2, 0.0]):
         x_tool = 0.4 * math.cos(q[0]) + 0.3 * math.cos(q[0] + q[1])
         load = np.array([x_tool, 0.3 * math.cos(q[0] + q[1])]) / reach  # drooping is positive here
-        for faults, read, true in (({"sag": sag}, load, load), ({"flex": sag}, 0.0 * load, load)):
+        for faults, read, true in (({"sag_deg": 0.5}, load, load), ({"flex_deg": 0.5}, 0.0 * load, load)):
             plant = robot(q_start=q, **faults)
             told, _ = driven(plant, [q] * 10)
             assert told[-1] - q == pytest.approx(sag * read, abs=2e-4 * sag + sag**2)
@@ -89,7 +89,7 @@ def test_sag_is_read_and_flexing_is_not_in_proportion_to_the_load():
 
 
 def test_play_leaves_the_link_behind_where_the_way_turns():
-    play, plant = math.radians(0.5), robot(play=math.radians(0.5))
+    play, plant = math.radians(0.5), robot(play_deg=0.5)
     there, back = WAY, [*WAY[::-1], [0.0, 0.0]]
     q, _ = driven(plant, there)
     assert plant.truth() - q[-1] == pytest.approx(0.5 * play * np.array([-1, 1]), abs=1e-12)
@@ -101,7 +101,7 @@ def test_play_leaves_the_link_behind_where_the_way_turns():
 def test_encoders_count_ticks_and_servos_may_do_so_too():
     tick = 2 * math.pi / 4096
     for coarse in (False, True):
-        plant = robot(ticks=4096, setpoint_ticks=coarse)
+        plant = robot(encoder_ticks=4096, setpoint_ticks=coarse)
         for target, q in zip(WAY, driven(plant, WAY)[0], strict=True):
             assert q / tick == pytest.approx(np.round(q / tick), abs=1e-9)
             assert abs(q - target).max() <= 0.5 * tick + 1e-12
@@ -118,7 +118,7 @@ def along(t):
 
 @pytest.mark.parametrize("exposure", [0.0, 0.02])
 def test_images_are_late_and_averaged_over_their_exposure(exposure):
-    plant = robot(delay=(0.1, 0.033), exposure=exposure, jitter=0.004, stamps=True)
+    plant = robot(delay_s={"left": 0.1, "right": 0.033}, exposure_s=exposure, jitter_s=0.004, stamps=True)
     clocks = []
     for target in WAY:
         plant.command(np.array(target), np.zeros(2), plant.now() + PERIOD)
@@ -135,7 +135,7 @@ def test_images_are_late_and_averaged_over_their_exposure(exposure):
 
 
 def test_cameras_that_run_freely_show_a_frame_until_the_next_has_come():
-    plant = robot(delay=(0.02, 0.02), interval=1 / 30, offset=0.016, jitter=0.002, sigma_px=0.5)
+    plant = robot(0.5, delay_s=0.02, frame_rate_hz=30, frame_offset_s=0.016, jitter_s=0.002)
     taken, shown, ages = [], [], []
     for k in range(400):
         plant.command(np.array(along(0.01 * k)), np.zeros(2), plant.now() + 0.01)
@@ -155,7 +155,7 @@ def test_cameras_that_run_freely_show_a_frame_until_the_next_has_come():
 
 
 def test_events_befall_the_robot_in_their_period():
-    plant = robot(WARPED)
+    plant = robot(**WARPED)
     seen = [plant.read(), *zip(*driven(plant, WAY[:12]), strict=True)]
     for k, (q, s) in enumerate(seen):
         moved = M.copy()
@@ -169,24 +169,18 @@ def test_events_befall_the_robot_in_their_period():
 
 
 def test_a_slip_and_a_frozen_reading_are_not_read():
-    plant = robot(Events(bump_at=5, bump=np.array([0.05, 0.0]), slips=True))
+    plant = robot(bump={"at_step": 5, "joint": 1, "by_deg": math.degrees(0.05), "read": False})
     q, _ = driven(plant, WAY[:8])
     assert plant.truth() - q[-1] == pytest.approx([0.05, 0.0], abs=1e-12)
-    q, _ = driven(robot(Events(frozen=0, frozen_at=3, frozen_until=7)), WAY[:10])
+    q, _ = driven(robot(frozen_joint={"joint": 1, "from_step": 3, "steps": 4}), WAY[:10])
     assert np.array(q)[:, 0] / 0.02 == pytest.approx([1, 2, 3, 3, 3, 3, 7, 8, 9, 10])
     assert np.array(q)[:, 1] / -0.01 == pytest.approx(np.arange(1, 11))
 
 
 def test_runs_are_the_same_to_the_bit_and_other_seeds_are_others():
-    faults = {
-        "delay": (0.05, 0.06),
-        "exposure": 0.01,
-        "jitter": 0.003,
-        "lag": 0.05,
-        "sag": 0.01,
-        "play": 0.01,
-    }
-    one, two, other = (driven(robot(WARPED, 0.5, seed, **faults), WAY) for seed in (1, 1, 2))
+    late = {"delay_s": {"left": 0.05, "right": 0.06}, "exposure_s": 0.01, "jitter_s": 0.003}
+    faults = late | {"lag_s": 0.05, "sag_deg": 0.5, "play_deg": 0.5} | WARPED
+    one, two, other = (driven(robot(0.5, seed, **faults), WAY) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one[1], two[1])
     assert np.isfinite(one[1][0]).all()
     assert (np.array(one[1])[0] != np.array(other[1])[0]).all()

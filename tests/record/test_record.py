@@ -12,7 +12,7 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.robots.contract import ForeignRobot
 from projservo_cli.stages import record as stage
 from projservo_cli.stages.own_robot import bounds_of
-from projservo_cli.stages.trials import simulate, trial_motions
+from projservo_cli.stages.record import simulate, trial_motions
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.store import load
 from projservo_cli.tables import read_joint_list, read_table

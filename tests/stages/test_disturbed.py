@@ -6,7 +6,6 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.simulation import events_of, faults_of
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 
@@ -57,29 +56,6 @@ def test_the_trace_holds_the_truth(driven):
     loose = driven("disturbance.play_deg=0.5", "disturbance.flex_deg=0.2", UNTESTED)
     off = np.degrees(np.abs(loose.q - loose.q_read))
     assert 0.2 < off.max() <= 0.25 + 0.2 + 1e-9
-
-
-def test_what_the_configuration_says_befalls_the_robot():
-    given = config(
-        "disturbance.bump={at_step: 3, joint: 2, by_deg: 3, read: false}",
-        "disturbance.frozen_joint={joint: 3, from_step: 10, steps: 20}",
-        "disturbance.camera_moved={at_step: 7, view: right, by_px: [1.5, -1]}",
-        "disturbance.marker_moved={at_step: 9, marker: 5, by_m: [0, 0.003, 0]}",
-        "disturbance.lost_markers={from_step: 4}",
-        "disturbance.delay_s={left: 0.1, right: 0.2}",
-        "disturbance.frame_rate_hz=25",
-        "disturbance.encoder_ticks=4096",
-        "disturbance.sag_deg=0.5",
-    )
-    events, faults = events_of(given, truth_of(given)), faults_of(given)
-    assert (events.bump_at, events.slips, events.marker, events.marker_at) == (3, True, 5, 9)
-    assert np.degrees(events.bump) == pytest.approx([0, 3, 0, 0, 0])
-    assert (events.frozen, events.frozen_at, events.frozen_until) == (2, 10, 30)
-    assert events.camera.tolist() == [[0, 0], [1.5, -1]]
-    assert events.lost == tuple(range(8))
-    assert events.lost_until > 10**9
-    assert (faults.delay, faults.interval, faults.ticks) == ((0.1, 0.2), 0.04, 4096)
-    assert np.degrees(faults.sag) == pytest.approx(0.5)
 
 
 def test_a_robot_of_somebody_else_is_not_disturbed():

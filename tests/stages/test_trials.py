@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.stages import trials
+from projservo_cli.stages import record as trials
 from projservo_cli.stages.world import joints_of, truth_of
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
