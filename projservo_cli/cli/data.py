@@ -169,7 +169,7 @@ def _teach(
     if not start:
         stage.require_face(settings, taught)
     check = None if calibration is None or start else stage.checked(settings, calibration, taught)
-    write_whole(output, stage.as_text(taught))
+    write_whole(output, taught.as_text())
     _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")
@@ -184,11 +184,8 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
         "sigma_px": taught.sigma,
         "unseen": taught.unseen,
         "moved": taught.moved,
-        "off_px": None if check is None else check.off,
-        "far": None if check is None else check.far,
-        "reached": None if check is None else check.reached,
-        "reason": None if check is None else check.reason,
     }
+    value |= dict.fromkeys(("off_px", "far", "reached", "reason")) if check is None else check._asdict()
     console.tell(value, _words_of_taught(path, taught, check, key))
 
 

@@ -14,7 +14,7 @@ from projservo_cli.records import Calibration, FloatArray, InputError, IntArray,
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.driven import DrivenRobot, Known, Steered
-from projservo_cli.robots.instants import NOTHING_KNOWN, UNKNOWN_S, DelayPrior
+from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.set_point import Servo
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
@@ -72,7 +72,7 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
     Yields what is read after each command. The robot has then stood still for ``plant.settle_s``, and so have
     the images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
     """
-    period, bounds = config.control.period_s, robot.robot.bounds
+    period, bounds, sag = config.control.period_s, robot.robot.bounds, sag_of(config, joints)
     begun, still = robot.look().q, _Standstill(config.plant.settle_s)
     while (gap := q - robot.target).any():
         robot.command(gap / np.max(np.abs(gap) / (bounds.speed * period), initial=1.0), period)
@@ -85,10 +85,10 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
     else:
         yield from at_rest(robot.reading, partial(robot.hold, period), config, what)
     gap = np.abs(q - robot.reading.q)
-    i = int(np.argmax(gap / np.maximum(sag_of(config, joints), _STILL)))
-    if gap[i] > max(sag_of(config, joints)[i], _STILL) or (q != robot.target).any():
+    i = int(np.argmax(gap / np.maximum(sag, _STILL)))
+    if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
         remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
-        if gap[i] > abs(q[i] - begun[i]) + sag_of(config, joints)[i]:
+        if gap[i] > abs(q[i] - begun[i]) + sag[i]:
             remedy = f"it went away from there, from {begun[i]:.6g}: look at its sign and unit"
         raise WorkFailed(
             f"{what}: joint {i + 1} was sent to {q[i]:.6g} and stands at {robot.reading.q[i]:.6g}, "
@@ -199,13 +199,10 @@ def new_views(reading: Reading, before: Reading | None) -> tuple[bool, bool]:
     """Whether each view has another frame than in the reading before, by its stamp or its pixels."""
     if before is None:
         return True, True
-    same = [
-        reading.t_view[view] == before.t_view[view]
-        if np.isfinite(reading.t_view[view])
-        else np.array_equal(reading.s[view], before.s[view], equal_nan=True)
-        for view in range(2)
-    ]
-    return not same[0], not same[1]
+    stamped = np.isfinite(reading.t_view)
+    same = np.isclose(reading.s, before.s, 0.0, 0.0, equal_nan=True).all(axis=(1, 2))
+    left, right = np.where(stamped, reading.t_view != before.t_view, ~same).tolist()
+    return left, right
 
 
 def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -248,23 +245,30 @@ def _in_the_loop(scenario: Scenario) -> FaultyRobot:
 
 def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
     """The robot, and as the loop of a law sees it: beside its truth, or what the calibration takes it for."""
-    config, joints = scenario.config, scenario.joints
+    config, joints, calibration = scenario.config, scenario.joints, scenario.calibration
+    assert calibration is not None
     if scenario.truth is None:
-        plant, robot = _believed_plant(scenario), foreign_robot(config, joints, len(scenario.observed))
+        plant, robot = (
+            _believed_plant(scenario, calibration),
+            foreign_robot(config, joints, len(scenario.observed)),
+        )
     else:
         plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
-    return robot, DrivenRobot(robot, plant, known_of(scenario, law), innovation_of(scenario))
+    innovation = None
+    if not untested(scenario):
+        noise = config.stop.innovation_factor * scenario.noise_px
+        innovation = Innovation(calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
+    return robot, DrivenRobot(robot, plant, _known_of(scenario, calibration, law), innovation)
 
 
-def _believed_plant(scenario: Scenario) -> Plant:
+def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
     """What the calibration takes the robot and its face for."""
-    assert scenario.calibration is not None
-    known = scenario.calibration.marker.tolist()
+    known = calibration.marker.tolist()
     face = [known.index(number) for number in scenario.numbers[: scenario.m]]
     task, rig = scenario.ends.by_points().task(scenario.model), scenario.config.rig
     return Plant(
         scenario.model,
-        np.ascontiguousarray(scenario.calibration.M[face]),
+        np.ascontiguousarray(calibration.M[face]),
         task.order,
         task.center,
         task.O,
@@ -276,51 +280,33 @@ def _believed_plant(scenario: Scenario) -> Plant:
     )
 
 
-def known_of(scenario: Scenario, law: str) -> Known:
+def _known_of(scenario: Scenario, calibration: Calibration, law: str) -> Known:
     """What is known of a robot and its images before a law drives it."""
-    config, calibration, numbers = scenario.config, scenario.calibration, scenario.observed
-    sigma_q = 0.0 if calibration is None else calibration.sigma_q or 0.0
-    known = numbers if calibration is None else tuple(calibration.marker.tolist())
+    config, numbers = scenario.config, scenario.observed
     return Known(
-        partial(predict, calibration) if calibration is not None else _true_images(scenario),
+        partial(predict, calibration),
         np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
-        np.array([numbers.index(number) if number in numbers else -1 for number in known]),
+        np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
         scenario.noise_px,
-        length_of(math.degrees(sigma_q), scenario.joints),
+        length_of(math.degrees(calibration.sigma_q or 0.0), scenario.joints),
         _delays_of(config, calibration),
         servo_of(config, scenario.joints),
         config.plant.timeout_s,
     )
 
 
-def _true_images(scenario: Scenario) -> Callable[[FloatArray], FloatArray]:
-    """Pixels (k, 2, m, 2) at joints (k, n) by the truth, for laws that are given that."""
-    truth = scenario.truth
-    assert truth is not None
-    return lambda q: np.stack([truth.images(row, truth.M) for row in q])
-
-
-def _delays_of(config: Config, calibration: Calibration | None) -> DelayPrior:
+def _delays_of(config: Config, calibration: Calibration) -> DelayPrior:
     """What is known of the delays of both views: given, calibrated, or nothing."""
-    given, jitter = config.plant.delay_s, NOTHING_KNOWN.jitter
-    if calibration is not None and calibration.delay_jitter_s is not None:
-        jitter = np.maximum(calibration.delay_jitter_s, _LEAST_JITTER_S)
+    given, known = config.plant.delay_s, NOTHING_KNOWN
+    if calibration.delay_s is not None:
+        interval, jitter = calibration.delay_interval_s, calibration.delay_jitter_s
+        assert interval is not None
+        assert jitter is not None
+        sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
+        known = DelayPrior(calibration.delay_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
     if given is not None:
-        return DelayPrior(np.array([given.left, given.right]), np.zeros(2), jitter)
-    if calibration is None or calibration.delay_s is None:
-        return NOTHING_KNOWN._replace(jitter=jitter)
-    sigma = np.full(2, UNKNOWN_S)
-    if calibration.delay_interval_s is not None:
-        sigma = np.ptp(calibration.delay_interval_s, axis=1) / _INTERVAL
-    return DelayPrior(calibration.delay_s.copy(), np.maximum(sigma, 0.5 * _LEAST_JITTER_S), jitter)
-
-
-def innovation_of(scenario: Scenario) -> Innovation | None:
-    """What tests the images of a run against the calibration; None where that is not done."""
-    if scenario.calibration is None or untested(scenario):
-        return None
-    noise = scenario.config.stop.innovation_factor * scenario.noise_px
-    return Innovation(scenario.calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
+        known = known._replace(mean=np.array([given.left, given.right]), sigma=np.zeros(2))
+    return known
 
 
 def untested(scenario: Scenario) -> str:

@@ -165,7 +165,7 @@ def _random_pose(
             continue
         if truth is None:
             return q
-        images = images_at(truth, q, np.zeros((2, len(truth.M), 2)))
+        images = _images_at(truth, q, np.zeros((2, len(truth.M), 2)))
         if np.isfinite(images).all(axis=(0, 2)).mean() >= _LEAST_SEEN:
             return q
     return reference
@@ -176,21 +176,16 @@ def seed_of_trials(config: Config) -> int:
     return config.seed if config.calibration.seed is None else config.calibration.seed
 
 
-def trial_noise(config: Config, poses: int, markers: int) -> FloatArray:
-    """Pixel noise (poses, 2, markers, 2) of the trial motions, px."""
-    drawn = generator(seed_of_trials(config), CALIBRATION_NOISE).standard_normal((poses, 2, markers, 2))
-    return config.noise.calibration_px * drawn
-
-
 def simulate(config: Config, truth: Truth, q: FloatArray | None = None) -> Observation:
     """Noisy images of all markers at poses (k, n), by default the trial motions; unseen outside an image."""
     q = trial_motions(config) if q is None else q
-    noise = trial_noise(config, len(q), len(truth.number))
-    images = np.stack([images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
+    drawn = generator(seed_of_trials(config), CALIBRATION_NOISE)
+    noise = config.noise.calibration_px * drawn.standard_normal((len(q), 2, len(truth.number), 2))
+    images = np.stack([_images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)
 
 
-def images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
+def _images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
     """Pixels (2, m, 2) of all markers at the joints q (n,), rad or m, with noise; NaN outside an image."""
     images = truth.images(q, truth.M) + noise
     inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)

@@ -38,10 +38,9 @@ from projservo_cli.robots.driven import DrivenRobot
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.stages import own_robot
-from projservo_cli.stages.motions import search_of, why_closed
+from projservo_cli.stages.motions import Ways, search_of, why_closed
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.ways import Ways
 from projservo_cli.stages.world import arm_of, is_disturbed
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed

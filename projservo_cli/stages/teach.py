@@ -44,10 +44,15 @@ class Taught:
             (int(self.marker[k]), VIEWS[view]) for view, k in np.argwhere(np.isnan(self.s[..., 0])).tolist()
         ]
 
+    def as_text(self) -> str:
+        """The file that ``task.goal`` and ``task.start`` take."""
+        head = "# What both cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
+        return head + plain_yaml(self.as_goal())
+
     def as_goal(self) -> dict[str, Any]:
         """What stands under ``task.goal`` of a configuration."""
         images: dict[str, Any] = {"markers": self.marker.tolist()}
-        for name, pixels in zip(("left", "right"), self.s, strict=True):
+        for name, pixels in zip(VIEWS, self.s, strict=True):
             images[name] = [None if math.isnan(u) else [u, v] for u, v in pixels.round(_DIGITS).tolist()]
         for name, sigma in zip(("sigma_left_px", "sigma_right_px"), self.sigma, strict=True):
             if np.isfinite(sigma).any():
@@ -55,12 +60,12 @@ class Taught:
         return {"images": images | {"joints": {"joints": self.q.tolist(), "unit": "rad"}}}
 
 
-class Checked(NamedTuple):
+class _Checked(NamedTuple):
     """What a calibration says to what was taught."""
 
     reason: str  # whether joints reach it, in words
     reached: bool
-    off: FloatArray  # (2, m) px by which markers are off what those joints, else those read, would show
+    off_px: FloatArray  # (2, m) by which markers are off what those joints, else those read, would show
     far: list[tuple[int, str, float]]  # markers beyond what noise explains, which view, how far, px
 
 
@@ -133,7 +138,7 @@ def _put_to(config: Config, q: FloatArray) -> FaultyRobot:
     return robot
 
 
-def checked(config: Config, calibration: Calibration, taught: Taught) -> Checked:
+def checked(config: Config, calibration: Calibration, taught: Taught) -> _Checked:
     """Whether joints reach what was taught, by a calibration, and which markers are off what they show.
 
     Raises WorkFailed if a camera does not see the whole face, InputError if the configuration has no face.
@@ -163,7 +168,7 @@ def checked(config: Config, calibration: Calibration, taught: Taught) -> Checked
         (numbers[k], VIEWS[view], float(off[view, k]))
         for view, k in np.argwhere(off > _FAR * math.sqrt(2.0) * noise).tolist()
     ]
-    return Checked(reason, reached, off, far)
+    return _Checked(reason, reached, off, far)
 
 
 def require_face(config: Config, taught: Taught) -> None:
@@ -175,9 +180,3 @@ def require_face(config: Config, taught: Taught) -> None:
             f"teach: the {side} camera does not see marker {number} of the face, markers.face {[*face]}: "
             "turn the face towards both cameras"
         )
-
-
-def as_text(taught: Taught) -> str:
-    """The file of what was taught: what stands under ``task.goal``."""
-    head = "# What both cameras saw: projservo teach. Name this file under task.goal, or task.start.\n"
-    return head + plain_yaml(taught.as_goal())

@@ -9,7 +9,7 @@ from projservo_cli.calibration.forward import Scene
 from projservo_cli.records import LAWS, METRIC_LAWS, MODES_OF, PRISMATIC, Calibration, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
-from projservo_cli.stages import studies, trials
+from projservo_cli.stages import record, studies
 from projservo_cli.stages.scenario import idealized
 from tests.fake_records import fake
 from tests.known import configured, driven, known_scenario, planned
@@ -45,7 +45,7 @@ def case(name="paper", steps=SHORT, whole=False):
     models = {"true": true.model, "twin": model, "calibrated": model}
     bench = studies.Comparison(clean, models, sense)
     extra = studies.run_studies(bench) if whole else studies.run_studies(bench, GAINS, PERIODS_S)
-    observation = trials.simulate(config, true)
+    observation = record.simulate(config, true)
     calibration = known(config, true, model, observation.q)
     numbers = tuple(true.number[i] for i in true.face)
     plant = scenario.plant_of("exact")

@@ -6,7 +6,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.teach import as_text, checked, teach
+from projservo_cli.stages.teach import checked, teach
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 
@@ -43,7 +43,7 @@ def test_with_play_a_taught_goal_is_met_where_joints_would_miss_it(calibration, 
     """By what the true pose shows: several times nearer than joints that play in their bearings."""
     given = config(*PLAY)
     path = tmp_path / "goal.yaml"
-    path.write_text(as_text(teach(given, 20, AT)), encoding="utf-8")
+    path.write_text(teach(given, 20, AT).as_text(), encoding="utf-8")
     asked = load_config(HOBBY, [*SHARP, f"task.goal={path}", f"task.start={path}"])
     assert asked.task.start.values("RRRRR") == pytest.approx(AT)
     taught = config(*PLAY, f"task.goal={path}", "stop.innovation_factor=0")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.stages.record import trial_noise
+from projservo_cli.stages.record import simulate
 from projservo_cli.stages.scenario import plant_of, scenario_of
 from projservo_cli.stages.world import truth_of
 from tests.known import configured as loaded
@@ -155,6 +155,6 @@ def test_noise_is_on_start_and_goal_images_and_that_of_trials_has_a_seed_of_its_
     for a, b in ((clean.s_start, noisy.s_start), (clean.s_star, noisy.s_star)):
         assert 0.2 < np.std(b - a) < 0.9
     own, other, both = (loaded("ur5", *sets) for sets in ((), ("calibration.seed=7",), ("seed=7",)))
-    noise = [trial_noise(config, 2, 3).ravel().tolist() for config in (own, other, both)]
+    noise = [simulate(config, truth_of(config)).images[0].tolist() for config in (own, other, both)]
     assert noise[1] == noise[2] != noise[0]
     assert other.seed == own.seed
