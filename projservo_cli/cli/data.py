@@ -1,7 +1,6 @@
 """What robots and cameras tell on the command line: ``record``, ``teach``, ``detect`` and ``validate``."""
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +175,8 @@ def _teach(
 
 
 def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: str) -> None:
+    import numpy as np
+
     value = {
         "file": path.resolve(),
         "markers": taught.marker,
@@ -186,25 +187,19 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
         "moved": taught.moved,
     }
     value |= dict.fromkeys(("off_px", "far", "reached", "reason")) if check is None else check._asdict()
-    console.tell(value, _words_of_taught(path, taught, check, key))
-
-
-def _words_of_taught(path: Path, taught: Any, check: Any, key: str) -> Iterator[str]:
-    import numpy as np
-
     left, right = taught.frames
     certain = f", to {np.nanmax(taught.sigma):.3g} px" if np.isfinite(taught.sigma).any() else ""
-    yield f"teach: {len(taught.marker)} markers from {left} images left and {right} right{certain}"
+    words = [f"teach: {len(taught.marker)} markers from {left} images left and {right} right{certain}"]
     if taught.moved is not None:
         i = int(np.abs(taught.moved).argmax())
-        yield f"  since it is held, joint {i + 1} moved by {taught.moved[i]:.3g} (rad or m)"
-    if taught.unseen:
-        yield wrapped("unseen: " + ", ".join(f"{number} ({side})" for number, side in taught.unseen), "  ")
+        words.append(f"  since it is held, joint {i + 1} moved by {taught.moved[i]:.3g} (rad or m)")
+    if unseen := ", ".join(f"{number} ({side})" for number, side in taught.unseen):
+        words.append(wrapped(f"unseen: {unseen}", "  "))
     if check is not None:
         far = ", ".join(f"{number} ({side}) by {px:.3g} px" for number, side, px in check.far)
-        yield wrapped(check.reason, "  ")
-        yield wrapped(f"markers off what the calibration shows there: {far or 'none'}", "  ")
-    yield f"set {key}: {path}"
+        words.append(wrapped(check.reason, "  "))
+        words.append(wrapped(f"markers off what the calibration shows there: {far or 'none'}", "  "))
+    console.tell(value, [*words, f"set {key}: {path}"])
 
 
 @main.command(

@@ -243,22 +243,20 @@ def _in_the_loop(scenario: Scenario) -> FaultyRobot:
     return FaultyRobot(world, config.disturbance)
 
 
-def connected(scenario: Scenario, law: str) -> tuple[ForeignRobot, DrivenRobot]:
-    """The robot, and as the loop of a law sees it: beside its truth, or what the calibration takes it for."""
+def connected(scenario: Scenario, law: str) -> DrivenRobot:
+    """The robot as the loop of a law sees it: beside its truth, or what the calibration takes it for."""
     config, joints, calibration = scenario.config, scenario.joints, scenario.calibration
     assert calibration is not None
     if scenario.truth is None:
-        plant, robot = (
-            _believed_plant(scenario, calibration),
-            foreign_robot(config, joints, len(scenario.observed)),
-        )
+        plant = _believed_plant(scenario, calibration)
+        robot = foreign_robot(config, joints, len(scenario.observed))
     else:
         plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
     innovation = None
     if not untested(scenario):
         noise = config.stop.innovation_factor * scenario.noise_px
         innovation = Innovation(calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
-    return robot, DrivenRobot(robot, plant, _known_of(scenario, calibration, law), innovation)
+    return DrivenRobot(robot, plant, _known_of(scenario, calibration, law), innovation)
 
 
 def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:

@@ -141,13 +141,14 @@ def trial_motions(config: Config) -> FloatArray:
                     "amplitude"
                 )
             rows.append(q)
-    ideal, rng = is_ideal(config), generator(seed_of_trials(config), TRIAL_POSES)
+    rng = generator(seed_of_trials(config), TRIAL_POSES)
+    # The closed form takes joints that are told to stand still to do so.
+    faultless = is_ideal(config) or settings.method == "closed_form"
     count = settings.random_poses
     if count is None:
-        count = 0 if ideal or settings.method == "closed_form" else _RANDOM_POSES
-    rows += [_random_pose(config, reference, amplitude, rng) for _ in range(count)]
-    q = np.array(rows)
-    if ideal or settings.method == "closed_form":  # which takes joints that are told to stand still to do so
+        count = 0 if faultless else _RANDOM_POSES
+    q = np.array(rows + [_random_pose(config, reference, amplitude, rng) for _ in range(count)])
+    if faultless:
         return q
     turn = 2.0 * np.pi / (config.disturbance.encoder_ticks or _TICKS)
     tick = np.where([kind == "P" for kind in joints.types], REACH_M / REACH_RAD, 1.0) * turn
@@ -165,8 +166,7 @@ def _random_pose(
             continue
         if truth is None:
             return q
-        images = _images_at(truth, q, np.zeros((2, len(truth.M), 2)))
-        if np.isfinite(images).all(axis=(0, 2)).mean() >= _LEAST_SEEN:
+        if np.isfinite(_images_at(truth, q, 0.0)).all(axis=(0, 2)).mean() >= _LEAST_SEEN:
             return q
     return reference
 
@@ -185,7 +185,7 @@ def simulate(config: Config, truth: Truth, q: FloatArray | None = None) -> Obser
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)
 
 
-def _images_at(truth: Truth, q: FloatArray, noise: FloatArray) -> FloatArray:
+def _images_at(truth: Truth, q: FloatArray, noise: FloatArray | float) -> FloatArray:
     """Pixels (2, m, 2) of all markers at the joints q (n,), rad or m, with noise; NaN outside an image."""
     images = truth.images(q, truth.M) + noise
     inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)

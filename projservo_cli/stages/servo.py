@@ -392,8 +392,8 @@ def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) 
     if own and (scenario.calibration is None or not scenario.calibration.usable):
         raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
     controller = _law_for(scenario, plan, law, replans)
-    robot, driven = own_robot.connected(scenario, law)
-    with at_rest_after(robot):
+    driven = own_robot.connected(scenario, law)
+    with at_rest_after(driven.robot):
         if own:
             wrong = driven.fits()
             if wrong:

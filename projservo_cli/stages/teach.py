@@ -141,9 +141,8 @@ def _put_to(config: Config, q: FloatArray) -> FaultyRobot:
 def checked(config: Config, calibration: Calibration, taught: Taught) -> _Checked:
     """Whether joints reach what was taught, by a calibration, and which markers are off what they show.
 
-    Raises WorkFailed if a camera does not see the whole face, InputError if the configuration has no face.
+    taught : with the whole face.
     """
-    require_face(config, taught)
     joints = joints_of(config, calibration.joint_types, calibration)
     start = np.clip(taught.q, joints.lower, joints.upper).tolist()
     asked = {

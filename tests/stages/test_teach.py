@@ -6,7 +6,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.teach import checked, teach
+from projservo_cli.stages.teach import checked, require_face, teach
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
 
@@ -72,7 +72,7 @@ def test_what_does_not_fit_the_calibration_is_told(calibration):
     assert nowhere.reason
     taught.s[1, 2] = np.nan
     with pytest.raises(WorkFailed, match="right camera does not see marker 2 of the face"):
-        checked(config(), calibration, taught)
+        require_face(config(), taught)
 
 
 def test_a_file_that_was_not_taught_is_refused(tmp_path):
