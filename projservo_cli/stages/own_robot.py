@@ -221,7 +221,7 @@ def simulated_robot(config: Config, joints: Joints, robot: FaultyRobot) -> Forei
     if config.plant.joint_limits == "report":
         endless = np.full(len(joints.types), math.inf)
         bounds = bounds._replace(lower=-endless, upper=endless)
-    markers = len(robot.world.number)
+    markers = len(robot.world.truth.number)
     return ForeignRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
 
 
@@ -231,15 +231,16 @@ def _in_the_loop(scenario: Scenario) -> FaultyRobot:
     assert truth is not None
     face, others, workspace = list(truth.face), list(truth.pins), np.zeros_like(plant.M)
 
-    def see(H: FloatArray, M: FloatArray) -> FloatArray:
-        """What both cameras see of markers (m, 4) after a displacement (4, 4), as the loop has it."""
+    def see(q: FloatArray, M: FloatArray) -> FloatArray:
+        """What both cameras see of markers (m, 4) at joints (n,), as the loop has it."""
         s, ordered = np.zeros((2, len(M), 2)), np.zeros((2, len(M), 2))
-        observe(plant._replace(M=M[face], pins=M[others]), as_mat(H), workspace, ordered, np.zeros(2))
+        H = as_mat(truth.displacement(q))
+        observe(plant._replace(M=M[face], pins=M[others]), H, workspace, ordered, np.zeros(2))
         s[:, face + others] = ordered
         return s
 
     start, sigma_px, period = scenario.exact.q_start, config.noise.servo_px, config.control.period_s
-    world = World(truth.robot, start, truth.M, truth.number, see, sigma_px, period, config.seed, SERVO_NOISE)
+    world = World(truth, start, see, False, sigma_px, period, config.seed, SERVO_NOISE)
     return FaultyRobot(world, config.disturbance)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from projservo_cli.calibration import REACH_M, REACH_RAD
 from projservo_cli.config import Config
 from projservo_cli.config.models import Disturbance, FrozenJoint, LostMarkers
-from projservo_cli.geometry.kinematics import joint_operators, project
+from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.robots.simulated import Arm
 from projservo_cli.stages.world import FAULTS, Truth
@@ -34,17 +34,15 @@ _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
 class World(NamedTuple):
     """A simulated robot and its rig while nothing is wrong."""
 
-    arm: Arm
+    truth: Truth
     q_start: FloatArray  # (n,) first readings, rad or m
-    M: FloatArray  # (m, 4) markers at the reference, m
-    number: tuple[int, ...]  # (m,) of the markers
-    # pixels (2, m, 2) of markers (m, 4) after a displacement (4, 4), NaN where unseen
+    # pixels (2, m, 2) of markers (m, 4), given at the reference, at joints (n,); NaN where unseen
     see: Callable[[FloatArray, FloatArray], FloatArray]
+    borders: bool  # whether markers outside an image are unseen
     sigma_px: float  # noise of a coordinate of each frame
     period: float  # of the loop, s
     seed: int
-    stream: int = 0  # of the random numbers of the seed
-    size: tuple[float, float] | None = None  # of images that end at their border, px
+    stream: int  # of the random numbers of the seed
 
     def random(self, view: int, k: int) -> np.random.Generator:
         """Random numbers of a frame of a view."""
@@ -55,18 +53,7 @@ def robot_by_itself(
     config: Config, truth: Truth, q_start: FloatArray, sigma_px: float, seed: int, stream: int
 ) -> "FaultyRobot":
     """The simulated robot at joints (n,), rad or m, that nothing befalls and whose images have borders."""
-    world = World(
-        truth.robot,
-        q_start,
-        truth.M,
-        truth.number,
-        lambda H, M: project(truth.P, M @ H.T),
-        sigma_px,
-        config.control.period_s,
-        seed,
-        stream,
-        (float(truth.image_size[0]), float(truth.image_size[1])),
-    )
+    world = World(truth, q_start, truth.images, True, sigma_px, config.control.period_s, seed, stream)
     events = [name for name in type(config.disturbance).model_fields if name not in FAULTS]
     return FaultyRobot(world, config.disturbance.model_copy(update=dict.fromkeys(events)))
 
@@ -165,15 +152,15 @@ class _Joints:
     """
 
     def __init__(self, world: World, given: Disturbance) -> None:
-        self.arm, self._lag, self._bump = world.arm, given.lag_s, given.bump
+        self.arm, self._lag, self._bump = world.truth.robot, given.lag_s, given.bump
         self._struck_at = math.inf if given.bump is None else given.bump.at_step * world.period
-        scale = np.where(world.arm.joint_types == PRISMATIC, _M_PER_RAD, 1.0)
+        scale = np.where(self.arm.joint_types == PRISMATIC, _M_PER_RAD, 1.0)
         self.tick = scale * (2.0 * math.pi / given.encoder_ticks if given.encoder_ticks else 0.0)
         self._play = 0.5 * math.radians(given.play_deg) * scale
         # What gravity costs a joint that holds the tool at full reach, rad.
         self._sag, self._flex = math.radians(given.sag_deg), math.radians(given.flex_deg)
         self._loaded = self._sag > 0.0 or self._flex > 0.0
-        self._reach = full_reach(world.arm) if self._loaded else 1.0
+        self._reach = full_reach(self.arm) if self._loaded else 1.0
         self.motor = np.array(world.q_start, dtype=np.float64)
         self._link, self._slip = self.motor.copy(), np.zeros(len(self.motor))  # beyond the play; beyond both
         load = self._load(self.motor)
@@ -284,21 +271,20 @@ class _Camera:
     def _exposed(self, k: int, middle: float) -> _Frame:
         """The frame of a number, its exposure half over at a time, s."""
         world, given, step = self._world, self._given, _step(middle, self._world.period)
-        M, moved, knocked, lost = world.M, given.marker_moved, given.camera_moved, given.lost_markers
-        if moved is not None and step >= moved.at_step:
+        truth, M = world.truth, world.truth.M
+        if (moved := given.marker_moved) is not None and step >= moved.at_step:
             M = M.copy()
-            M[world.number.index(moved.marker), :3] += world.arm.base_tool[:3, :3] @ moved.by_m
-        many = _EXPOSED if self._given.exposure_s else 1
-        instants = middle + self._given.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
-        from_tool = np.linalg.inv(world.arm.base_tool)
-        shown = [world.see(world.arm.pose(self._joints.at(t)) @ from_tool, M)[self._view] for t in instants]
+            M[truth.number.index(moved.marker), :3] += truth.robot.base_tool[:3, :3] @ moved.by_m
+        many = _EXPOSED if given.exposure_s else 1
+        instants = middle + given.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
+        shown = [world.see(self._joints.at(t), M)[self._view] for t in instants]
         rng = world.random(self._view, _BEFORE + k)
         rng.standard_normal()  # that of the jitter
         pixels = np.mean(shown, axis=0) + world.sigma_px * rng.standard_normal(shown[0].shape)
-        if knocked is not None and step >= knocked.at_step:
+        if (knocked := given.camera_moved) is not None and step >= knocked.at_step:
             pixels += knocked.by_view()[self._view]
-        if lost is not None and _lasts(lost, step):
-            pixels[[world.number.index(number) for number in lost.markers or world.number]] = math.nan
-        if world.size is not None:
-            pixels[~((pixels >= -0.5) & (pixels <= np.array(world.size) - 0.5)).all(axis=1)] = math.nan
+        if (lost := given.lost_markers) is not None and _lasts(lost, step):
+            pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
+        if world.borders:
+            pixels[~((pixels >= -0.5) & (pixels <= truth.image_size - 0.5)).all(axis=1)] = math.nan
         return _Frame(middle, middle + self._clock, pixels)

@@ -9,6 +9,7 @@ from projservo_cli.config.models import Disturbance
 from projservo_cli.records import REVOLUTE
 from projservo_cli.robots.simulated import Arm
 from projservo_cli.stages.simulation import FaultyRobot, World, full_reach
+from projservo_cli.stages.world import Truth
 from tests.samples import displacement, pixels, revolute, rig
 
 PERIOD = 0.04
@@ -39,10 +40,8 @@ def images(q, M=M):
 
 
 def robot(sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **disturbance):
-    def see(H, M):
-        return pixels(CAMERAS, M @ H.T)
-
-    world = World(arm(), np.array(q_start), M, (0, 1, 2), see, sigma_px, PERIOD, seed)
+    truth = Truth(arm(), CAMERAS, M, (0, 1, 2), (), 0, np.full(2, math.inf))
+    world = World(truth, np.array(q_start), truth.images, True, sigma_px, PERIOD, seed, 0)
     return FaultyRobot(world, Disturbance.model_validate(disturbance))
 
 
