@@ -63,10 +63,10 @@ class Taught:
 class _Checked(NamedTuple):
     """What a calibration says to what was taught."""
 
-    reason: str  # whether joints reach it, in words
-    reached: bool
-    off_px: FloatArray  # (2, m) by which markers are off what those joints, else those read, would show
+    off_px: FloatArray  # (2, m) by which markers are off what the joints that reach it, else those read, show
     far: list[tuple[int, str, float]]  # markers beyond what noise explains, which view, how far, px
+    reached: bool
+    reason: str  # whether joints reach it, in words
 
 
 def teach(
@@ -167,7 +167,7 @@ def checked(config: Config, calibration: Calibration, taught: Taught) -> _Checke
         (numbers[k], VIEWS[view], float(off[view, k]))
         for view, k in np.argwhere(off > _FAR * math.sqrt(2.0) * noise).tolist()
     ]
-    return _Checked(reason, reached, off, far)
+    return _Checked(off, far, reached, reason)
 
 
 def require_face(config: Config, taught: Taught) -> None:
