@@ -6,7 +6,7 @@ knows how it is stored.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,15 +119,11 @@ class Observation:
 
     def rows(self, keep: BoolArray) -> "Observation":
         """Some of the poses (K,)."""
-        return Observation(
-            self.pose[keep],
-            self.marker,
-            self.q[keep],
-            self.images[keep],
-            None if self.moving is None else self.moving[keep],
-            None if self.t_q is None else self.t_q[keep],
-            None if self.t_view is None else self.t_view[keep],
-        )
+        kept: dict[str, Any] = {}
+        for name in ("pose", "q", "images", "moving", "t_q", "t_view"):
+            values = getattr(self, name)
+            kept[name] = None if values is None else values[keep]
+        return replace(self, **kept)
 
     @property
     def at_rest(self) -> "Observation":
@@ -203,8 +199,7 @@ class Calibration:
     )
     sigma_q: float | None = _scalar(
         units="rad",
-        about="rms of joint readings less true angles, of prismatic joints × 0.3 m/rad; 0 where no noise of "
-        "joints shows, none where it was not asked for",
+        about="rms of joint readings less true joints, prismatic × 0.3 m/rad; 0 where none shows",
         default=None,
     )
     sigma_q_interval: FloatArray | None = _array(
@@ -217,15 +212,10 @@ class Calibration:
         "view", "limit", units="s", about="95 % interval of the delay", default=None
     )
     delay_jitter_s: FloatArray | None = _array(
-        "view",
-        units="s",
-        about="deviation of single images beyond what pixels and joints explain",
-        default=None,
+        "view", units="s", about="deviation of single images from the delay", default=None
     )
     model_px: float = _scalar(
-        units="px",
-        about="error of the model per coordinate by the residuals, 0 within noise",
-        default=0.0,
+        units="px", about="error of the model per coordinate, 0 within noise", default=0.0
     )
 
     def model(self) -> Model:

@@ -152,21 +152,18 @@ def write_table(observation: Observation, path: Path | str, *, recording: str = 
     columns |= {f"q{i}": np.repeat(values, m) for i, values in enumerate(observation.q.T, 1)}
     pixels = np.moveaxis(observation.images, 1, 2).reshape(K * m, 4).T
     columns |= {name: _or_empty(values) for name, values in zip(_PIXELS, pixels, strict=True)}
-    if observation.moving is not None:
-        columns[_MOVING] = np.repeat(observation.moving, m)
-    if observation.t_q is not None:
-        columns["t_q"] = _or_empty(np.repeat(observation.t_q, m))
+    moments = {_MOVING: observation.moving, "t_q": observation.t_q}
     if observation.t_view is not None:
-        columns |= {
-            name: _or_empty(np.repeat(values, m))
-            for name, values in zip(_TIMES[1:], observation.t_view.T, strict=True)
-        }
+        moments |= dict(zip(_TIMES[1:], observation.t_view.T, strict=True))
+    for name, values in moments.items():
+        if values is not None:
+            columns[name] = _or_empty(np.repeat(values, m))
     if recording:
         columns[_RECORDING] = np.full(K * m, recording)
     write_whole(Path(path), to_csv(columns))
 
 
-def _or_empty(values: FloatArray) -> npt.NDArray[Any]:
+def _or_empty(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Cells of numbers, empty for NaN."""
     return np.where(np.isnan(values), "", values.astype(object))
 

@@ -411,7 +411,7 @@ def minimize(
             new_residual = problem.residual(candidate)
             new_cost = _cost(weight, new_residual, problem.strain(candidate))
             fresh = bool(np.isfinite(new_cost)) and new_cost <= cost
-            moved = _cost(weight, here.change(x))
+            moved = _cost(weight, here.change(x), np.zeros(0))
             settled = moved <= least_change * max(cost, _LEAST_RESIDUAL**2 * float(weight.sum()))
         if fresh:
             scene, residual, weight = candidate, new_residual, _weights(new_residual, rows, robust)
@@ -453,7 +453,6 @@ def _weights(residual: FloatArray, rows: BoolArray, robust: bool) -> FloatArray:
     return np.where(rows, 1.0 / (1.0 + (distance / width) ** 2), 0.0)
 
 
-def _cost(weight: FloatArray, residual: FloatArray, strain: FloatArray | None = None) -> float:
+def _cost(weight: FloatArray, residual: FloatArray, strain: FloatArray) -> float:
     """Weighted sum of squares of residuals (2, N, 2), and that of strains (K, n) if any, px²."""
-    images = float((weight[..., None] * residual**2).sum())
-    return images if strain is None else images + float((strain**2).sum())
+    return float((weight[..., None] * residual**2).sum()) + float((strain**2).sum())

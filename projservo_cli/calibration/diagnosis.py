@@ -260,7 +260,8 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     if d + 1 >= K:
         return 0.0
     columns = _cleared_columns(solution, frame)
-    scores = (columns * solution.whitened_residual).sum(axis=(1, 3))
+    left = solution.problem.whitened(solution.scene, solution.raw.reshape(-1, 1), solution.used)
+    scores = (columns * left.reshape(solution.raw.shape)).sum(axis=(1, 3))
     by_pose = np.stack([np.bincount(readings.pose_of, score)[poses] for score in scores])
     total = by_pose.sum(axis=1)
     flat = columns.reshape(d, -1)

@@ -277,8 +277,6 @@ def _record(
         predicted_p99_px=None if verdict.error is None else verdict.error[1],
         lens=scene.lens,
         sigma_q=None if joint_noise is None else joint_noise.sigma_q,
-        sigma_q_interval=None
-        if joint_noise is None or joint_noise.interval is None
-        else np.array(joint_noise.interval),
+        sigma_q_interval=None if joint_noise is None else joint_noise.interval,
         model_px=float(np.sqrt(over)),
     )

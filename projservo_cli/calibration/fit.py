@@ -45,12 +45,9 @@ class Solution:
         return float((self.residual[self.used] ** 2).sum() + (self.problem.strain(self.scene) ** 2).sum())
 
     @property
-    def whitened_residual(self) -> FloatArray:
-        """S^-½ times what is left of the images at the joints as read, (2, N, 2), px."""
-        if self.problem.tau is None:
-            return self.residual
-        raw = self.problem.with_noise(None).residual(self.scene) * self.used[..., None]
-        return self.problem.whitened(self.scene, raw.reshape(-1, 1), self.used).reshape(raw.shape)
+    def raw(self) -> FloatArray:
+        """Predicted minus seen at the joints as read, (2, N, 2), px, zero where it does not count."""
+        return self.problem.with_noise(None).residual(self.scene) * self.used[..., None]
 
     @property
     def joint_effect_px(self) -> float:
@@ -68,8 +65,7 @@ class Solution:
     @property
     def rms_px(self) -> float:
         """Root mean square of the Euclidean residual per marker and view at the joints as read, px."""
-        residual = self.problem.with_noise(None).residual(self.scene)
-        return float(np.sqrt((residual[self.used] ** 2).sum() / max(int(self.used.sum()), 1)))
+        return float(np.sqrt((self.raw[self.used] ** 2).sum() / max(int(self.used.sum()), 1)))
 
     @property
     def typical_px(self) -> float:

@@ -22,11 +22,9 @@ from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.records import BoolArray, FloatArray
 
-# What a prismatic joint errs where a revolute one errs by one rad, m.
-M_PER_RAD = REACH_M / REACH_RAD
 # Noise of joints that is looked for, rad: of the best encoders, and beyond any robot.
 _LEAST, _MOST = 1e-6, np.radians(1.0)
-_GRID, _FARTHER, _NEVER = 33, 5.0, 1e30
+_GRID, _FARTHER, _NEVER, _NONE = 33, 5.0, 1e30, -np.inf
 _SHARE = 0.001  # of what is left without noise of joints, that pixels may be to blame for, at least
 _OPEN = 1e-12  # information of a direction that images leave open, over that of the best known one
 # Twice the gain of the logarithm of the likelihood by chance: in 1 of 100 at the border; 95 % of an interval.
@@ -39,7 +37,7 @@ _LEAST_TICK, _ON_TICK = 1e-5, 0.01
 
 def unit_noise(prismatic: BoolArray) -> FloatArray:
     """Noise (n,) of joints where that of revolute ones is one rad, rad or m."""
-    return np.where(prismatic, M_PER_RAD, 1.0)
+    return np.where(prismatic, REACH_M / REACH_RAD, 1.0)
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class JointNoise:
     """Deviation of joint readings from the true joints, rad; of prismatic joints × 0.3 m/rad."""
 
     sigma_q: float
-    interval: tuple[float, float] | None  # of 95 %; None where it was given or explains nothing
+    interval: FloatArray | None  # (2,) of 95 %; None where it was given or explains nothing
     over_pixels: float  # sigma_q over the noise of pixels, rad/px
     ticks: bool = False  # whether it is that of counted ticks
 
@@ -63,43 +61,44 @@ class JointNoise:
         likelihood = _Likelihood(problem, scene, used, sigma_px)
         # Ratios of both noises, rad/px, as logarithms: even steps from the least that matters to the most,
         # at which pixels may be left with far less noise.
-        sigma = likelihood.sigma(0.0)
+        sigma = likelihood.sigma(_NONE)
         ends = _LEAST / sigma, _MOST / (sigma if likelihood.given is not None else _SHARE * sigma)
         places = np.log(np.geomspace(*ends, _GRID))
-        values = [likelihood.deviance(np.exp(place)) for place in places]
+        values = [likelihood.deviance(place) for place in places]
         best = int(np.argmin(values))
         near = places[max(best - 1, 0)], places[min(best + 1, _GRID - 1)]
-        found = minimize_scalar(lambda x: likelihood.deviance(np.exp(x)), bounds=near, method="bounded")
-        place, least, none = float(found.x), float(found.fun), likelihood.deviance(0.0)
+        found = minimize_scalar(likelihood.deviance, bounds=near, method="bounded")
+        place, least, none = float(found.x), float(found.fun), likelihood.deviance(_NONE)
 
         def beyond(at: float) -> float:
             """How far a place is beyond the interval."""
-            return likelihood.deviance(np.exp(at)) - least - _INTERVAL
+            return likelihood.deviance(at) - least - _INTERVAL
 
-        def told(at: float) -> float:
-            """Noise of joints at a place, with that of pixels which goes with it, rad."""
-            return float(np.exp(at) * likelihood.sigma(np.exp(at)))
-
-        low = 0.0 if none - least <= _INTERVAL else told(brentq(beyond, places[0] - _FARTHER, place))
-        high = told(brentq(beyond, place, places[-1])) if beyond(places[-1]) > 0.0 else _MOST
+        low, high = 0.0, _MOST
+        if none - least > _INTERVAL:
+            low = likelihood.sigma_q(brentq(beyond, places[0] - _FARTHER, place))
+        if beyond(places[-1]) > 0.0:
+            high = likelihood.sigma_q(brentq(beyond, place, places[-1]))
         if high >= _MOST:  # no noise: a model that is wrong asks for any amount of it
             return NO_JOINT_NOISE
         if none - least <= _SIGNIFICANT:
-            return cls(0.0, (0.0, high), 0.0)
-        sigma_q, ratio = told(place), float(np.exp(place))
-        if likelihood.contradicted(ratio):
+            return cls(0.0, np.array([0.0, high]), 0.0)
+        if likelihood.contradicted(place):
             return NO_JOINT_NOISE
         counted = tick_noise(problem.readings.q, problem.readings.prismatic)
-        if low <= counted <= high:
-            return cls(counted, (low, high), ratio * counted / sigma_q, True)
-        return cls(sigma_q, (low, high), ratio)
+        ticks, sigma_q = low <= counted <= high, likelihood.sigma_q(place)
+        taken = counted if ticks else sigma_q
+        return cls(taken, np.array([low, high]), float(np.exp(place)) * taken / sigma_q, ticks)
 
 
 NO_JOINT_NOISE = JointNoise(0.0, None, 0.0)  # where none explains what is left
 
 
 class _Likelihood:
-    """Restricted likelihood of what is left of the images about a scene, at any ratio of both noises."""
+    """Restricted likelihood of what is left of the images about a scene.
+
+    At a place: the logarithm of the noise of joints over that of pixels, rad/px.
+    """
 
     def __init__(self, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None) -> None:
         self.given = sigma_px
@@ -123,21 +122,22 @@ class _Likelihood:
         self.g = free.T @ problem.gradient(J, residual)
         self.square = float((residual**2).sum())
 
-    def _normal(self, ratio: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Normal equations A, g in the free directions at a ratio of both noises, and shares of joints."""
-        share = ratio**2 * self.eigenvalue / (1.0 + ratio**2 * self.eigenvalue)
+    def _normal(self, place: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal equations A, g in the free directions, and squares (K n,) of what joints do to images."""
+        square = np.exp(2.0 * place) * self.eigenvalue
+        share = square / (1.0 + square)
         A = np.eye(len(self.g)) - (self.B.T * share) @ self.B
-        return A, self.g - self.B.T @ (share * self.h), share
+        return A, self.g - self.B.T @ (share * self.h), square
 
-    def _parts(self, ratio: float) -> tuple[float, float]:
-        """Squares that are left, px², and logarithms of determinants, at a ratio of the noises, rad/px."""
-        A, g, share = self._normal(ratio)
+    def _parts(self, place: float) -> tuple[float, float]:
+        """Squares that are left, px², and logarithms of determinants, at a place."""
+        A, g, square = self._normal(place)
         factor = cho_factor(A)
-        left = self.square - float(share @ self.h**2) - float(g @ cho_solve(factor, g))
+        left = self.square - float(square / (1.0 + square) @ self.h**2) - float(g @ cho_solve(factor, g))
         logs = 2.0 * float(np.log(np.diagonal(factor[0])).sum())
-        return max(left, 1e-300), logs + float(np.log1p(ratio**2 * self.eigenvalue).sum())
+        return max(left, 1e-300), logs + float(np.log1p(square).sum())
 
-    def contradicted(self, ratio: float) -> bool:
+    def contradicted(self, place: float) -> bool:
         """Whether fits without and with noise of joints predict images that noise alone does not set apart.
 
         Both are right where what is left is noise, and the first only wastes some of the data. Where the
@@ -146,28 +146,32 @@ class _Likelihood:
         so that no fit is made for nothing. The second is the most precise one where there is such noise,
         so that the variance of the difference is the difference of the variances.
         """
-        A, g, _ = self._normal(ratio)
+        A, g, square = self._normal(place)
         inverse = np.linalg.inv(A)
         apart = self.g - inverse @ g
-        variance = np.eye(len(A)) + (self.B.T * (ratio**2 * self.eigenvalue)) @ self.B - inverse
-        variances = self.sigma(ratio) ** 2 * np.maximum(np.linalg.eigvalsh(variance), 0.0)
+        variance = np.eye(len(A)) + (self.B.T * square) @ self.B - inverse
+        variances = self.sigma(place) ** 2 * np.maximum(np.linalg.eigvalsh(variance), 0.0)
         return float(apart @ apart) > _LENIENT * quantile(variances, _CHANCE)
 
-    def deviance(self, ratio: float) -> float:
+    def deviance(self, place: float) -> float:
         """Twice the negative logarithm of the likelihood, up to a constant; of the best noise of pixels."""
         try:
-            left, logs = self._parts(ratio)
+            left, logs = self._parts(place)
         except np.linalg.LinAlgError:  # of joints that may be anywhere nothing is left to tell the robot by
             return _NEVER
         if self.given is not None:
             return left / self.given**2 + logs
         return float(self.dof * np.log(left) + logs)
 
-    def sigma(self, ratio: float) -> float:
-        """Noise of pixels at a ratio: as given, else the most likely one, px."""
+    def sigma(self, place: float) -> float:
+        """Noise of pixels at a place: as given, else the most likely one, px."""
         if self.given is not None:
             return self.given
-        return float(np.sqrt(self._parts(ratio)[0] / max(self.dof, 1)))
+        return float(np.sqrt(self._parts(place)[0] / max(self.dof, 1)))
+
+    def sigma_q(self, place: float) -> float:
+        """Noise of joints at a place, rad."""
+        return float(np.exp(place) * self.sigma(place))
 
 
 def tick_noise(q: FloatArray, prismatic: BoolArray) -> float:

@@ -197,11 +197,8 @@ def judged(
         reason = f"{reason}, with joint readings off by {words}"
         if solution.joint_effect_px > solution.sigma_px:
             limit = "joint readings"
-            advice.append(
-                f"joint readings off by {words} move images by {solution.joint_effect_px:.3g} px, more than "
-                f"pixel noise of {solution.sigma_px:.3g} px: finer or stiffer joints would help, not better "
-                "pixels"
-            )
+            effect = f"these move images by {solution.joint_effect_px:.3g} px, more than pixel noise"
+            advice.append(f"joint readings are off, and {effect}: finer or stiffer joints would help")
     if warned or suspicion == "lens":
         limit = suspicion
     elif (weak := noise > WEAK_NOISE).any():

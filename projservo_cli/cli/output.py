@@ -174,7 +174,7 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
     if value["sigma_q"] is not None:
         yield wrapped(f"joint readings: {_joint_noise(value)}", "  ")
     if value["delay_s"] is not None:
-        yield wrapped(f"images late by {_delays(value)}", "  ")
+        yield wrapped(f"images late by {', '.join(_delays(value))}", "  ")
     weak = ", ".join(joint["name"] for joint in value["joints"] if joint["weak"])
     found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in LISTS if value[name]]
     if weak or found:
@@ -207,16 +207,12 @@ def _joint_noise(value: dict[str, Any]) -> str:
     return f"off by {sigma:.3g}° rms (95 %: {low:.3g}° to {high:.3g}°)"
 
 
-def _delays(value: dict[str, Any]) -> str:
-    """By how much images of both views are late, with the interval and by how much single ones differ, ms."""
-    names = ("delay_s", "delay_interval_s", "delay_jitter_s")
-    found = []
-    for view, delay, (low, high), jitter in zip(
-        ("left", "right"), *(value[name] for name in names), strict=True
-    ):
-        interval = f"95 %: {1e3 * low:.1f} to {1e3 * high:.1f}"
-        found.append(f"{1e3 * delay:.1f} ms {view} ({interval}; single ones ± {1e3 * jitter:.1f})")
-    return ", ".join(found)
+def _delays(value: dict[str, Any]) -> Iterator[str]:
+    """By how much images of each view are late, with the interval and by how much single ones differ, ms."""
+    for i, view in enumerate(("left", "right")):
+        late = value["delay_s"][i], *value["delay_interval_s"][i], value["delay_jitter_s"][i]
+        delay, low, high, jitter = (1e3 * seconds for seconds in late)
+        yield f"{delay:.1f} ms {view} (95 %: {low:.1f} to {high:.1f}; single ones ± {jitter:.1f})"
 
 
 def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
