@@ -11,6 +11,7 @@ nonstandard conditions", JASA 82, 1987.
 """
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -186,17 +187,15 @@ def _tick(values: FloatArray) -> float:
     """The step of which all distances of values (K,) are multiples; 0 where there is none."""
     steps = np.diff(np.unique(values))
     steps = steps[steps > 0.1 * _LEAST_TICK]
-    if len(steps) < 2:
-        return 0.0
-    tick = float(steps[0])
-    for step in steps[1:]:  # Euclid's algorithm, on numbers that are rounded
-        a, b = max(tick, float(step)), min(tick, float(step))
-        while b > _ON_TICK * _LEAST_TICK:
-            a, b = b, abs(a - b * round(a / b))
-        tick = a
-        if tick < _LEAST_TICK:
-            return 0.0
-    return float(np.median(steps / np.round(steps / tick)))
+    tick = reduce(_common_measure, steps.tolist(), 0.0)
+    return float(np.median(steps / np.round(steps / tick))) if len(steps) > 1 and tick >= _LEAST_TICK else 0.0
+
+
+def _common_measure(a: float, b: float) -> float:
+    """Greatest number that both are multiples of: Euclid's algorithm, on numbers that are rounded."""
+    while b > _ON_TICK * _LEAST_TICK:
+        a, b = b, abs(a - b * round(a / b))
+    return a
 
 
 def quantile(variances: FloatArray, probability: float) -> float:
