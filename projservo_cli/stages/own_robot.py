@@ -35,20 +35,15 @@ def bounds_of(config: Config, joints: Joints) -> Bounds:
     """What no command to a robot may exceed."""
     plant, period = config.plant, config.control.period_s
     speed = joints.speed * plant.speed_scale
-    lead = speed * (plant.lag_s + period) + sag_of(config, joints)
+    lead = speed * (plant.lag_s + period) + length_of(plant.sag_deg, joints)
     if plant.lead_deg is not None:
         lead = length_of(plant.lead_deg, joints)
     return Bounds(joints.lower, joints.upper, speed, lead, period)
 
 
-def sag_of(config: Config, joints: Joints) -> FloatArray:
-    """How far (n,) a joint may stay from where it was sent, rad or m."""
-    return length_of(config.plant.sag_deg, joints)
-
-
 def servo_of(config: Config, joints: Joints) -> Servo:
     """What is taken of the servos of a robot."""
-    return Servo(config.plant.lag_s, sag_of(config, joints))
+    return Servo(config.plant.lag_s, length_of(config.plant.sag_deg, joints))
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
@@ -65,17 +60,17 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
     return ForeignRobot(robot, f"plant {target}", markers, bounds, plant.timeout_s, plant.open_s)
 
 
-def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: str) -> Iterator[Reading]:
+def way_to(robot: Steered, q: FloatArray, settle_s: float, what: str) -> Iterator[Reading]:
     """Move to joints (n,) along a straight line at the speed limit and come to rest there.
 
     what : the command it is for, in messages.
-    Yields what is read after each command. The robot has then stood still for ``plant.settle_s``, and so have
-    the images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
+    Yields what is read after each command. The robot has then stood still for so many s, and so have the
+    images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
     """
-    period, bounds, sag = config.control.period_s, robot.robot.bounds, sag_of(config, joints)
-    begun, still = robot.look().q, _Standstill(config.plant.settle_s)
+    bounds, sag = robot.robot.bounds, robot.servo.sag
+    begun, still = robot.look().q, _Standstill(settle_s)
     while (gap := q - robot.target).any():
-        robot.command(gap / np.max(np.abs(gap) / (bounds.speed * period), initial=1.0), period)
+        robot.command(gap / np.max(np.abs(gap) / (bounds.speed * bounds.period), initial=1.0), bounds.period)
         stands = still.joints(robot.look())
         yield robot.reading
         away = np.abs(q - robot.reading.q) - np.abs(q - begun)
@@ -83,7 +78,7 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
         if (away > bounds.lead).any() or (stands and held.any()):
             break
     else:
-        yield from at_rest(robot.reading, partial(robot.hold, period), config, what)
+        yield from at_rest(robot.reading, partial(robot.hold, bounds.period), settle_s, what)
     gap = np.abs(q - robot.reading.q)
     i = int(np.argmax(gap / np.maximum(sag, _STILL)))
     if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
@@ -97,11 +92,11 @@ def way_to(robot: Steered, q: FloatArray, config: Config, joints: Joints, what: 
         )
 
 
-def at_rest(reading: Reading, look: Callable[[], Reading], config: Config, what: str) -> Iterator[Reading]:
+def at_rest(reading: Reading, look: Callable[[], Reading], settle_s: float, what: str) -> Iterator[Reading]:
     """Look, a period after the other, until joints and images stand still, and yield what is read."""
-    still, first = _Standstill(config.plant.settle_s), reading.t_q
+    still, first = _Standstill(settle_s), reading.t_q
     while not still.all(reading):
-        if reading.t_q > first + config.plant.settle_s + _PATIENCE_S:
+        if reading.t_q > first + settle_s + _PATIENCE_S:
             raise WorkFailed(
                 f"{what}: {still.moving or 'the robot'} does not come to rest within {_PATIENCE_S:g} s: look "
                 "for what vibrates, creeps or flickers"

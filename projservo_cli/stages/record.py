@@ -20,7 +20,6 @@ from projservo_cli.stages.own_robot import (
     averaged,
     foreign_robot,
     new_views,
-    sag_of,
     servo_of,
     simulated_robot,
     way_to,
@@ -215,7 +214,7 @@ def new_recording(
     key = digest(config, DEPENDS_ON)[:16]
     recording = _Recording(path, key, targets, np.array(numbers, dtype=np.int64))
     if path.exists() and not force:
-        _resume(recording, sag_of(config, joints) + _SLACK)
+        _resume(recording, servo_of(config, joints).sag + _SLACK)
     return recording
 
 
@@ -306,8 +305,7 @@ def _simulated(config: Config, recording: _Recording) -> Iterator[int]:
 
 def _recorded(robot: ForeignRobot, config: Config, recording: _Recording) -> Iterator[int]:
     """Drive to one pending pose after the other and look; the number of each that was recorded."""
-    joints = joints_of(config)
-    steered = Steered(robot, servo_of(config, joints))
+    steered, settle_s = Steered(robot, servo_of(config, joints_of(config))), config.plant.settle_s
 
     def look() -> Reading:
         """A look after a period."""
@@ -315,11 +313,11 @@ def _recorded(robot: ForeignRobot, config: Config, recording: _Recording) -> Ite
         return steered.hold(config.control.period_s)
 
     for pose in recording.pending:
-        seen = list(way_to(steered, recording.targets[pose], config, joints, "record"))
+        seen = list(way_to(steered, recording.targets[pose], settle_s, "record"))
         recording.commands += len(seen)
         recording.done[pose], squares, count = averaged(steered.reading, look, config.plant.frames)
         recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
-        recording.ways[pose + 1] = _moving(seen, config.plant.settle_s)
+        recording.ways[pose + 1] = _moving(seen, settle_s)
         yield pose
 
 

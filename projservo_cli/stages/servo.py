@@ -398,8 +398,8 @@ def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) 
             wrong = driven.fits()
             if wrong:
                 raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-            start = scenario.ends.q_start
-            for _ in own_robot.way_to(driven.steered, start, scenario.config, scenario.joints, "servo"):
+            start, settle_s = scenario.ends.q_start, scenario.config.plant.settle_s
+            for _ in own_robot.way_to(driven.steered, start, settle_s, "servo"):
                 pass
         driven.begin()
         standing = Standing(driven, scenario.gains.period, scenario.limits)

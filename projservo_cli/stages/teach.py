@@ -114,7 +114,7 @@ def teach(
             wait("take your hands away")
         first, reading = robot.read(), look()
         if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
-            reading = [reading, *at_rest(reading, look, config, "teach")][-1]
+            reading = [reading, *at_rest(reading, look, config.plant.settle_s, "teach")][-1]
         mean, squares, count = averaged(reading, look, frames)
     sigma = np.sqrt(squares / np.maximum(2 * count * (count - 1), 1))
     return Taught(
