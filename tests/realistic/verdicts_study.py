@@ -2,8 +2,8 @@
 
     python -m tests.realistic.verdicts_study [--arms ur5 hobby] [--tasks 5] [-o runs.csv]
 
-Guided runs of the first tasks by seed; what befalls a robot, does at period 10. A fault that a robot copes with
-must end in ``converged``; every other in the verdict and the words that are expected. ``plateau`` and
+Guided runs of the first tasks by seed; what befalls a robot, does at period 10. A fault that a robot copes
+with must end in ``converged``; every other in the verdict and the words that are expected. ``plateau`` and
 ``max steps`` without a cause are catch-alls, and count as wrong.
 """
 
@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.robots.faulty import FaultyRobot
 from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.simulation import FaultyRobot
 from tests.guidance.studies import in_two_processes, write_rows
 from tests.known import configured
 from tests.realistic.conditions import ARMS, SEEDS, task_config
@@ -148,7 +148,7 @@ def driven(job):
     for seed in list(SEEDS)[:count]:
         mine = task_config(config, arm, seed)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("projservo_cli.stages.simulation.FaultyRobot", robot)
+            patch.setattr("projservo_cli.stages.own_robot.FaultyRobot", robot)
             try:
                 trace = servo.run(mine, calibration, plan.run(mine, calibration), "exact_track")
                 found = {"verdict": trace.verdict, "reason": trace.reason, "steps": trace.steps}
@@ -171,9 +171,8 @@ def main():
     for mine in in_two_processes(driven, jobs, "arms and faults"):
         rows += mine
         right = sum(row["right"] for row in mine)
-        print(
-            f"{mine[0]['arm']}, {mine[0]['fault']}: {right} of {len(mine)} as expected ({mine[0]['expected']})"
-        )
+        arm, fault, expected = (mine[0][name] for name in ("arm", "fault", "expected"))
+        print(f"{arm}, {fault}: {right} of {len(mine)} as expected ({expected})", flush=True)
         for row in mine:
             if not row["right"]:
                 print(f"    {row.get('seed')}: {row['verdict']}: {row['reason']}", flush=True)
