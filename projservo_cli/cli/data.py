@@ -104,7 +104,7 @@ def _tell_recording(console: Console, recording: Any) -> None:
 
 @main.command("teach", epilog="Example: projservo teach results/mine -c mine.yaml -o goal.yaml")
 @click.argument("run", required=False, type=option.PATH)
-@option.configuration(help="Configuration (YAML). Default: paper.yaml.")
+@option.configuration(help="Configuration (YAML). Default: that in RUN, else paper.yaml.")
 @option.override
 @option.output(metavar="FILE", help="File to write (YAML). Default: goal.yaml, with --start start.yaml.")
 @click.option("--start", is_flag=True, help="It is a start that is taught: task.start.")
@@ -154,7 +154,7 @@ def _teach(
 
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
-    settings = option.configured(config, options)
+    settings = option.configured(config, options, run)
     put = None
     if at is not None:
         try:

@@ -132,11 +132,23 @@ def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
     return run or output
 
 
-def configured(config: str | None, options: Mapping[str, Any]) -> "Config":
-    """The configuration in a file, by default the one that comes with projservo, with what options say."""
+def configured(config: str | None, options: Mapping[str, Any], run: Path | None = None) -> "Config":
+    """The configuration in a file, else in a run, else that which comes with projservo, with what options say.
+
+    Raises UsageError where a robot is named by the run alone, which starts no code.
+    """
     from projservo_cli.config import load_config
 
-    return load_config(config or _shipped(), _overrides(options))
+    stored = None if config or run is None else _stored(run)
+    if stored is None or not stored.configuration:
+        return load_config(config or _shipped(), _overrides(options))
+    found = load_config(stored.path, _overrides(options), text=stored.configuration)
+    if found.plant.use is not None:
+        raise click.UsageError(
+            f"plant {found.plant.use} is named by the stored run alone, which starts no code: give the "
+            "configuration again with -c"
+        )
+    return found
 
 
 def calibration_of(run: Path | None, config: "Config") -> "Calibration | None":

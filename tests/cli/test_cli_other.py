@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import projservo_cli.calibration
+from projservo_cli.config import load_config, to_yaml
 from projservo_cli.equations import REGISTER
-from projservo_cli.store import load
+from projservo_cli.store import Run, load, save
 
 ROOT = Path(__file__).parents[2]
 
@@ -122,3 +123,15 @@ def test_a_goal_is_taught_and_told(projservo, tmp_path, monkeypatch):
         refused = projservo(*hobby, *wrong, "-o", "other.yaml")
         assert (refused.code, told in refused.err) == (2, True)
     assert not (tmp_path / "other.yaml").exists()
+
+
+def test_what_is_taught_beside_a_run_is_of_its_configuration(projservo, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = load_config(ROOT / "configs" / "hobby.yaml", ["plant.frames=2"])
+    save(Run(tmp_path / "run.h5", to_yaml(config), {}))
+    at = ("--at", "20,-5,5,-10,80", "--at-unit", "deg", "--frames", "3")
+    answer = projservo("teach", tmp_path, *at, "--json")
+    assert (answer.code, len(answer.json["joints"])) == (0, 5)
+    save(Run(tmp_path / "run.h5", to_yaml(config).replace("plant:", "plant:\n  use: nowhere:Robot"), {}))
+    refused = projservo("teach", tmp_path, "--force")
+    assert (refused.code, "named by the stored run alone" in refused.err) == (2, True)

@@ -88,7 +88,7 @@ def test_each_way_to_diverge(cause):
 def test_verdicts_have_the_promised_names():
     assert set(VERDICTS) == {
         "converged", "plateau", "diverged", "left image", "behind camera", "joint limit", "singular",
-        "max steps", "markers lost", "disturbed", "failed",
+        "max steps", "markers lost", "disturbed", "failed", "not following",
     }  # fmt: skip
 
 
