@@ -133,7 +133,7 @@ def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
 
 
 def configured(config: str | None, options: Mapping[str, Any], run: Path | None = None) -> "Config":
-    """The configuration in a file, else in a run, else that which comes with projservo, with what options say.
+    """The configuration in a file, else in a run, else that which is shipped, with what options say.
 
     Raises UsageError where a robot is named by the run alone, which starts no code.
     """
