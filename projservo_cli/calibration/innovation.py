@@ -34,6 +34,8 @@ _BENT = 0.2
 # Advantage over the next cause, twice the logarithm of odds, at which one is named; looks that are waited for
 # that; share of what a cause explains that, left to others, shows that there are several.
 _CLEAR, _PATIENCE, _LEFT = 2.0 * np.log(100.0), 12, 0.25
+# What a joint slipped by is told once it differs by no more than this share from what it was looks before.
+_STEADY = 0.1
 # Frames of both views so near to each other, s, are one look; so many are kept for those of the other view.
 _TOGETHER_S, _WAITING = 0.025, 25
 # Frames that are so near show joints of one reading.
@@ -160,6 +162,7 @@ class Innovation:
         self._pending: list[tuple[BoolArray, _Sums]] = []
         self._readings: list[FloatArray] = []
         self._doubtful = 0
+        self._amounts: list[tuple[int, float]] = []
         self._waiting: tuple[list[_Frame], list[_Frame]] = ([], [])
         self._reached = np.full(2, -np.inf)
         self._first: FloatArray | None = None
@@ -401,12 +404,14 @@ class Innovation:
         blamed = self._blamed(total)
         if not blamed:
             self._doubtful = 0
+            self._amounts.clear()
             return ""
         self._doubtful += 1
         best, *others = sorted(blamed, key=lambda blame: -blame.score)
         who = self._causes[best.causes[0]][:2]
         others = [blame for blame in others if self._causes[blame.causes[0]][:2] != who]
         clear = not others or best.score - others[0].score >= _CLEAR
+        clear &= self._is_steady(best)
         if not clear and self._doubtful < _PATIENCE:
             return ""
         rms = np.sqrt(np.square(look.r).sum() / max(2.0 * look.seen.sum(), 1.0))
@@ -416,7 +421,19 @@ class Innovation:
         if share.max() > _LEFT:
             second = self._said(_Blame(0.0, [int(np.argmax(share))], left), look)
             return f"{fit}, for more than one cause: {self._said(best, look)}; {second}"
-        return f"{fit}: {self._said(best, look)}" + ("" if clear else f"; or {self._said(others[0], look)}")
+        return f"{fit}: {self._said(best, look)}" + (
+            "" if clear or not others else f"; or {self._said(others[0], look)}"
+        )
+
+    def _is_steady(self, blame: _Blame) -> bool:
+        """Whether what a joint slipped by stays: a reading that stands still is off by ever more."""
+        who, amount = blame.causes[0], float(blame.evidence.amount[blame.causes[0], 0])
+        self._amounts.append((who, amount))
+        before = self._amounts[-WINDOW:]
+        return self._causes[who].kind != "slipped" or (
+            len(before) == WINDOW
+            and all(i == who and abs(a - amount) <= _STEADY * abs(amount) for i, a in before)
+        )
 
     def _blamed(self, total: _Sums) -> list[_Blame]:
         """What may be named, each cause since its best onset, by the criterion of Schwarz."""
