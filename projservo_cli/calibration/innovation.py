@@ -36,6 +36,8 @@ _BENT = 0.2
 _CLEAR, _PATIENCE, _LEFT = 2.0 * np.log(100.0), 12, 0.25
 # What a joint slipped by is told once it differs by no more than this share from what it was looks before.
 _STEADY = 0.1
+# By so much a link may flex under its load, rad, which looks like a joint that slipped.
+_FLEXIBLE = np.radians(1.0)
 # Frames of both views so near to each other, s, are one look; so many are kept for those of the other view.
 _TOGETHER_S, _WAITING = 0.025, 25
 # Frames that are so near show joints of one reading.
@@ -481,7 +483,10 @@ class Innovation:
             far = f"{1e3 * amount[0]:.2g} mm" if slides else f"{np.degrees(amount[0]):.2g} deg"
             alike = " or the base turned likewise" if i == 0 else ""
             alike += " or the tool turned likewise in its holder" if i == len(self._sigma_q) - 1 else ""
+            alike += " or its link flexes" if not slides and abs(amount[0]) <= _FLEXIBLE else ""
             return f"joint {i + 1} slipped by {far}{alike}; home it again, or recalibrate"
+        if kind == "flexible":
+            return f"links flex, or several joints slipped, by {px:.2g} px; less load, or recalibrate"
         if kind == "frozen":
             which = "all joints" if i < 0 else f"joint {i + 1}"
             return f"the reading of {which} stands still while the arm moves; look at its encoder and cable"
@@ -549,6 +554,7 @@ def _table_of(n: int, m: int, d: int) -> tuple[list[_Cause], int]:
         causes.append(_Cause("frozen", i, np.array([n + i]), everything))
         causes.append(_Cause("frozen", i, np.array([i, n + i, at_faster + i]), everything))
     causes.append(_Cause("frozen", -1, n + np.arange(n), everything))
+    causes.append(_Cause("flexible", -1, np.arange(n), everything))
     for v in (0, 1):
         causes.append(_Cause("late", v, np.array([2 * n + v]), views[v]))
         causes.append(_Cause("camera", v, at_camera + v * free + np.arange(free), views[v]))

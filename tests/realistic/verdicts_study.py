@@ -88,7 +88,7 @@ FAULTS = {
     "lag 150 ms": ("converged", ("disturbance.lag_s=0.15",), FaultyRobot),
     "sag 0.5 deg": ("converged", ("disturbance.sag_deg=0.5",), FaultyRobot),
     "flex 0.02 deg": ("converged", ("disturbance.flex_deg=0.02",), FaultyRobot),
-    "flex 0.5 deg": ("converged", ("disturbance.flex_deg=0.5",), FaultyRobot),
+    "flex 0.5 deg": ("converged|link flexes|links flex", ("disturbance.flex_deg=0.5",), FaultyRobot),
     "play 0.5 deg": ("converged|play in the joints", ("disturbance.play_deg=0.5",), FaultyRobot),
     "joint struck by 3 deg": (
         "converged",
