@@ -116,11 +116,19 @@ class Observation:
     t_view: FloatArray | None = _array(
         "pose", "view", units="s", about="stamps of both images, NaN where there are none", default=None
     )
+    sigma: FloatArray | None = _array(
+        "pose",
+        "view",
+        "marker",
+        units="px",
+        about="standard deviation of the pixels, per coordinate, NaN where unseen",
+        default=None,
+    )
 
     def rows(self, keep: BoolArray) -> "Observation":
         """Some of the poses (K,)."""
         kept: dict[str, Any] = {}
-        for name in ("pose", "q", "images", "moving", "t_q", "t_view"):
+        for name in ("pose", "q", "images", "moving", "t_q", "t_view", "sigma"):
             values = getattr(self, name)
             kept[name] = None if values is None else values[keep]
         return replace(self, **kept)

@@ -1,9 +1,10 @@
 """Observation tables: one row per marker seen at one robot pose, as comma-separated values.
 
-Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, perhaps ``moving, t_q,
-t_left, t_right``; further columns are ignored. Joint readings are rad or m, pixels are raw, empty pixel
-cells mean *unseen*. A pose with a number in ``moving`` is a moment of that motion; times are s, empty where
-unknown. Files are UTF-8 with or without byte-order mark, with any line ends.
+Columns, in any order: ``pose, marker, q1 … qN, u_left, v_left, u_right, v_right``, perhaps ``sigma_left,
+sigma_right, moving, t_q, t_left, t_right``; further columns are ignored. Joint readings are rad or m, pixels
+are raw, empty pixel cells mean *unseen*. Sigmas are standard deviations of the pixels, px. A pose with a
+number in ``moving`` is a moment of that motion; times are s, empty where unknown. Files are UTF-8 with or
+without byte-order mark, with any line ends.
 """
 
 import csv
@@ -27,7 +28,7 @@ _MAX_COLUMNS = 10_000
 _MAX_BYTES = 100_000_000  # of a table; more would not be calibrated from
 _MAX_CELLS = 5_000_000  # poses × markers: mistyped numbers of poses must not fill the memory
 _TWO_TURNS = 4.0 * math.pi  # rad; no arm with stops turns a joint that far from its zero
-_PIXELS = ("u_left", "v_left", "u_right", "v_right")
+_PIXELS, _SIGMAS = ("u_left", "v_left", "u_right", "v_right"), ("sigma_left", "sigma_right")
 _MOVING, _TIMES = "moving", ("t_q", "t_left", "t_right")
 _RECORDING = "recording"  # column that says which recording a row belongs to
 _JOINT = re.compile(r"q[1-9][0-9]{0,8}")
@@ -58,9 +59,11 @@ def read_table(
     Returns poses in the order of their first row, markers by number; NaN where unseen; readings in rad and m.
     Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
     """
-    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=[_MOVING, *_TIMES])
+    optional = [*_SIGMAS, _MOVING, *_TIMES]
+    sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=optional)
+    stated = sheet.has_both(_SIGMAS)
     readings: dict[int, tuple[int, dict[str, float | None]]] = {}
-    seen: dict[tuple[int, int], tuple[int, list[float]]] = {}
+    seen: dict[tuple[int, int], tuple[int, list[float]]] = {}  # line; pixels, then their deviations
     for row in sheet.rows():
         for u, v in (_PIXELS[:2], _PIXELS[2:]):
             if (row[u] == "") != (row[v] == ""):
@@ -68,6 +71,10 @@ def read_table(
         pose, marker = row.integer("pose"), row.integer("marker")
         of_pose = {name: row.number(name) for name in sheet.joints} | row.moment()
         pixels = [row.number(name) if row[name] else math.nan for name in _PIXELS]
+        pixels += [
+            row.deviation(name) if stated and row[u] else math.nan
+            for name, u in zip(_SIGMAS, _PIXELS[::2], strict=True)
+        ]
         line, first = readings.setdefault(pose, (row.line, of_pose))
         for name, value in of_pose.items():
             if value != first[name]:
@@ -85,8 +92,10 @@ def read_table(
     if len(poses) * len(markers) > _MAX_CELLS:
         raise InputError(f"{sheet.file}: {len(poses)} poses × {len(markers)} markers are too many to hold")
     images = np.full((len(poses), 2, len(markers), 2), np.nan)
+    sigma = np.full(images.shape[:3], np.nan)
     for (pose, marker), (_, pixels) in seen.items():
-        images[poses[pose], :, markers[marker]] = np.reshape(pixels, (2, 2))
+        images[poses[pose], :, markers[marker]] = np.reshape(pixels[:4], (2, 2))
+        sigma[poses[pose], :, markers[marker]] = pixels[4:]
     numbers, values = np.array([*poses], dtype=np.int64), [of_pose for _, of_pose in readings.values()]
     # (K, columns); what is not known becomes NaN
     q_read, moving, times = (
@@ -101,6 +110,7 @@ def read_table(
         moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
         times[:, 0] if np.isfinite(times[:, 0]).any() else None,
         times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
+        sigma if stated else None,
     )
 
 
@@ -114,8 +124,7 @@ def read_joint_list(
     Raises InputError ``file:line: what`` when the file cannot be read or a row makes no sense.
     """
     sheet = _Sheet(path, [], joint_types, optional=["pose", "left", "right"])
-    if ("left" in sheet.columns) != ("right" in sheet.columns):
-        raise InputError(f"{sheet.file}:1: give the columns left and right both, or neither")
+    sheet.has_both(("left", "right"))
     lines: dict[int, int] = {}
     readings, names = [], []
     for row in sheet.rows():
@@ -152,6 +161,9 @@ def write_table(observation: Observation, path: Path | str, *, recording: str = 
     columns |= {f"q{i}": np.repeat(values, m) for i, values in enumerate(observation.q.T, 1)}
     pixels = np.moveaxis(observation.images, 1, 2).reshape(K * m, 4).T
     columns |= {name: _or_empty(values) for name, values in zip(_PIXELS, pixels, strict=True)}
+    if observation.sigma is not None:
+        sigma = np.where(np.isnan(observation.images[..., 0]), np.nan, observation.sigma)
+        columns |= {name: _or_empty(sigma[:, v].ravel()) for v, name in enumerate(_SIGMAS)}
     moments = {_MOVING: observation.moving, "t_q": observation.t_q}
     if observation.t_view is not None:
         moments |= dict(zip(_TIMES[1:], observation.t_view.T, strict=True))
@@ -233,6 +245,12 @@ class _Row(dict[str, str]):
             raise InputError(f"{self.where}: {column} is {self[column]!r}; expected a finite number")
         return value
 
+    def deviation(self, column: str) -> float:
+        """A standard deviation."""
+        if not (value := self.number(column)) > 0.0:
+            raise InputError(f"{self.where}: {column} is {self[column]!r}; expected a positive number, px")
+        return value
+
 
 class _Sheet:
     """A table: the columns that are read (those needed, q1 … qN, optional ones if present), and its rows."""
@@ -284,6 +302,13 @@ class _Sheet:
             letters = f"{joint_types!r} has {len(joint_types)} letters"
             return f"{n} joint columns q1…q{n}, but joints {letters}; give one R or P a column"
         return ""
+
+    def has_both(self, pair: tuple[str, str]) -> bool:
+        """Whether both columns of a pair are there; an InputError for one without the other."""
+        present = [name in self.columns for name in pair]
+        if any(present) and not all(present):
+            raise InputError(f"{self.file}:1: give the columns {pair[0]} and {pair[1]} both, or neither")
+        return all(present)
 
     def rows(self) -> Iterator[_Row]:
         """Each row that is not blank; an InputError at one of another length than the header."""

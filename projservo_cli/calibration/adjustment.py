@@ -69,7 +69,8 @@ def moved_operators(scene: Scene) -> list[FloatArray]:
 class LeastSquares:
     """Images to explain, and where each parameter stands: both cameras, joints, markers, then both lenses.
 
-    The derivative of the images is compact: (2, N, 2, c) for each reading by the c parameters it depends on.
+    Residuals and derivatives are weighed, so that all have the noise of a pixel of weight one. The derivative
+    of the images is compact: (2, N, 2, c) for each reading by the c parameters it depends on.
     Offsets of joint readings come after the ``size`` parameters, (K, n) in units of ``tau``, in which their
     squares weigh as those of pixels.
     """
@@ -128,19 +129,19 @@ class LeastSquares:
         return pixels if scene.lens is None else bent(scene.lens[:, None], pixels), m[..., 2]
 
     def residual(self, scene: Scene) -> FloatArray:
-        """Predicted minus seen pixels (2, N, 2), zero where not seen."""
+        """Predicted minus seen pixels (2, N, 2), weighed, zero where not seen."""
         readings = self.readings
-        return np.where(readings.seen[..., None], self.pixels(scene)[0] - readings.pixels, 0.0)
+        residual = np.where(readings.seen[..., None], self.pixels(scene)[0] - readings.pixels, 0.0)
+        return np.asarray(residual * readings.weight[..., None])
 
-    def derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
-        """Pixels (2, N, 2) and their compact derivative (2, N, 2, c), columns as in ``columns``.
+    def derivative(self, scene: Scene) -> FloatArray:
+        """Compact derivative (2, N, 2, c) of the weighed images, columns as in ``columns``.
 
         With Y_i the point behind joint i, D_i the derivative by it and B a generator, a joint contributes
         D_i (B Y_i − E_i B Y_{i+1}), where D_i E_i is D_{i+1}.
         """
-        readings = self.readings
-        q = self.joints(scene)
-        pixels, Y, by_camera, D, by_lens = scene.images(q, readings.pose_of, readings.marker_of)
+        readings, q = self.readings, self.joints(scene)
+        _, Y, by_camera, D, by_lens = scene.images(q, readings.pose_of, readings.marker_of)
         blocks = [by_camera]
         for i, B in enumerate(_generators(scene)):
             near, far = (D[k] @ np.einsum("bij,Nj->Nib", B, Y[k]) for k in (i, i + 1))
@@ -148,12 +149,12 @@ class LeastSquares:
         blocks.append(D[-1][..., :3])
         if by_lens is not None:
             blocks.append(by_lens)
-        return pixels, np.concatenate(blocks, axis=3)
+        return np.concatenate(blocks, axis=3) * readings.weight[..., None, None]
 
-    def joint_derivative(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
-        """Pixels (2, N, 2) and their derivative (2, N, 2, n) by the joint values."""
+    def joint_derivative(self, scene: Scene) -> FloatArray:
+        """Derivative (2, N, 2, n) of the weighed images by the joint values."""
         images = scene.images(self.joints(scene), self.readings.pose_of, self.readings.marker_of)
-        return images.pixels, images.by_joint(scene.H_hat)
+        return images.by_joint(scene.H_hat) * self.readings.weight[..., None, None]
 
     def retract(self, scene: Scene, x: FloatArray) -> Scene:
         """Scene after a step x (size or more,); screws move as rigid bodies and keep their constraints."""
@@ -258,7 +259,7 @@ class JointErrors:
     def __init__(self, problem: LeastSquares, scene: Scene, weight: FloatArray | BoolArray, unit: FloatArray):
         (K, n), self.pose_of = problem.q.shape, problem.readings.pose_of
         root = np.sqrt(weight)[..., None, None]
-        self.G = problem.joint_derivative(scene)[1] * unit
+        self.G = problem.joint_derivative(scene) * unit
         weighted = root * self.G
         self.V = np.linalg.eigh(problem.at_poses((np.swapaxes(weighted, 2, 3) @ weighted).sum(axis=0)))[1]
         along = weighted @ self.V[self.pose_of]
@@ -317,7 +318,7 @@ class _Expansion:
     ) -> None:
         self.problem, self.scene, self.residual, self.weight = problem, scene, residual, weight
         first = problem.size - len(least)
-        self.J = problem.derivative(scene)[1]
+        self.J = problem.derivative(scene)
         A = problem.normal(self.J, weight)
         self.errors, self.strain, self.raw = None, np.zeros(0), residual
         if problem.tau is not None:

@@ -77,6 +77,7 @@ def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) ->
         predicted[readings.pose_of[rows]] - readings.pixels[:, rows].transpose(1, 0, 2)[:, :, None], axis=3
     )
     # A view that did not see the marker has no say.
+    distance = distance * readings.weight[:, rows].T[..., None]
     distance = np.where(readings.seen[:, rows].T[..., None], distance, 0.0)
     fits: BoolArray = np.max(distance, axis=1) <= limit
     fits[np.arange(rows.size), readings.marker_of[rows]] = False
@@ -124,7 +125,7 @@ def _require_explained(readings: Readings, used: BoolArray, found: Outliers, epi
     # Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
     both = readings.both
     out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
-    agree = epipolar.within(readings.pixels[0][both], readings.pixels[1][both], _CONSISTENT)
+    agree = epipolar.within(readings.rows(both), _CONSISTENT)
     unexplained, sightings = int((out & agree).sum()), int(both.sum())
     if unexplained > max(3.0, _MOST_UNEXPLAINED * sightings):
         raise Misfit(
@@ -281,7 +282,7 @@ def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
     exact = LeastSquares.of(solution.problem.readings, solution.problem.q_reference, lens=True)
     problem = exact.with_noise(solution.problem.tau)
     scene = dataclasses.replace(solution.scene, lens=_undistorted(frame))
-    J = problem.whitened(scene, problem.dense(problem.derivative(scene)[1], solution.used), solution.used)
+    J = problem.whitened(scene, problem.dense(problem.derivative(scene), solution.used), solution.used)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
     others, lenses = J[:, : problem.lens], J[:, problem.lens :]
     left = lenses - others @ np.linalg.lstsq(others, lenses, rcond=None)[0]

@@ -41,7 +41,7 @@ class Epipolar:
 
         Raises WorkFailed with fewer than eight pairs, or where they do not determine the geometry.
         """
-        left, right = readings.pixels[0][readings.both], readings.pixels[1][readings.both]
+        (left, right), weight = readings.pixels[:, readings.both], readings.weight[:, readings.both]
         count = len(left)
         if count < 8:
             raise WorkFailed(
@@ -52,15 +52,15 @@ class Epipolar:
         a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
         picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
         candidates = _eight_point(a[picks], b[picks])
-        medians = np.median(np.abs(_sampson(candidates, a, b)), axis=1)
+        medians = np.median(np.abs(_sampson(candidates, a, b, weight)), axis=1)
         F = candidates[np.argmin(medians)]
         for _ in range(10):
-            r, slope = _sampson_and_slope(F, a, b)
+            r, slope = _sampson_and_slope(F, a, b, weight)
             F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
-        F = _refine(F, a, b, 2.0 * _deviation(_sampson(F, a, b), 1e-12))
+        F = _refine(F, a, b, weight)
         product = T_.T @ F @ T
         in_pixels: FloatArray = product / float(np.linalg.norm(product))
-        residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right))
+        residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right), weight)
         inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
         if inlier.sum() <= _PARAMETERS:
             raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
@@ -84,9 +84,10 @@ class Epipolar:
         """Standard error of the noise as a share of it, one residual a correspondence less those F takes."""
         return float(1.0 / np.sqrt(2.0 * (np.count_nonzero(self.inlier) - _PARAMETERS)))
 
-    def within(self, left: FloatArray, right: FloatArray, deviations: float) -> BoolArray:
-        """Which pixels (N, 2) obey the geometry to so many standard deviations."""
-        return np.abs(_sampson(self.F, _homogeneous(left), _homogeneous(right))) <= deviations * self.sigma_px
+    def within(self, readings: Readings, deviations: float) -> BoolArray:
+        """Which of readings (N,) that both views saw obey the geometry to so many standard deviations."""
+        left, right = _homogeneous(readings.pixels)
+        return np.abs(_sampson(self.F, left, right, readings.weight)) <= deviations * self.sigma_px
 
 
 def _deviation(r: FloatArray, least: float) -> float:
@@ -106,20 +107,23 @@ def _normalization(pixels: FloatArray) -> FloatArray:
     return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
 
 
-def _sampson_and_slope(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _sampson_and_slope(
+    F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Signed first-order distances (…, N) of points (N, 3) from F (…, 3, 3), the root of [HZ04] eq. (11.9).
 
-    And the length (…, N) of the gradient of rightᵀ F left by all four pixels.
+    And the length (…, N) of the gradient of rightᵀ F left by all four pixels, each over its weight (2, N).
     """
     lines_right, lines_left = left @ np.swapaxes(F, -1, -2), right @ F
-    square = (lines_right[..., :2] ** 2).sum(axis=-1) + (lines_left[..., :2] ** 2).sum(axis=-1)
+    by_right, by_left = ((lines[..., :2] ** 2).sum(axis=-1) for lines in (lines_right, lines_left))
+    square = by_right / weight[1] ** 2 + by_left / weight[0] ** 2
     slope = np.sqrt(np.maximum(square, np.finfo(float).tiny))
     return (lines_right * right).sum(axis=-1) / slope, slope
 
 
-def _sampson(F: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+def _sampson(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArray) -> FloatArray:
     """The distances alone."""
-    return _sampson_and_slope(F, left, right)[0]
+    return _sampson_and_slope(F, left, right, weight)[0]
 
 
 def _eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None = None) -> FloatArray:
@@ -135,8 +139,8 @@ def _eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None 
     return np.asarray((U * s[..., None, :]) @ Vt)
 
 
-def _refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) -> FloatArray:
-    """Least Cauchy loss, flat beyond a scale, of the Sampson distances over the seven parameters of F.
+def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArray) -> FloatArray:
+    """Least Cauchy loss of the Sampson distances over the seven parameters of F.
 
     F = U diag(cos φ, sin φ, 0) Vᵀ; U and V turn by rotation vectors. Source of the parameters:
     A. Bartoli, P. Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters",
@@ -150,8 +154,9 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, scale: float) ->
         return np.asarray((U @ turn * [np.cos(phi + x[6]), np.sin(phi + x[6]), 0.0]) @ turn_.T @ Vt)
 
     def distances(x: FloatArray) -> FloatArray:
-        return _sampson(turned(x), left, right)
+        return _sampson(turned(x), left, right, weight)
 
+    scale = 2.0 * _deviation(_sampson(F, left, right, weight), 1e-12)
     found = least_squares(
         distances, np.zeros(7), "3-point", loss="cauchy", f_scale=scale, ftol=_TIGHT, xtol=_TIGHT, gtol=_TIGHT
     )

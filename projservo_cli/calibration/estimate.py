@@ -54,7 +54,8 @@ def calibrate(
     observation : stereo images of the markers at a sequence of poses, raw px, NaN where unseen.
     joint_types : one letter a joint, R or P.
     method : ``refined`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
-    sigma_px : noise per coordinate, px; None estimates it from the epipolar geometry.
+    sigma_px : noise per coordinate, px; None takes the root mean square of the observation's ``sigma``,
+        else estimates it from the epipolar geometry. Readings with a sigma of their own are weighed by it.
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : of the random starts.
@@ -96,10 +97,10 @@ def calibrate(
         require_motion(readings)
         if lens and image_size is not None:
             _require_size(readings, image_size)
-        require_images(readings, sigma_px)
+        require_images(readings, sigma_px or readings.stated_px)
         rng = np.random.default_rng(seed)
         epipolar = Epipolar.of(readings, rng)
-        expect = partial(Expected.of, sigma_px=sigma_px, source=source)
+        expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=readings.stated_px)
         expected = expect(epipolar)
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":

@@ -20,6 +20,8 @@ from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 # is less, more than pixel noise is left; above the last the model does not describe the data.
 WARN_RATIO, _WARN_ERRORS, REFUSE_RATIO = 1.15, 4.0, 3.0
 _CHI2_TAIL = 1e-4
+# Standard error of stated noise as a share of it: who states it estimates it, too.
+_STATED_ERROR = 0.1
 # A direction whose singular value is this share of the largest is open.
 OPEN_DIRECTION = 1e-10
 
@@ -34,7 +36,7 @@ class Solution:
 
     problem: LeastSquares
     scene: Scene
-    residual: FloatArray  # (2, N, 2) predicted minus seen, px
+    residual: FloatArray  # (2, N, 2) predicted minus seen, px, weighed
     used: BoolArray  # (2, N) readings that count; the rest of those seen are outliers
     dof: int  # degrees of freedom
     joint_noise: JointNoise | None = None  # of joint readings; None where it was not asked for
@@ -46,7 +48,7 @@ class Solution:
 
     @property
     def raw(self) -> FloatArray:
-        """Predicted minus seen at the joints as read, (2, N, 2), px, zero where it does not count."""
+        """``residual`` at the joints as read, zero where it does not count."""
         return self.problem.with_noise(None).residual(self.scene) * self.used[..., None]
 
     @property
@@ -54,7 +56,7 @@ class Solution:
         """By how much joints that are off move a coordinate of the images, rms, px."""
         if self.problem.tau is None:
             return 0.0
-        G = self.problem.joint_derivative(self.scene)[1][self.used] * self.problem.tau
+        G = self.problem.joint_derivative(self.scene)[self.used] * self.problem.tau
         return self.sigma_px * float(np.sqrt((G**2).sum(axis=-1).mean()))
 
     @property
@@ -65,7 +67,8 @@ class Solution:
     @property
     def rms_px(self) -> float:
         """Root mean square of the Euclidean residual per marker and view at the joints as read, px."""
-        return float(np.sqrt((self.raw[self.used] ** 2).sum() / max(int(self.used.sum()), 1)))
+        raw = self.raw / self.problem.readings.weight[..., None]
+        return float(np.sqrt((raw[self.used] ** 2).sum() / max(int(self.used.sum()), 1)))
 
     @property
     def typical_px(self) -> float:
@@ -94,7 +97,7 @@ class Solution:
         At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
         """
         problem, scene = self.problem, self.scene
-        J = problem.whitened(scene, problem.dense(problem.derivative(scene)[1], self.used), self.used)
+        J = problem.whitened(scene, problem.dense(problem.derivative(scene), self.used), self.used)
         scale = np.linalg.norm(J, axis=0)
         # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
         scale = np.where(scale > 0.0, scale, scale.max())
@@ -116,8 +119,14 @@ class Expected:
     error: float  # its own standard error as a share of it, zero where it was given
 
     @classmethod
-    def of(cls, epipolar: Epipolar, sigma_px: float | None, source: str) -> "Expected":
-        """What was given, px, known for a ``simulated`` source, else the noise of the rig itself."""
+    def of(
+        cls, epipolar: Epipolar, sigma_px: float | None, source: str, stated_px: float | None
+    ) -> "Expected":
+        """What was given, px, or is stated, known for a ``simulated`` source; else the noise of the rig."""
+        if sigma_px is None and stated_px is not None:
+            return cls(
+                stated_px, source == "simulated", "that the sigmas of the markers state", _STATED_ERROR
+            )
         if sigma_px is None:
             return cls(epipolar.noise_px, False, "that the epipolar geometry shows", epipolar.relative_error)
         return cls(sigma_px, source == "simulated", "that were given", 0.0)

@@ -63,6 +63,7 @@ class _Frame(NamedTuple):
     q_dot: FloatArray  # (n,) and their velocities
     sigma: float  # uncertainty of the instant, s
     image: FloatArray  # (m, 2) px, NaN where unseen
+    noise: FloatArray  # (m,) standard deviation of the pixels, px
 
 
 class _Look(NamedTuple):
@@ -138,7 +139,9 @@ class Innovation:
         self._scene = Scene(calibration.P, calibration.H_hat_0, prismatic, calibration.M, calibration.lens)
         self._factor = covariance_root(calibration.covariance)
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
-        self._sigma = max(sigma_px, bent, LEAST_SIGMA)
+        self._least = max(bent, LEAST_SIGMA)
+        self._sigma = max(sigma_px, self._least)
+        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA)
         self._floor = max(calibration.model_px, bent) / self._sigma
         sigma_q = calibration.sigma_q or 0.0
         if calibration.sigma_q_interval is not None:
@@ -185,6 +188,8 @@ class Innovation:
         delay_sigma: FloatArray,
         images: FloatArray,
         fresh: BoolArray,
+        *,
+        stated: FloatArray | None = None,
     ) -> str:
         """What is wrong, in words; empty while nothing is, or while it is not clear what.
 
@@ -196,13 +201,18 @@ class Innovation:
         delay_sigma : (2,) uncertainty of these instants, of the delay and its jitter together, s.
         images : (2, m, 2) raw pixels of the markers of the calibration, NaN where unseen.
         fresh : (2,) whether the frame of a view is new; one that comes twice is no second measurement.
+        stated : (2, m) standard deviations of the pixels, px, if they are told: by how much more than what
+            it was told the calibration found is added.
         """
+        noise = np.full(images.shape[:2], self._sigma)
+        if stated is not None:
+            noise = np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), noise)
         self._first = q[0] if self._first is None else self._first
         if self._at_rest:
             self._at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
         for v in np.flatnonzero(fresh):
-            frame = _Frame(float(t[v]), q[v], q_dot[v], max(float(delay_sigma[v]), _LEAST_ERROR), images[v])
-            self._waiting[v].append(frame)
+            late = max(float(delay_sigma[v]), _LEAST_ERROR)
+            self._waiting[v].append(_Frame(float(t[v]), q[v], q_dot[v], late, images[v], noise[v]))
         self._reached = np.maximum(self._reached, t)
         said = ""
         while not said and any(frames := self._next()):
@@ -229,8 +239,8 @@ class Innovation:
         self._delay_sigma = np.array([frame.sigma for frame in both])
         self._start = one.t if self._start is None else self._start
         self._t = np.array([frame.t for frame in both]) - self._start
-        q, q_dot, images = (np.stack([frame[i] for frame in both]) for i in (1, 2, 4))
-        look = self._look(q, q_dot, images)
+        q, q_dot, images, noise = (np.stack([frame[i] for frame in both]) for i in (1, 2, 4, 5))
+        look = self._look(q, q_dot, images, noise)
         self._readings.append(q[0])
         beyond, off = self._beyond_chance(look)
         self._pending.append((beyond, self._added(look, off)))
@@ -243,8 +253,8 @@ class Innovation:
             return self._named(look, gross)
         return ""
 
-    def _look(self, q: FloatArray, q_dot: FloatArray, images: FloatArray) -> _Look:
-        """Residuals and derivatives of one look: each view at its own joints (2, n)."""
+    def _look(self, q: FloatArray, q_dot: FloatArray, images: FloatArray, noise: FloatArray) -> _Look:
+        """Residuals and derivatives of one look: each view at its own joints (2, n), noise (2, m) px."""
         scene, away, views = self._scene, q - self.calibration.q_reference, np.arange(2)
         m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
         r = images - scene.seen(away)[views, views]
@@ -265,7 +275,7 @@ class Innovation:
             new = np.concatenate([new * left, new * ~left], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
         bend = 0.5 * np.abs(q_dot).sum(axis=1).max() * (late @ self._delay_sigma)
-        R = new @ new.T + np.diag(self._sigma**2 + bend**2)
+        R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
         return _Look(seen, r.ravel(), B.reshape(rows, -1), F, R)
 
     def _causes_derivative(

@@ -103,7 +103,7 @@ class _Likelihood:
 
     def __init__(self, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None) -> None:
         self.given = sigma_px
-        unit, J = unit_noise(problem.readings.prismatic), problem.derivative(scene)[1]
+        unit, J = unit_noise(problem.readings.prismatic), problem.derivative(scene)
         A = problem.normal(J, used.astype(np.float64))
         errors, residual = JointErrors(problem, scene, used, unit), problem.residual(scene)
         if problem.tau is not None:  # at the joints as read

@@ -59,7 +59,7 @@ class _Uncertainty:
         problem, scene = self.solution.problem, self.solution.scene
         there = LeastSquares.of(problem.readings.everywhere(q), problem.q_reference, scene.lens is not None)
         shown = shown.swapaxes(1, 2).reshape(2, -1)  # sightings are in the order of markers
-        J = there.dense(there.derivative(scene)[1], shown)
+        J = there.dense(there.derivative(scene), shown)
         return np.asarray(J[np.repeat(shown.ravel(), 2)] @ self.factor)
 
     def at(self, i: int, offsets: FloatArray) -> FloatArray:
@@ -230,7 +230,7 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
     readings, q_reference = solution.problem.readings, solution.problem.q_reference
     span = require_motion(readings)
     there = LeastSquares.of(readings.everywhere(q_reference[None]), q_reference)
-    rate = there.joint_derivative(solution.scene)[1]
+    rate = there.joint_derivative(solution.scene)
     motion = np.linalg.norm(rate, axis=2).mean(axis=(0, 1)) * span
     i = int(np.argmin(motion))
     require_moved(i, float(span[i]), bool(readings.prismatic[i]), float(motion[i]), sigma_px)
@@ -354,16 +354,16 @@ def _predicted(
     factor = found.spread_factor()
     place = held_out[whole.pose_of] & known[whole.marker_of]
     test = LeastSquares.of(whole.of_poses(held_out).of_markers(known), q_reference, lens)
-    pixels, J = test.derivative(found.scene)
-    spread = test.dense(J, np.ones_like(test.readings.seen)) @ factor
-    variance = (spread**2).sum(axis=1).reshape(pixels.shape)
+    left, weight = test.residual(found.scene), test.readings.weight[..., None]
+    spread = test.dense(test.derivative(found.scene), np.ones_like(test.readings.seen)) @ factor
+    variance = (spread**2).sum(axis=1).reshape(left.shape)
     # A direction the other poses leave open would stay where the whole fit put it.
     if np.sqrt(variance[test.readings.seen].mean()) > _UNDETERMINED_NOISE:
         raise WorkFailed(_OPEN)
     if tau is not None:  # the joints of a pose held out are off by their own noise
-        variance += ((test.joint_derivative(found.scene)[1] * tau) ** 2).sum(axis=-1)
+        variance += ((test.joint_derivative(found.scene) * tau) ** 2).sum(axis=-1)
     difference, error = np.zeros((2, *whole.seen.shape, 2))
-    difference[:, place], error[:, place] = test.readings.pixels - pixels, sigma_px * np.sqrt(1.0 + variance)
+    difference[:, place], error[:, place] = -left / weight, sigma_px * np.sqrt(1.0 + variance) / weight
     return solution.used & place, difference, error
 
 

@@ -33,6 +33,9 @@ class Readings:
     marker_of: IntArray  # (N,) position in ``marker``, never falling
     pixels: FloatArray  # (2, N, 2) px, zero where not seen
     seen: BoolArray  # (2, N) whether the view saw the marker
+    # (2, N) by which residuals are weighed: ``stated_px`` over the standard deviation of the reading, or one
+    weight: FloatArray
+    stated_px: float | None  # root mean square of the standard deviations that are stated, px, if any
 
     @classmethod
     def of(cls, observation: Observation, joint_types: str) -> "Readings":
@@ -53,6 +56,11 @@ class Readings:
         finite = np.asarray(np.isfinite(observation.images).all(axis=3))
         marker_of, pose_of = np.nonzero(finite.any(axis=1).T)
         seen = finite[pose_of, :, marker_of].T
+        weight, stated_px = np.ones(seen.shape), None
+        if observation.sigma is not None and seen.any():
+            sigma = np.maximum(observation.sigma[pose_of, :, marker_of].T[seen], LEAST_SIGMA)
+            stated_px = float(np.sqrt(np.mean(sigma**2)))
+            weight[seen] = stated_px / sigma
         present, marker_of_present = np.unique(marker_of, return_inverse=True)
         return cls(
             q=np.array(observation.q, dtype=np.float64),
@@ -63,14 +71,23 @@ class Readings:
             marker_of=marker_of_present,
             pixels=np.where(seen[..., None], observation.images[pose_of, :, marker_of].swapaxes(0, 1), 0.0),
             seen=seen,
+            weight=weight,
+            stated_px=stated_px,
         )
 
     def everywhere(self, q: FloatArray) -> "Readings":
         """All markers at other joint readings (K, n), rad or m, as if both views had seen them at zero."""
         marker_of, pose_of = np.divmod(np.arange(self.marker.size * len(q)), len(q))
-        pixels, seen = np.zeros((2, marker_of.size, 2)), np.ones((2, marker_of.size), dtype=np.bool_)
+        pixels, weight = np.zeros((2, marker_of.size, 2)), np.ones((2, marker_of.size))
         return dataclasses.replace(
-            self, q=q, pose=np.arange(len(q)), pose_of=pose_of, marker_of=marker_of, pixels=pixels, seen=seen
+            self,
+            q=q,
+            pose=np.arange(len(q)),
+            pose_of=pose_of,
+            marker_of=marker_of,
+            pixels=pixels,
+            seen=weight > 0.0,
+            weight=weight,
         )
 
     def grid(self) -> FloatArray:
@@ -92,6 +109,7 @@ class Readings:
             marker_of=self.marker_of[keep],
             pixels=self.pixels[:, keep],
             seen=self.seen[:, keep],
+            weight=self.weight[:, keep],
         )
 
     def of_poses(self, keep: BoolArray) -> "Readings":
@@ -160,6 +178,12 @@ def _require_shapes(observation: Observation) -> None:
         given = getattr(observation, name)
         if given is not None and given.shape != shape:
             raise InputError(f"{name} of shape {given.shape}: expected {shape} for {K} poses")
+    if observation.sigma is not None:
+        if observation.sigma.shape != (K, 2, m):
+            raise InputError(f"sigma of shape {observation.sigma.shape}: expected {(K, 2, m)}")
+        stated = observation.sigma[np.isfinite(observation.images).all(axis=3)]
+        if not ((stated > 0.0) & (stated < np.inf)).all():
+            raise InputError("sigma must be a positive number wherever a marker was seen, px")
 
 
 # Reach at which predictions are judged, rad and m.

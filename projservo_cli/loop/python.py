@@ -103,6 +103,7 @@ class _LoopPlant(Protocol):
     # where it can
     disturbance: str
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
+    weight: FloatArray | None  # (2, markers) of the pixels last observed in a fit; None for one
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
@@ -127,16 +128,26 @@ class BuiltInLaw:
         self.gains = gains
         span = span_of(model, task.A_star)
         self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M), span)
-        self.law = Law(code, model, task, gains)
+        self._weight = np.ones_like(task.body.weight)
+        self.law = Law(code, model, self._weighed(task), gains)
         self._bound = _bind(self.law, self.state)
         self.errors, self.share, self.fit = self.state.errors, self.state.share, self.state.fit
         self.face_px, self.blocked = self.state.face_px, self.state.blocked
 
     def follow(self, task: Task) -> None:
         """Follow another plan to the goal from its beginning."""
-        self.law = self.law._replace(task=task)
+        self.law = self.law._replace(task=self._weighed(task))
         self.state.clock[0] = 0.0
         self._bound = _bind(self.law, self.state)
+
+    def _weighed(self, task: Task) -> Task:
+        """The task with the weights of this law, which ``weigh`` changes."""
+        return task._replace(body=task.body._replace(weight=self._weight))
+
+    def weigh(self, weight: FloatArray) -> None:
+        """Weigh the pixels (2, k) of the next instant in the fit of the body."""
+        k = min(weight.shape[1], self._weight.shape[1])
+        self._weight[:, :k] = weight[:, :k]
 
     @property
     def path(self) -> FloatArray:
@@ -223,6 +234,8 @@ def _instant(
     if plant.disturbance:
         return DISTURBED, q_dot
     if plant.in_front:
+        if plant.weight is not None and isinstance(law, BuiltInLaw):
+            law.weigh(plant.weight)
         status, q_dot = law(log.s[k], log.read[k])
         log.errors[k], log.fit[k] = law.errors, _told(law, "fit")
         face_px = float(_told(law, "face_px")[0])

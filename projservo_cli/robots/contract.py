@@ -257,8 +257,9 @@ class ForeignRobot:
                 raise WorkFailed(f"{self.name}: {what}: one clock must stamp all of them")
         if sigma is not None:
             sigma = self._numbers("read() gave sigma_px", sigma, (2, self._markers))
-            if not (sigma[np.isfinite(s[..., 0])] > 0.0).all():
-                raise WorkFailed(f"{self.name}: read() gave a sigma_px that is not positive")
+            told = sigma[np.isfinite(s[..., 0])]
+            if not ((told > 0.0) & (told < math.inf)).all():
+                raise WorkFailed(f"{self.name}: read() gave a sigma_px that is no positive number")
         return Reading(q, s, before if np.isnan(times[0]) else float(times[0]), times[1:], sigma)
 
     def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:

@@ -96,7 +96,8 @@ class DrivenRobot:
     innovation : test of the raw images against the calibration; None tests nothing.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
-    the images no longer agree with the calibration, or what failed; else empty. Of each look since ``begin``:
+    the images no longer agree with the calibration, or what failed; else empty. ``weight``: (2, k) of the
+    pixels shown in a fit, where the robot tells their deviations. Of each look since ``begin``:
     ``delays`` of both views as followed, (2,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
     that tells them, joints (n,) or the pose (4, 4) of its tool.
     """
@@ -117,6 +118,7 @@ class DrivenRobot:
         self.H = np.eye(4)
         self.hidden = np.zeros(2)
         self.disturbance = ""
+        self.weight: FloatArray | None = None
         self.begin()
 
     def begin(self) -> None:
@@ -142,11 +144,17 @@ class DrivenRobot:
         """Pixels (2, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
         reading, history, order = self.steered.reading, self.steered.history, self.known.order
         images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
+        shown, stated = self.known.shown, None
+        if reading.sigma_px is not None:
+            stated = reading.sigma_px[:, order]
+            self.weight = _weights(reading.sigma_px[:, shown], reading.s[:, shown])
         frames = self._instants.look(reading.t_view, images, history)
         q_then = history.at(frames.t)
         if self.innovation is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
-            wrong = self.innovation.disturbed(frames.t, q_then, q_dot, frames.sigma, images, frames.fresh)
+            wrong = self.innovation.disturbed(
+                frames.t, q_then, q_dot, frames.sigma, images, frames.fresh, stated=stated
+            )
             self.disturbance = wrong or self.disturbance
         q = self.steered.set_point.at_rest
         there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]
@@ -154,7 +162,7 @@ class DrivenRobot:
             carries = not np.array_equal(q, q_then[view])
             self._carried[view] = there[view] - then[view][view] if carries else 0.0
         self.delays.append(self._instants.mean)
-        return np.ascontiguousarray(reading.s[:, self.known.shown]) + self._carried
+        return np.ascontiguousarray(reading.s[:, shown]) + self._carried
 
     def fits(self) -> str:
         """What is wrong with the images where the robot stands; empty where nothing is."""
@@ -195,3 +203,12 @@ class DrivenRobot:
     def stop(self) -> None:
         """Come to rest."""
         self.robot.stop()
+
+
+def _weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
+    """Weights (2, k) of pixels (2, k, 2) of deviations (2, k) in a fit: the rms of those seen over each."""
+    seen = np.isfinite(s[..., 0])
+    weight = np.ones(seen.shape)
+    if seen.any():
+        weight[seen] = np.sqrt(np.mean(sigma[seen] ** 2)) / sigma[seen]
+    return weight

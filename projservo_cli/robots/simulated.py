@@ -168,10 +168,11 @@ class AnalyticPlant:
     marker was in front of both cameras when last observed. ``markers``: how many are observed, those of the
     face first. ``hidden``: (2,) 1 where the face was self-occluded when last observed. ``disturbance``: why
     the law that drove it failed; else empty. ``takes_parts``: it goes straight to the end of each step; the
-    samples are the same.
+    samples are the same. ``weight``: all pixels weigh alike.
     """
 
     takes_parts = False
+    weight: FloatArray | None = None
 
     def __init__(self, plant: Plant, q_start: FloatArray, noise: FloatArray) -> None:
         self.plant = plant

@@ -110,30 +110,49 @@ def averaged(
 ) -> tuple[Reading, FloatArray, FloatArray]:
     """The mean of looks at a robot at rest, of which each view shows so many frames, each frame once.
 
-    Markers that most of the frames of a view do not show are NaN. Returns the mean; sums (2, m) of the
-    squares by which pixels are off it, px²; how many frames (2, m) show a marker, 0 where it is NaN.
+    Frames are weighed by the deviations they tell, if they do. Markers that most of the frames of a view do
+    not show are NaN. Returns the mean; sums (2, m) of the squares by which pixels are off it, px²; how many
+    frames (2, m) show a marker, 0 where it is NaN.
     """
-    looks, frames = [reading], [[view] for view in reading.s]
+    looks, frames = [reading], [[_frame(reading, view)] for view in (0, 1)]
     for _ in range(_WAITED * wanted):
         if min(map(len, frames)) >= wanted:
             break
         looks.append(look())
         for view, new in enumerate(new_views(*looks[:-3:-1])):
             if new and len(frames[view]) < wanted:
-                frames[view].append(looks[-1].s[view])
-    s, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
+                frames[view].append(_frame(looks[-1], view))
+    s, sigma, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
     q = looks[0].q + np.mean([seen.q - looks[0].q for seen in looks], axis=0)
-    return looks[-1]._replace(q=q, s=s), squares, count
+    told = reading.sigma_px if reading.sigma_px is None or len(looks) == 1 else sigma
+    return looks[-1]._replace(q=q, s=s, sigma_px=told), squares, count
 
 
-def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Mean (m, 2) of frames of one view, px, squares (m,) by which they are off it, and their count (m,)."""
-    seen = np.array(frames)
+def _frame(reading: Reading, view: int) -> FloatArray:
+    """What a view shows: u, v and their deviation (m, 3), px, a deviation of one where none is told."""
+    sigma = np.ones(len(reading.s[view])) if reading.sigma_px is None else reading.sigma_px[view]
+    return np.column_stack([reading.s[view], sigma])
+
+
+def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Mean (m, 2) of frames (m, 3) of one view, its deviation (m,), squares (m,) off it, their count (m,).
+
+    What does not scatter from frame to frame does not average away: the share of the variance told that
+    scatters, of all markers together, becomes less.
+    """
+    seen, sigma = np.split(np.array(frames), [2], axis=2)
     count = np.isfinite(seen[..., 0]).sum(axis=0)
     count[2 * count <= len(seen)] = 0
-    mean: FloatArray = np.nansum(seen, axis=0) / np.maximum(count, 1)[:, None]
+    weight = np.where(np.isfinite(seen), sigma**-2.0, 0.0)
+    total = np.maximum(weight.sum(axis=0), 1e-300)
+    mean: FloatArray = np.nansum(seen * weight, axis=0) / total
     mean[count == 0] = np.nan
-    return mean, np.nansum((seen - mean) ** 2, axis=(0, 2)), count
+    off = (seen - mean) ** 2
+    freedom = 2 * np.maximum(count - 1, 0).sum()
+    scatter = min(1.0, float(np.nansum(off / sigma**2)) / freedom) if freedom else 1.0
+    typical = count / total[:, 0]  # variance of a frame
+    variance = typical * (1.0 - scatter) + scatter / total[:, 0]
+    return mean, np.sqrt(variance), np.nansum(off, axis=(0, 2)), count
 
 
 class _Standstill:

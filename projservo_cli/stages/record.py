@@ -103,6 +103,7 @@ class _Recording:
         pose = [*(k for k, _ in rest), *range(-1, -1 - len(way), -1)]
         moving = [*(0 for _ in rest), *(k for k, _ in way)]
         timed = np.isfinite([reading.t_q for reading in rows]).any()
+        sigma = [reading.sigma_px for reading in rows if reading.sigma_px is not None]
         return Observation(
             np.array(pose, dtype=np.int64),
             self.marker,
@@ -111,6 +112,7 @@ class _Recording:
             np.array(moving, dtype=np.int64) if way else None,
             np.array([reading.t_q for reading in rows]) if timed else None,
             np.array([reading.t_view for reading in rows]) if timed else None,
+            np.array(sigma) if len(sigma) == len(rows) else None,
         )
 
 
@@ -233,7 +235,8 @@ def _resume(recording: _Recording, most: FloatArray) -> None:
     t_q = nobody if table.t_q is None else table.t_q
     t_view = np.stack([nobody, nobody], axis=1) if table.t_view is None else table.t_view
     for k, pose in enumerate(table.pose.tolist()):
-        reading = Reading(table.q[k], table.images[k][:, column], t_q[k], t_view[k], None)
+        sigma = None if table.sigma is None else table.sigma[k][:, column]
+        reading = Reading(table.q[k], table.images[k][:, column], t_q[k], t_view[k], sigma)
         if moving[k] > 0:
             recording.ways.setdefault(int(moving[k]), []).append(reading)
             continue

@@ -116,12 +116,12 @@ def teach(
         if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
             reading = [reading, *at_rest(reading, look, config.plant.settle_s, "teach")][-1]
         mean, squares, count = averaged(reading, look, frames)
-    sigma = np.sqrt(squares / np.maximum(2 * count * (count - 1), 1))
+    sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
     return Taught(
         np.array(numbers, dtype=np.int64),
         mean.q,
         mean.s,
-        np.where(count > 1, sigma, np.nan),
+        sigma if mean.sigma_px is None else mean.sigma_px,
         count.max(axis=1),
         None if moved is None else mean.q - moved,
     )

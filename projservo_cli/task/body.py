@@ -59,6 +59,7 @@ class Body(NamedTuple):
     turn: FloatArray  # (m, 3, 3) coordinates of Ĥ_r M in the basis D, one row a rotation
     a_inf: FloatArray  # (4,) plane at infinity
     shown: BoolArray  # (2, m) views of the markers that the goal showed
+    weight: FloatArray  # (2, m) of their residuals in a fit
 
 
 class _Until(NamedTuple):
@@ -95,6 +96,7 @@ NO_BODY = Body(
     np.zeros((0, 3, 3)),
     np.zeros(4),
     np.zeros((2, 0), dtype=np.bool_),
+    np.ones((2, 0)),
 )
 
 
@@ -128,6 +130,7 @@ def body_of(model: Model, M: FloatArray) -> Body:
         np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
         np.ascontiguousarray(model.a_inf),
         np.ones((2, len(M)), dtype=np.bool_),
+        np.ones((2, len(M))),
     )
 
 
@@ -169,6 +172,7 @@ def _image_row(
     """Velocities of one image coordinate under the six motions, [RH00] eq. (7), and its residual.
 
     t, t_depth : numerator and denominator of the coordinate under the translations.
+    inverse_depth : of the marker, 1/m3; it and the residual e are weighed alike.
     turn : (3, 3) rotations of the marker as translations.
     """
     x = (t[0] - pixel * t_depth[0]) * inverse_depth
@@ -216,10 +220,11 @@ def _normal_equations(
             inverse = 1.0 / depth
             u = dot(p_u, M) * inverse
             v = dot(p_v, M) * inverse
-            e_u = float(s[view, k, 0]) - u
-            e_v = float(s[view, k, 1]) - v
-            row_u = _image_row(t_u, t_w, u, inverse, body.turn[k], e_u)
-            row_v = _image_row(t_v, t_w, v, inverse, body.turn[k], e_v)
+            weight = float(body.weight[view, k])
+            e_u = weight * (float(s[view, k, 0]) - u)
+            e_v = weight * (float(s[view, k, 1]) - v)
+            row_u = _image_row(t_u, t_w, u, weight * inverse, body.turn[k], e_u)
+            row_v = _image_row(t_v, t_w, v, weight * inverse, body.turn[k], e_v)
             N = _accumulate(N, row_u, row_v)
             squares += e_u * e_u + e_v * e_v
             views += 1

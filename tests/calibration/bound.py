@@ -59,16 +59,19 @@ def spread(J, ahead):
 
 
 class Bound:
-    """Cramér–Rao bound of predictions: covariance factor @ factor.T per px² of noise, for visible rows."""
+    """Cramér–Rao bound of predictions: covariance factor @ factor.T per px² of noise, for visible rows.
 
-    def __init__(self, robot, trained, q):
+    ``weight``: of each coordinate, one over its own noise, px.
+    """
+
+    def __init__(self, robot, trained, q, weight=1.0):
         x, dq = parameters(robot), q - robot.q_reference
         # The other model is the same robot.
         np.testing.assert_allclose(
             images(x, robot.joint_types, len(robot.markers), dq), robot.images(q), atol=1e-8
         )
         J = derivative(robot, trained)
-        self.factor = spread(J, derivative(robot, q))
+        self.factor = spread(np.reshape(weight, (-1, 1)) * J, derivative(robot, q))
         self.rank = self.factor.shape[1]
         self.coordinates = J.shape[0]
 

@@ -103,7 +103,7 @@ S = np.zeros((2, 3, 2))
         ((np.zeros(2), S + np.inf), r"infinite pixel: NaN stands for unseen"),
         ((np.zeros(2), S, np.nan), r"gave t_q as nan: must be finite"),
         ((np.zeros(2), S, None, "now"), r"gave t_left as str"),
-        ((np.zeros(2), S, None, None, None, np.zeros((2, 3))), r"a sigma_px that is not positive"),
+        ((np.zeros(2), S, None, None, None, np.zeros((2, 3))), r"a sigma_px that is no positive number"),
     ],
 )
 def test_nonsense_readings(answer, message):
