@@ -67,14 +67,14 @@ def arm():
     return Arm(calibrate.run(config)[1], scene, model.q_reference, truth.image_size)
 
 
-def first_alarm(arm, read, s, q_dot=None, delay_sigma=0.0, fresh=None, sigma=SIGMA):
+def first_alarm(arm, read, s, q_dot=None, delay_sigma=0.0, fresh=None, sigma=SIGMA, stated=None):
     """When something is said of looks at readings (k, n) and images (k, 2, m, 2), and what."""
     test = Innovation(arm.calibration, sigma, LOOKS)
     for k in range(len(read)):
         speed = np.zeros(read.shape[1]) if q_dot is None else q_dot[k]
         new = np.ones(2, dtype=bool) if fresh is None else fresh[k]
         at_once, t = (np.stack([row] * 2) for row in (read[k], speed)), np.full(2, PERIOD * k)
-        said = test.disturbed(t, *at_once, np.full(2, delay_sigma), s[k], new)
+        said = test.disturbed(t, *at_once, np.full(2, delay_sigma), s[k], new, stated=stated)
         if said:
             return k, said
     return None, ""
@@ -138,6 +138,19 @@ def test_single_slips_of_the_detector_and_unseen_markers_are_no_disturbance(arm)
     s[4::7, 1] = np.nan
     s[12::9, :, 4] += 30.0
     assert first_alarm(arm, q, s) == (None, "")
+
+
+def test_a_marker_is_tested_by_the_deviation_it_states(arm):
+    """Two that are seen badly disturb nothing where they say so, and what a sharp one shows is not hidden."""
+    q, _ = arm.way(0)
+    stated = np.full((2, len(arm.scene.M)), 0.1)
+    stated[:, :2] = 5.0
+    s = arm.images(at_once(q))
+    s += stated[..., None] * np.random.default_rng(9).standard_normal(s.shape)
+    assert first_alarm(arm, q, s, stated=stated) == (None, "")
+    assert first_alarm(arm, q, s)[0] < 10
+    s[20:, 0, 4] += 3.0  # less than what the others are off
+    assert 20 <= first_alarm(arm, q, s, stated=stated)[0] < 40
 
 
 def test_instants_that_are_uncertain_are_not_taken_for_a_disturbance(arm):

@@ -1,4 +1,4 @@
-"""Readings with deviations of their own: the bound is reached, and what is stated is what the residuals show."""
+"""Readings with deviations of their own: the bound is reached, and residuals are what is stated."""
 
 import dataclasses
 

@@ -5,7 +5,9 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
+from projservo_cli.robots.contract import Reading
 from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.own_robot import averaged
 from projservo_cli.stages.teach import checked, require_face, teach
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT
@@ -36,6 +38,24 @@ def test_frames_are_averaged_and_their_scatter_is_told():
     once = teach(given, 1, AT)
     assert np.isnan(once.sigma).all()
     assert "sigma_left_px" not in once.as_goal()["images"]
+
+
+@pytest.mark.parametrize("lasting", [0.0, 0.3])
+def test_frames_are_averaged_by_what_they_tell_of_themselves(rng, lasting):
+    """One sharp and two blurred frames a round, part of whose errors lasts and does not average away."""
+    sigma, m = [0.1, 1.0, 1.0] * 5, 400
+    stays = lasting * rng.standard_normal((2, m, 2))
+    readings = [
+        Reading(AT, stays + one * rng.standard_normal((2, m, 2)), float(k), np.full(2, float(k)), told)
+        for k, one in enumerate(sigma)
+        for told in [np.full((2, m), np.hypot(one, lasting))]
+    ]
+    rest = iter(readings[1:])
+    mean, _, count = averaged(readings[0], lambda: next(rest), len(sigma))
+    assert (count == len(sigma)).all()
+    assert np.sqrt(np.mean(mean.s**2)) == pytest.approx(np.sqrt(np.mean(mean.sigma_px**2)), rel=0.25)
+    if lasting == 0.0:
+        assert mean.sigma_px == pytest.approx(np.sqrt(1.0 / np.sum(np.array(sigma) ** -2.0)), rel=0.1)
 
 
 @pytest.mark.volume

@@ -85,16 +85,17 @@ def test_two_directions_of_turning_imply_the_third():
 
 @pytest.mark.parametrize("seed", FRAMES)
 def test_a_step_is_that_of_finite_differences(seed):
-    """The least-squares solution of the images' Jacobian, over the views that were seen."""
+    """The weighted least-squares solution of the images' Jacobian, over the views that were seen."""
     model, M, _ = seen_from(seed)
-    body = body_of(model, M)
+    weight = np.random.default_rng(2).uniform(0.1, 3.0, (2, len(M)))
+    body = body_of(model, M)._replace(weight=weight)
     H = poe(model, model.q_reference + 0.1)
     s = pixels(model.P, M @ poe(model, model.q_reference + 0.12).T)
     s[0, 3] = s[1, 7] = math.nan
 
     def residual(xi):
         e = s - pixels(model.P, M @ (H @ expm(twist_of(body, xi))).T)
-        return e[np.isfinite(s)]
+        return (weight[..., None] * e)[np.isfinite(s)]
 
     step = 1e-5
     J = np.stack([(residual(-step * x) - residual(step * x)) / (2 * step) for x in np.eye(6)], axis=1)
