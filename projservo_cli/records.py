@@ -5,7 +5,7 @@ dimensions and the unit to a field, so that the run file can label what it store
 knows how it is stored.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 
+VIEWS = ("left", "right")
 
 # Dimensions that have the same size in every record.
 SIZES = {
@@ -225,6 +226,11 @@ class Calibration:
     model_px: float = _scalar(
         units="px", about="error of the model per coordinate, 0 within noise", default=0.0
     )
+
+    def places(self, numbers: Iterable[int]) -> list[int]:
+        """Where markers stand in ``marker`` and ``M``, by their numbers; ValueError for one that does not."""
+        known = self.marker.tolist()
+        return [known.index(number) for number in numbers]
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""
@@ -496,7 +502,7 @@ class Trace:
         about="why a run that was to follow the plan went without it; empty where it followed", default=""
     )
     untested: str = _scalar(
-        about="why the images of a robot that is not simulated were not tested against the calibration",
+        about="why the images of a robot of the contract were not tested against the calibration",
         default="",
     )
     overruns: int | None = _scalar(
@@ -552,7 +558,6 @@ class Report:
 
 
 REPLAN, TRACK, IMAGE_TRACK = "replan", "track", "image_track"
-MODES = (REPLAN, TRACK, IMAGE_TRACK)
 MODES_OF = {  # of laws of the package that follow a plan as well; all others only replan
     "direct_three": (REPLAN, TRACK),
     "direct_two": (REPLAN, TRACK),

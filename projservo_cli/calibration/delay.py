@@ -30,6 +30,14 @@ _STRAIGHT = 0.025
 _OUTLIER, _BEFORE = 4.0, 0.5
 
 
+def comes_again(stamp: float, s: FloatArray, last_stamp: float, last_s: FloatArray) -> bool:
+    """Whether a frame is the last one once more: of the same stamp, s, or the same pixels (m, 2).
+
+    Stamps are NaN, and pixels, where there are none.
+    """
+    return stamp == last_stamp or np.array_equal(s, last_s, equal_nan=True)
+
+
 @dataclass(frozen=True, eq=False)
 class _Frames:
     """Frames of one view on the way, each once."""
@@ -53,14 +61,14 @@ class _Frames:
         seen = np.isfinite(s[..., 0]).sum(axis=1) >= min(_LEAST_MARKERS, s.shape[1])
         rows = np.flatnonzero(np.isin(moving, list(ways)) & np.isfinite(t_q) & seen)
         rows = rows[np.lexsort((t_q[rows], moving[rows]))]
-        again = [row for last, row in pairwise(rows) if np.array_equal(s[last], s[row], equal_nan=True)]
+        stamps = np.full(len(s), np.nan) if observation.t_view is None else observation.t_view[:, view]
+        again = [k for last, k in pairwise(rows) if comes_again(stamps[k], s[k], stamps[last], s[last])]
         rows = rows[~np.isin(rows, again)]
-        t = t_q[rows]
-        if observation.t_view is not None and len(rows):
-            stamps, first = np.unique(observation.t_view[rows, view], return_index=True)
-            late = t[first] - stamps
-            if np.isfinite(late).all() and np.ptp(late) < _LATEST - _EARLIEST:  # both clocks went on
-                rows, t = rows[first], stamps + late.mean()  # by the clock of the readings
+        t, late = t_q[rows], t_q[rows] - stamps[rows]
+        if (
+            len(rows) and np.isfinite(late).all() and np.ptp(late) < _LATEST - _EARLIEST
+        ):  # both clocks went on
+            t = stamps[rows] + late.mean()  # by the clock of the readings
         return cls(calibration, view, ways, moving[rows], t, s[rows])
 
     def joints(self, delay: FloatArray | float) -> FloatArray:

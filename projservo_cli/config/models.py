@@ -416,6 +416,16 @@ class Trajectory(Section):
         "that no marker enters, nor what is between those of the face",
     )
 
+    @property
+    def rehearses(self) -> bool:
+        """Whether half turns are rehearsed; where shares are searched for both senses are compared."""
+        return self.profile not in ("constrained", "auto")
+
+    @property
+    def needs_covariance(self) -> bool:
+        """Whether a plan takes the covariance of the calibration: searches through joint space, regions."""
+        return self.profile in ("joint", "auto") or bool(self.keep_out)
+
 
 class _Control(Section):
     """The laws to run, in which modes, their gains in 1/s, and how fast the joints may move."""
@@ -539,8 +549,8 @@ class _Stop(Section):
     lost_steps: Whole = Field(25, description="periods for which lost markers are waited for")
     innovation_factor: NotNegative = Field(
         1.0,
-        description="a robot of yours is disturbed where images are off the prediction by more than chance "
-        "and so many times the noise; 0 tests nothing",
+        description="a run of a robot of yours, or of a simulated one with faults, is disturbed where images "
+        "are off the prediction by more than chance and so many times the noise; 0 tests nothing",
     )
 
 

@@ -1,6 +1,7 @@
 """The closed loop in Python: any law on any plant, the same limits, counting and verdicts."""
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -11,7 +12,6 @@ from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
 from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.mechanisms import span_of
-from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import (
     DISTURBED,
     FAILED,
@@ -160,13 +160,6 @@ class BuiltInLaw:
         return status, self.state.q_dot.copy()
 
 
-class _Watch(Protocol):
-    """Who watches over a run, and may overrule the verdict of an instant."""
-
-    def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
-        """Verdict of an instant, or what it becomes; joint velocities (n,) may be written instead."""
-
-
 def run_in_python(
     law: LoopLaw,
     plant: _LoopPlant,
@@ -175,15 +168,15 @@ def run_in_python(
     limits: Limits,
     scale: float = 1.0,
     *,
-    watch: _Watch | None = None,
-    standing: Standing | None = None,
+    standing: Callable[[Log, int, int], int] | None = None,
+    watch: Callable[[Log, int, int, FloatArray], int] | None = None,
 ) -> tuple[int, int, Log]:
     """Drive a law on a plant to its verdict.
 
     plant : any; it is stopped however the run ends.
     s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
-    watch : asked at every instant what becomes of its verdict; standing : asked before, of a robot that need
-        not follow what it is sent.
+    standing : what becomes of the verdict of an instant of a robot that need not follow what it is sent.
+    watch : what then becomes of it where the run is watched; joint velocities (n,) may be written instead.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
     if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
     fails before the first instant is complete.
@@ -198,16 +191,16 @@ def run_in_python(
             try:
                 verdict, q_dot = _instant(law, plant, s_star, limits, log, k)
                 if standing is not None:
-                    verdict = standing.ruled(log, k, verdict)
+                    verdict = standing(log, k, verdict)
                 if watch is not None:
-                    verdict = watch.ruled(log, k, verdict, q_dot)
+                    verdict = watch(log, k, verdict, q_dot)
                 if verdict == RUNNING:
                     told = float(_told(law, "share")[0]), int(_told(law, "blocked")[0])
                     verdict = bounded(log, k, Command(q_dot, *told, period, scale), plant.plant, limits)
                     if verdict == RUNNING:
                         _send(law, plant, log.scratch[0, : len(q_dot)], limits, period, scale)
                     elif watch is not None:
-                        verdict = watch.ruled(log, k, verdict, q_dot)
+                        verdict = watch(log, k, verdict, q_dot)
                 if verdict == WAITING:
                     plant.command(np.zeros_like(q_dot), period)
             except WorkFailed as error:

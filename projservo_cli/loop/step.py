@@ -15,9 +15,10 @@ Precedence of the verdicts at one instant, first match wins:
    is stop. A command that would pass a limit is shortened to end there.
 
 While markers are lost the robot is held where it is for up to ``lost_steps`` periods in a row; the run
-goes on when they are seen again. ``disturbed`` is what the loop of a robot that is not simulated ends
-in, before all others, where the images no longer agree with the calibration; ``failed`` where a robot or a
-law of somebody else raises, is late or answers nonsense once the run has begun.
+goes on when they are seen again. ``disturbed`` is what the run of a robot of the contract, yours
+or a simulated one with faults, ends in before all others, where the images no longer agree with the
+calibration; ``failed`` where a robot or a law of somebody else raises, is late or answers nonsense once the
+run has begun.
 
 A robot that need not follow what it is sent has ``converged`` once it stands as far as images tell; until
 then it is held. Where it stands still away from the goal, ``plateau`` ends the run at once, and ``not

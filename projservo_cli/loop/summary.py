@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
-from projservo_cli.geometry.jit import merged, njit
+from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.loop.step import CONVERGED, Log
 from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import Ends, Plant, pose_after, shows_face
@@ -77,10 +77,10 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
         slowed,
         int(ended.limited),
         _effort(log, steps, period),
-        math.degrees(_angle_between(mul(first, base_tool), goal_pose)),
+        math.degrees(angle_between(mul(first, base_tool), goal_pose)),
         MM * _distance(start, goal),
         MM * _distance(end, goal),
-        math.degrees(_angle_between(mul(last, base_tool), goal_pose)),
+        math.degrees(angle_between(mul(last, base_tool), goal_pose)),
         MM * length,
         MM * at_samples,
     )
@@ -116,8 +116,8 @@ def _distance(A: Vec4, B: Vec4) -> float:
     return math.sqrt(dot(way, way))
 
 
-@merged
-def _angle_between(A: Mat4, B: Mat4) -> float:
+@composed
+def angle_between(A: Mat4, B: Mat4) -> float:
     """Angle of the rotation from pose A to pose B, rad."""
     trace = (A[0] * B[0] + A[4] * B[4] + A[8] * B[8]) + (A[1] * B[1] + A[5] * B[5] + A[9] * B[9])
     trace += A[2] * B[2] + A[6] * B[6] + A[10] * B[10]

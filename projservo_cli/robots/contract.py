@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from projservo_cli.calibration.delay import comes_again
 from projservo_cli.records import FloatArray, WorkFailed
 from projservo_cli.robots.plugins import what_failed
 
@@ -32,6 +33,14 @@ class Reading(NamedTuple):
     t_view: FloatArray  # (2,) stamps of both frames, s, by whatever clock; NaN where there are none
     sigma_px: FloatArray | None  # (2, m) standard deviation of each corner, px; None where none is told
 
+    def new_views(self, before: "Reading | None") -> tuple[bool, bool]:
+        """Whether each view has another frame than in the reading before."""
+        if before is None:
+            return True, True
+        both = zip(self.t_view, self.s, before.t_view, before.s, strict=True)
+        left, right = (not comes_again(*frames) for frames in both)
+        return left, right
+
 
 class Bounds(NamedTuple):
     """What no command may exceed, (n,) each, rad or m, per s where it is a speed."""
@@ -41,6 +50,14 @@ class Bounds(NamedTuple):
     speed: FloatArray  # with the factor of every command
     lead: FloatArray  # of a set-point before the last reading
     period: float  # of the loop, s
+
+    def within_limits(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Least and most (n,) that a set-point may be at a reading (n,): one beyond a limit may return."""
+        return np.minimum(self.lower, q), np.maximum(self.upper, q)
+
+    def not_far_ahead(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Least and most (n,) that a set-point may be without leading a reading (n,) too far."""
+        return q - self.lead, q + self.lead
 
 
 class Robot(Protocol):
@@ -274,8 +291,8 @@ class ForeignRobot:
         # From the last set-point on, which after a pause was held: thinking took a period at most.
         step = bounds.speed * max(0.0, due - max(self._due, self._shown[0] - bounds.period))
         allowed = {
-            "beyond its limits": (np.minimum(bounds.lower, q), np.maximum(bounds.upper, q)),
-            "too far ahead of the reading": (q - bounds.lead, q + bounds.lead),
+            "beyond its limits": bounds.within_limits(q),
+            "too far ahead of the reading": bounds.not_far_ahead(q),
             # Back towards the reading it may jump: that shortens the way of the robot.
             "too far from the last one": (np.minimum(sent, q) - step, np.maximum(sent, q) + step),
         }

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.records import BoolArray, FloatArray, WorkFailed
+from projservo_cli.calibration.delay import comes_again
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, WorkFailed
 
-VIEWS = ("left", "right")
 # Deviation of a delay of which nothing is known, and of a single frame where no calibration tells it, s.
 UNKNOWN_S, _JITTER_S = 0.3, 0.012
 # Readings that are kept, and how far beyond the last one joints are taken to move on, s.
@@ -189,9 +189,7 @@ class _View:
 
     def _is_fresh(self, stamp: float, image: FloatArray) -> bool:
         """Whether an image is another one than the last."""
-        if self._image is not None and (
-            stamp == self._stamp or np.array_equal(image, self._image, equal_nan=True)
-        ):
+        if self._image is not None and comes_again(stamp, image, self._stamp, self._image):
             return False
         self._image, self._stamp = image.copy(), stamp
         return True

@@ -20,7 +20,7 @@ from projservo_cli.guidance.validity import BORDER, CLEAR, Asked, Constraints, c
 from projservo_cli.guidance.way import Budget, Way, find_way, first_within, margins_at, within_region
 from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Plan, Spread, WorkFailed
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.verdicts import sight_words, verdict_of, way_words, why_no_way
+from projservo_cli.stages.verdicts import sight_words, verdict_of
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.target import Shown
@@ -34,7 +34,7 @@ class Found(NamedTuple):
     motion: Motion  # as it is stored, at the instants sigma
     time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
     feasible: bool
-    reason: str  # feasible, reason: whether it may be followed, in words
+    reason: str  # feasible, reason: whether it may be followed, in words; a way tells that itself
     way: Way | None = None  # through joint space, where one was looked for
     entered: str = ""  # which region it enters that is kept out of, in words
 
@@ -76,10 +76,10 @@ def search_of(scenario: Scenario) -> JointSearch:
     calibration, spread = scenario.calibration, NO_SPREAD
     if calibration is not None:
         numbers = scenario.numbers if len(scenario.ends.body.M) else scenario.numbers[: scenario.m]
-        known, demands = calibration.marker.tolist(), scenario.demands
+        demands = scenario.demands
         spread = spread_of(
             calibration,
-            tuple(known.index(number) for number in numbers),
+            tuple(calibration.places(numbers)),
             scenario.m,
             (tuple(demands.lower), tuple(demands.upper), tuple(demands.image_size)),
             scenario.config.trajectory.search.seed,
@@ -196,13 +196,13 @@ def joint_way(
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
-        return Found(linear.judged, motion, unknown, False, why_no_way(way), way)
+        return Found(linear.judged, motion, unknown, False, "", way)
     motion = sampled_way(reaching, way.pace, trajectory.samples)
     least = float(way.pace.time[-1])
     asked = least if trajectory.duration_s is None else trajectory.duration_s
     _require_time(asked, least)
     time = np.linspace(0.0, asked, len(motion.mu))
-    return Found(motion, motion, time, True, way_words(way), way)
+    return Found(motion, motion, time, True, "", way)
 
 
 def sampled_way(reaching: Reaching, pace: Pace, samples: int) -> Motion:

@@ -10,7 +10,7 @@ import numpy as np
 from projservo_cli.calibration import WINDOW, Innovation, predict
 from projservo_cli.config import Config
 from projservo_cli.geometry.algebra import as_mat
-from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.driven import DrivenRobot, Known, Steered
@@ -119,7 +119,7 @@ def averaged(
         if min(map(len, frames)) >= wanted:
             break
         looks.append(look())
-        for view, new in enumerate(new_views(*looks[:-3:-1])):
+        for view, new in enumerate(looks[-1].new_views(looks[-2])):
             if new and len(frames[view]) < wanted:
                 frames[view].append(_frame(looks[-1], view))
     s, sigma, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
@@ -185,7 +185,7 @@ class _Standstill:
     def all(self, reading: Reading) -> bool:
         """Whether joints and images have stood still up to the next reading."""
         still = self.joints(reading)
-        new = new_views(reading, self._last)
+        new = reading.new_views(self._last)
         self._last = reading
         for view, rows in enumerate(self._s):
             frames = self._kept(rows, reading.t_q, reading.s[view].ravel() if new[view] else None)
@@ -193,7 +193,7 @@ class _Standstill:
                 continue  # the same image all the time
             square, variance = _drift(frames[:, np.isfinite(frames).all(axis=0)])
             if square.size and square.mean() > max(_STILL_PX**2, 2.0 * variance.mean()):
-                self.moving = self.moving or f"the {('left', 'right')[view]} image"
+                self.moving = self.moving or f"the {VIEWS[view]} image"
             still = still and len(rows) >= _LEAST
         return still and not self.moving
 
@@ -207,16 +207,6 @@ class _Standstill:
 
 
 _Rows = deque[tuple[float, FloatArray]]
-
-
-def new_views(reading: Reading, before: Reading | None) -> tuple[bool, bool]:
-    """Whether each view has another frame than in the reading before, by its stamp or its pixels."""
-    if before is None:
-        return True, True
-    stamped = np.isfinite(reading.t_view)
-    same = np.isclose(reading.s, before.s, 0.0, 0.0, equal_nan=True).all(axis=(1, 2))
-    left, right = np.where(stamped, reading.t_view != before.t_view, ~same).tolist()
-    return left, right
 
 
 def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -276,12 +266,10 @@ def connected(scenario: Scenario, law: str) -> DrivenRobot:
 
 def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
     """What the calibration takes the robot and its face for."""
-    known = calibration.marker.tolist()
-    face = [known.index(number) for number in scenario.numbers[: scenario.m]]
     task, rig = scenario.ends.by_points().task(scenario.model), scenario.config.rig
     return Plant(
         scenario.model,
-        np.ascontiguousarray(calibration.M[face]),
+        np.ascontiguousarray(calibration.M[calibration.places(scenario.numbers[: scenario.m])]),
         task.order,
         task.center,
         task.O,

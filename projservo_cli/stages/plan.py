@@ -37,7 +37,7 @@ from projservo_cli.stages.motions import (
     why_closed,
 )
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.told import told_of
+from projservo_cli.stages.told import reason_of, told_of
 from projservo_cli.stages.verdicts import least_of, verdict_of
 from projservo_cli.stages.world import Joints, face_numbers
 from projservo_cli.task.face import Task, center_of, face_plane
@@ -52,7 +52,7 @@ from projservo_cli.task.visibility import (
 
 
 def _partitioned(
-    model: Model, shown: Shown, profile: str, lower: FloatArray, upper: FloatArray
+    model: Model, shown: Shown, trajectory: Trajectory, lower: FloatArray, upper: FloatArray
 ) -> tuple[State, Task, Parts, str]:
     """Measure and partition the task at its start; half turns are rehearsed within joint limits.
 
@@ -60,14 +60,9 @@ def _partitioned(
     rotations, a half turn in the sense that was rehearsed, and what to say of the rehearsal.
     """
     task, seen = shown.task(model), straight_views(model.lens, shown.s_start)
-    bounds = (lower, upper) if rehearses(profile) else None
+    bounds = (lower, upper) if trajectory.rehearses else None
     state, parts, arrives = begin(model, task, seen, shown.q_start, bounds)
     return state, task, parts, "" if arrives else "; neither sense of the half turn arrived when rehearsed"
-
-
-def rehearses(profile: str) -> bool:
-    """Whether half turns are rehearsed; where shares are searched for both senses are compared."""
-    return profile not in ("constrained", "auto")
 
 
 def _joint_motions(state: State) -> FloatArray:
@@ -122,17 +117,8 @@ def run(config: Config, calibration: Calibration, joints: Joints | None = None) 
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "
             f"choose among {', '.join(map(str, sorted(known)))}"
         )
-    return _plan_of(scenario_of(config, calibration, joints=joints))
-
-
-def needs_covariance(trajectory: Trajectory) -> bool:
-    """Whether a plan takes the covariance of the calibration: a search through joint space and regions do."""
-    return trajectory.profile in ("joint", "auto") or bool(trajectory.keep_out)
-
-
-def _plan_of(scenario: Scenario) -> Plan:
-    trajectory = scenario.config.trajectory
-    search = search_of(scenario) if needs_covariance(trajectory) else None
+    scenario, trajectory = scenario_of(config, calibration, joints=joints), config.trajectory
+    search = search_of(scenario) if trajectory.needs_covariance else None
     return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
 
 
@@ -200,7 +186,7 @@ def _planned(
 ) -> tuple[Plan, str]:
     """Plan of one profile, and what of its constraints fails, in words; empty where all hold."""
     face = shown.by_points()
-    state, task, parts, note = _partitioned(model, shown, trajectory.profile, demands.lower, demands.upper)
+    state, task, parts, note = _partitioned(model, shown, trajectory, demands.lower, demands.upper)
     H_hat = np.array([as_array(H) for H in (parts.H_t, parts.H_r, parts.H_p)])
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
@@ -217,7 +203,7 @@ def _planned(
     plan = Plan(
         profile=trajectory.profile,
         feasible=found.feasible,
-        reason=found.reason + ("" if way else note),
+        reason=found.reason + note if way is None else reason_of(way),
         tau=tau,
         theta_r=theta_r,
         theta_p=theta_p,
@@ -285,6 +271,6 @@ def _senses(parts: Parts, task: Task) -> tuple[FloatArray, FloatArray]:
 
 def rotation_sense(scenario: Scenario) -> FloatArray:
     """Joint motions (2, n) of both rotations in the sense of a plan whose profile rehearses half turns."""
-    profile, joints = scenario.config.trajectory.profile, scenario.joints
-    state, _, parts, _ = _partitioned(scenario.model, scenario.ends, profile, joints.lower, joints.upper)
+    asked, joints = scenario.config.trajectory, scenario.joints
+    state, _, parts, _ = _partitioned(scenario.model, scenario.ends, asked, joints.lower, joints.upper)
     return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])

@@ -19,7 +19,6 @@ from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.own_robot import (
     averaged,
     foreign_robot,
-    new_views,
     servo_of,
     simulated_robot,
     way_to,
@@ -328,7 +327,7 @@ def _moving(seen: list[Reading], settle_s: float) -> list[Reading]:
     """What was read on a way before all stood still, each frame once."""
     found = []
     for before, reading in pairwise(seen):
-        new = np.array(new_views(reading, before))
+        new = np.array(reading.new_views(before))
         if new.any() and reading.t_q < seen[-1].t_q - settle_s:
             found.append(reading._replace(s=np.where(new[:, None, None], reading.s, np.nan)))
     return found

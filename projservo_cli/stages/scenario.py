@@ -186,9 +186,9 @@ def scenario_of(
     body = NO_BODY
     pins: tuple[int, ...] = ()
     if not _by_points(config, calibration):
-        known = observed if calibration is None else tuple(calibration.marker.tolist())
+        known = observed if calibration is None else calibration.marker.tolist()
         pins = tuple(number for number in observed if number in known and number not in face)
-        body = _body(calibration or truth, tuple(known.index(number) for number in (*face, *pins)))
+        body = _body(calibration or truth, (*face, *pins))
     if truth is not None:
         exact, ends, q_goal = _simulated_ends(config.task, joints.types, truth, pins, center)
     else:
@@ -265,10 +265,11 @@ def _by_points(config: Config, calibration: Calibration | None) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _body(known: Calibration | Truth, indices: tuple[int, ...]) -> Body:
-    """Body of markers of a calibration, by their indices in it, the same for every run with it."""
-    model = known.model if isinstance(known, Truth) else known.model()
-    return body_of(model, known.M[list(indices)])
+def _body(known: Calibration | Truth, numbers: tuple[int, ...]) -> Body:
+    """Body of markers of a calibration, by their numbers, the same for every run with it."""
+    if isinstance(known, Truth):
+        return body_of(known.model, known.of(numbers))
+    return body_of(known.model(), known.M[known.places(numbers)])
 
 
 def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
@@ -338,8 +339,7 @@ def _predicted_ends(
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
     task = config.task
     assert task is not None
-    m, known = len(face_numbers(config)), calibration.marker.tolist()
-    columns = [known.index(number) for number in numbers]
+    m, columns = len(face_numbers(config)), calibration.places(numbers)
     for vector, key in ((task.start, "task.start"), (task.goal.joints, "task.goal.joints")):
         if vector is not None and len(vector.joints) != len(joints.types):
             raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")

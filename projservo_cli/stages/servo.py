@@ -12,13 +12,14 @@ import numpy as np
 from projservo_cli.config import Config
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains, Law, new_state
+from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span, span_of
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.loop.summary import MM, Ended, Summary, path_deviation, summarize
+from projservo_cli.loop.summary import MM, Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.watch import Watch
 from projservo_cli.records import (
     REPLAN,
@@ -102,7 +103,8 @@ class Outcome:
         pose, goal_pose = H @ scenario.true_ends.base_tool, scenario.true_ends.goal_pose
         if driven is not None and driven.truths and not simulated:
             pose, goal_pose = _told_poses(scenario, _whole(driven.truths, rows))
-            told |= _pose_errors(pose[-1], goal_pose)
+            told["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
+            told["rotation_error_deg"] = math.degrees(angle_between(as_mat(pose[-1]), as_mat(goal_pose)))
         numbers: dict[str, Any] = {n: None if math.isnan(told[n]) else told[n] for n in _TOLD}
         if simulated:
             numbers["success"] = told["success"] == 1.0
@@ -142,7 +144,7 @@ class Outcome:
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
-            untested="" if simulated else untested(scenario),
+            untested="" if driven is None else untested(scenario),
             overruns=None if driven is None else driven.steered.overruns,
             delay=None if driven is None else _whole(driven.delays, rows),
         )
@@ -169,16 +171,6 @@ def _told_poses(scenario: Scenario, truths: FloatArray) -> tuple[FloatArray, Flo
     if truths.ndim == 3:
         return truths, goal
     return np.array([goal * np.nan if arm is None else arm.pose(q) for q in truths]), goal
-
-
-def _pose_errors(pose: FloatArray, goal: FloatArray) -> dict[str, float]:
-    """Position and rotation that are left from a pose of the tool to another, (4, 4), m; NaN if unknown."""
-    R = pose[:3, :3].T @ goal[:3, :3]
-    turn = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return {
-        "position_error_mm": MM * float(np.linalg.norm(goal[:3, 3] - pose[:3, 3])),
-        "rotation_error_deg": math.degrees(math.atan2(float(np.linalg.norm(turn)), float(np.trace(R)) - 1.0)),
-    }
 
 
 def _told_anew(anew: tuple[str, ...]) -> list[str]:
@@ -360,8 +352,8 @@ def _driven_in_python(
         gains.period,
         limits,
         scale,
-        watch=watch,
-        standing=standing,
+        standing=None if standing is None else standing.ruled,
+        watch=None if watch is None else watch.ruled,
     )
     limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
     driven = plant if isinstance(plant, DrivenRobot) else None
@@ -470,8 +462,7 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
     gains, ends = scenario.gains, scenario.ends.by_points()
     if law not in CODES:
         assert scenario.calibration is not None
-        known = scenario.calibration.marker.tolist()
-        face = np.array([known.index(number) for number in scenario.numbers[: scenario.m]])
+        face = np.array(scenario.calibration.places(scenario.numbers[: scenario.m]))
         model = ImageModel(**vars(scenario.calibration))
         # Its own: what a law writes to must not be what other laws are given.
         setup = copy.deepcopy(LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period))

@@ -11,13 +11,12 @@ import numpy as np
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config, plain_yaml
 from projservo_cli.config.models import TaskSettings
-from projservo_cli.records import Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Reading, at_rest_after
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.own_robot import at_rest, averaged, foreign_robot, simulated_robot
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
 from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself
-from projservo_cli.stages.verdicts import VIEWS
 from projservo_cli.stages.world import face_numbers, joints_of, limit_passed, truth_of
 
 _FAR = 4.0  # standard deviations that a marker may be off
@@ -157,10 +156,10 @@ def checked(config: Config, calibration: Calibration, taught: Taught) -> _Checke
         q = plan.q[-1] if reached else taught.q
     except WorkFailed as error:
         reached, reason, q = False, str(error), taught.q
-    known, numbers = calibration.marker.tolist(), taught.marker.tolist()
-    both = [k for k, number in enumerate(numbers) if number in known]
+    numbers = taught.marker.tolist()
+    both = np.flatnonzero(np.isin(numbers, calibration.marker))
     off = np.full(taught.sigma.shape, np.nan)
-    expected = predict(calibration, q[None])[0][:, [known.index(numbers[k]) for k in both]]
+    expected = predict(calibration, q[None])[0][:, calibration.places(taught.marker[both])]
     off[:, both] = np.linalg.norm(taught.s[:, both] - expected, axis=2)
     noise = np.maximum(np.nan_to_num(taught.sigma), calibration.sigma_px)
     far = [

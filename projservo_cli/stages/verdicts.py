@@ -14,13 +14,7 @@ from projservo_cli.guidance.margins import (
     Motion,
     joint_margin,
 )
-from projservo_cli.guidance.validity import CLEAR, FRONT, LIMITS, MARGINS
-from projservo_cli.guidance.way import Way, may_start
-from projservo_cli.records import FloatArray
-
-VIEWS = ("left", "right")
-# Margins that are told where no way was found: those that stopped most.
-TOLD = 2
+from projservo_cli.records import VIEWS, FloatArray
 
 
 def verdict_of(motion: Motion) -> tuple[bool, str, str]:
@@ -103,60 +97,3 @@ def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
         f"the profile {profile} turns the face away from a camera ({', '.join(lost)}): "
         "choose another trajectory.profile"
     )
-
-
-def way_words(way: Way) -> str:
-    """How a way through joint space leads to the goal, in words."""
-    g = int(np.abs(way.goals - way.corners[-1]).max(axis=1).argmin())
-    corners = len(way.corners) - 2
-    how = "a straight way" if corners == 0 else f"a way round {corners} corner{'s' * (corners != 1)}"
-    nearest = "the nearest" if g == 0 else f"number {g + 1}"
-    some = "" if way.shown == len(way.goals) else f", of which the {len(way.goals)} nearest were tried"
-    barred = f"; {way.barred} more are within a region" if way.barred else ""
-    goal = "the only joints" if way.shown == 1 else f"{nearest} of {way.shown} joint vectors"
-    return f"{how} in joint space leads to {goal} that show the goal{some}{barred}"
-
-
-def why_no_way(way: Way) -> str:
-    """Why no way was found, in words."""
-    if way.region:
-        return f"the start is already within region {way.region}"
-    if way.solutions == 0:
-        return (
-            "no joints were found that show the goal: the arm may not reach it, or its images are of "
-            "other markers or in another order"
-        )
-    if len(way.goals) == 0:
-        barred = f" and {way.barred} within a region that is kept out of" if way.barred else ""
-        return (
-            f"of {way.solutions} joint vectors that show the goal, whole turns apart, {way.hidden} lie "
-            f"beyond the joint limits or do not show the face to both cameras{barred}"
-        )
-    if not may_start(way.had):
-        worst = int(way.had.argmin())
-        what = "a joint limit" if worst == LIMITS else _stopped(way, worst)
-        return f"the start is already at or beyond {what}"
-    failed = way.failures[:MARGINS]
-    most = [
-        f"{_stopped(way, int(i))} ({failed[i] / failed.sum():.0%})"
-        for i in np.argsort(-failed, kind="stable")[:TOLD]
-        if failed[i] > 0
-    ]
-    return (
-        f"no way was found to any of {len(way.goals)} joint vectors that show the goal, in {way.draws} "
-        f"samples; what stopped most: {', '.join(most)}"
-    )
-
-
-def _stopped(way: Way, margin: int) -> str:
-    if margin == LIMITS:
-        return f"the limits of joint {int(way.failures[MARGINS:].argmax()) + 1}"
-    if margin == CLEAR:
-        return "a region that is kept out of"
-    kind, view = (margin - FRONT) // 2, VIEWS[(margin - FRONT) % 2]
-    return (
-        f"a marker behind the {view} camera",
-        f"the face edge-on to the {view} camera",
-        f"the width of the face in the {view} image",
-        f"the border of the {view} image",
-    )[kind]

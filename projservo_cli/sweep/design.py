@@ -28,7 +28,6 @@ from projservo_cli.records import (
     names_of,
 )
 from projservo_cli.robots.simulated import METRIC_A_INF
-from projservo_cli.stages.plan import needs_covariance
 from projservo_cli.stages.steps import affects, key_of
 from projservo_cli.stages.world import Truth, truth_of
 
@@ -300,7 +299,7 @@ class Design:
 
     def with_covariance(self) -> set[str]:
         """Keys of the calibrations of which a run needs the covariance, each 0.2 MB."""
-        cells = [c for c in range(self.cells) if needs_covariance(self.cell(c).trajectory)]
+        cells = [c for c in range(self.cells) if self.cell(c).trajectory.needs_covariance]
         return {self.calibration_key(*place) for place in product(cells, range(self._calibrations))}
 
     @property

@@ -17,7 +17,7 @@ from projservo_cli.loop.step import RUNNING, VERDICTS
 from projservo_cli.loop.trial import NUMBERS, VERDICT, Setting, Trials
 from projservo_cli.records import BODY_LAWS, Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.plan import rehearses, rotation_sense
+from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.steps import key_of
@@ -168,7 +168,7 @@ def is_compiled(design: Design, config: Config) -> bool:
     """Whether a run is made by the kernel of whole runs, which needs no plan and leaves no trace."""
     assert config.robot is not None
     six = len(config.robot.joint_types) == COORDINATES
-    kernel = six and sense_is_enough(config, name_of_run(config)) and rehearses(config.trajectory.profile)
+    kernel = six and sense_is_enough(config, name_of_run(config)) and config.trajectory.rehearses
     return kernel and not design.sweep.between_samples
 
 
@@ -220,7 +220,7 @@ def _numbers_of(scenario: Scenario, law: str, seeds: Sequence[int]) -> FloatArra
         scenario.believed_by(law),
         scenario.exact.body,
         law in BODY_LAWS,
-        rehearses(scenario.config.trajectory.profile),
+        scenario.config.trajectory.rehearses,
         scenario.gains,
         Course(scenario.plant_of(law), scenario.limits, scenario.exact.q_start),
         scenario.true_ends,
@@ -274,7 +274,7 @@ def _run(
     name, (cell, _, number, _) = name_of_run(config), design.numbers(run)
     try:
         scenario = scenario_of(config, calibration)
-        if sense_is_enough(config, name) and rehearses(config.trajectory.profile):
+        if sense_is_enough(config, name) and config.trajectory.rehearses:
             made = drive(scenario, rotation_sense(scenario), name)
         else:
             made = drive(scenario, _plan(config, calibration, design.calibration_key(cell, number)), name)

@@ -16,7 +16,7 @@ from projservo_cli.guidance.validity import CLEAR
 from projservo_cli.guidance.way import Budget, find_way, margins_at
 from projservo_cli.records import Spread, WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.verdicts import why_no_way
+from projservo_cli.stages.told import reason_of
 from tests.conftest import ROOT
 from tests.guidance.cases import COUNT, case
 from tests.known import configured
@@ -133,12 +133,12 @@ def test_a_region_of_one_image_bars_that_image():
     c = found.c._replace(keep_out=keep_out_of([(everywhere, None, True)]))
     way = find_way(c, found.aim, found.q_start, nothing, Budget(samples=200), found.acceleration)
     assert len(way.corners) == 0
-    assert why_no_way(way) == "the start is already within region 1"
+    assert reason_of(way) == "the start is already within region 1"
     around = found.aim.s_star[0, 1] + [[-3.0, -3.0], [3.0, -3.0], [0.0, 5.0]]
     c = found.c._replace(keep_out=keep_out_of([(around, None, True)]))
     way = find_way(c, found.aim, found.q_start, nothing, Budget(samples=200), found.acceleration)
     assert way.solutions == way.hidden + way.barred
-    assert f"and {way.barred} within a region that is kept out of" in why_no_way(way)
+    assert f"and {way.barred} within a region that is kept out of" in reason_of(way)
 
 
 @pytest.fixture(scope="module")

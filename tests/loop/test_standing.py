@@ -75,23 +75,30 @@ def test_a_robot_that_gains_nothing_is_given_up_with_a_cause(read, what):
     assert k < 300
 
 
+def _still(k):
+    """Joints that stand, rad."""
+    return 0.1, 0.0
+
+
+def _far(k):
+    """A joint that moves on."""
+    return 0.01 * k, 0.0
+
+
 def test_a_robot_that_moves_or_comes_nearer_or_sees_nothing_goes_on():
-    far = lambda k: (0.01 * k, 0.0)  # noqa: E731
-    assert judged(lambda k: 50.0, far, far)[0] == RUNNING
-    still = lambda k: (0.1, 0.0)  # noqa: E731
-    assert judged(lambda k: 5.0 + 900.0 * 0.995**k, still, still, most=800)[0] == RUNNING
-    assert judged(lambda k: np.nan, still, still, verdict=WAITING)[0] == RUNNING
+    assert judged(lambda k: 50.0, _far, _far)[0] == RUNNING
+    assert judged(lambda k: 5.0 + 900.0 * 0.995**k, _still, _still, most=800)[0] == RUNNING
+    assert judged(lambda k: np.nan, _still, _still, verdict=WAITING)[0] == RUNNING
 
 
 def test_arrival_is_believed_once_the_robot_stands():
-    still = lambda k: (0.1, 0.0)  # noqa: E731
-    ruled, _, k = judged(lambda k: 0.4, still, still, carried=lambda k: 8.0 * 0.8**k)
+    ruled, _, k = judged(lambda k: 0.4, _still, _still, carried=lambda k: 8.0 * 0.8**k)
     assert ruled == CONVERGED
     assert k == 13  # 8 px fall below half a pixel
-    assert judged(lambda k: 0.4, still, still)[2] == 0
+    assert judged(lambda k: 0.4, _still, _still)[2] == 0
     # An arm that is off once it stands is driven on.
     ruled, _, k = judged(
-        lambda k: 0.9 if k < 20 else 1.5 * 0.9 ** (k - 20), still, still, carried=lambda k: 8.0 * (k < 20)
+        lambda k: 0.9 if k < 20 else 1.5 * 0.9 ** (k - 20), _still, _still, carried=lambda k: 8.0 * (k < 20)
     )
     assert ruled == CONVERGED
     assert k == 24
