@@ -1,4 +1,4 @@
-"""What robots and cameras tell on the command line: ``record``, ``teach``, ``detect`` and ``validate``."""
+"""What robots and cameras tell on the command line: ``teach``, ``detect`` and ``validate``."""
 
 import sys
 from pathlib import Path
@@ -12,94 +12,6 @@ from projservo_cli.cli.output import Console, wrapped
 
 # Predictions so many times the noise away come from another robot, or from other units.
 _FAR = 20.0
-
-
-@main.command("record", epilog="Example: projservo record -c configs/stanford.yaml --output trials.csv")
-@option.configuration(help="Configuration (YAML). Default: paper.yaml.")
-@option.override
-@option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
-@click.option(
-    "--motions",
-    metavar="CSV",
-    type=option.PATH,
-    help="Further poses after the trial motions, a row each, with columns q1 ... qN.",
-)
-@option.joint_unit
-@option.speed_scale
-@option.confirm
-@option.force(help="Begin anew, whatever stands in the table.")
-@option.dry_run
-@option.told
-def _record(
-    console: Console,
-    *,
-    config: str | None,
-    output: Path,
-    motions: Path | None,
-    joint_unit: str | None,
-    confirm: bool,
-    force: bool,
-    dry_run: bool,
-    **options: Any,
-) -> None:
-    """Drive the robot through trial motions and write a table.
-
-    Drives the robot of a configuration, simulated or yours, through its trial motions (and --motions, whose
-    readings --joint-unit is about), in steps that the joint-speed limit allows, and writes what both cameras
-    see into an observation table for calibrate --data.
-
-    The table grows as the robot goes. After an interruption the same command continues it; a table of another
-    configuration is refused, unless --force begins anew.
-    """
-    if joint_unit is not None and motions is None:
-        raise click.UsageError("--joint-unit is that of --motions, which is not given")
-    from projservo_cli.files import working_in
-    from projservo_cli.stages.record import new_recording, record
-    from projservo_cli.tables import read_joint_list
-
-    settings = option.configured(config, options)
-    poses = None
-    if motions is not None:
-        types = settings.robot.joint_types if settings.robot is not None else None
-        poses = read_joint_list(motions, types, joint_unit)
-    if dry_run:
-        _tell_recording(console, new_recording(settings, output, motions=poses, force=force))
-        return
-    with working_in(output.parent, name=f".{output.name}.lock"):
-        recording = new_recording(settings, output, motions=poses, force=force)
-        if recording.pending and confirm:
-            console.confirm("record", settings.plant)
-        if recording.found and recording.pending:
-            console.say(f"{output}: continued after {recording.found} of {len(recording.targets)} poses")
-        try:
-            record(settings, recording, progress=console.progress)
-        except KeyboardInterrupt:
-            done = f"{len(recording.done)} of {len(recording.targets)}"
-            console.say(f"{output}: {done} poses; run again to continue")
-            raise
-        _tell_recording(console, recording)
-
-
-def _tell_recording(console: Console, recording: Any) -> None:
-    value = {
-        "table": recording.path.resolve(),
-        "poses": len(recording.targets),
-        "recorded": len(recording.done) - recording.found,
-        "found": recording.found,
-        "pending": len(recording.pending),
-        "markers": len(recording.marker),
-        "unseen": recording.unseen,
-        "commands": recording.commands,
-        "spread_px": recording.spread_px,
-    }
-    words = [
-        "record: {recorded} poses recorded, {found} there before, {pending} to be recorded; "
-        "{markers} markers",
-        "  unseen: {unseen} marker-view pairs; {commands} commands sent",
-    ]
-    if recording.spread_px is not None:
-        words.append("  spread of the images of a pose: {spread_px:.3g} px per coordinate")
-    console.tell(value, [*(text.format_map(value) for text in words), f"table: {recording.path}"])
 
 
 @main.command("teach", epilog="Example: projservo teach results/mine -c mine.yaml -o goal.yaml")

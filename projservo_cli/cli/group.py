@@ -149,8 +149,8 @@ class _Group(click.Group):
 
 main = _Group(
     "projservo",
-    help="Uncalibrated stereo visual servoing in projective space. The stages calibrate, plan, servo and "
-    "report chain in one call; each first makes what it lacks. Options may stand anywhere.",
+    help="Uncalibrated stereo visual servoing in projective space. The stages record, calibrate, plan, "
+    "servo and report chain in one call; each first makes what it lacks. Options may stand anywhere.",
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
 )
 click.version_option(__version__, message="projservo %(version)s")(main)

@@ -21,6 +21,7 @@ _Function = Callable[..., Any]
 
 PATH = click.Path(path_type=Path)
 _RESULTS = Path("results")
+_TRIALS = "trials.csv"  # beside a run: the table of a recording that was told no other place
 _KEYS = {  # that options stand for
     "data": "data.table",
     "joints": "data.joints",
@@ -159,9 +160,13 @@ def calibration_of(run: Path | None, config: "Config") -> "Calibration | None":
     return found.calibration if found is not None and "calibrate" in found.results else None
 
 
-def resolve(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
-    """The configuration with all overrides, and the run as stored so far."""
-    from projservo_cli.config import load_config
+def resolve(options: Mapping[str, Any], *, recording: bool = False) -> tuple["Config", "Run"]:
+    """The configuration with all overrides, and the run as stored so far.
+
+    A table beside the run, or the one that a ``recording`` puts there, is that of the configuration unless
+    it names another.
+    """
+    from projservo_cli.config import Override, load_config, to_yaml
 
     if options.get("origin") is not None:
         return _from_sweep(options)
@@ -172,7 +177,12 @@ def resolve(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
         config = load_config(None, _overrides(options))
     else:
         config = configured(options["config"], options)
-    return config, stored or _run_of(options, config)
+    run = stored or _run_of(options, config)
+    table = run.path.resolve().with_name(_TRIALS)
+    if config.data is None and (recording or table.is_file()):
+        beside = Override(f"{table}", "data.table", str(table))
+        config = load_config(config.name, [beside], text=to_yaml(config))
+    return config, run
 
 
 def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
@@ -224,7 +234,8 @@ def _overrides(options: Mapping[str, Any]) -> list["Override"]:
     from projservo_cli.config import Override
 
     found = []
-    for name, key in _KEYS.items():
+    keys = {key: name for name, key in _KEYS.items() if not (name == "joint_unit" and "motions" in options)}
+    for key, name in keys.items():
         given = options.get(name)
         if given is None or given is False:
             continue

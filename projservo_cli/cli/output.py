@@ -146,6 +146,8 @@ def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> It
     """Lines on the object of a stage or the report of a ``sweep``; ``detailed`` with claims and margins."""
     if "failed" in value:  # the reason is told with the exit code
         yield f"{stage}: {'failed' if value['failed'].split('/')[0] == stage else 'not made'}"
+    elif stage == "record":
+        yield from _of_recording(value)
     elif stage == "calibrate":
         yield from _of_calibration(value)
     elif stage == "plan":
@@ -156,6 +158,16 @@ def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> It
         yield from _of_sweep(value)
     else:
         yield from _of_report(value, detailed)
+
+
+def _of_recording(value: dict[str, Any]) -> Iterator[str]:
+    yield (
+        "record: {recorded} poses recorded, {found} there before, {pending} to be recorded; "
+        "{markers} markers".format_map(value)
+    )
+    yield "  unseen: {unseen} marker-view pairs; {commands} commands sent".format_map(value)
+    if value["spread_px"] is not None:
+        yield "  spread of the images of a pose: {spread_px:.3g} px per coordinate".format_map(value)
 
 
 def _of_calibration(value: dict[str, Any]) -> Iterator[str]:

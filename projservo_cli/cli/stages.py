@@ -26,6 +26,86 @@ def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -
     return [law for law in LAWS if law.startswith(incomplete)]
 
 
+@main.stage("record", epilog="Example: projservo record -c configs/stanford.yaml --output trials.csv")
+@option.configuration(help="Configuration (YAML). Default: paper.yaml.")
+@option.override
+@option.output(metavar="TABLE", help="Observation table to write (CSV).", required=True)
+@click.option(
+    "--motions",
+    metavar="CSV",
+    type=option.PATH,
+    help="Further poses after the trial motions, a row each, with columns q1 ... qN.",
+)
+@option.joint_unit
+@option.speed_scale
+@option.confirm
+@option.force(help="Begin anew, whatever stands in the table.")
+@option.dry_run
+@option.told
+@click.pass_obj
+def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
+    """Drive the robot through trial motions and write a table.
+
+    Drives the robot of a configuration, simulated or yours, through its trial motions (and --motions, whose
+    readings --joint-unit is about), in steps that the joint-speed limit allows, and writes what both cameras
+    see into an observation table for calibrate.
+
+    The table grows as the robot goes. After an interruption the same command continues it; a table of another
+    configuration is refused, unless --force begins anew.
+
+    Before other stages, as in projservo record calibrate, -o is the run, and the table is data.table, else
+    trials.csv beside the run; a recording of another configuration of the same plant is made anew.
+    """
+    if options["joint_unit"] is not None and options["motions"] is None:
+        raise click.UsageError("--joint-unit is that of --motions, which is not given")
+    if len(stages) > 1:
+        return _make(console, stages, options)
+    from projservo_cli.stages.record import new_recording
+
+    config, path = option.configured(options["config"], options), options["output"]
+    poses = _motions(config, options)
+    recording = new_recording(config, path, motions=poses, force=options["force"])
+    if not options["dry_run"]:
+        with _writing(path):
+            recording = new_recording(config, path, motions=poses, force=options["force"])
+            _drive(console, config, recording, confirm=options["confirm"])
+    console.tell(recording.told, [*words_of("record", recording.told), f"table: {path}"])
+    return 0
+
+
+def _motions(config: Any, options: Mapping[str, Any]) -> Any:
+    """The list of ``--motions``; None where none is given."""
+    from projservo_cli.tables import read_joint_list
+
+    if options["motions"] is None:
+        return None
+    types = config.robot.joint_types if config.robot is not None else None
+    return read_joint_list(options["motions"], types, options["joint_unit"])
+
+
+def _writing(table: Path) -> AbstractContextManager[None]:
+    """Keep other processes from writing a table."""
+    from projservo_cli.files import working_in
+
+    return working_in(table.parent, name=f".{table.name}.lock")
+
+
+def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> None:
+    """Record what is pending, and say how far it is where that is interrupted."""
+    from projservo_cli.stages.record import record
+
+    if recording.pending and confirm:
+        console.confirm("record", config.plant)
+    total = len(recording.targets)
+    if recording.found and recording.pending:
+        console.say(f"{recording.path}: continued after {recording.found} of {total} poses")
+    try:
+        record(config, recording, progress=console.progress)
+    except KeyboardInterrupt:
+        console.say(f"{recording.path}: {len(recording.done)} of {total} poses; run again to continue")
+        raise
+
+
 @main.stage(
     "calibrate", epilog="Example: projservo calibrate --data trials.csv --joints RRPRRR -o results/mine"
 )
@@ -144,6 +224,7 @@ class _Chain:
     steps: Sequence[Any]
     failed: str = ""
     reason: str = ""
+    recording: Any = None  # where the call records
     laws_done: tuple[str, ...] = ()
     beside: dict[str, dict[str, Any]] = field(default_factory=dict)  # further values of a stage's object
 
@@ -172,16 +253,56 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
         tidy(folder, _FIGURES)
         return _work(chain)
     with working_in(folder, _FIGURES):
-        # Anew, since another process may have written the run until now.
-        return _work(_asked(console, names, options))
+        if chain.recording is None:  # anew, since another process may have written the run until now
+            return _work(_asked(console, names, options))
+        with _writing(chain.recording.path):
+            return _work(_recorded(_asked(console, names, options)))
 
 
-def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> _Chain:
-    """What is to be done, by the configuration and what the run holds; refused where it must not be."""
-    from projservo_cli.stages.steps import steps_for
+def _recorded(chain: _Chain) -> _Chain:
+    """Record what is to be recorded; what is to be done with the table."""
+    from projservo_cli.records import WorkFailed
 
-    given = _law_names(options.get("laws", ()))
-    config, stored = option.resolve(options)
+    recording, why = chain.recording, chain.recording.why
+    if why:
+        chain.console.say(f"record: making ({why})")
+    try:
+        _drive(chain.console, chain.config, recording, confirm=chain.options["confirm"])
+    except WorkFailed as error:
+        chain.failed, chain.reason = "record", " ".join(str(error).split()).removeprefix("record: ")
+        return chain
+    unasked = {**chain.options, "confirm": chain.options["confirm"] and not why}
+    return _asked(chain.console, chain.names, unasked, replace(recording, why=""))
+
+
+def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
+    """What there is to record into the table that a calibration is made from."""
+    from projservo_cli.records import InputError
+    from projservo_cli.stages.record import new_recording
+
+    if config.data.joint_unit == "deg":
+        raise InputError("data.joint_unit: record writes rad; leave it out")
+    stored = run.results.get("calibrate")
+    table, force = config.data.table, options["force"]
+    if stored and stored.inputs.get("table", table) != table and config.plant.use is None and not force:
+        raise InputError(
+            f"{run.path}: its calibration comes from {stored.inputs['table']} and would be replaced by a "
+            "simulated one; choose another folder with -o, or use --force"
+        )
+    return new_recording(config, Path(table), motions=_motions(config, options), force=force, redo=True)
+
+
+def _asked(
+    console: Console, names: Sequence[str], options: Mapping[str, Any], recording: Any = None
+) -> _Chain:
+    """What is to be done, by the configuration and what the run holds; refused where it must not be.
+
+    recording : where it was made just now.
+    """
+    from projservo_cli.stages.steps import Step, steps_for
+
+    given, records = _law_names(options.get("laws", ())), "record" in names
+    config, stored = option.resolve(options, recording=records)
     if options.get("suggest") is not None and config.calibration.method != "refined":
         raise click.UsageError(
             f"--suggest: the method {config.calibration.method} has no covariance to judge poses by; "
@@ -191,8 +312,14 @@ def _asked(console: Console, names: Sequence[str], options: Mapping[str, Any]) -
         from projservo_cli.stages.report import require
 
         require(config, wanted)
-    steps = steps_for(config, stored, names, laws=given, force=options["force"])
-    chain = _Chain(console, names, options, tuple(s.law for s in steps if s.law), config, stored, steps)
+    if records and recording is None:
+        recording = _recording(config, stored, options)
+    stages, why = [name for name in names if name != "record"], recording.why if records else ""
+    steps = steps_for(config, stored, stages, laws=given, force=options["force"], recording=why)
+    if records:
+        steps.insert(0, Step("record", "", "", {}, why))
+    laws = tuple(step.law for step in steps if step.law)
+    chain = _Chain(console, names, options, laws, config, stored, steps, recording=recording)
     if not options["dry_run"]:
         _require_named(chain)
     return chain
@@ -229,6 +356,7 @@ def _require_named(chain: _Chain) -> None:
     from projservo_cli.robots import plugins
 
     plant = chain.config.plant.use
+    records = any(step.stage == "record" and step.why for step in chain.steps)
     servo = [step for step in chain.steps if step.stage == "servo" and step.why]
     if servo and plant is not None and "servo" not in chain.names:
         raise click.UsageError(
@@ -237,7 +365,7 @@ def _require_named(chain: _Chain) -> None:
         )
     laws = [law_and_mode(step.law)[0] for step in servo]
     wanted = {("law", law): f"--law {law}" for law in laws if law not in CODES}
-    if servo and plant is not None:
+    if (servo or records) and plant is not None:
         wanted["plant", plant] = f"--set plant={plant}"
     given = {Override.parse(text).key for text in chain.options["sets"]}
     named = {kind: bool(keys & given) for kind, keys in _NAMING.items()}
@@ -266,12 +394,16 @@ def _work(chain: _Chain) -> int:
 
     values = {}
     for name in chain.names:
-        if chain.lacks(name):
+        if name == "record":
+            failed = {"reason": chain.reason, "failed": name} if chain.lacks(name) else {}
+            values[name] = {"run": chain.run.path.resolve()} | chain.recording.told | failed
+        elif chain.lacks(name):
             values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
         else:
             values[name] = stage_object(name, chain.run, chain.config, chain.laws)
             values[name] |= chain.beside.get(name, {})
     words = [line for name in values for line in words_of(name, values[name], detailed=chain.console.verbose)]
+    words += [f"table: {chain.recording.path}"] if chain.recording is not None else []
     words += [f"run: {chain.run.path}"] if chain.run.results else []
     chain.console.tell(values if len(values) > 1 else values[chain.names[0]], words)
     findings = list(_findings(chain))
@@ -284,6 +416,8 @@ def _announce(chain: _Chain) -> None:
     """Say in one line for each reason what will be made, and what is up to date."""
     reasons: dict[str, list[str]] = {}
     for step in chain.steps:
+        if step.stage == "record" and len(chain.recording.done) > chain.recording.found:
+            continue  # it was said before it was made
         needed = "" if step.stage in chain.names else f", needed by {chain.names[-1]}"
         if step.why or not needed:
             reasons.setdefault(step.why and step.why + needed, []).append(step.name)
@@ -298,9 +432,12 @@ def _make_steps(chain: _Chain) -> None:
     from projservo_cli.store import save
 
     console = chain.console
+    if chain.failed:
+        return
     motion = next((step for step in chain.steps if step.law and step.why), None)
-    for done, step in enumerate(chain.steps):
-        console.progress("results", done, len(chain.steps))
+    steps = [step for step in chain.steps if step.stage != "record"]
+    for done, step in enumerate(steps):
+        console.progress("results", done, len(steps))
         if step is motion and chain.options.get("confirm"):
             console.confirm("servo", chain.config.plant)
         if step.why:

@@ -4,9 +4,10 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -59,13 +60,14 @@ class _Recording:
     """A table in the making."""
 
     path: Path  # of the table
-    key: str  # hash of what the pixels depend on, stored with every row
+    key: str  # the plant, and a hash of what the pixels depend on; stored with every row
     targets: FloatArray  # (K, n) joints to drive to, rad or m; the row is the number of the pose
     marker: IntArray  # (m,) numbers of the markers
     done: dict[int, Reading] = field(default_factory=dict)  # the poses that are done
     # Frames on the way to poses that are done, by the number of the motion: that of the pose, from 1.
     ways: dict[int, list[Reading]] = field(default_factory=dict)
     found: int = 0  # how many of them an earlier call recorded
+    why: str = "none yet"  # why there is something to record; empty where there is nothing
     commands: int = 0  # steps sent to the robot
     # Sum of the squares by which pixels of one pose are off their mean, px², and its degrees of freedom.
     scatter: FloatArray = field(default_factory=lambda: np.zeros(2))
@@ -85,6 +87,21 @@ class _Recording:
         """Standard deviation of the pixels of a pose, per coordinate; None for single images."""
         squares, freedom = self.scatter
         return float(np.sqrt(squares / freedom)) if freedom > 0.0 else None
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What became of it, as JSON values."""
+        return {
+            "table": self.path.resolve(),
+            "poses": len(self.targets),
+            "recorded": len(self.done) - self.found,
+            "found": self.found,
+            "pending": len(self.pending),
+            "markers": len(self.marker),
+            "unseen": self.unseen,
+            "commands": self.commands,
+            "spread_px": self.spread_px,
+        }
 
     def save(self) -> None:
         """Write all that is done; the file appears whole or not at all."""
@@ -193,13 +210,18 @@ def _images_at(truth: Truth, q: FloatArray, noise: FloatArray | float) -> FloatA
     return images
 
 
+class _OutdatedError(InputError):
+    """A table of another configuration."""
+
+
 def new_recording(
-    config: Config, path: Path, *, motions: JointList | None = None, force: bool = False
+    config: Config, path: Path, *, motions: JointList | None = None, force: bool = False, redo: bool = False
 ) -> _Recording:
     """What there is to record, and what of it the table holds already.
 
     motions : further poses after the trial motions, numbered on.
     force : begin anew, whatever stands at ``path``; else a table of another configuration is refused.
+    redo : begin anew also where ``path`` is a recording of the same plant with another configuration.
     """
     if config.plant.use is None:
         truth_of(config)  # refuses what lacks a part of the simulation
@@ -212,22 +234,31 @@ def new_recording(
             if wrong := limit_passed(q, joints.lower, joints.upper):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
-    key = digest(config, DEPENDS_ON)[:16]
+    plant = config.plant.use or "simulated"
+    key = f"{plant} {digest(config, DEPENDS_ON)[:16]}"
     recording = _Recording(path, key, targets, np.array(numbers, dtype=np.int64))
-    if path.exists() and not force:
-        _resume(recording, servo_of(config, joints).sag + _SLACK)
+    if path.exists() and force:
+        return replace(recording, why="asked for by --force")
+    if path.exists():
+        try:
+            return _resumed(recording, servo_of(config, joints).sag + _SLACK)
+        except _OutdatedError:
+            if not redo or (recording_of(path) or "").rpartition(" ")[0] != plant:
+                raise
+            return replace(recording, why="outdated")
     return recording
 
 
-def _resume(recording: _Recording, most: FloatArray) -> None:
-    """Take over the poses of an interrupted recording, at most so far (n,) from where they were to be."""
-    path, remedy = recording.path, "choose another --output, or replace it with --force"
+def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
+    """The poses of an interrupted recording taken over, at most so far (n,) from where they were to be."""
+    recording = replace(empty, done={}, ways={})
+    path, remedy = recording.path, "choose another table, or replace it with --force"
     if recording_of(path) != recording.key:
-        raise InputError(f"{path}: was not recorded with this configuration; {remedy}")
+        raise _OutdatedError(f"{path}: was not recorded with this configuration; {remedy}")
     n = recording.targets.shape[1]
     table = read_table(path, "R" * n, "rad")
     if sorted(recording.marker) != table.marker.tolist():
-        raise InputError(f"{path}: has other markers than the configuration; {remedy}")
+        raise _OutdatedError(f"{path}: has other markers than the configuration; {remedy}")
     column = np.searchsorted(table.marker, recording.marker)
     nobody = np.full(len(table.pose), np.nan)
     moving = np.zeros(len(nobody), dtype=np.int64) if table.moving is None else table.moving
@@ -241,9 +272,11 @@ def _resume(recording: _Recording, most: FloatArray) -> None:
             continue
         known = 0 <= pose < len(recording.targets)
         if not known or (np.abs(table.q[k] - recording.targets[pose]) > most).any():
-            raise InputError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
+            raise _OutdatedError(f"{path}: pose {pose} is none of those to be recorded; {remedy}")
         recording.done[pose] = reading
     recording.found = len(recording.done)
+    recording.why = "interrupted" if recording.pending else ""
+    return recording
 
 
 def record(
@@ -254,6 +287,8 @@ def record(
     robot : what is driven; None takes that of ``plant.use``, or simulates that of the configuration, which
         stands wherever it is sent unless something is wrong with it.
     """
+    if not recording.pending:
+        return
     robot = robot or _robot_of(config, recording)
     poses = _simulated(config, recording) if robot is None else _recorded(robot, config, recording)
     kept, due = len(recording.done), time.monotonic() + SAVE_EVERY
@@ -276,7 +311,7 @@ def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
     joints = joints_of(config)
     if config.plant.use is not None:
         return foreign_robot(config, joints, len(recording.marker))
-    if not has_faults(config) or not recording.pending:
+    if not has_faults(config):
         return None
     first, sigma_px = recording.targets[recording.pending[0]], config.noise.calibration_px
     seed = seed_of_trials(config)
@@ -286,6 +321,11 @@ def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
 
 def observed(config: Config, *, progress: Progress = silent) -> tuple[Observation, float | None]:
     """What the trial motions of the simulated robot show, and the noise of its pixels, px, if any."""
+    if config.plant.use is not None:
+        raise InputError(
+            f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
+            "name one with --data"
+        )
     truth, sigma_px = truth_of(config), config.noise.calibration_px
     recording = _Recording(Path(), "", trial_motions(config), np.array(truth.number))
     robot = _robot_of(config, recording)

@@ -62,20 +62,28 @@ class Step:
 
 
 def steps_for(
-    config: Config, run: Run, named: Sequence[str], *, laws: Sequence[str] = (), force: bool = False
+    config: Config,
+    run: Run,
+    named: Sequence[str],
+    *,
+    laws: Sequence[str] = (),
+    force: bool = False,
+    recording: str = "",
 ) -> list[Step]:
     """All results that the named stages consist of or need, in the order of making.
 
     run : what is stored so far; possibly nothing.
     laws : instead of ``control.laws``.
     force : make the named stages even where they are up to date, and replace a recorded calibration.
+    recording : why the table has to be recorded first; keys of what rests on it are not known until then.
     """
     stages = STAGES[: max(map(STAGES.index, named)) + 1]
     if not has_task(config) and set(named) <= {"calibrate", "report"}:
         stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
     steps: list[Step] = []
-    for step in _needed(config, run, laws or config.control.laws, stages):
-        remade = any(before.why for before in steps if before.stage != step.stage)
+    inputs = {} if recording else _file_hashes(config, run)
+    for step in _needed(config, inputs, laws or config.control.laws, stages):
+        remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
         steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
     stored = run.calibration.source if "calibrate" in run.results else ""
     if steps[0].why and not force and stored == "recorded" and not config.recorded:
@@ -97,9 +105,10 @@ def affects(key: str, stage: str) -> bool:
     return any(part.startswith(f"{key}.") or f"{key}.".startswith(part) for part in parts)
 
 
-def _needed(config: Config, run: Run, laws: Sequence[str], stages: Sequence[str]) -> Iterator[Step]:
+def _needed(
+    config: Config, inputs: dict[str, str], laws: Sequence[str], stages: Sequence[str]
+) -> Iterator[Step]:
     """Every result of the stages with its key, each made from those before."""
-    inputs = _file_hashes(config, run)
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     for stage in stages:
         keys = []

@@ -104,7 +104,7 @@ def complete(line, monkeypatch, capsys):
     ("line", "offered"),
     [
         ("projservo cal", ["plain,calibrate"]),
-        ("projservo calibrate re", ["plain,report"]),
+        ("projservo calibrate re", ["plain,record", "plain,report"]),
         ("projservo -q calibrate plan -o x s", ["plain,servo"]),
         ("projservo servo --law st", ["plain,stacked"]),
         ("projservo validate --dat", ["plain,--data"]),

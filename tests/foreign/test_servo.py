@@ -399,6 +399,24 @@ def test_a_report_never_moves_a_robot(servo, projservo):
     assert CALLS == []
 
 
+def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    CALLS.clear()
+    alone = projservo("calibrate", "-c", UR5, *SOUND, "-o", "run")
+    assert (alone.code, CALLS) == (2, [])
+    assert "is calibrated from a table: record it" in alone.err
+    chain = ("record", "calibrate", "-o", "run", "--set", "calibration.frames_per_joint=4")
+    answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
+    assert answer.code == 0, answer.err
+    assert (answer.json["record"]["recorded"], answer.json["calibrate"]["source"]) == (37, "recorded")
+    assert CALLS[-2:] == ["stop", "close"]
+    CALLS.clear()
+    refused = projservo(*chain, "--set", "seed=5")
+    assert (refused.code, CALLS) == (2, [])
+    assert "is named by the stored run alone, which starts no code" in refused.err
+    assert projservo("calibrate", "-o", "run", "--json").json["usable"] == answer.json["calibrate"]["usable"]
+
+
 def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     few = ["--set", "calibration.frames_per_joint=2"]
