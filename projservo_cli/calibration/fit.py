@@ -303,7 +303,9 @@ def with_joint_noise(exact: Solution, expected: Expected, given: float | None) -
         if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
             break
         problem = exact.problem.with_noise(noise.over_pixels * unit_noise(exact.problem.readings.prismatic))
-        found = fit_inliers(problem, solution.scene, noise.sigma_q / noise.over_pixels)
+        # What joints that err did to the scene hides that their noise explains the images.
+        scene = minimize(problem, solution.scene, solution.used, robust=True, most=20).scene
+        found = fit_inliers(problem, scene, noise.sigma_q / noise.over_pixels)
         if found is None:
             return dataclasses.replace(exact, joint_noise=NO_JOINT_NOISE)
         solution = dataclasses.replace(found, joint_noise=noise)
