@@ -102,21 +102,16 @@ class Motion(NamedTuple):
     def shares(self) -> FloatArray:
         """Each margin (s, 4) over that at the worse of both ends, or over 1 where that is not positive."""
         margins = self.along.margins
-        return np.asarray(margins / scale_of(margins[0], margins[-1]))
+        worse = np.minimum(margins[0], margins[-1])
+        return np.asarray(margins / np.where(worse > 0.0, worse, 1.0))
 
     def holds(self) -> bool:
         """Whether all constraints hold."""
         return bool(self.along.margins.min() > 0.0)
 
 
-def scale_of(first: FloatArray, last: FloatArray) -> FloatArray:
-    """What margins (...,) are shares of: those at the worse of both ends, 1 where that is not positive."""
-    worse = np.minimum(first, last)
-    return np.where(worse > 0.0, worse, 1.0)
-
-
 @merged
-def visibility_margin(reaching: Reaching, view: int, mu_t: float, mu_r: float) -> float:
+def _visibility(reaching: Reaching, view: int, mu_t: float, mu_r: float) -> float:
     """Margin of one camera: the dual motion of its optical centre against the plane, [RH00] section 4.2.
 
     The translation carries the centre along a line, the rotation within the plane leaves the plane as
@@ -145,13 +140,6 @@ def pixel(model: Model, view: int, A: Vec4) -> tuple[float, float]:
 
 
 @merged
-def in_front(P: FloatArray, A: Vec4, M: Vec4) -> bool:
-    """Whether a camera has a point M on the side on which it had it at A."""
-    depth = row(P, 2, A)
-    return row(P, 2, M) * depth > 1e-9 * (depth * depth)
-
-
-@merged
 def from_border(image_size: FloatArray, u: float, v: float) -> float:
     """Distance of a pixel from the border of the image, px; negative outside, ``BEHIND`` of none."""
     if not math.isfinite(u + v):
@@ -159,13 +147,12 @@ def from_border(image_size: FloatArray, u: float, v: float) -> float:
     return min(u + 0.5, v + 0.5, float(image_size[0]) - 0.5 - u, float(image_size[1]) - 0.5 - v)
 
 
-@merged
-def image_margin(demands: Demands, distance: float) -> float:
-    """Margin of a distance from the border, px; 1 where images have no border."""
-    half = 0.5 * min(float(demands.image_size[0]), float(demands.image_size[1]))
+def image_margin(demands: Demands, distance: FloatArray) -> FloatArray:
+    """Margins (...,) of distances from the border, px; 1 where images have no border."""
+    half = 0.5 * float(demands.image_size.min())
     if not math.isfinite(half):
-        return 1.0 if distance > 0.0 else WORST
-    return max(WORST, (distance - demands.border_px) / (half - demands.border_px))
+        return np.where(distance > 0.0, 1.0, WORST)
+    return np.maximum(WORST, (distance - demands.border_px) / (half - demands.border_px))
 
 
 @merged
@@ -260,40 +247,40 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
 
 
 @merged
-def put_displaced(reaching: Reaching, mu_t: float, mu_r: float, mu_p: float, found: Along, i: int) -> None:
-    """Write displacement and visibility of one instant, at shares."""
-    put_mat(found.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu_t, mu_r, mu_p))
+def put_displaced(reaching: Reaching, mu: FloatArray, found: Along, i: int) -> None:
+    """Write displacement and visibility of one instant, at shares (3,)."""
+    put_mat(found.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
     for view in range(2):
-        found.visibility[i, view] = visibility_margin(reaching, view, mu_t, mu_r)
+        found.visibility[i, view] = _visibility(reaching, view, mu[0], mu[1])
 
 
 @njit
 def put_carried(carrier: Carrier, mu: FloatArray, found: Along) -> None:
-    """Write displacement, visibility, joints and condition at shares mu (s, 3), whose first row is zero.
+    """Write all but images and margins at shares mu (s, 3), from the joints at the first on.
 
     Where the joints would move too far between two of them, the way is made in parts.
     """
-    reaching = carrier.reaching
     for i in range(mu.shape[0]):
-        put_displaced(reaching, mu[i, 0], mu[i, 1], mu[i, 2], found, i)
+        put_displaced(carrier.reaching, mu[i], found, i)
     for i in range(mu.shape[0]):
+        before = max(0, i - 1)
         parts = 0 if i == 0 else 1
         condition = -1.0
         while condition < 0.0 and parts <= MOST_PARTS:
-            put_row(found.q[i], reaching.q_start if i == 0 else found.q[i - 1])
-            ends = (mu[max(0, i - 1)], mu[i])
+            put_row(found.q[i], found.q[before])
+            ends = (mu[before], mu[i])
             condition = carry_joints(carrier, ends, parts, SETTLED, MOST_PART, found.q[i])
             parts = 2 * parts if parts > 0 else MOST_PARTS + 1
         if condition < 0.0:
             for l in range(found.q.shape[1]):
                 found.q[i, l] = math.nan
             return
-        found.condition[i] = condition
+        found.condition[i], found.limit[i] = condition, limit_margin(carrier.reaching.demands, found.q[i])
 
 
 @njit
 def _put_moved(carrier: Carrier, found: Along) -> None:
-    """Write displacement, visibility and condition at joints (s, n), by the forward kinematics."""
+    """Write displacement, visibility, limit and condition at joints (s, n), by the forward kinematics."""
     reaching, model = carrier.reaching, carrier.reaching.model
     a, start = vec(reaching.a), forward(model, reaching.q_start)
     back = backward(model, reaching.q_start)
@@ -301,52 +288,19 @@ def _put_moved(carrier: Carrier, found: Along) -> None:
         H = mul(operators_at(model, found.q[i], carrier.work.H_hat), back)
         put_mat(found.H_d[i], H)
         found.condition[i] = _reciprocal_condition(carrier, H)
+        found.limit[i] = limit_margin(reaching.demands, found.q[i])
         H_back = mul(start, backward(model, found.q[i]))
         for view in range(2):
             O = vec(reaching.O[view])
             found.visibility[i, view] = dot(a, apply(H_back, O)) / dot(a, O)
 
 
-@merged
-def put_images(reaching: Reaching, found: Along) -> None:
-    """Write the images of displaced faces."""
-    for i in range(found.H_d.shape[0]):
-        for k in range(reaching.A.shape[0]):
-            A = vec(reaching.A[k])
-            M = apply(mat(found.H_d[i]), A)
-            for view in range(2):
-                if in_front(reaching.model.P[view], A, M):
-                    u, v = pixel(reaching.model, view, M)
-                    found.s[i, view, k, 0], found.s[i, view, k, 1] = u, v
-
-
-@njit
-def put_path_margins(reaching: Reaching, found: Along) -> None:
-    """Write distances and margins, where all else is known."""
-    demands, A, P = reaching.demands, reaching.A, reaching.model.P
-    for i in range(found.q.shape[0]):
-        H = mat(found.H_d[i])
-        for view in range(2):
-            least = math.inf
-            for k in range(A.shape[0]):
-                u, v = found.s[i, view, k, 0], found.s[i, view, k, 1]
-                shown = in_front(P[view], vec(A[k]), apply(H, vec(A[k])))
-                least = min(least, from_border(demands.image_size, u, v) if shown else BEHIND)
-            found.distance[i, view] = least
-        margins = found.margins[i]
-        margins[VISIBILITY] = min(found.visibility[i, 0], found.visibility[i, 1])
-        margins[IMAGE] = image_margin(demands, min(found.distance[i, 0], found.distance[i, 1]))
-        margins[JOINTS], margins[CONDITIONING] = 1.0, WORST
-        if not math.isnan(found.condition[i]):
-            found.limit[i] = margins[JOINTS] = limit_margin(demands, found.q[i])
-            margins[CONDITIONING] = found.condition[i] - demands.conditioning
-
-
-def along_shares(reaching: Reaching, mu: FloatArray) -> Motion:
-    """The motion of shares mu (s, 3), whose first row is zero."""
+def along_shares(reaching: Reaching, mu: FloatArray, q: FloatArray | None = None) -> Motion:
+    """The motion of shares mu (s, 3) from joints q (n,) at the first; none where it begins at the start."""
     found = room_along(reaching, len(mu))
+    found.q[0] = reaching.q_start if q is None else q
     put_carried(carrier_of(reaching), np.ascontiguousarray(mu), found)
-    return _measured(Motion(reaching, mu, found))
+    return measured(Motion(reaching, mu, found))
 
 
 def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
@@ -354,13 +308,24 @@ def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
     found = room_along(reaching, len(q))
     found.q[:] = q
     _put_moved(carrier_of(reaching), found)
-    return _measured(Motion(reaching, np.full((len(q), 3), np.nan), found))
+    return measured(Motion(reaching, np.full((len(q), 3), np.nan), found))
 
 
-def _measured(motion: Motion) -> Motion:
-    """The motion with its images, distances and margins."""
-    model, found = motion.reaching.model, motion.along
-    M = motion.reaching.A @ np.swapaxes(found.H_d, 1, 2)
+def measured(motion: Motion) -> Motion:
+    """The motion with its images, distances and margins, where all else is known."""
+    reaching, found = motion.reaching, motion.along
+    demands, model = reaching.demands, reaching.model
+    M = reaching.A @ np.swapaxes(found.H_d, 1, 2)
     found.s[:] = np.moveaxis(project(model.P, M, model.lens), 0, 1)
-    put_path_margins(motion.reaching, found)
+    # A camera has a marker before it as long as it has it on the side on which it had it at the start.
+    depth = reaching.A @ model.P[:, 2].T
+    shown = (M @ model.P[:, 2].T) * depth > 1e-9 * depth**2
+    border = np.minimum(found.s + 0.5, demands.image_size - 0.5 - found.s).min(axis=3)
+    border = np.where(np.swapaxes(shown, 1, 2) & np.isfinite(border), border, BEHIND)
+    found.distance[:] = border.min(axis=2)
+    followed = ~np.isnan(found.condition)
+    found.margins[:, VISIBILITY] = found.visibility.min(axis=1)
+    found.margins[:, IMAGE] = image_margin(demands, found.distance.min(axis=1))
+    found.margins[:, JOINTS] = np.where(followed, found.limit, 1.0)
+    found.margins[:, CONDITIONING] = np.where(followed, found.condition - demands.conditioning, WORST)
     return motion

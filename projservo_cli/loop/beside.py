@@ -18,7 +18,6 @@ from projservo_cli.guidance.margins import (
     carrier_of,
     limits_alone,
     put_carried,
-    put_path_margins,
     room_along,
 )
 from projservo_cli.loop.step import new_log
@@ -63,6 +62,5 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     yield put_view, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)
     yield put_carried, (carrier_of(reaching), O, along)
-    yield put_path_margins, (reaching, along)
     yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))
     yield path_deviation, (plant, log, 1, 0.04, q, q)
