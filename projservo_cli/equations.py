@@ -161,7 +161,7 @@ REGISTER = (
     _entry(
         "20",
         "Direct control directTHREE",
-        "control.direct_three.direct_three",
+        "control.direct.direct_three",
         "control/test_direct.py::test_each_error_decays_at_its_own_rate",
         "−ė = λe with q̇ = […] ė leads away from the goal; the motion that reaches it is q̇ = λ_t τ "
         "q̂_t + λ_r θ_r q̂_r + λ_p θ_p q̂_p.",
@@ -169,14 +169,14 @@ REGISTER = (
     _entry(
         "21",
         "Displacement that directTHREE integrates to",
-        "control.direct_three.direct_three",
+        "control.direct.direct_three",
         "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit",
         "λ_r θ_r is printed twice; the second is λ_p θ_p.",
     ),
     _entry(
         "22",
         "Translation and rotation at once",
-        "control.direct_two.direct_two control.exact.exact",
+        "control.direct.direct_two control.exact.exact",
         "acceptance/test_paper_task.py::test_drift_falls_with_the_gain_and_with_the_limit "
         "control/test_exact.py::test_the_centre_keeps_to_its_line",
         "exp(τĤ_t) exp(θĤ_s) = exp(τĤ_t + θĤ_s) holds only to first order, or where the translation is "
@@ -186,7 +186,7 @@ REGISTER = (
     _entry(
         "23",
         "Direct control directTWO",
-        "control.direct_two.direct_two control.law.single_rotation",
+        "control.direct.direct_two control.law.single_rotation",
         "control/test_direct.py::test_one_rotation_decays_at_the_rate_of_its_gain "
         "control/test_direct.py::test_any_ratio_converges",
         "Sign as in (20): q̇ = λ_t τ q̂_t + λ_s θ_s q̂_s.",

@@ -63,7 +63,6 @@ class WorkFailed(RuntimeError):  # noqa: N818 - a verdict, not a programming err
 
 REVOLUTE = 0
 PRISMATIC = 1
-FREE = 2  # a twist of a free-flying rig: its operator does not move with the others
 
 NO_LENS = np.array([[0.0, 0.0, 1.0, 0.0, 0.0]] * 2)
 
@@ -77,7 +76,7 @@ class Model(NamedTuple):
 
     P: FloatArray  # (2, 3, 4) cameras, left and right, to pixels
     H_hat_0: FloatArray  # (n, 4, 4) joint operators at the reference, one unit of motion per rad or m
-    joint_types: IntArray  # (n,) ``REVOLUTE``, ``PRISMATIC`` or ``FREE``
+    joint_types: IntArray  # (n,) ``REVOLUTE`` or ``PRISMATIC``
     q_reference: FloatArray  # (n,) joint reading at the reference, rad or m
     a_inf: FloatArray  # (4,) plane at infinity, the common left null vector of the operators
     # (2, 5) radial distortion of both views: image centre u, v and radius, px, then k1, k2
@@ -275,7 +274,7 @@ class CrossValidation:
     )
 
 
-# All laws built in; compiled code knows each by its place here.
+# All laws built in; compiled code knows each by its place here, as ``control`` has it.
 LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact")
 METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
 # Laws that need the points of the face themselves, and those that can measure with the body.

@@ -1,10 +1,12 @@
-"""Control laws: one file a law, one contract, one if-chain.
+"""Control laws: the paper's own, that without drift, and classical ones; one contract, one if-chain.
 
-Run files and tables know a law by its name, compiled code by the code in its file. A law is added by its
-file, its lines here, and its name among ``records.LAWS``, whose order means nothing to compiled code.
+Run files and tables know a law by its name, compiled code by its place among ``records.LAWS``. A law is added
+by its function, its lines here, and its name there.
 """
 
-from projservo_cli.control import blockwise, direct_three, direct_two, euclidean_points, exact, stacked
+from projservo_cli.control import exact
+from projservo_cli.control.classical import blockwise, euclidean_points, stacked
+from projservo_cli.control.direct import direct_three, direct_two
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, speed_share
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import bends, straight
@@ -13,18 +15,9 @@ from projservo_cli.task.trajectory import Reference, following, near_way, put_ai
 
 # Share of what the images ask for in a period that corrects a way through joint space.
 _CORRECTED = 0.2
-_DIRECT_THREE, _DIRECT_TWO, _STACKED = direct_three.CODE, direct_two.CODE, stacked.CODE
-_BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = blockwise.CODE, euclidean_points.CODE, exact.CODE
-CODES = {
-    "direct_three": _DIRECT_THREE,
-    "direct_two": _DIRECT_TWO,
-    "stacked": _STACKED,
-    "blockwise": _BLOCKWISE,
-    "euclidean_points": _EUCLIDEAN_POINTS,
-    "exact": _EXACT,
-}
-if set(CODES) != set(LAWS) or len(set(CODES.values())) < len(CODES):
-    raise ValueError(f"each of {', '.join(LAWS)} needs a code of its own: {CODES}")
+CODES = {law: code for code, law in enumerate(LAWS)}
+# In the order of their names, and as many.
+_DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = range(len(LAWS))
 
 
 @internal
@@ -47,15 +40,15 @@ def command(law: Law, s: FloatArray, q: FloatArray, state: State) -> int:
         lead = 1.0 / (gains.gain * gains.period)
         put_aim(model, task.reference, float(state.clock[0]), lead, state.A_aim, state.s_aim, state.q_ahead)
     if code == _DIRECT_THREE:
-        status = direct_three.direct_three(model, task, gains, seen, q, state)
+        status = direct_three(model, task, gains, seen, q, state)
     elif code == _DIRECT_TWO:
-        status = direct_two.direct_two(model, task, gains, seen, q, state)
+        status = direct_two(model, task, gains, seen, q, state)
     elif code == _STACKED:
-        status = stacked.stacked(model, task, gains, seen, q, state)
+        status = stacked(model, task, gains, seen, q, state)
     elif code == _BLOCKWISE:
-        status = blockwise.blockwise(model, task, gains, seen, q, state)
+        status = blockwise(model, task, gains, seen, q, state)
     elif code == _EUCLIDEAN_POINTS:
-        status = euclidean_points.euclidean_points(model, task, gains, seen, q, state)
+        status = euclidean_points(model, task, gains, seen, q, state)
     else:
         status = exact.exact(model, task, gains, seen, q, state)
     if following(task.reference):

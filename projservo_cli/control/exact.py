@@ -29,15 +29,13 @@ from projservo_cli.task.face import Task
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.trajectory import following, planned_step, through_joints, under_way
 
-CODE = 5
-
 # A joint step of one part of the continuation, rad or m: between its ends linear joint motion strays
 # by about 0.1 mm from the path of a robot of a metre's size.
-PART_STEP = math.radians(2.5)
-ROUND_OFF = 1e-13
+_PART_STEP = math.radians(2.5)
+_ROUND_OFF = 1e-13
 # Halvings of a step until its end is at a limit: below round-off of a joint reading.
-HALVINGS = 48
-BRANCH_FACTOR = 2.0
+_HALVINGS = 48
+_BRANCH_FACTOR = 2.0
 
 
 class _Step(NamedTuple):
@@ -112,7 +110,7 @@ def _continued(model: Model, task: Task, q: FloatArray, step: _Step, state: Stat
         for i in range(n):
             part = state.path[j, i] - state.path[j - 1, i]
             taken += part * part
-        if taken > BRANCH_FACTOR * BRANCH_FACTOR * predicted + ROUND_OFF * ROUND_OFF:
+        if taken > _BRANCH_FACTOR * _BRANCH_FACTOR * predicted + _ROUND_OFF * _ROUND_OFF:
             return False
     return True
 
@@ -134,7 +132,7 @@ def _up_to_limit(model: Model, task: Task, gains: Gains, q: FloatArray, step: _S
     """
     share = 0.0
     width = 0.5
-    for _ in range(HALVINGS):
+    for _ in range(_HALVINGS):
         trial = _scaled(step, share + width, step.pieces)
         _first_order(trial, state)
         if _continued(model, task, q, trial, state):
@@ -187,7 +185,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
     share = speed_share(state.q_dot, gains.speed, gains.period)
     step = _scaled(whole, share, 1)
     most = _first_order(step, state)
-    count = min(MOST_PARTS, max(1, math.ceil(most / PART_STEP)))
+    count = min(MOST_PARTS, max(1, math.ceil(most / _PART_STEP)))
     step = _scaled(step, 1.0, count)
     while not _continued(model, task, q, step, state):
         if count == MOST_PARTS:

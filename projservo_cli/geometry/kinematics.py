@@ -17,14 +17,12 @@ from projservo_cli.geometry.algebra import (
 )
 from projservo_cli.geometry.jit import inline, internal, merged, njit
 from projservo_cli.geometry.lens import through
-from projservo_cli.records import FREE, NO_LENS, PRISMATIC, FloatArray, Model
+from projservo_cli.records import NO_LENS, PRISMATIC, FloatArray, Model
 
 
 @internal
 def _joint_displacement(H_hat: Mat4, joint_type: int, q: float) -> Mat4:
-    """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5); none of a free-flying rig's twists."""
-    if joint_type == FREE:
-        return IDENTITY
+    """Displacement exp(q Ĥ) of one joint, [RH00] eqs. (4), (5)."""
     if joint_type == PRISMATIC:
         return translation(H_hat, q)
     return rotation(H_hat, q)
@@ -73,8 +71,6 @@ def operators_at(model: Model, q: FloatArray, H_hat: FloatArray) -> Mat4:
     for i in range(n):
         operator = mat(model.H_hat_0[i])
         put_mat(H_hat[i], mul(mul(H, operator), H_inverse))
-        if model.joint_types[i] == FREE:
-            continue
         amount = float(q[i]) - float(model.q_reference[i])
         if i == n - 1:
             H = mul(H, _joint_displacement(operator, model.joint_types[i], amount))

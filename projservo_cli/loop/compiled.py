@@ -10,7 +10,7 @@ from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import RUNNING, WAITING, Command, Instant, Limits, Log, bounded, note, verdict_at
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Plant, move, observe, rig_distance
+from projservo_cli.robots.simulated import Plant, observe, rig_distance
 
 
 class Course(NamedTuple):
@@ -73,9 +73,10 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
                         log.path[k, j, i] = state.path[j, i]
         if verdict >= 0:
             return verdict, k
-        move(plant, dq, log.H[k : k + 2], log.q[k : k + 2])
         for i in range(n):
+            log.q[k + 1, i] = log.q[k, i] + dq[i]
             log.read[k + 1, i] = log.q[k + 1, i]
+        put_mat(log.H[k + 1], forward(plant.model, log.q[k + 1]))
     return RUNNING, limits.max_steps  # not reached: the last instant has a verdict
 
 

@@ -130,7 +130,7 @@ class BuiltInLaw:
         self.state = new_state(len(model.H_hat_0), len(task.A_star), len(task.body.M), span)
         self._weight = np.ones_like(task.body.weight)
         self.law = Law(code, model, self._weighed(task), gains)
-        self._bound = _bind(self.law, self.state)
+        self._bound: Any = None  # until it is called from Python
         self.errors, self.share, self.fit = self.state.errors, self.state.share, self.state.fit
         self.face_px, self.blocked = self.state.face_px, self.state.blocked
 
@@ -138,7 +138,7 @@ class BuiltInLaw:
         """Follow another plan to the goal from its beginning."""
         self.law = self.law._replace(task=self._weighed(task))
         self.state.clock[0] = 0.0
-        self._bound = _bind(self.law, self.state)
+        self._bound = None
 
     def _weighed(self, task: Task) -> Task:
         """The task with the weights of this law, which ``weigh`` changes."""
@@ -156,6 +156,8 @@ class BuiltInLaw:
 
     def __call__(self, s: FloatArray, q: FloatArray) -> tuple[int, FloatArray]:
         """Status and joint velocity of one instant."""
+        if self._bound is None:
+            self._bound = _bind(self.law, self.state)
         status = _bound_command(self._bound, s, q)
         return status, self.state.q_dot.copy()
 

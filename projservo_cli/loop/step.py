@@ -99,7 +99,7 @@ class Log(NamedTuple):
     # have been waited for
     begun: FloatArray
     M: FloatArray
-    scratch: FloatArray  # M, scratch: (m, 4) and (4, n), at least (4, 2), workspaces of the simulated robot
+    scratch: FloatArray  # M, scratch: (m, 4) and (3, n), at least (3, 2), workspaces of the simulated robot
 
 
 def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
@@ -122,7 +122,7 @@ def new_log(n: int, m: int, max_steps: int, errors: int, parts: int = 0) -> Log:
         np.full(3, -1.0),
         np.zeros(3),
         np.zeros((m, 4)),
-        np.zeros((4, max(n, 2))),
+        np.zeros((3, max(n, 2))),
     )
 
 

@@ -5,9 +5,10 @@ from typing import NamedTuple
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_vec, sub, vec
 from projservo_cli.geometry.jit import composed, merged, njit
+from projservo_cli.geometry.kinematics import forward
 from projservo_cli.loop.step import CONVERGED, Log
 from projservo_cli.records import FloatArray
-from projservo_cli.robots.simulated import Ends, Plant, pose_after, shows_face
+from projservo_cli.robots.simulated import Ends, Plant, shows_face
 from projservo_cli.task.face import center_of
 
 MM = 1e3
@@ -157,10 +158,10 @@ def path_deviation(
     """
     ends = vec(start), vec(goal)
     n, M = log.q.shape[1], log.M[: plant.M.shape[0]]
-    part, reached, q, dq = log.scratch[0], log.scratch[1], log.scratch[2], log.scratch[3]
+    q, dq, q_part = log.scratch[0], log.scratch[1], log.scratch[2, :n]
     most = 0.0
     for k in range(steps):
-        H, parts = mat(log.H[k]), max(1, log.parts[k])
+        parts = max(1, log.parts[k])
         samples = max(1, SUBSAMPLES // parts)
         for j in range(parts):
             for i in range(n):
@@ -170,10 +171,10 @@ def path_deviation(
                     q[i], dq[i] = log.path[k, j, i], log.path[k, j + 1, i] - log.path[k, j, i]
             for sample in range(1, samples + 1):
                 for i in range(n):
-                    part[i] = dq[i] * (sample / samples)
-                H_part = pose_after(plant, H, q[:n], part, reached)
+                    q_part[i] = q[i] + dq[i] * (sample / samples)
+                H = forward(plant.model, q_part)
                 for i in range(M.shape[0]):
-                    put_vec(M[i], apply(H_part, vec(plant.M[i])))
+                    put_vec(M[i], apply(H, vec(plant.M[i])))
                 most = max(most, _line_distance(center_of(M, plant.center), ends[0], ends[1]))
     return most
 

@@ -12,19 +12,14 @@ from projservo_cli.geometry.algebra import (
     as_array,
     as_mat,
     axpy,
-    combine,
     dot,
-    mat,
-    mul,
-    put_mat,
     put_vec,
-    twist_exponential,
     vec,
 )
-from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.jit import merged, njit
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, row
 from projservo_cli.geometry.lens import bend
-from projservo_cli.records import FREE, FloatArray, IntArray, Model
+from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.face import center_of, face_plane
 
 NO_PINS = np.zeros((0, 4))
@@ -41,7 +36,7 @@ class Ends(NamedTuple):
 class Plant(NamedTuple):
     """True robot, rig and face in the metric frame."""
 
-    model: Model  # metric model; ``FREE`` joint types make the rig fly
+    model: Model  # metric model
     M: FloatArray  # (m, 4) points of the face at the reference, m
     order: IntArray  # (m,) markers around the face
     center: int  # index of the centre marker, or ``MIDPOINT``
@@ -53,33 +48,6 @@ class Plant(NamedTuple):
     opaque: bool  # whether the face hides its markers from a camera behind it
     # (p, 4) further markers of the body at the reference, m; a camera sees those within its image
     pins: FloatArray = NO_PINS
-
-
-@internal
-def pose_after(plant: Plant, H: Mat4, q: FloatArray, dq: FloatArray, q_next: FloatArray) -> Mat4:
-    """Displacement of the face after the joint step dq, rad or m; the joints are written to q_next.
-
-    A serial robot is moved by its joints; a free-flying rig by one exponential of its twist.
-    """
-    n = q.shape[0]
-    for i in range(n):
-        q_next[i] = q[i] + dq[i]
-    if plant.model.joint_types[0] != FREE:
-        return forward(plant.model, q_next)
-    X = combine(float(dq[0]), mat(plant.model.H_hat_0[0]), 0.0, mat(plant.model.H_hat_0[0]))
-    for i in range(1, n):
-        X = combine(1.0, X, float(dq[i]), mat(plant.model.H_hat_0[i]))
-    return mul(twist_exponential(X), H)
-
-
-@njit
-def move(plant: Plant, dq: FloatArray, H: FloatArray, q: FloatArray) -> None:
-    """Move the robot by a joint step (n,), rad or m.
-
-    H, q : (2, 4, 4) and (2, n), displacement of the face and joints, rad or m, before the step and, on
-        return, after it.
-    """
-    put_mat(H[1], pose_after(plant, mat(H[0]), q[0], dq, q[1]))
 
 
 @njit
@@ -205,9 +173,8 @@ class AnalyticPlant:
     def command(self, step: FloatArray, period: float) -> None:
         """Move by the joint step (n,), rad or m; the simulated robot always arrives."""
         del period
-        H, q = (np.stack([rows, rows]) for rows in (self.H, self.q))
-        move(self.plant, step, H, q)
-        self.H, self.q = H[1], q[1]
+        self.q = self.q + step
+        self.H = as_array(forward(self.plant.model, self.q))
 
     def stop(self) -> None:
         """Nothing moves between commands."""

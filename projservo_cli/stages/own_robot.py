@@ -13,9 +13,8 @@ from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
-from projservo_cli.robots.driven import DrivenRobot, Known, Steered
+from projservo_cli.robots.driven import DrivenRobot, Known, Servo, Steered
 from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
-from projservo_cli.robots.set_point import Servo
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
 from projservo_cli.stages.simulation import FaultyRobot, World

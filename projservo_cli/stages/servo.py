@@ -11,10 +11,10 @@ import numpy as np
 
 from projservo_cli.config import Config
 from projservo_cli.control import CODES
-from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains, Law, new_state
+from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.geometry.kernels import COORDINATES
-from projservo_cli.geometry.mechanisms import in_span, span_of
+from projservo_cli.geometry.mechanisms import in_span
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.standing import Standing
@@ -294,19 +294,14 @@ def _drive_compiled(
     scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, believed: Model | None
 ) -> Outcome:
     """Drive a built-in law on the simulated robot in the compiled loop."""
-    model = scenario.believed_by(law) if believed is None else believed
-    ends, gains, limits = scenario.ends, scenario.gains, scenario.limits
-    task = _task_for(scenario, plan, law, replans, model)
-    n, m, observed = len(ends.q_start), scenario.m, len(scenario.numbers_of(law))
-    span = span_of(model, task.A_star)
-    state = new_state(n, m, observed, span)
-    sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
-    state.driven[:] = in_span(span, model, ends.q_start, sense)
-    log = new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if gains.substeps else 0)
-    plant = scenario.plant_of(law)
+    controller = _built_in(scenario, plan, law, replans, believed)
+    q_start, limits, observed = scenario.ends.q_start, scenario.limits, len(scenario.numbers_of(law))
+    parts = MOST_PARTS if scenario.gains.substeps else 0
+    log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
+    plant, state = scenario.plant_of(law), controller.state
     noise = scenario.noise_of(law, scenario.config.seed, limits.max_steps + 1)
-    built_in, course = Law(CODES[law], model, task, gains), Course(plant, limits, ends.q_start.copy())
-    code, steps = run_compiled(built_in, course, noise, state, log)
+    course = Course(plant, limits, q_start.copy())
+    code, steps = run_compiled(controller.law, course, noise, state, log)
     return Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
 
 
@@ -467,8 +462,15 @@ def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw
         # Its own: what a law writes to must not be what other laws are given.
         setup = copy.deepcopy(LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period))
         return ForeignLaw(plugins.make("law", law, (setup,), {}), f"law {law}")
-    believed = scenario.believed_by(law)
-    built_in = BuiltInLaw(CODES[law], believed, _task_for(scenario, plan, law, replans, believed), gains)
-    sense = in_span(built_in.state.work.span, believed, ends.q_start, plan.rotation_sense())
-    built_in.state.driven[:] = sense
-    return built_in
+    return _built_in(scenario, plan, law, replans)
+
+
+def _built_in(
+    scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, believed: Model | None = None
+) -> BuiltInLaw:
+    """A built-in law with the model that it is given, or another one, and the sense of its rotations."""
+    model = believed or scenario.believed_by(law)
+    found = BuiltInLaw(CODES[law], model, _task_for(scenario, plan, law, replans, model), scenario.gains)
+    sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
+    found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
+    return found

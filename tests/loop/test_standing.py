@@ -7,8 +7,8 @@ import pytest
 
 from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
+from projservo_cli.robots.driven import Servo
 from projservo_cli.robots.instants import NOTHING_KNOWN
-from projservo_cli.robots.set_point import Servo
 from tests.scene import limits
 
 PERIOD, TICK = 0.1, 1.5e-3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.robots.contract import Bounds
-from projservo_cli.robots.set_point import Servo, SetPoint
+from projservo_cli.robots.driven import Servo, SetPoint
 
 PERIOD = 0.04
 BOUNDS = Bounds(np.full(2, -1.5), np.full(2, 1.5), np.full(2, 2.0), np.full(2, 0.4), PERIOD)

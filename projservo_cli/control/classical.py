@@ -1,0 +1,77 @@
+"""Classical stereo laws, to compare with: stacked views, each view by itself, points in metres."""
+
+from projservo_cli.control.law import LOST, OK, SINGULAR, Gains, State, measure, pseudo_inverse, put_view
+from projservo_cli.geometry.algebra import apply, mat, vec
+from projservo_cli.geometry.jit import merged
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.task.face import Task
+
+
+@merged
+def stacked(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+    """Joint velocity −λ J⁺ (s − s*) with both views stacked.
+
+    Source: the law of reference [8] in [RH00], with the Jacobian of [RH00] eq. (7) at each instant.
+    """
+    if not measure(model, task, s, q, state):
+        return LOST
+    n = q.shape[0]
+    rows = 2 * state.A.shape[0]
+    for view in range(2):
+        put_view(model, task, s, state, view, view * rows)
+    if not pseudo_inverse(state, 2 * rows, state.q_dot):
+        return SINGULAR
+    for i in range(n):
+        state.q_dot[i] *= -gains.gain
+    return OK
+
+
+@merged
+def blockwise(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State) -> int:
+    """Joint velocity −λ (J_left⁺ e_left + J_right⁺ e_right), each view by itself.
+
+    Source: the law of reference [10] in [RH00], with the Jacobian of [RH00] eq. (7) at each instant.
+    """
+    if not measure(model, task, s, q, state):
+        return LOST
+    n = q.shape[0]
+    state.q_dot[:] = 0.0
+    for view in range(2):
+        # Not a constant, for which the compiler would make the function anew.
+        put_view(model, task, s, state, view, 0 * view)
+        rows = 2 * state.A.shape[0]
+        if not pseudo_inverse(state, rows, state.work.newton):
+            return SINGULAR
+        for i in range(n):
+            state.q_dot[i] -= gains.gain * state.work.newton[i]
+    return OK
+
+
+@merged
+def euclidean_points(
+    model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, state: State
+) -> int:
+    """Joint velocity −λ J⁺ (X − X*) for points X in metres; the model must be metric.
+
+    Source: "a Jacobian for 3D Euclidean points (like (6) but in Euclidean space)", [RH00] section 6.
+    """
+    if not measure(model, task, s, q, state):
+        return LOST
+    n = q.shape[0]
+    m = state.A.shape[0]
+    system, operators = state.work.system, state.work.columns
+    for i in range(operators.shape[0]):
+        operator = mat(operators[i])
+        for k in range(m):
+            velocity = apply(operator, vec(state.A[k]))
+            system.B[i, 3 * k] = velocity[0]
+            system.B[i, 3 * k + 1] = velocity[1]
+            system.B[i, 3 * k + 2] = velocity[2]
+    for k in range(m):
+        for j in range(3):
+            system.rhs[3 * k + j] = state.A[k, j] - task.A_star[k, j]
+    if not pseudo_inverse(state, 3 * m, state.q_dot):
+        return SINGULAR
+    for i in range(n):
+        state.q_dot[i] *= -gains.gain
+    return OK
