@@ -7,7 +7,7 @@ by its function, its lines here, and its name there.
 from projservo_cli.control import exact
 from projservo_cli.control.classical import blockwise, euclidean_points, stacked
 from projservo_cli.control.direct import direct_three, direct_two
-from projservo_cli.control.law import LOST, OK, Gains, Law, State, speed_share
+from projservo_cli.control.law import LOST, OK, Gains, Law, State, limit_speed
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import bends, straight
 from projservo_cli.records import LAWS, FloatArray
@@ -86,8 +86,5 @@ def _go_on(reference: Reference, gains: Gains, status: int, limited: bool, state
     if status != OK:
         return
     if not limited:
-        share = speed_share(state.q_dot, gains.speed, 1.0)
-        for i in range(state.q_dot.shape[0]):
-            state.q_dot[i] *= share
-        state.share[0] = share
+        state.share[0] = limit_speed(state.q_dot, gains.speed)
     state.clock[0] += reference.rate * state.share[0]

@@ -381,6 +381,15 @@ def pseudo_inverse(state: State, rows: int, q_hat: FloatArray) -> bool:
 
 
 @merged
+def limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
+    """Scale joint velocities (n,) uniformly to the joint-speed limit; returns the share that is left."""
+    share = speed_share(q_dot, speed, 1.0)
+    for i in range(q_dot.shape[0]):
+        q_dot[i] *= share
+    return share
+
+
+@merged
 def speed_share(q_step: FloatArray, speed: FloatArray, period: float) -> float:
     """Share of the amplitude at which the first-order joint step keeps the joint-speed limit."""
     share = 1.0

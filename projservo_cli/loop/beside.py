@@ -34,7 +34,7 @@ def compiling_beside() -> Iterator[None]:
     if CACHE_FOLDER is None or any(CACHE_FOLDER.rglob("compiled.run_compiled-*.nbi")):
         yield
         return
-    command = [sys.executable, "-c", f"from {__name__} import compile_now; compile_now()"]
+    command = [sys.executable, "-c", f"from {__name__} import _compile_now; _compile_now()"]
     with Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL) as other:
         try:
             yield
@@ -42,7 +42,7 @@ def compiling_beside() -> Iterator[None]:
             other.kill()
 
 
-def compile_now() -> None:
+def _compile_now() -> None:
     """Compile all calls."""
     for kernel, arguments in calls():
         kernel.compile(tuple(map(typeof, arguments)))

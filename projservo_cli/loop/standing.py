@@ -43,15 +43,15 @@ _TIMES_LATE = 4.0
 class Standing:
     """Judge of a run of a robot that need not follow what it is sent.
 
-    robot : what is driven; period : of the loop, s; limits : of the run.
+    robot : what is driven; limits : of the run.
     ``why``: what holds the robot, once that was found. ``minimum``: whether that is the law alone.
     """
 
-    def __init__(self, robot: DrivenRobot, period: float, limits: Limits) -> None:
+    def __init__(self, robot: DrivenRobot, limits: Limits) -> None:
         self._robot, self._limits = robot, limits
-        known = robot.known
-        late = known.servo.lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
-        self._window = max(limits.plateau_steps, math.ceil(_TIMES_LATE * late / period))
+        known, bounds = robot.known, robot.robot.bounds
+        late = bounds.lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
+        self._window = max(limits.plateau_steps, math.ceil(_TIMES_LATE * late / bounds.period))
         self._still = np.maximum(_DEVIATIONS * known.sigma_q, _LEAST)
         self._best, self._since = math.inf, 0
         self._read: list[FloatArray] = []
@@ -99,7 +99,7 @@ class Standing:
             return verdict
         moved, sent = (np.ptp(rows[-window:], axis=0) for rows in (self._read, self._sent))
         moved_since, sent_since = (np.ptp(rows[self._since :], axis=0) for rows in (self._read, self._sent))
-        stands, sag = bool((moved <= self._still).all()), self._robot.known.servo.sag
+        stands, sag = bool((moved <= self._still).all()), self._robot.robot.bounds.sag
         short: BoolArray = np.all(self._short[-window:], axis=0) & stands
         stays = (moved_since <= self._still) & (sent_since > _STAYS * np.maximum(sag, self._still)) | short
         if stays.any():

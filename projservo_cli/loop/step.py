@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.control.law import LOST, SINGULAR
+from projservo_cli.control.law import LOST, SINGULAR, limit_speed
 from projservo_cli.geometry.jit import merged
 from projservo_cli.geometry.kinematics import beyond_limits
 from projservo_cli.records import FloatArray, IntArray
@@ -276,7 +276,7 @@ def bounded(log: Log, k: int, asked: Command, plant: Plant, limits: Limits) -> i
     """
     q_dot = asked.q_dot
     dq = log.scratch[0, : q_dot.shape[0]]
-    log.factor[k] = asked.share if asked.share >= 0.0 else _limit_speed(q_dot, limits.speed)
+    log.factor[k] = asked.share if asked.share >= 0.0 else limit_speed(q_dot, limits.speed)
     for i in range(q_dot.shape[0]):
         q_dot[i] *= asked.scale
         dq[i] = q_dot[i] * asked.period
@@ -292,20 +292,6 @@ def bounded(log: Log, k: int, asked: Command, plant: Plant, limits: Limits) -> i
     for i in range(q_dot.shape[0]):
         log.q_dot[k, i] = q_dot[i]
     return RUNNING
-
-
-@merged
-def _limit_speed(q_dot: FloatArray, speed: FloatArray) -> float:
-    """Scale the command uniformly to the joint-speed limit; returns the factor, 1 where it holds."""
-    factor = 1.0
-    for i in range(q_dot.shape[0]):
-        size = abs(q_dot[i])
-        if size * factor > speed[i]:
-            factor = speed[i] / size
-    if factor < 1.0:
-        for i in range(q_dot.shape[0]):
-            q_dot[i] *= factor
-    return factor
 
 
 @merged

@@ -43,13 +43,15 @@ class Reading(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What no command may exceed, (n,) each, rad or m, per s where it is a speed."""
+    """What no command may exceed, and how servos follow; (n,) each, rad or m, per s where it is a speed."""
 
     lower: FloatArray
     upper: FloatArray  # lower, upper: joint limits; infinite for none
     speed: FloatArray  # with the factor of every command
     lead: FloatArray  # of a set-point before the last reading
     period: float  # of the loop, s
+    lag_s: float  # time constant with which joints follow, s
+    sag: FloatArray  # (n,) how far joints stay short under gravity
 
     def within_limits(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Least and most (n,) that a set-point may be at a reading (n,): one beyond a limit may return."""

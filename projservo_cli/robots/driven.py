@@ -23,25 +23,17 @@ from projservo_cli.robots.simulated import Plant, observe
 _STILL = 0.2
 
 
-class Servo(NamedTuple):
-    """What is taken of the servos of a robot."""
-
-    lag_s: float  # time constant with which joints follow, s
-    sag: FloatArray  # (n,) how far joints stay short under gravity, rad or m
-
-
 class SetPoint:
     """The set-point of a robot.
 
-    bounds : of its commands; servo : what is taken of its servos.
+    bounds : of its commands, with what is taken of its servos.
     q : (n,) first reading, rad or m: where it is sent at first.
     ``target``: (n,) the set-point, rad or m. ``short``: (n,) joints whose last step was cut short because the
     set-point was too far ahead of the reading.
     """
 
-    def __init__(self, bounds: Bounds, servo: Servo, q: FloatArray) -> None:
-        self._bounds, self._servo = bounds, servo
-        self.target = q.copy()
+    def __init__(self, bounds: Bounds, q: FloatArray) -> None:
+        self._bounds, self.target = bounds, q.copy()
         self.short: BoolArray = np.zeros(len(q), dtype=np.bool_)
         self._q, self._sag = q.copy(), np.zeros(len(q))
         self._behind = np.zeros(len(q))  # by how much a servo of that lag would be
@@ -54,13 +46,13 @@ class SetPoint:
     def read(self, q: FloatArray, seconds: float) -> None:
         """Learn the sag from a reading (n,), so long after the last one: only while hardly anything moves."""
         self._q = q.copy()
-        weight = 1.0 / (1.0 + (self._behind / (_STILL * self._servo.sag)) ** 2)
-        share = -math.expm1(-seconds / self._servo.lag_s)
+        weight = 1.0 / (1.0 + (self._behind / (_STILL * self._bounds.sag)) ** 2)
+        share = -math.expm1(-seconds / self._bounds.lag_s)
         self._sag += share * weight * (self.target - q - self._sag)
 
     def step(self, dq: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
         """Go on by a joint step (n,), rad or m, in so many seconds: the set-point (n,) and its speed (n,)."""
-        bounds, lag, before, q = self._bounds, self._servo.lag_s, self.target, self._q
+        bounds, lag, before, q = self._bounds, self._bounds.lag_s, self.target, self._q
         target = np.clip(before + dq, *bounds.not_far_ahead(q))
         self.short = target != before + dq
         self.target = np.clip(target, *bounds.within_limits(q))
@@ -75,7 +67,7 @@ class Steered:
 
     The robot itself accumulates nothing.
 
-    robot : what is driven; servo : what is taken of its servos.
+    robot : what is driven.
     ``reading``: of the last look. ``history``: joint readings of all looks. ``set_point``: where it is sent,
     at first where it is read to stand. ``overruns``: periods that reading and thinking did not fit into.
     """
@@ -83,9 +75,8 @@ class Steered:
     reading: Reading
     set_point: SetPoint
 
-    def __init__(self, robot: ForeignRobot, servo: Servo) -> None:
-        self.robot, self.servo, self.history = robot, servo, History()
-        self.overruns = 0
+    def __init__(self, robot: ForeignRobot) -> None:
+        self.robot, self.history, self.overruns = robot, History(), 0
         self._due: float | None = None
 
     @property
@@ -100,7 +91,7 @@ class Steered:
         if self.history:
             self.set_point.read(q, t - self.history.last[0])
         else:
-            self.set_point = SetPoint(self.robot.bounds, self.servo, q)
+            self.set_point = SetPoint(self.robot.bounds, q)
         self.history.add(t, q)
         return self.reading
 
@@ -116,9 +107,9 @@ class Steered:
         if self.robot.wait_until(due):
             self.overruns += 1
 
-    def hold(self, period: float) -> Reading:
-        """Hold the set-point for a period, s, and look."""
-        self.command(np.zeros_like(self.reading.q), period)
+    def hold(self) -> Reading:
+        """Hold the set-point for a period, and look."""
+        self.command(np.zeros_like(self.reading.q), self.robot.bounds.period)
         return self.look()
 
 
@@ -132,7 +123,6 @@ class Known(NamedTuple):
     sigma_px: float  # noise of the pixels
     sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 where none shows
     delays: DelayPrior
-    servo: Servo
     timeout_s: float  # longest that an image may stand still while joints move, s
 
 
@@ -162,7 +152,7 @@ class DrivenRobot:
     def __init__(
         self, robot: ForeignRobot, plant: Plant, known: Known, innovation: Innovation | None
     ) -> None:
-        self.robot, self.steered, self.plant = robot, Steered(robot, known.servo), plant
+        self.robot, self.steered, self.plant = robot, Steered(robot), plant
         self.known, self.innovation = known, innovation
         self.markers = len(known.shown)
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.shown])

@@ -13,7 +13,7 @@ from projservo_cli.geometry.algebra import as_mat
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
-from projservo_cli.robots.driven import DrivenRobot, Known, Servo, Steered
+from projservo_cli.robots.driven import DrivenRobot, Known, Steered
 from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
@@ -31,18 +31,13 @@ _WAITED = 5  # looks for each image that is wanted, where the same one comes aga
 
 
 def bounds_of(config: Config, joints: Joints) -> Bounds:
-    """What no command to a robot may exceed."""
+    """What no command to a robot may exceed, and what is taken of its servos."""
     plant, period = config.plant, config.control.period_s
-    speed = joints.speed * plant.speed_scale
-    lead = speed * (plant.lag_s + period) + length_of(plant.sag_deg, joints)
+    speed, sag = joints.speed * plant.speed_scale, length_of(plant.sag_deg, joints)
+    lead = speed * (plant.lag_s + period) + sag
     if plant.lead_deg is not None:
         lead = length_of(plant.lead_deg, joints)
-    return Bounds(joints.lower, joints.upper, speed, lead, period)
-
-
-def servo_of(config: Config, joints: Joints) -> Servo:
-    """What is taken of the servos of a robot."""
-    return Servo(config.plant.lag_s, length_of(config.plant.sag_deg, joints))
+    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag)
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
@@ -66,8 +61,7 @@ def way_to(robot: Steered, q: FloatArray, settle_s: float, what: str) -> Iterato
     Yields what is read after each command. The robot has then stood still for so many s, and so have the
     images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
     """
-    bounds, sag = robot.robot.bounds, robot.servo.sag
-    begun, still = robot.look().q, _Standstill(settle_s)
+    bounds, begun, still = robot.robot.bounds, robot.look().q, _Standstill(settle_s)
     while (gap := q - robot.target).any():
         robot.command(gap / np.max(np.abs(gap) / (bounds.speed * bounds.period), initial=1.0), bounds.period)
         stands = still.joints(robot.look())
@@ -77,9 +71,9 @@ def way_to(robot: Steered, q: FloatArray, settle_s: float, what: str) -> Iterato
         if (away > bounds.lead).any() or (stands and held.any()):
             break
     else:
-        yield from at_rest(robot.reading, partial(robot.hold, bounds.period), settle_s, what)
+        yield from at_rest(robot.reading, robot.hold, settle_s, what)
     gap = np.abs(q - robot.reading.q)
-    i = int(np.argmax(gap / np.maximum(sag, _STILL)))
+    i, sag = int(np.argmax(gap / np.maximum(bounds.sag, _STILL))), bounds.sag
     if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
         remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
@@ -290,7 +284,6 @@ def _known_of(scenario: Scenario, calibration: Calibration, law: str) -> Known:
         scenario.noise_px,
         length_of(math.degrees(calibration.sigma_q or 0.0), scenario.joints),
         _delays_of(config, calibration),
-        servo_of(config, scenario.joints),
         config.plant.timeout_s,
     )
 

@@ -19,8 +19,8 @@ from projservo_cli.robots.driven import Steered
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.own_robot import (
     averaged,
+    bounds_of,
     foreign_robot,
-    servo_of,
     simulated_robot,
     way_to,
 )
@@ -241,7 +241,7 @@ def new_recording(
         return replace(recording, why="asked for by --force")
     if path.exists():
         try:
-            return _resumed(recording, servo_of(config, joints).sag + _SLACK)
+            return _resumed(recording, bounds_of(config, joints).sag + _SLACK)
         except _OutdatedError:
             if not redo or (recording_of(path) or "").rpartition(" ")[0] != plant:
                 raise
@@ -347,12 +347,12 @@ def _simulated(config: Config, recording: _Recording) -> Iterator[int]:
 
 def _recorded(robot: ForeignRobot, config: Config, recording: _Recording) -> Iterator[int]:
     """Drive to one pending pose after the other and look; the number of each that was recorded."""
-    steered, settle_s = Steered(robot, servo_of(config, joints_of(config))), config.plant.settle_s
+    steered, settle_s = Steered(robot), config.plant.settle_s
 
     def look() -> Reading:
         """A look after a period."""
         recording.commands += 1
-        return steered.hold(config.control.period_s)
+        return steered.hold()
 
     for pose in recording.pending:
         seen = list(way_to(steered, recording.targets[pose], settle_s, "record"))

@@ -389,7 +389,7 @@ def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) 
             for _ in own_robot.way_to(driven.steered, start, settle_s, "servo"):
                 pass
         driven.begin()
-        standing = Standing(driven, scenario.gains.period, scenario.limits)
+        standing = Standing(driven, scenario.limits)
         watch = _watch(scenario, plan, law, controller, replans=replans, standing=standing)
         return _driven_in_python(scenario, controller, driven, watch, standing)
 

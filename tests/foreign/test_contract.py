@@ -10,7 +10,7 @@ import pytest
 from projservo_cli.config import load_config
 from projservo_cli.robots.contract import ForeignRobot, at_rest_after
 from projservo_cli.robots.driven import Steered
-from projservo_cli.stages.own_robot import bounds_of, servo_of, way_to
+from projservo_cli.stages.own_robot import bounds_of, way_to
 from projservo_cli.stages.simulation import robot_by_itself
 from projservo_cli.stages.world import joints_of, truth_of
 from tests.documentation.blocks import DOCS, ROOT, blocks_of
@@ -70,7 +70,7 @@ def steered(robot):
     joints = joints_of(config)
     foreign = ForeignRobot(robot, "robot", 10, bounds_of(config, joints), 5.0, 5.0)
     with at_rest_after(foreign):
-        steered = Steered(foreign, servo_of(config, joints))
+        steered = Steered(foreign)
         steered.look()
         yield steered
     assert {*threads} == {"open", "read", "command", "stop", "close"}

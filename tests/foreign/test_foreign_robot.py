@@ -15,7 +15,7 @@ from projservo_cli.robots import contract
 from projservo_cli.robots.contract import Bounds, ForeignRobot, at_rest_after
 
 PERIOD = 0.04
-BOUNDS = Bounds(np.full(2, -1.0), np.ones(2), np.ones(2), np.full(2, 0.3), PERIOD)
+BOUNDS = Bounds(np.full(2, -1.0), np.ones(2), np.ones(2), np.full(2, 0.3), PERIOD, 0.15, np.zeros(2))
 
 
 class Scripted:

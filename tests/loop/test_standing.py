@@ -7,7 +7,6 @@ import pytest
 
 from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
-from projservo_cli.robots.driven import Servo
 from projservo_cli.robots.instants import NOTHING_KNOWN
 from tests.scene import limits
 
@@ -19,9 +18,8 @@ class Robot:
     """Readings, set-points and what is carried, as a test says."""
 
     def __init__(self):
-        self.known = SimpleNamespace(
-            servo=Servo(0.15, np.full(2, 0.017)), delays=NOTHING_KNOWN, sigma_q=np.full(2, TICK / 12**0.5)
-        )
+        self.known = SimpleNamespace(delays=NOTHING_KNOWN, sigma_q=np.full(2, TICK / 12**0.5))
+        self.robot = SimpleNamespace(bounds=SimpleNamespace(lag_s=0.15, sag=np.full(2, 0.017), period=PERIOD))
         point = SimpleNamespace(short=np.zeros(2, dtype=bool))
         self.steered = SimpleNamespace(reading=None, target=None, set_point=point)
         self.carried_px = 0.0
@@ -33,7 +31,7 @@ class Robot:
 def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=lambda k: 0.0, most=900):
     """Verdict of a run, why, and when; of what is a function of the instant."""
     robot, log = Robot(), new_log(2, 4, 1000, 5)
-    standing = Standing(robot, PERIOD, LIMITS)
+    standing = Standing(robot, LIMITS)
     for k in range(most):
         log.judged[k] = error(k)
         robot.steered.reading = SimpleNamespace(q=np.array(read(k), dtype=float))

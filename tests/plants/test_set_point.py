@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from projservo_cli.robots.contract import Bounds
-from projservo_cli.robots.driven import Servo, SetPoint
+from projservo_cli.robots.driven import SetPoint
 
 PERIOD = 0.04
-BOUNDS = Bounds(np.full(2, -1.5), np.full(2, 1.5), np.full(2, 2.0), np.full(2, 0.4), PERIOD)
-SERVO = Servo(0.15, np.full(2, math.radians(1.0)))
+SAG = np.full(2, math.radians(1.0))
+BOUNDS = Bounds(np.full(2, -1.5), np.full(2, 1.5), np.full(2, 2.0), np.full(2, 0.4), PERIOD, 0.15, SAG)
 
 
 def test_an_arm_that_follows_rests_where_it_is_read_to_the_bit():
-    rng, point = np.random.default_rng(0), SetPoint(BOUNDS, SERVO, np.array([0.1, -0.3]))
+    rng, point = np.random.default_rng(0), SetPoint(BOUNDS, np.array([0.1, -0.3]))
     q = np.array([0.1, -0.3])
     for _ in range(50):
         step = rng.uniform(-0.07, 0.07, 2)
@@ -29,7 +29,7 @@ def test_an_arm_that_follows_rests_where_it_is_read_to_the_bit():
 @pytest.mark.parametrize("lag", [0.0, 0.05, 0.15])
 def test_sag_is_learnt_at_rest_and_lag_is_not_taken_for_it(lag):
     sag, q = np.array([0.008, -0.004]), np.zeros(2)
-    point = SetPoint(BOUNDS, SERVO, q)
+    point = SetPoint(BOUNDS, q)
     worst = 0.0
     for k in range(80):
         target, _ = point.step(np.full(2, 0.03 if k < 30 else 0.0), PERIOD)
@@ -42,7 +42,7 @@ def test_sag_is_learnt_at_rest_and_lag_is_not_taken_for_it(lag):
 
 
 def test_a_set_point_leads_no_farther_than_it_may_and_stays_within_the_limits():
-    point = SetPoint(BOUNDS, SERVO, np.zeros(2))
+    point = SetPoint(BOUNDS, np.zeros(2))
     for _ in range(20):
         point.step(np.array([0.08, 0.0]), PERIOD)  # and nothing moves
     np.testing.assert_array_equal(point.target, [0.4, 0.0])
