@@ -15,6 +15,7 @@ import numpy.typing as npt
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
 
@@ -514,6 +515,18 @@ class Trace:
         units="s",
         about="instant of the joint reading less that of the image, as followed",
         default=None,
+    )
+    frame_instant: IntArray | None = _array(
+        "frame", about="instants of which frames are kept; absent where the robot shows none", default=None
+    )
+    frame_s: FloatArray | None = _array(
+        *("frame", "view", "observed", "xy"), units="px", about="all that was found in them", default=None
+    )
+    frame_size: IntArray | None = _array(
+        "frame", "view", about="bytes of each frame among frame_jpeg", default=None
+    )
+    frame_jpeg: ByteArray | None = _array(
+        "frame_byte", about="the frames as JPEG, one after the other", default=None
     )
     q_read: FloatArray | None = _array(
         "instant",

@@ -126,7 +126,9 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
             if (value := getattr(record, field.name)) is None:
                 continue
             dims, told = field.metadata.get("dims"), ""
-            if dims is not None:
+            if dims is not None and np.asarray(value).dtype == np.uint8:
+                told = "left out: bytes"
+            elif dims is not None:
                 arrays[field.name] = np.asarray(value)
             elif isinstance(value, (str, float)):
                 told = str(value)

@@ -161,6 +161,7 @@ class FigureSpec:
     shares: bool = False  # whether it shows shares of translation and rotations
     modes: bool = False  # whether it compares runs that follow the plan with others
     goal: bool = False  # whether it needs a known goal pose
+    frames: bool = False  # whether it shows frames; where no robot has any, nothing is left out
     task: bool = True  # whether it needs a task; without, a calibration and what it was made from will do
 
     def lacking(self, material: Fit) -> str:
@@ -178,6 +179,8 @@ class FigureSpec:
             return "a way through joint space has no shares of translation and rotations: see figure 16"
         if self.modes and not material.compared():
             return "no run follows the plan: set control.mode, such as [replan, track], and run servo report"
+        if self.frames and all(trace.frame_instant is None for trace in material.traces.values()):
+            return "the robot shows no frames"
         if self.goal and not material.goal_known():
             return "the pose of the goal is unknown, only its images are"
         return ""

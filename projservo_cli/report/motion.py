@@ -12,8 +12,18 @@ from markupsafe import Markup
 
 from projservo_cli.files import replacing
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.records import BODY_LAWS, BoolArray, FloatArray, InputError, IntArray, Plan, Trace
+from projservo_cli.records import (
+    BODY_LAWS,
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    Plan,
+    Trace,
+)
 from projservo_cli.report import style
+from projservo_cli.report.figures.frames import frames_of, with_halo
 from projservo_cli.report.figures.guided import tree_edges, with_gaps
 from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.scene import pyramids, skeleton
@@ -284,6 +294,7 @@ _PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
 _BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
 _PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
 _COLORS = 128
+_FILM_WIDTH = 320  # px, of which a panel shows most
 
 
 def write_animation(
@@ -296,7 +307,7 @@ def write_animation(
     """Write the animation of runs that moved as GIF: the first direct law beside the classical ones.
 
     ``order`` are the markers around the face, ``size`` is that of the images in px; where it is not known,
-    the animation shows what reaches around all that was seen.
+    the animation shows what reaches around all that was seen. Where the runs have frames, these are shown.
     """
     from PIL import Image
 
@@ -311,6 +322,9 @@ def write_animation(
         progress("animation", len(images), FRAMES)
     # The last frame has all colours; one palette for all keeps what does not move the same.
     palette = images[-1].quantize(_COLORS, method=Image.Quantize.MAXCOVERAGE)
+    if any(run.frame_jpeg is not None for run in columns.values()):
+        greys = np.repeat(np.arange(0, 256, 256 // (256 - _COLORS)), 3).tolist()
+        palette.putpalette([*(palette.getpalette() or ())[: 3 * _COLORS], *greys])
     first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     with replacing(path) as temporary:
         durations = [*[FRAME_MS] * len(others), LAST_MS]
@@ -326,6 +340,10 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
     end = max(ends or [run.period * run.steps for run in traces.values()])
     every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
     near = near_pixels(np.concatenate(every), size)
+    films = {name: frames_of(run, width=_FILM_WIDTH) for name, run in traces.items()}
+    margin = 0.06
+    if any(film is not None for film in films.values()):  # whole images
+        near, margin = np.array([[-0.5, -0.5], size - 0.5]), 0.0
     width = max(_LEAST_WIDTH, _PANEL * len(traces) + 0.5)
     columns: list[list[_Panel]] = []
 
@@ -335,11 +353,14 @@ def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> I
             for view, (panel, camera) in enumerate(zip(column, VIEWS, strict=True)):
                 style.face(panel, run.s[0, view, order], style.START)
                 style.face(panel, run.s_star[view, order], style.GOAL)
-                style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near)
+                style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
                 panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
                 panel.set_xlabel("u (px)" if view else "")
             shown = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
             columns.append([_Panel(*one) for one in shown])
+            if (film := films[name]) is not None and run.frame_instant is not None:
+                for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
+                    panel.over(frames, run.frame_instant, size)
         looks = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
         looks["face hidden from this camera"] = _BEHIND
         style.legend_below(figure, looks, 4 if len(runs) > 2 else 2)
@@ -371,10 +392,25 @@ class _Panel:
         (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
         place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}
         self.word = axes.text(0.5, 0.03, "", fontweight="bold", fontsize=8, **place)
+        self.ground: Any = None
+        self.instant: IntArray = np.zeros(0, dtype=np.int64)
+
+    def over(self, frames: ByteArray, instant: IntArray, size: FloatArray) -> None:
+        """Lay frames (k, height, width) of instants (k,) of images of a size, px, beneath."""
+        extent = (-0.5, size[0] - 0.5, size[1] - 0.5, -0.5)
+        limits = self.axes.get_xlim(), self.axes.get_ylim()
+        self.ground = self.axes.imshow(frames[0], cmap="gray", vmin=0, vmax=255, extent=extent, aspect="auto")
+        self.axes.set(xlim=limits[0], ylim=limits[1])
+        self.axes.grid(visible=False)
+        with_halo(self.axes)
+        self.frames, self.instant = frames, instant
+        self.face.set_alpha(0.5)
 
     def show(self, now: int) -> None:
         """Show the paths up to an instant, and the face at it."""
         past, hidden = self.s[: now + 1], self.hidden[: now + 1]
+        if self.ground is not None:  # the newest frame that is kept
+            self.ground.set_data(self.frames[np.searchsorted(self.instant, now, side="right") - 1])
         for k, (line, behind) in enumerate(zip(self.paths, self.behind, strict=True)):
             line.set_data(*past[:, k].T)
             behind.set_data(*np.where(hidden[:, None], past[:, k], np.nan).T)

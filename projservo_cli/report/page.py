@@ -148,7 +148,7 @@ def _pictures(directory: Path, files: Sequence[str], folder: str, prefix: str) -
         if (directory / own["csv"]).is_file():
             links.insert(0, ("numbers (CSV)", folder + own["csv"]))
         number = str(int(spec.name[3:5]))
-        section = "control" if spec.laws or spec.studies or spec.modes else "plan"
+        section = "control" if spec.laws or spec.studies or spec.modes or spec.frames else "plan"
         picture = _Picture(prefix + spec.name, number, spec.title, spec.paper, drawing, tuple(links))
         found[section if spec.task else "calibration"].append(picture)
     return found

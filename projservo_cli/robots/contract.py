@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.delay import comes_again
-from projservo_cli.records import FloatArray, WorkFailed
+from projservo_cli.records import ByteArray, FloatArray, WorkFailed
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -69,7 +69,8 @@ class Robot(Protocol):
     ``release()`` and ``hold()``, which let go of the arm, so that somebody can move it for ``projservo
     teach``, and hold it again; and, if it is a simulator, ``truth()``, the pose (4, 4) of the tool in its
     base frame, m, or its joints (n,), for results alone. A simulator's time passes in ``command`` alone,
-    which moves it to ``due``.
+    which moves it to ``due``. And ``frames``, both images (2, height, width) of its last look in grey, uint8,
+    or None: a run keeps some, which the report shows.
     """
 
     def open(self) -> None:
@@ -120,6 +121,7 @@ class ForeignRobot:
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
         self._shown = -math.inf, 0.0  # what its clock showed last, and when by that of this machine, s
         self._last: Reading | None = None
+        self.frames: ByteArray | None = None  # (2, height, width) of the last look, where the robot has them
         self._sent: FloatArray | None = None  # the last set-point (n,)
         self._due = -math.inf  # when it is to be there, s
         self._orders: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
@@ -137,9 +139,22 @@ class ForeignRobot:
 
     def read(self) -> Reading:
         """Joints and pixels of one look."""
-        before, answer = self._ask("read", lambda: (self._now(), self.robot.read()))
+        before, answer, frames = self._ask("read", self._look)
         self._last = self._checked(self._time(before), answer)
+        if frames is not None and not (
+            isinstance(frames, np.ndarray)
+            and frames.dtype == np.uint8
+            and frames.shape[:1] == (2,)
+            and frames.ndim == 3
+            and frames.size
+        ):
+            raise WorkFailed(f"{self.name}: frames must be an array (2, height, width) of uint8, or None")
+        self.frames = None if frames is None else frames.copy()
         return self._last
+
+    def _look(self) -> tuple[Any, Any, Any]:
+        """What the clock shows, the look, and the frames of it."""
+        return self._now(), self.robot.read(), getattr(self.robot, "frames", None)
 
     def now(self) -> float:
         """What the clock of the robot shows, s; that of this machine where it has none."""

@@ -5,16 +5,17 @@ the joints at which the arm would come to rest if nothing more were sent: lag ha
 and sag is integrated away.
 """
 
+import io
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
-from projservo_cli.records import BoolArray, FloatArray, IntArray
+from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
 from projservo_cli.robots.instants import DelayPrior, Delays, History
 from projservo_cli.robots.simulated import Plant, observe
@@ -113,6 +114,61 @@ class Steered:
         return self.look()
 
 
+MOST_FRAMES = 60  # pairs of a run that are kept
+_QUALITY = 85  # of JPEG
+
+
+class _Shot(NamedTuple):
+    """A pair of frames that is kept."""
+
+    instant: int
+    s: FloatArray  # (2, m, 2) px, what was found in it
+    jpeg: tuple[bytes, bytes]
+
+
+class Film:
+    """Frames of a run, evenly thinned while it runs, the first and the last among them."""
+
+    def __init__(self) -> None:
+        self._kept: list[_Shot] = []
+        self._every = 1  # instants from one to the next
+        self._last: tuple[int, FloatArray, ByteArray] | None = None
+
+    def show(self, instant: int, s: FloatArray, frames: ByteArray) -> None:
+        """Take the frames (2, height, width) of an instant, and the pixels (2, m, 2) that were found."""
+        self._last = instant, s, frames
+        if instant % self._every == 0 and len(self._kept) == MOST_FRAMES - 1:
+            self._kept, self._every = self._kept[::2], 2 * self._every
+        if instant % self._every == 0:
+            self._kept.append(_Shot(instant, s, _as_jpeg(frames)))
+
+    def told(self) -> dict[str, Any]:
+        """What a ``Trace`` holds of it."""
+        if self._last is None:
+            return {}
+        instant, s, frames = self._last
+        shots = [*self._kept]
+        if not shots or shots[-1].instant != instant:
+            shots.append(_Shot(instant, s, _as_jpeg(frames)))
+        whole = b"".join(one for shot in shots for one in shot.jpeg)
+        return {
+            "frame_instant": np.array([shot.instant for shot in shots], dtype=np.int64),
+            "frame_s": np.array([shot.s for shot in shots]),
+            "frame_size": np.array([[len(one) for one in shot.jpeg] for shot in shots], dtype=np.int64),
+            "frame_jpeg": np.frombuffer(whole, dtype=np.uint8),
+        }
+
+
+def _as_jpeg(frames: ByteArray) -> tuple[bytes, bytes]:
+    """Both frames (2, height, width) as files."""
+    from PIL import Image
+
+    files = io.BytesIO(), io.BytesIO()
+    for file, frame in zip(files, frames, strict=True):
+        Image.fromarray(frame).save(file, "JPEG", quality=_QUALITY)
+    return files[0].getvalue(), files[1].getvalue()
+
+
 class Known(NamedTuple):
     """What is known of a robot and its images before it is driven."""
 
@@ -143,7 +199,7 @@ class DrivenRobot:
     the images no longer agree with the calibration, or what failed; else empty. ``weight``: (2, k) of the
     pixels shown in a fit, where the robot tells their deviations. Of each look since ``begin``:
     ``delays`` of both views as followed, (2,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
-    that tells them, joints (n,) or the pose (4, 4) of its tool.
+    that tells them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames.
     """
 
     in_front = True
@@ -170,6 +226,7 @@ class DrivenRobot:
         self.delays: list[FloatArray] = []
         self.readings: list[FloatArray] = []
         self.truths: list[FloatArray] = []
+        self.film = Film()
         self.steered.overruns = 0
 
     def joints(self) -> FloatArray:
@@ -180,6 +237,8 @@ class DrivenRobot:
         self.H = as_array(H)
         M = np.zeros_like(self.plant.M)
         observe(self.plant, H, M, np.zeros((2, len(M) + len(self.plant.pins), 2)), self.hidden)
+        if self.robot.frames is not None:
+            self.film.show(len(self.readings), self.steered.reading.s, self.robot.frames)
         self.readings.append(read)
         self.truths += [] if truth is None else [truth]
         return self.steered.set_point.at_rest

@@ -134,13 +134,14 @@ def draw_all(
             progress("figures", done, len(FIGURES))
             contents: dict[str, bytes] = {}
             if reason := spec.lacking(material):
-                left_out.append({"what": spec.name, "reason": reason})
+                left_out += [] if spec.frames else [{"what": spec.name, "reason": reason}]
             else:
                 if partial := spec.partly(material):
                     left_out.append({"what": f"{spec.name}, in part", "reason": partial})
                 data = spec.data(material)
                 figure = style.drawn(spec.draw, data, spec.height)
-                contents = {_NUMBERS: to_csv(data).encode(), **style.contents(figure, formats)}
+                numbers = {name: values for name, values in data.items() if values.dtype != np.uint8}
+                contents = {_NUMBERS: to_csv(numbers).encode(), **style.contents(figure, formats)}
             for kind in {*style.FORMATS, _NUMBERS} - {*contents}:
                 (folder / f"{spec.name}.{kind}").unlink(missing_ok=True)
             for kind, content in contents.items():

@@ -211,9 +211,12 @@ def scenario_of(
 
 
 def idealized(config: Config) -> Config:
-    """A configuration without noise and disturbances in the loop."""
+    """A configuration of the simulated robot without noise and disturbances in the loop."""
     noise = config.noise.model_copy(update={"servo_px": 0.0})
-    return config.model_copy(update={"noise": noise, "disturbance": type(config.disturbance)()})
+    plant = config.plant.model_copy(update={"use": None, "options": {}})
+    return config.model_copy(
+        update={"noise": noise, "plant": plant, "disturbance": type(config.disturbance)()}
+    )
 
 
 def _gains(config: Config, joints: Joints) -> Gains:

@@ -147,6 +147,7 @@ class Outcome:
             untested="" if driven is None else untested(scenario),
             overruns=None if driven is None else driven.steered.overruns,
             delay=None if driven is None else _whole(driven.delays, rows),
+            **({} if driven is None else driven.film.told()),
         )
 
 

@@ -51,7 +51,7 @@ _SEAL_SIZE = len(_SEAL % bytes(64))
 _FORMAT = ("v110", "v110")  # that of HDF5 from 2016, with checksums in its structures
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 # Kind and size in bytes of the numbers of each type of array, as they are stored.
-_STORED = {"float64": ("f", 8), "int64": ("i", 8), "bool": ("i", 1)}
+_STORED = {"float64": ("f", 8), "int64": ("i", 8), "bool": ("i", 1), "uint8": ("u", 1)}
 _Record = TypeVar("_Record", Observation, Calibration, Plan)
 _SCHEMA = "projservo run"
 SERVO = "servo/"

@@ -9,6 +9,7 @@ from projservo_cli.calibration.forward import Scene
 from projservo_cli.records import LAWS, METRIC_LAWS, MODES_OF, PRISMATIC, Calibration, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
+from projservo_cli.robots.driven import Film
 from projservo_cli.stages import record, studies
 from projservo_cli.stages.scenario import idealized
 from tests.fake_records import fake
@@ -36,6 +37,7 @@ def case(name="paper", steps=SHORT, whole=False):
     plan = planned(scenario, model, samples=21, duration=3.0)
     sense = plan.rotation_sense()
     traces = {law: driven(scenario, sense, law, true.model if law in METRIC_LAWS else model) for law in LAWS}
+    traces["direct_three"] = filmed(traces["direct_three"], *true.image_size.astype(int))
     for law in FOLLOWING:
         followed = name_of(law, MODES_OF[law][1])
         traces[followed] = driven(scenario, plan, followed, model)
@@ -54,6 +56,18 @@ def case(name="paper", steps=SHORT, whole=False):
         bench,
         Material(calibration, observation, model, true.robot, plant, plan, numbers, traces, extra),
     )
+
+
+def filmed(trace, width, height):
+    """A run of which there are frames: black, with a bright square where a marker is."""
+    film = Film()
+    for k, s in enumerate(trace.s):
+        frames = np.zeros((2, height, width), dtype=np.uint8)
+        for view, marker in np.ndindex(s.shape[:2]):
+            u, v = s[view, marker].round().astype(int)
+            frames[view, max(0, v - 8) : v + 9, max(0, u - 8) : u + 9] = 200
+        film.show(k, s, frames)
+    return replace(trace, **film.told())
 
 
 def known(config, true, model, q):

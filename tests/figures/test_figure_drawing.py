@@ -87,8 +87,8 @@ def test_same_input_gives_the_same_bytes():
 
 
 def test_names_follow_the_numbers_of_the_paper():
-    # 0 the overview, 13 the calibration, 14 the path, 15 the modes, 16 the way
-    assert [int(name[3:5]) for name in NAMES] == list(range(17))
+    # 0 the overview, 13 the calibration, 14 the path, 15 the modes, 16 the way, 17 the frames
+    assert [int(name[3:5]) for name in NAMES] == list(range(18))
 
 
 def test_importing_figures_does_not_import_matplotlib():

@@ -79,3 +79,13 @@ def test_markers_that_were_not_seen_are_told_and_leave_the_rest(frames):
     assert lower.sum() > 200  # the word, and the face that is gone, in the image of the right camera alone
     assert not upper.any()
     assert count(last[0], motion.SEEN) > 0.9 * count(last[1], motion.SEEN)
+
+
+def test_frames_are_the_ground_and_the_drawing_of_today_lies_over_them(frames):
+    traces = case()[2].traces
+    filmed, bare = traces["direct_three"], traces["direct_two"]
+    (shown,) = frames(1, filmed=filmed, bare=bare)
+    left, right = np.array_split(shown, 2, axis=1)
+    assert (left < 12).all(axis=2).mean() > 0.4  # frames are black
+    assert (right < 12).all(axis=2).mean() < 0.1
+    assert count(left, motion.SEEN) > 20

@@ -1,0 +1,105 @@
+"""Figure 17: what both cameras saw at the start, on the way and at the end of a run, with what was found."""
+
+import io
+
+import numpy as np
+
+from projservo_cli.records import BODY_LAWS, ByteArray, IntArray, Trace
+from projservo_cli.report import style
+from projservo_cli.report.material import VIEWS, Data, Material, registered, title
+
+_MOMENTS = ("start", "on the way", "end")
+_HALO = 1.2  # points, by which lines over a frame are wider in white
+_FOUND: style.Look = {"color": style.ORANGE, "marker": "+", "linestyle": "none", "markersize": 5.0}
+_FACE: style.Look = {"color": style.GREEN, "linewidth": 1.2}
+_PATH: style.Look = {"color": style.VERMILION, "linewidth": 0.9}
+
+
+def frames_of(trace: Trace, shown: IntArray | None = None, width: int | None = None) -> ByteArray | None:
+    """Frames (k, 2, height, width) of a run, of those kept the ones shown (k,); None where none are kept.
+
+    width : px that they need not exceed, at which they are read faster and smaller.
+    """
+    from PIL import Image
+
+    if trace.frame_jpeg is None or trace.frame_size is None:
+        return None
+    ends = np.cumsum(trace.frame_size).reshape(-1, 2)
+    shown = np.arange(len(ends)) if shown is None else shown
+    pairs = []
+    for k in shown:
+        pair = []
+        for end, size in zip(ends[k], trace.frame_size[k], strict=True):
+            image = Image.open(io.BytesIO(trace.frame_jpeg[end - size : end].tobytes()), formats=["JPEG"])
+            if width is not None and image.width > width:
+                image.draft("L", (width, width * image.height // image.width))
+            pair.append(np.asarray(image.convert("L")))
+        pairs.append(pair)
+    return np.array(pairs)
+
+
+def _filmed(material: Material) -> str:
+    """The run that is shown: of those with frames the first of a direct law, else the first."""
+    names = [name for name, trace in material.traces.items() if trace.frame_instant is not None]
+    return next((name for name in names if name in BODY_LAWS), names[0])
+
+
+def _data(material: Material) -> Data:
+    """Frames of three moments, all that was found in them, the path of the face and its goal."""
+    name, order = _filmed(material), material.plant.order
+    trace = material.traces[name]
+    assert trace.frame_instant is not None
+    assert trace.frame_s is not None
+    half = np.abs(trace.image_error[trace.frame_instant] - 0.5 * trace.image_error[0])
+    shown = np.array([0, int(np.nanargmin(half)), len(half) - 1])
+    frames = frames_of(trace, shown)
+    assert frames is not None
+    return {
+        "run": np.array(f"{title(name)}, {trace.verdict}"),
+        "instant": trace.frame_instant[shown],
+        "period_s": np.array(trace.period),
+        "found": trace.frame_s[shown],
+        "s": trace.s[:, :, order],
+        "s_star": trace.s_star[:, order],
+        "frames": frames,
+    }
+
+
+def with_halo(axes: "style.Axes") -> None:
+    """Draw all lines over a frame with a white margin, so that they show on any ground."""
+    from matplotlib.patheffects import withStroke
+
+    for line in axes.lines:
+        line.set_path_effects([withStroke(linewidth=line.get_linewidth() + _HALO, foreground="white")])
+
+
+@registered(
+    "fig17_frames",
+    "What both cameras saw at the start, on the way and at the end",
+    "beside the paper's",
+    _data,
+    frames=True,
+    alt="A row for each camera, with its image at the start, on the way and at the end of a run. Drawn over "
+    "them are the markers that were found, the face with the paths of its markers so far, and the goal.",
+)
+def _draw(data: Data, figure: "style.Figure") -> None:
+    """A row a camera, a column a moment."""
+    frames = data["frames"]
+    height, width = frames.shape[2:]
+    figure.set_figheight(2.0 * style.WIDTH / 3.0 * height / width + 0.95)
+    figure.suptitle(str(data["run"]), fontsize=8.5)
+    panels = figure.subplots(2, 3)
+    for row, view in zip(panels, range(2), strict=True):
+        for i, panel in enumerate(row):
+            panel.imshow(frames[i, view], cmap="gray", vmin=0, vmax=255)
+            s = data["s"][: data["instant"][i] + 1, view]
+            style.paths(panel, s, _PATH)
+            style.face(panel, s[-1], _FACE)
+            style.face(panel, data["s_star"][view], style.GOAL)
+            panel.plot(*data["found"][i, view].T, **_FOUND)
+            with_halo(panel)
+            panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
+            seconds = data["instant"][i] * float(data["period_s"])
+            panel.set_title(f"{VIEWS[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
+    looks = {"markers found": _FOUND, "face": _FACE, "path of a marker": _PATH, "goal": style.GOAL}
+    style.legend_below(figure, looks, 4)
