@@ -224,7 +224,7 @@ def translation(H_hat: Mat4, tau: float) -> Mat4:
 
 def exp_rotation(H_hat: FloatArray, theta: float) -> FloatArray:
     """Projective rotation (4, 4) of a revolute operator (4, 4) by an angle, rad: [RH00] eq. (4)."""
-    return as_array(rotation(as_mat(H_hat), float(theta)))
+    return as_array(rotation(mat(H_hat), float(theta)))
 
 
 def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> FloatArray:
@@ -243,11 +243,6 @@ def normalize_displacement(H: FloatArray, A: FloatArray, a_inf: FloatArray) -> F
     if np.sum((A @ a_inf) * (A @ result.T @ a_inf)) < 0.0:
         result = -result
     return result
-
-
-def as_mat(H: FloatArray) -> Mat4:
-    """(4, 4) array as the tuple of sixteen floats the kernels take."""
-    return tuple(H.ravel().tolist())  # type: ignore[return-value]  # the type knows any number
 
 
 def as_array(H: Mat4) -> FloatArray:

@@ -84,48 +84,36 @@ def workspace(n: int, rows: int, span: Span = OWN) -> Work:
 
 
 @merged
-def _put_rows(work: Work, i: int, first: int, A: Vec4) -> None:
-    """Write a velocity into four rows of column i."""
-    put_vec(work.system.B[i, first : first + 4], A)
-
-
-@merged
 def translation_mechanism(work: Work, A: Vec4, D: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Translation along the line through A and A + D, [RH00] eq. (8).
 
     The joint motion of unit norm under which two planes through the line have no velocity.
     """
     a_1, a_2 = dual_pencil(A, D)
-    operators = work.basis
-    n = q_hat.shape[0]
-    for i in range(n):
-        operator = mat(operators[i])
-        _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
-        _put_rows(work, i, 4, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
+    for i in range(q_hat.shape[0]):
+        operator = mat(work.basis[i])
+        put_vec(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_1)))
+        put_vec(work.system.B[i, 4:8], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a_2)))
     return _moving(work, q_hat)
 
 
 @internal
 def rotation_mechanism(work: Work, A_1: Vec4, A_2: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Revolution around the axis through two points, [RH00] eq. (9), scaled to radians."""
-    operators = work.basis
-    n = q_hat.shape[0]
-    for i in range(n):
-        operator = mat(operators[i])
-        _put_rows(work, i, 0, apply(operator, A_1))
-        _put_rows(work, i, 4, apply(operator, A_2))
+    for i in range(q_hat.shape[0]):
+        operator = mat(work.basis[i])
+        put_vec(work.system.B[i, 0:4], apply(operator, A_1))
+        put_vec(work.system.B[i, 4:8], apply(operator, A_2))
     return _to_radians(work, q_hat)
 
 
 @merged
 def planar_mechanism(work: Work, a: Vec4, A: Vec4, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """Revolution around a point within a plane, [RH00] eq. (10), scaled to radians."""
-    operators = work.basis
-    n = q_hat.shape[0]
-    for i in range(n):
-        operator = mat(operators[i])
-        _put_rows(work, i, 0, sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
-        _put_rows(work, i, 4, apply(operator, A))
+    for i in range(q_hat.shape[0]):
+        operator = mat(work.basis[i])
+        put_vec(work.system.B[i, 0:4], sub((0.0, 0.0, 0.0, 0.0), apply_transposed(operator, a)))
+        put_vec(work.system.B[i, 4:8], apply(operator, A))
     return _to_radians(work, q_hat)
 
 
@@ -138,13 +126,12 @@ def _moving(work: Work, q_hat: FloatArray) -> tuple[bool, Mat4]:
     """
     if not kernel_vector(work.system, 8, q_hat):
         return False, NO_OPERATOR
-    operators = work.basis
-    H = multiple(float(q_hat[0]), mat(operators[0]))
+    H = multiple(float(q_hat[0]), mat(work.basis[0]))
     for i in range(1, q_hat.shape[0]):
-        H = combine(1.0, H, float(q_hat[i]), mat(operators[i]))
+        H = combine(1.0, H, float(q_hat[i]), mat(work.basis[i]))
     terms = 0.0
     for i in range(q_hat.shape[0]):
-        operator = mat(operators[i])
+        operator = mat(work.basis[i])
         terms += q_hat[i] * q_hat[i] * inner(operator, operator)
     if not inner(H, H) > _NULL_MOTION * _NULL_MOTION * terms:
         return False, NO_OPERATOR

@@ -83,7 +83,7 @@ class DelayPrior(NamedTuple):
 NOTHING_KNOWN = DelayPrior(np.zeros(2), np.full(2, UNKNOWN_S), np.full(2, _JITTER_S))
 
 
-class Frames(NamedTuple):
+class _Frames(NamedTuple):
     """When the images of a look were taken."""
 
     t: FloatArray  # (2,) s, by the clock of the readings
@@ -113,7 +113,7 @@ class Delays:
         """Delays (2,) as followed, s: of images from their readings, or from their stamps."""
         return np.array([view.mean for view in self._views])
 
-    def look(self, t_view: FloatArray, images: FloatArray, history: History) -> Frames:
+    def look(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
         """Instants of both images of a look.
 
         t_view : (2,) s, stamps, NaN where there are none; images : (2, m, 2) px, NaN where unseen.
@@ -124,7 +124,7 @@ class Delays:
             view.look(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
         ]
         t, sigma, fresh = zip(*found, strict=True)
-        return Frames(np.array(t), np.array(sigma), np.array(fresh))
+        return _Frames(np.array(t), np.array(sigma), np.array(fresh))
 
 
 class _View:

@@ -10,9 +10,9 @@ from projservo_cli.geometry.algebra import (
     Vec4,
     apply,
     as_array,
-    as_mat,
     axpy,
     dot,
+    mat,
     put_vec,
     vec,
 )
@@ -161,7 +161,7 @@ class AnalyticPlant:
     def observe(self) -> FloatArray:
         """Noisy pixels (2, markers, 2), NaN where unseen."""
         s = np.zeros((2, self.markers, 2))
-        self.in_front = observe(self.plant, as_mat(self.H), self.M, s, self.hidden)
+        self.in_front = observe(self.plant, mat(self.H), self.M, s, self.hidden)
         s += self.noise[self.observations]
         self.observations += 1
         return s

@@ -9,7 +9,7 @@ import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation, predict
 from projservo_cli.config import Config
-from projservo_cli.geometry.algebra import as_mat
+from projservo_cli.geometry.algebra import mat
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
@@ -231,7 +231,7 @@ def _in_the_loop(scenario: Scenario) -> FaultyRobot:
     def see(q: FloatArray, M: FloatArray) -> FloatArray:
         """What both cameras see of markers (m, 4) at joints (n,), as the loop has it."""
         s, ordered = np.zeros((2, len(M), 2)), np.zeros((2, len(M), 2))
-        H = as_mat(truth.displacement(q))
+        H = mat(truth.displacement(q))
         observe(plant._replace(M=M[face], pins=M[others]), H, workspace, ordered, np.zeros(2))
         s[:, face + others] = ordered
         return s

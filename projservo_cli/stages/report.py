@@ -61,7 +61,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
             studies = run_studies(bench, progress=progress)
         material = replace(_material(run, bench, studies, left_out), trajectory=config.trajectory)
         with _unless_it_fails("equation (22)", left_out):
-            distance, _ = composition_error(metric_plan(bench))
+            distance = composition_error(metric_plan(bench))
             share = np.array(LAMBDAS)
         claims = [claim._asdict() for claim in claims_of(material, share, distance)]
     figures = draw_all(material, directory, config.report.formats, left_out, progress)

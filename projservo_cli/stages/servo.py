@@ -12,7 +12,7 @@ import numpy as np
 from projservo_cli.config import Config
 from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains
-from projservo_cli.geometry.algebra import as_mat
+from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
 from projservo_cli.loop.compiled import Course, run_compiled
@@ -48,12 +48,12 @@ from projservo_cli.task.target import followed
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class _Outcome:
     """A run as it ended."""
 
     scenario: Scenario
     verdict: str
-    disturbance: str  # verdict, disturbance: the verdict, and why the images no longer agree where that is it
+    why: str  # verdict, why: how it ended, and what held, disturbed or failed it, where something did
     steps: int  # commands sent
     log: Log  # what was recorded
     limited: float  # how often visibility limited the translation
@@ -64,7 +64,6 @@ class Outcome:
     unplanned: str = ""  # why it went without the plan that it was to follow
     anew: tuple[str, ...] = ()  # when and why a way was searched anew
     driven: DrivenRobot | None = None  # what was driven, where that is a robot of the contract
-    held: str = ""  # what held a robot that stood still away from the goal
 
     @cached_property
     def summary(self) -> Summary:
@@ -104,7 +103,7 @@ class Outcome:
         if driven is not None and driven.truths and not simulated:
             pose, goal_pose = _told_poses(scenario, _whole(driven.truths, rows))
             told["position_error_mm"] = MM * float(np.linalg.norm(goal_pose[:3, 3] - pose[-1, :3, 3]))
-            told["rotation_error_deg"] = math.degrees(angle_between(as_mat(pose[-1]), as_mat(goal_pose)))
+            told["rotation_error_deg"] = math.degrees(angle_between(mat(pose[-1]), mat(goal_pose)))
         numbers: dict[str, Any] = {n: None if math.isnan(told[n]) else told[n] for n in _TOLD}
         if simulated:
             numbers["success"] = told["success"] == 1.0
@@ -114,7 +113,7 @@ class Outcome:
             mode=self.mode,
             planned_s=self.planned_s,
             verdict=self.verdict,
-            reason="; ".join([self.disturbance or _reason(self, joint, remaining), *_told_anew(self.anew)]),
+            reason="; ".join([_reason(self, joint, remaining), *_told_anew(self.anew)]),
             searches_anew=len(self.anew),
             steps=steps,
             period=scenario.gains.period,
@@ -193,7 +192,7 @@ def _rms(squares: FloatArray, count: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(mean))
 
 
-def _reason(run: Outcome, joint: int, remaining: tuple[float | None, float | None]) -> str:
+def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | None]) -> str:
     """Why a run ended, in a sentence."""
     log, steps, limits = run.log, run.steps, run.scenario.limits
     error, first = float(log.judged[steps]), float(log.judged[0])
@@ -206,11 +205,11 @@ def _reason(run: Outcome, joint: int, remaining: tuple[float | None, float | Non
     ]
     return {
         "converged": f"image error {error:.3g} px is within {within:.3g} px",
-        "plateau": f"the robot stands still at an image error of {error:.3g} px: {run.held}"
-        if run.held
+        "plateau": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
+        if run.why
         else f"no step left; image error {error:.3g} px fell by less than 1 % in the last "
         f"{limits.plateau_steps} steps: a local minimum",
-        "not following": f"{run.held}; {' and '.join(left)} are left",
+        "not following": f"{run.why}; {' and '.join(left)} are left",
         "max steps": f"no step left; image error {error:.3g} px was still changing",
         "diverged": f"image error {error:.3g} px (at first {first:.3g}) or the distance of the face grew "
         f"{limits.diverged_factor:g}-fold",
@@ -221,6 +220,7 @@ def _reason(run: Outcome, joint: int, remaining: tuple[float | None, float | Non
         "joint limit": f"joint {joint + 1} stands at its limit, {float(log.read[steps, joint]):.6g} (rad or "
         f"m), and the task would take it beyond; {' and '.join(left)} are left",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
+        **dict.fromkeys(("disturbed", "failed"), run.why),
     }[run.verdict]
 
 
@@ -235,7 +235,7 @@ def run(config: Config, calibration: Calibration, plan: Plan, name: str) -> Trac
     return drive(scenario_of(config, calibration), plan, name).trace()
 
 
-def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Model | None = None) -> Outcome:
+def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Model | None = None) -> _Outcome:
     """Drive the run of a name to its verdict.
 
     plan : of the task; a built-in law that does not follow it needs but the joint motions (2, n) of its
@@ -293,7 +293,7 @@ def _task_for(scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bo
 
 def _drive_compiled(
     scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, believed: Model | None
-) -> Outcome:
+) -> _Outcome:
     """Drive a built-in law on the simulated robot in the compiled loop."""
     controller = _built_in(scenario, plan, law, replans, believed)
     q_start, limits, observed = scenario.ends.q_start, scenario.limits, len(scenario.numbers_of(law))
@@ -303,10 +303,10 @@ def _drive_compiled(
     noise = scenario.noise_of(law, scenario.config.seed, limits.max_steps + 1)
     course = Course(plant, limits, q_start.copy())
     code, steps = run_compiled(controller.law, course, noise, state, log)
-    return Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
+    return _Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
 
 
-def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
+def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) -> _Outcome:
     """Drive a law on the simulated robot without a fault in the Python loop."""
     controller = _law_for(scenario, plan, law, replans)
     noise = scenario.noise_of(law, scenario.config.seed, scenario.limits.max_steps + 1)
@@ -338,7 +338,7 @@ def _driven_in_python(
     plant: AnalyticPlant | DrivenRobot,
     watch: Watch | None,
     standing: Standing | None = None,
-) -> Outcome:
+) -> _Outcome:
     """Drive any law on any plant, every command scaled."""
     gains, limits, scale = scenario.gains, scenario.limits, scenario.config.plant.speed_scale
     code, steps, log = run_in_python(
@@ -356,21 +356,20 @@ def _driven_in_python(
     if driven is not None:  # it goes from sample to sample, whatever was asked for
         path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
         log = log._replace(path=path, parts=np.ones_like(log.parts))
-    return Outcome(
+    return _Outcome(
         scenario,
         VERDICTS[code],
-        plant.disturbance,
+        plant.disturbance or ("" if standing is None else standing.why),
         steps,
         log,
         limited,
         plant.plant,
         anew=() if watch is None else tuple(watch.told),
         driven=driven,
-        held="" if standing is None else standing.why,
     )
 
 
-def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) -> Outcome:
+def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) -> _Outcome:
     """Drive a robot of the contract under a law from the start of the task, where a simulated one stands.
 
     That of ``plant.use`` is driven there. Before its first motion, what it sees must agree with the

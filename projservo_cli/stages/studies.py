@@ -12,10 +12,10 @@ from projservo_cli.config import Config
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.algebra import (
     as_array,
-    as_mat,
     composed_angle,
     composed_operator,
     exp_rotation,
+    mat,
     twist_exponential,
 )
 from projservo_cli.guidance.margins import limits_alone
@@ -136,24 +136,22 @@ def metric_plan(bench: Comparison) -> Plan:
     return plan_task(bench.models["true"], shown, trajectory, limits)
 
 
-def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> tuple[FloatArray, FloatArray]:
+def composition_error(plan: Plan, lambdas: Sequence[float] = LAMBDAS) -> FloatArray:
     """How far both sides of [RH00] eq. (22) differ when a metric plan is taken in shares λ of τ and θ_s.
 
-    Returns distance: (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m; norm:
-    (k,) Frobenius norm of the difference of both displacements, m and rad mixed. Raises WorkFailed if the
-    task has no rotation.
+    Returns the distance (k,) of the centre under exp(λτ Ĥ_t) exp(λθ_s Ĥ_s) and exp(λτ Ĥ_t + λθ_s Ĥ_s), m.
+    Raises WorkFailed if the task has no rotation.
     """
     theta_s, a, b, c = composed_angle(plan.theta_r, plan.theta_p)
-    turns, H_s = composed_operator(as_mat(plan.H_hat[1]), as_mat(plan.H_hat[2]), a, b, c)
+    turns, H_s = composed_operator(mat(plan.H_hat[1]), mat(plan.H_hat[2]), a, b, c)
     if not turns:
         raise WorkFailed("two rotations by 0° compose to the identity, which has no axis")
     H_hat_s = as_array(H_s)
-    distance, norm = [], []
+    distance = []
     for share in lambdas:
         shift = np.eye(4) + share * plan.tau * plan.H_hat[0]
         product = shift @ exp_rotation(H_hat_s, share * theta_s)
         summed = share * (plan.tau * plan.H_hat[0] + theta_s * H_hat_s)
-        difference = product - as_array(twist_exponential(as_mat(summed)))
+        difference = product - as_array(twist_exponential(mat(summed)))
         distance.append(float(np.linalg.norm(difference @ plan.A_c)))
-        norm.append(float(np.linalg.norm(difference)))
-    return np.array(distance), np.array(norm)
+    return np.array(distance)

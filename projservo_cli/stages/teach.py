@@ -26,7 +26,7 @@ _BESIDE, _AT_REST_S = 0.02, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Taught:
+class _Taught:
     """What the robot and its cameras tell of the pose it was moved to."""
 
     marker: IntArray  # (m,) numbers of the markers
@@ -70,7 +70,7 @@ class _Checked(NamedTuple):
 
 def teach(
     config: Config, frames: int, at: Sequence[float] | None = None, wait: Callable[[str], None] | None = None
-) -> Taught:
+) -> _Taught:
     """Look where the robot stands, and average so many frames of each camera.
 
     at : joints (n,) that a simulated robot is put to, rad or m.
@@ -116,7 +116,7 @@ def teach(
             reading = [reading, *at_rest(reading, look, config.plant.settle_s, "teach")][-1]
         mean, squares, count = averaged(reading, look, frames)
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
-    return Taught(
+    return _Taught(
         np.array(numbers, dtype=np.int64),
         mean.q,
         mean.s,
@@ -137,7 +137,7 @@ def _put_to(config: Config, q: FloatArray) -> FaultyRobot:
     return robot
 
 
-def checked(config: Config, calibration: Calibration, taught: Taught) -> _Checked:
+def checked(config: Config, calibration: Calibration, taught: _Taught) -> _Checked:
     """Whether joints reach what was taught, by a calibration, and which markers are off what they show.
 
     taught : with the whole face.
@@ -169,7 +169,7 @@ def checked(config: Config, calibration: Calibration, taught: Taught) -> _Checke
     return _Checked(off, far, reached, reason)
 
 
-def require_face(config: Config, taught: Taught) -> None:
+def require_face(config: Config, taught: _Taught) -> None:
     """Refuse what does not show the whole face to both cameras, with a WorkFailed."""
     face = face_numbers(config)
     if unseen := [(number, side) for number, side in taught.unseen if number in face]:

@@ -9,7 +9,6 @@ from projservo_cli.geometry.algebra import (
     apply,
     apply_transposed,
     as_array,
-    as_mat,
     axpy,
     combine,
     dot,
@@ -34,7 +33,7 @@ vectors = st.tuples(entries, entries, entries, entries)
 def test_products_agree_with_numpy(rng):
     A, B = rng.normal(size=(2, 4, 4))
     x, y = rng.normal(size=(2, 4))
-    A_v, B_v, x_v, y_v = as_mat(A), as_mat(B), tuple(x.tolist()), tuple(y.tolist())
+    A_v, B_v, x_v, y_v = mat(A), mat(B), tuple(x.tolist()), tuple(y.tolist())
     assert as_array(mul(A_v, B_v)) == pytest.approx(A @ B, abs=1e-14)
     assert apply(A_v, x_v) == pytest.approx(A @ x, abs=1e-14)
     assert apply_transposed(A_v, x_v) == pytest.approx(A.T @ x, abs=1e-14)
@@ -52,7 +51,7 @@ def test_values_and_arrays_convert_without_change(rng):
     put_vec(y, vec(x))
     assert np.array_equal(A, B)
     assert np.array_equal(x, y)
-    assert np.array_equal(as_array(as_mat(A)), A)
+    assert np.array_equal(as_array(mat(A)), A)
 
 
 def test_unit_vectors():

@@ -10,10 +10,10 @@ from scipy.linalg import expm
 
 from projservo_cli.geometry.algebra import (
     as_array,
-    as_mat,
     composed_angle,
     composed_operator,
     incidence_angles,
+    mat,
 )
 from tests.samples import frame, revolute
 
@@ -67,7 +67,7 @@ def perpendicular_pair(seed):
 def composed(H_r, H_p, theta_r, theta_p):
     """Angle and operator (4, 4) of the one rotation."""
     theta_s, *coefficients = composed_angle(theta_r, theta_p)
-    found, H_s = composed_operator(as_mat(H_r), as_mat(H_p), *coefficients)
+    found, H_s = composed_operator(mat(H_r), mat(H_p), *coefficients)
     assert found
     return theta_s, as_array(H_s)
 
@@ -107,4 +107,4 @@ def test_half_a_turn(theta_p):
 
 def test_the_identity_has_no_axis():
     H_r, H_p = perpendicular_pair(1)
-    assert not composed_operator(as_mat(H_r), as_mat(H_p), *composed_angle(0.0, 0.0)[1:])[0]
+    assert not composed_operator(mat(H_r), mat(H_p), *composed_angle(0.0, 0.0)[1:])[0]

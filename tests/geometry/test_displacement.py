@@ -8,8 +8,8 @@ from scipy.linalg import expm
 
 from projservo_cli.geometry.algebra import (
     as_array,
-    as_mat,
     exp_rotation,
+    mat,
     normalize_displacement,
     translation,
     twist_exponential,
@@ -37,7 +37,7 @@ def test_rotation_is_the_matrix_exponential(theta):
 def test_translation_is_the_matrix_exponential(tau):
     for seed in range(4):
         H_hat = conjugate(prismatic([1, 2, -3]), seed)
-        assert as_array(translation(as_mat(H_hat), tau)) == pytest.approx(expm(tau * H_hat), abs=1e-13)
+        assert as_array(translation(mat(H_hat), tau)) == pytest.approx(expm(tau * H_hat), abs=1e-13)
 
 
 def test_scale_of_a_homography_keeps_points_on_their_side_of_infinity():
@@ -65,4 +65,4 @@ def test_exponential_of_any_twist(size):
     for w, v in [([1, 2, -2], [0.3, -0.5, 0.2]), ([0, 0, 3], [1, 0, 5]), ([0, 0, 0], [1, 2, 3])]:
         X = size * hat(np.array(w) / 3.0, v)
         # Round-off of the entries, which grow with the translation of size·5.
-        assert as_array(twist_exponential(as_mat(X))) == pytest.approx(expm(X), abs=1e-13)
+        assert as_array(twist_exponential(mat(X))) == pytest.approx(expm(X), abs=1e-13)

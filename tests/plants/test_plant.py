@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.algebra import as_mat
+from projservo_cli.geometry.algebra import mat
 from projservo_cli.robots.simulated import AnalyticPlant, observe
 from tests.samples import displacement, poe
 from tests.scene import STEP, scene
@@ -11,7 +11,7 @@ from tests.scene import STEP, scene
 
 def observed(plant, H):
     M, s, hidden = np.zeros_like(plant.M), np.zeros((2, len(plant.M), 2)), np.zeros(2)
-    in_front = observe(plant, as_mat(H), M, s, hidden)
+    in_front = observe(plant, mat(H), M, s, hidden)
     return in_front, M, s, hidden
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.geometry.algebra import as_array, as_mat
+from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import SEEN, SETTLED, body_of, fit_body
@@ -41,7 +41,7 @@ def twist_of(body, xi):
 
 
 def fitted(model, body, s, H, until=SEEN):
-    return fit_body(model.P, body, np.ascontiguousarray(s), as_mat(H), until, np.zeros((6, 7)))
+    return fit_body(model.P, body, np.ascontiguousarray(s), mat(H), until, np.zeros((6, 7)))
 
 
 @pytest.mark.parametrize("seed", FRAMES)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.geometry.algebra import as_array, as_mat
+from projservo_cli.geometry.algebra import as_array, mat
 from projservo_cli.records import WorkFailed
 from projservo_cli.task.body import SETTLED, body_of, fit_body
 from projservo_cli.task.face import UNSEEN_GOAL, require_found
@@ -44,7 +44,7 @@ def test_the_goal_is_the_least_squares_fit_to_all_that_is_seen(rng):
     model, shown, _ = case(frame(2))
     star = shown.s_star + 0.5 * rng.normal(size=shown.s_star.shape)
     star[0, 6] = math.nan
-    H = as_mat(poe(model, scene().q_goal))
+    H = mat(poe(model, scene().q_goal))
     fit = fit_body(model.P, shown.body, star, H, SETTLED, np.zeros((6, 7)))
     assert fit.settled
     wanted = shown.body.M[:4] @ as_array(fit.H).T

@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from projservo_cli.geometry.algebra import as_mat
+from projservo_cli.geometry.algebra import mat
 from projservo_cli.task.face import MIDPOINT, center_of, cyclic_order, face_plane
 from projservo_cli.task.visibility import (
     arc_minimum,
@@ -128,7 +128,7 @@ def test_a_rotation_that_never_turns_the_face_away():
 def test_margin_coefficients_describe_the_carried_plane(G, rng):
     H_hat = G @ revolute([0.1, 0.2, 1.3], [1, 2, 3]) @ np.linalg.inv(G)
     a, O = rng.normal(size=(2, 4))
-    c_0, c_s, c_c = margin_coefficients(tuple(a.tolist()), as_mat(H_hat), tuple(O.tolist()))
+    c_0, c_s, c_c = margin_coefficients(tuple(a.tolist()), mat(H_hat), tuple(O.tolist()))
     for theta in np.linspace(-6, 6, 13):
         wanted = carried(a, expm(theta * H_hat)) @ O
         assert c_0 + c_s * math.sin(theta) + c_c * math.cos(theta) == pytest.approx(wanted, abs=1e-11)
@@ -154,10 +154,10 @@ def test_translation_is_limited_by_the_camera_that_loses_sight_first():
     sign, limits = (1, tau[0]) if (tau[0] > 0).all() else (-1, tau[1])
     assert (limits > 0).all()
     assert abs(limits[0] - limits[1]) > 0.1
-    arguments = tuple(a.tolist()), as_mat(sign * H_t)
+    arguments = tuple(a.tolist()), mat(sign * H_t)
     assert limited_translation(*arguments, 100.0, 0.9, task) == pytest.approx(0.9 * limits.min())
     assert limited_translation(*arguments, 0.5 * limits.min(), 0.9, task) == 0.5 * limits.min()
-    assert limited_translation(tuple(a.tolist()), as_mat(-sign * H_t), 100.0, 0.9, task) == 100.0
+    assert limited_translation(tuple(a.tolist()), mat(-sign * H_t), 100.0, 0.9, task) == 100.0
     blind = task._replace(visible=task.visible * np.where(limits == limits.min(), -1.0, 1.0))
     assert limited_translation(*arguments, 100.0, 0.9, blind) == pytest.approx(0.9 * limits.max())
 
@@ -184,7 +184,7 @@ def sense_case(seed):
 
 
 def chosen(a, a_t, H_hat, theta, task, against_previous=False):
-    return choose_sense(tuple(a.tolist()), tuple(a_t.tolist()), as_mat(H_hat), theta, task, against_previous)
+    return choose_sense(tuple(a.tolist()), tuple(a_t.tolist()), mat(H_hat), theta, task, against_previous)
 
 
 def test_sense_of_the_turn_by_brute_force():
