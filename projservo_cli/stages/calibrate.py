@@ -25,14 +25,6 @@ from projservo_cli.stages.world import image_size_of, is_ideal, joints_of
 from projservo_cli.tables import read_table, to_csv
 
 
-def _joint_noise(config: Config, *, ideal: bool) -> float | None:
-    """Deviation of joint readings, rad; None where it is to be estimated."""
-    given = config.calibration.joint_noise_deg
-    if given is not None:
-        return float(np.radians(given))
-    return 0.0 if ideal else None
-
-
 def run(
     config: Config, *, progress: Progress = silent
 ) -> tuple[Observation, Calibration, CrossValidation | None]:
@@ -45,6 +37,7 @@ def run(
     settings, seed = config.calibration, seed_of_trials(config)
     ideal = is_ideal(config) and not config.recorded
     init = Nominal(**read_nominal(settings.init)) if settings.init is not None else None
+    noise_deg = 0.0 if ideal and settings.joint_noise_deg is None else settings.joint_noise_deg
     if config.data is not None:
         observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
         sigma_px = config.data.noise_px
@@ -69,7 +62,7 @@ def run(
         seed=seed,
         lens=settings.lens,
         init=init,
-        joint_noise=_joint_noise(config, ideal=ideal),
+        joint_noise=None if noise_deg is None else float(np.radians(noise_deg)),
         fitted=hold_out if settings.cross_validate is not None else None,
         tell=progress,
     )
