@@ -208,9 +208,9 @@ REGISTER = (
     _entry(
         "§4.2",
         "Visibility and the motions that do not change it",
-        "guidance.margins.visibility_margin task.visibility.visibility_translation "
+        "guidance.margins._visibility task.visibility.visibility_translation "
         "task.visibility.visibility_angles task.visibility.choose_sense "
-        "task.visibility.limited_translation guidance.lattice.turning_sense",
+        "task.visibility.limited_translation",
         "task/test_visibility.py::test_neutral_along_the_ray_of_a_point_of_the_face "
         "task/test_visibility.py::test_neutral_parallel_to_the_face_and_within_its_plane "
         "task/test_visibility.py::test_neutral_about_any_axis_through_the_optical_center "

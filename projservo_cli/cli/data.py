@@ -115,7 +115,7 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
 
 
 @main.command(
-    epilog="Example: projservo detect images/left images/right --joints-csv q.csv --output tags.csv"
+    "detect", epilog="Example: projservo detect images/left images/right --joints-csv q.csv --output tags.csv"
 )
 @click.argument("left")
 @click.argument("right")
@@ -143,7 +143,7 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
 )
 @option.force(help="Replace the table if there is one.")
 @option.told
-def detect(
+def _detect(
     console: Console,
     *,
     left: str,
@@ -204,7 +204,7 @@ def detect(
     console.tell(value, [*(text.format_map(value) for text in words), f"table: {output}"])
 
 
-@main.command(epilog="Example: projservo validate results/mine --data validation.csv")
+@main.command("validate", epilog="Example: projservo validate results/mine --data validation.csv")
 @click.argument("run", required=False, type=option.PATH)
 @option.output(metavar="DIR", help="The run, instead of an argument.")
 @click.option("--data", metavar="TABLE", type=option.PATH, required=True, help="Observation table (CSV).")
@@ -214,7 +214,7 @@ def detect(
     help="Unit of the table's revolute joints. Default: that of the run.",
 )
 @option.told
-def validate(
+def _validate(
     console: Console, *, run: Path | None, output: Path | None, data: Path, joint_unit: str | None
 ) -> None:
     """Predict held-out images with a calibration.

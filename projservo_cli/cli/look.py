@@ -14,11 +14,11 @@ from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console, words_of, wrapped
 
 
-@main.command(epilog="Example: projservo show results/ur5 --json")
+@main.command("show", epilog="Example: projservo show results/ur5 --json")
 @click.argument("run", required=False, type=option.PATH)
 @option.output(metavar="DIR", help="The run, instead of an argument.")
 @option.told
-def show(console: Console, *, run: Path | None, output: Path | None) -> None:
+def _show(console: Console, *, run: Path | None, output: Path | None) -> None:
     """Show what a run holds and how it was made.
 
     Lists the results in a run, by default of results/paper, and what they were made with; -v with every
@@ -62,12 +62,12 @@ def _made(provenance: Any) -> str:
     )
 
 
-@main.command(epilog="Example: projservo compare results/paper results/ur5 -o both.html")
+@main.command("compare", epilog="Example: projservo compare results/paper results/ur5 -o both.html")
 @click.argument("runs", nargs=-1, required=True, type=option.PATH, metavar="RUN RUN ...")
 @option.output(metavar="PAGE", help="Page to write.", default="compare.html", show_default=True)
 @option.force(help="Replace the page if there is one.")
 @option.told
-def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bool) -> None:
+def _compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bool) -> None:
     """Show runs side by side on one page.
 
     Writes one page like report.html with the differences of the configurations, and calibrations, plans,
@@ -87,13 +87,13 @@ def compare(console: Console, *, runs: tuple[Path, ...], output: Path, force: bo
     console.tell(value, [f"compare: {len(runs)} runs: {output}"])
 
 
-@main.command(epilog="Example: projservo export results/ur5 -o tables")
+@main.command("export", epilog="Example: projservo export results/ur5 -o tables")
 @click.argument("run", type=option.PATH)
 @option.output(metavar="DIR", help="Folder to write. Default: csv beside run.h5.")
 @option.force(help="Replace what is there.")
 @click.option("--to", type=click.Choice(["csv"]), default="csv", help="Kind of files.", expose_value=False)
 @option.told
-def export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:
+def _export(console: Console, *, run: Path, output: Path | None, force: bool) -> None:
     """Write all arrays of a run as CSV tables.
 
     Writes a folder with a table for each result, a column for each index of an array, and fields.csv, which
@@ -143,9 +143,9 @@ def _write_tables(run: Any, folder: Path) -> Iterator[Path]:
         yield write_whole(folder / file, text)
 
 
-@main.command(epilog="Example: projservo equations --json")
+@main.command("equations", epilog="Example: projservo equations --json")
 @option.told
-def equations(console: Console) -> None:
+def _equations(console: Console) -> None:
     """List the equations of the paper and the code of each.
 
     Prints number, title, function, test and erratum of every equation.

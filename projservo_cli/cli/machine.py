@@ -18,11 +18,11 @@ _STARTER, _SCHEMA = "projservo.yaml", "projservo.schema.json"  # as the first li
 _MACHINE = ("projservo", "python", "numpy", "numba", "llvmlite", "system", "cpu", "cpu_count", "date", "jit")
 
 
-@main.command(epilog="Example: projservo init mine.yaml")
+@main.command("init", epilog="Example: projservo init mine.yaml")
 @click.argument("file", default=_STARTER, type=option.PATH)
 @option.force(help="Replace the file if there is one.")
 @option.told
-def init(console: Console, *, file: Path, force: bool) -> None:
+def _init(console: Console, *, file: Path, force: bool) -> None:
     """Write a commented configuration to start from.
 
     Writes a configuration that runs as it is, with a comment on every key, and beside it the schema by which
@@ -70,9 +70,9 @@ def _as_text(schema: dict[str, Any]) -> str:
     return json.dumps(schema, ensure_ascii=False, indent=2) + "\n"
 
 
-@main.command(epilog="Example: projservo doctor --json")
+@main.command("doctor", epilog="Example: projservo doctor --json")
 @option.told
-def doctor(console: Console) -> int:
+def _doctor(console: Console) -> int:
     """Say what is installed and where things go.
 
     Lists versions, extras, whether the kernels are compiled, and the folder of results. Exit code 1 when
@@ -149,11 +149,11 @@ def _found(value: dict[str, Any]) -> Iterator[str]:
     yield f"results: {results['folder']}{'' if results['writable'] else ', which CANNOT be written to'}"
 
 
-@main.command(epilog="Example: projservo bench --json")
+@main.command("bench", epilog="Example: projservo bench --json")
 @option.configuration(help="Configuration (YAML) with a simulated task. Default: paper.yaml.")
 @option.override
 @option.told
-def bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> None:
+def _bench(console: Console, *, config: str | None, sets: tuple[str, ...]) -> None:
     """Measure the speed of a control step and of a run.
 
     Times a step of every law in 256 states of a noisy run, a call from Python and a traced run of 150 steps,

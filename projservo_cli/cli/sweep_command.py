@@ -10,7 +10,7 @@ from projservo_cli.cli.group import main
 from projservo_cli.cli.output import Console
 
 
-@main.command(epilog="Example: projservo sweep -c configs/sweep_noise.yaml -j 2")
+@main.command("sweep", epilog="Example: projservo sweep -c configs/sweep_noise.yaml -j 2")
 @option.configuration(help="Configuration of the sweep (YAML).", required=True)
 @option.override
 @option.output(metavar="DIR", help="Folder of the sweep. Default: results/<name of the sweep>.")
@@ -23,7 +23,7 @@ from projservo_cli.cli.output import Console
     help="The Dask scheduler whose workers do the work, such as tcp://host:8786.",
 )
 @option.told
-def sweep(
+def _sweep(
     console: Console,
     *,
     config: str,
