@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 from scipy.special import ndtr
@@ -202,17 +203,18 @@ class TagFinder:
     """Finds the tags of one dictionary.
 
     dictionary : name as OpenCV has it, with or without ``DICT_``, any case: ``4X4_50``, ``APRILTAG_36H11``.
+    ``cv``: the module of OpenCV.
     Raises InputError when OpenCV is not installed or does not know the dictionary.
     """
 
     def __init__(self, dictionary: str) -> None:
-        self._cv = _opencv()
-        aruco = self._cv.aruco
+        self.cv = _opencv()
+        aruco = self.cv.aruco
         known = {name.upper().removeprefix("DICT_"): name for name in dir(aruco) if name.startswith("DICT_")}
         name = known.get(dictionary.upper().removeprefix("DICT_"))
         if name is None:
             raise InputError(f"--dictionary {dictionary}: unknown; valid: {', '.join(sorted(known))}")
-        tags = aruco.getPredefinedDictionary(getattr(aruco, name))
+        self._tags = tags = aruco.getPredefinedDictionary(getattr(aruco, name))
         parameters = aruco.DetectorParameters()
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._detector = aruco.ArucoDetector(tags, parameters)
@@ -227,11 +229,22 @@ class TagFinder:
             content = np.frombuffer(path.read_bytes(), dtype=np.uint8)
         except OSError as error:
             raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-        flags = self._cv.IMREAD_GRAYSCALE | self._cv.IMREAD_IGNORE_ORIENTATION
-        image = self._cv.imdecode(content, flags) if content.size else None
+        flags = self.cv.IMREAD_GRAYSCALE | self.cv.IMREAD_IGNORE_ORIENTATION
+        image = self.cv.imdecode(content, flags) if content.size else None
         if image is None:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
         return np.asarray(image, dtype=np.float64)
+
+    def picture(self, number: int, cell_px: int) -> npt.NDArray[np.uint8]:
+        """Grey values of a tag with its bright margin of one cell, in cells of so many px.
+
+        Raises InputError where the dictionary has no such tag.
+        """
+        known = len(self._tags.bytesList)
+        if number >= known:
+            raise InputError(f"there is no tag {number} in the dictionary, which has tags 0 to {known - 1}")
+        tag = self.cv.aruco.generateImageMarker(self._tags, number, self._cells * cell_px)
+        return np.pad(tag, cell_px, constant_values=255)
 
     def find(self, image: FloatArray) -> tuple[dict[int, FloatArray], int]:
         """Corners (4, 2), px, of each tag in an image, and how many tags were there more than once.

@@ -75,7 +75,7 @@ def _teach(
         except ValueError as error:
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
     calibration = option.calibration_of(run, settings)
-    asks = settings.plant.use is not None and sys.stdin.isatty()
+    asks = not settings.plant.simulated and sys.stdin.isatty()
     taught = stage.teach(settings, frames, put, console.wait if asks else None)
     if not start:
         stage.require_face(settings, taught)

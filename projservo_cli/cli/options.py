@@ -144,7 +144,7 @@ def configured(config: str | None, options: Mapping[str, Any], run: Path | None 
     if stored is None or not stored.configuration:
         return load_config(config or _shipped(), _overrides(options))
     found = load_config(stored.path, _overrides(options), text=stored.configuration)
-    if found.plant.use is not None:
+    if not found.plant.simulated:
         raise click.UsageError(
             f"plant {found.plant.use} is named by the stored run alone, which starts no code: give the "
             "configuration again with -c"

@@ -284,7 +284,7 @@ def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
         raise InputError("data.joint_unit: record writes rad; leave it out")
     stored = run.results.get("calibrate")
     table, force = config.data.table, options["force"]
-    if stored and stored.inputs.get("table", table) != table and config.plant.use is None and not force:
+    if stored and stored.inputs.get("table", table) != table and config.plant.simulated and not force:
         raise InputError(
             f"{run.path}: its calibration comes from {stored.inputs['table']} and would be replaced by a "
             "simulated one; choose another folder with -o, or use --force"
@@ -355,7 +355,7 @@ def _require_named(chain: _Chain) -> None:
     from projservo_cli.records import law_and_mode
     from projservo_cli.robots import plugins
 
-    plant = chain.config.plant.use
+    plant = None if chain.config.plant.simulated else chain.config.plant.use
     records = any(step.stage == "record" and step.why for step in chain.steps)
     servo = [step for step in chain.steps if step.stage == "servo" and step.why]
     if servo and plant is not None and "servo" not in chain.names:

@@ -20,11 +20,12 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from projservo_cli.config.models import Config
+from projservo_cli.config.models import RENDERED, Config, RenderedOptions
 from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.files import text_of
 from projservo_cli.records import InputError
+from projservo_cli.robots import described
 
 try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
     from yaml import CSafeLoader as _Parser
@@ -52,7 +53,7 @@ _PHRASES = {
 }
 
 # Values that name files, relative to the configuration.
-_FILES = (("data", "table"), ("calibration", "init"))
+_FILES = (("data", "table"), ("calibration", "init"), ("robot", "mjcf"), ("robot", "urdf"))
 _DIGITS = 9  # of a position in a list
 _MOST = 200  # problems that are looked at; who has more has taken another file
 _Path = tuple[str | int, ...]
@@ -279,7 +280,9 @@ def load_config(
         document.override(change)
         _spell_out(document.values)
     _fill_in(document.values, path)
+    _fill_in_arm(document)
     _fill_in_taught(document, pathlib.Path(path).parent if path is not None else pathlib.Path())
+    _check_options(document)
     return _validated(Config, document)
 
 
@@ -360,6 +363,9 @@ def _spell_out(values: dict[str, Any]) -> None:
     """Replace ``plant: module:Class`` and ``law: module:Class`` by the keys they stand for."""
     if isinstance(values.get("plant"), str):
         values["plant"] = {"use": values["plant"]}
+    plant = values.get("plant")
+    if isinstance(plant, dict) and plant.get("use") == RENDERED and values.get("markers") is None:
+        values["markers"] = {"tags": "roof"}
     control = values.setdefault("control", {}) if isinstance(values.get("law"), str) else None
     if isinstance(control, dict) and "laws" not in control:
         control["laws"] = [values.pop("law")]
@@ -376,6 +382,25 @@ def _fill_in(values: dict[str, Any], path: pathlib.Path | str | None) -> None:
     for file in (data.get("table") if isinstance(data, dict) else None, path):
         if isinstance(file, (str, pathlib.Path)) and str(file):
             values.setdefault("name", pathlib.Path(file).stem)
+
+
+def _fill_in_arm(document: _Document) -> None:
+    """Put the screws of the joints beside the name of an MJCF, or in place of that of a URDF."""
+    robot = document.values.get("robot")
+    for kind in ("mjcf", "urdf") if isinstance(robot, dict) else ():
+        file, tip = robot.get(kind), robot.get("tip")
+        if not (isinstance(file, str) and isinstance(tip, str)) or {"dh", "screws", "limits"} & robot.keys():
+            continue
+        try:
+            if kind == "mjcf":
+                robot["screws"] = described.read_mjcf(file, tip)
+            else:
+                text = text_of(file, "a URDF", _MAX_BYTES)
+                screws = described.read_urdf(file, tip, text)
+                rest = {key: value for key, value in robot.items() if key not in ("urdf", "tip")}
+                document.values["robot"] = {**rest, "screws": screws}
+        except InputError as error:
+            raise InputError(f"{document.place(('robot', kind))}: robot.{kind}: {error}") from error
 
 
 def _fill_in_taught(document: _Document, base: pathlib.Path) -> None:
@@ -397,7 +422,19 @@ def _fill_in_taught(document: _Document, base: pathlib.Path) -> None:
         task[key] = images["joints"] if key == "start" else taught.values
 
 
-def _translated(model: type[Root], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
+def _check_options(document: _Document) -> None:
+    """Note what is wrong with the options of a plant that is not a class of somebody's."""
+    plant = document.values.get("plant")
+    if not isinstance(plant, dict) or plant.get("use") != RENDERED:
+        return
+    try:
+        RenderedOptions.model_validate(plant.get("options") or {})
+    except ValidationError as error:
+        for path, what in _translated(RenderedOptions, error.errors(include_url=False)):
+            document.wrong(("plant", "options", *path), what)
+
+
+def _translated(model: type[BaseModel], errors: Sequence[ErrorDetails]) -> Iterator[Finding]:
     """What pydantic found, in words."""
     places = [error["loc"] for error in errors]
     for error, place in list(zip(errors, places, strict=True))[:_MOST]:
@@ -409,7 +446,7 @@ def _translated(model: type[Root], errors: Sequence[ErrorDetails]) -> Iterator[F
             yield place, _phrase(model, error)
 
 
-def _phrase(model: type[Root], error: ErrorDetails) -> str:
+def _phrase(model: type[BaseModel], error: ErrorDetails) -> str:
     kind, path, given = error["type"], error["loc"], error["input"]
     context = error.get("ctx", {})
     if kind == "extra_forbidden":

@@ -18,12 +18,12 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from projservo_cli.config.markers import Markers
 from projservo_cli.config.regions import KeptOut
 from projservo_cli.config.robot import (
     Count,
     Finding,
     JointVector,
-    Markers,
     NotNegative,
     Number,
     Positive,
@@ -164,13 +164,15 @@ def _law(name: str) -> str:
     return target
 
 
+RENDERED = "mujoco"
+"""The plant that is simulated and rendered by MuJoCo."""
+
+
 def _plant(name: str) -> str:
-    target = plugins.target_of("plant", name)
+    target = name if name == RENDERED else plugins.target_of("plant", name)
     if target is None:
-        names = ", ".join(plugins.registered("plant"))
-        raise ValueError(
-            "must be module:Class, such as my_robot:Robot" + (f", or one of {names}" if names else "")
-        )
+        names = ", ".join((RENDERED, *plugins.registered("plant")))
+        raise ValueError(f"must be module:Class, such as my_robot:Robot, or one of {names}")
     return target
 
 
@@ -492,6 +494,23 @@ class _EachView(Section):
     right: Number = Field(description="of the right camera")
 
 
+class RenderedOptions(Section):
+    """The options of the plant mujoco."""
+
+    servo: Literal["own", "position", "velocity"] = Field(
+        "own",
+        description="what moves the joints: the actuators of robot.mjcf where it has some, else position",
+    )
+    grey_noise: NotNegative = Field(
+        2.0, description="standard deviation of a pixel's noise, grey levels of 255"
+    )
+    blur_px: NotNegative = Field(0.7, description="standard deviation by which a lens blurs")
+    k1: Number = Field(
+        0.0, gt=-1, lt=1, description="radial distortion, in units of the focal length: r (1 + k1 r²)"
+    )
+    light: Literal["soft", "side"] = Field("soft", description="from all around, or hard and from one side")
+
+
 class _PlantSettings(Section):
     """What is driven, and what the simulated robot does at its borders.
 
@@ -500,7 +519,9 @@ class _PlantSettings(Section):
     """
 
     use: PlantClass | None = Field(
-        None, description="class of a robot of yours, module:Class; null for the simulated one"
+        None,
+        description="class of a robot of yours, module:Class; mujoco for a simulated one before rendered "
+        "cameras; null for one that is simulated by its points",
     )
     options: dict[str, Plain] = Field({}, description="arguments that the class is made with")
     timeout_s: Positive = Field(1.0, description="most time an answer of the robot may take")
@@ -534,6 +555,16 @@ class _PlantSettings(Section):
     image_border: Literal["report", "stop"] = Field(
         "report", description="whether a marker beyond the image is noted or ends the run"
     )
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the robot is a simulated one, whose truth is known."""
+        return self.use in (None, RENDERED)
+
+    @property
+    def rendered(self) -> RenderedOptions | None:
+        """Options of the plant mujoco; None where another one is driven."""
+        return RenderedOptions.model_validate(self.options) if self.use == RENDERED else None
 
 
 class _Stop(Section):
@@ -583,7 +614,7 @@ def _limits_in_joint_space(
     plant: _PlantSettings, trajectory: Trajectory, robot: RobotSettings | None
 ) -> Iterator[Finding]:
     bounded = robot is not None and (robot.limits is not None or np.isfinite(robot.ranges).all())
-    if trajectory.profile == "joint" and plant.use is not None and not bounded:
+    if trajectory.profile == "joint" and not plant.simulated and not bounded:
         yield ("robot",), f"the profile joint needs the limits of all joints: {LIMITS_MISSING}"
 
 
@@ -630,10 +661,10 @@ def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator
     if task is None or task.goal.images is None:
         return
     path, images = ("task", "goal", "images"), task.goal.images
-    if markers is None or markers.face is None:
+    if markers is None or markers.front is None:
         yield path, "needs markers.face, whose markers these pixels are"
         return
-    numbers = images.markers or markers.face
+    numbers = images.markers or markers.front
     yield from markers.unknown(images.markers or (), *path, "markers")
     if len(set(numbers)) < len(numbers):
         yield (*path, "markers"), "a number stands here twice"
@@ -643,13 +674,27 @@ def _goal_images(task: TaskSettings | None, markers: Markers | None) -> Iterator
             yield (*path, key), f"{len(given)} entries for {len(numbers)} markers"
         elif key in ("left", "right"):
             seen = [number for number, pixel in zip(numbers, given, strict=True) if pixel is not None]
-            for number in [number for number in markers.face if number not in seen][:1]:
+            for number in [number for number in markers.front if number not in seen][:1]:
                 yield (*path, key), f"marker {number} of the face is not seen; show the whole face"
 
 
 def _simulated_alone(disturbance: Disturbance, plant: _PlantSettings) -> Iterator[Finding]:
-    if plant.use is not None and disturbance != Disturbance():
+    if not plant.simulated and disturbance != Disturbance():
         yield ("disturbance",), "disturbs the simulated robot; leave it out where plant.use names another"
+
+
+def _rendered(plant: _PlantSettings, noise: _Noise, markers: Markers | None) -> Iterator[Finding]:
+    """What means something else, or nothing, where images are rendered."""
+    if plant.use != RENDERED:
+        return
+    for key in ("calibration_px", "servo_px"):
+        if getattr(noise, key) != getattr(_Noise(), key):
+            yield (
+                ("noise", key),
+                "is that of projected points; images of plant mujoco have options.grey_noise",
+            )
+    if markers is not None and markers.tags is None:
+        yield ("markers",), "plant mujoco shows tags: set markers.tags, such as roof"
 
 
 def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
@@ -705,7 +750,7 @@ def _speed_in_joint_space(
 _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the sections that each takes
     rule: {*inspect.signature(rule).parameters}
     for rule in (
-        *(_same_joints, _joint_vectors, _goal_images, _simulated_alone),
+        *(_same_joints, _joint_vectors, _goal_images, _simulated_alone, _rendered),
         *(_disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
         *(_speed_in_joint_space, _limits_in_joint_space),
     )
@@ -721,7 +766,7 @@ def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
     robot = sections.get("robot")
     if robot is not None and robot.limits is not None and not robot.joints:
         yield ("robot",), "a simulated run needs dh or screws (a recorded one sets data.table)"
-    if "markers" in sections and getattr(sections["markers"], "positions_m", None) is None:
+    if "markers" in sections and getattr(sections["markers"], "points", None) is None:
         yield ("markers", "positions_m"), f"{reason} (a recorded one sets data.table)"
     calibration = sections.get("calibration")
     if sections.get("task", "broken") is None and calibration and calibration.reference is None:

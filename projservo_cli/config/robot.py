@@ -5,7 +5,7 @@ Or, in a file of its own, what is believed of them, as a start for a calibration
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -14,11 +14,10 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
-    PlainValidator,
     Strict,
+    StringConstraints,
     ValidationError,
     ValidationInfo,
-    WithJsonSchema,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -31,6 +30,7 @@ Positive = Annotated[float, Strict(), Field(gt=0)]
 NotNegative = Annotated[float, Strict(), Field(ge=0)]
 Whole = Annotated[int, Strict(), Field(ge=0, le=2**63 - 1)]
 Count = Annotated[int, Strict(), Field(ge=1, le=1_000_000)]
+_File = Annotated[str, StringConstraints(min_length=1)]
 Vector2 = tuple[Number, Number]
 Vector3 = tuple[Number, Number, Number]
 Vector4 = tuple[Number, Number, Number, Number]
@@ -172,7 +172,7 @@ class _ScrewJoint(_Joint):
             yield ("v",), "must be orthogonal to w: a revolute joint has no pitch"
 
 
-def _not_rigid(T: Matrix44) -> str:
+def not_rigid(T: Matrix44) -> str:
     """Why a matrix is no pose; empty where it is one."""
     R = np.array(T)[:3, :3]
     if T[3] != (0, 0, 0, 1):
@@ -191,7 +191,7 @@ class _DH(Section):
 
     def contradictions(self) -> Iterator[Finding]:
         """A tool that is nowhere."""
-        if what := _not_rigid(self.tool):
+        if what := not_rigid(self.tool):
             yield ("tool",), what
 
 
@@ -205,7 +205,7 @@ class _Screws(Section):
     def contradictions(self) -> Iterator[Finding]:
         """A reading too many or too few, or a tool that is nowhere."""
         yield from self.reference.miscounted("".join(joint.type for joint in self.joints), "reference")
-        if what := _not_rigid(self.base_tool):
+        if what := not_rigid(self.base_tool):
             yield ("base_tool",), what
 
 
@@ -242,11 +242,19 @@ class _Limits(Section):
 
 
 class RobotSettings(Section):
-    """A serial arm, given by a DH table or by screws; of one of yours perhaps its limits alone."""
+    """A serial arm, given by a DH table, by screws or in a file; of one of yours perhaps its limits alone.
+
+    Where a file is read, its screws are put beside ``mjcf`` or in place of ``urdf``.
+    """
 
     name: str = Field("", description="for figures and reports")
     dh: _DH | None = Field(None, description="a Denavit-Hartenberg table")
     screws: _Screws | None = Field(None, description="joint screws at a reference, instead of dh")
+    mjcf: _File | None = Field(
+        None, description="instead: a model of MuJoCo, drawn and moved as it is by the plant mujoco"
+    )
+    urdf: _File | None = Field(None, description="instead: a URDF, of which the screws alone are taken")
+    tip: str | None = Field(None, description="body of mjcf or link of urdf whose frame is that of the tool")
     limits: _Limits | None = Field(None, description="joint limits, where neither dh nor screws are given")
 
     @property
@@ -266,9 +274,12 @@ class RobotSettings(Section):
         return tuple(joint.limits for joint in self.joints)
 
     def contradictions(self) -> Iterator[Finding]:
-        """Nothing, or more than one of what tells joints and limits."""
-        if (self.dh, self.screws, self.limits).count(None) != 2:
-            yield (), "give exactly one of dh, screws and, for a robot of yours, limits"
+        """Nothing, or more than one of what tells joints and limits; a file without a tip."""
+        screws = None if self.mjcf is not None else self.screws  # those of the file
+        if (self.dh, screws, self.mjcf, self.urdf, self.limits).count(None) != 4:
+            yield (), "give exactly one of dh, screws, mjcf, urdf and, for a robot of yours, limits"
+        if (self.tip is None) != (self.mjcf is None and self.urdf is None):
+            yield ("tip",), "names the body of mjcf, or the link of urdf, that holds the tool: give both"
 
 
 class Camera(Section):
@@ -311,66 +322,6 @@ class Rig(Section):
     right: Camera = Field(description="the right camera")
 
 
-def _center(value: Any) -> Any:
-    if value == "midpoint" or (type(value) is int and 0 <= value < 2**63):
-        return value
-    raise ValueError("must be midpoint or the number of a marker of the face")
-
-
-_Center = Annotated[
-    Literal["midpoint"] | int,
-    PlainValidator(_center),
-    WithJsonSchema({"anyOf": [{"const": "midpoint", "type": "string"}, {"type": "integer", "minimum": 0}]}),
-]
-
-
-class Markers(Section):
-    """Points fixed to the tool; the face is the part of them that must stay visible."""
-
-    positions_m: tuple[Vector3, ...] | None = Field(
-        None, min_length=1, max_length=10_000, description="in the frame of the tool"
-    )
-    numbers: tuple[Whole, ...] | None = Field(
-        None, min_length=1, description="number of each marker; null for 0, 1, 2 ..."
-    )
-    face: tuple[Whole, ...] | None = Field(
-        None, min_length=3, description="numbers of those in a plane that must stay visible"
-    )
-    center: _Center = Field("midpoint", description="of the face: midpoint, or a number")
-
-    @property
-    def known(self) -> tuple[int, ...] | None:
-        """Numbers of all markers, in the order of ``positions_m``; None where a table will tell."""
-        if self.numbers is None and self.positions_m is not None:
-            return tuple(range(len(self.positions_m)))
-        return self.numbers
-
-    def contradictions(self) -> Iterator[Finding]:
-        """Numbers that are missing, strange or given twice."""
-        known, face = self.known, self.face or ()
-        if known is not None:
-            if self.positions_m is not None and len(known) != len(self.positions_m):
-                yield ("numbers",), f"{len(known)} numbers for {len(self.positions_m)} positions_m"
-            if len(set(known)) < len(known):
-                yield ("numbers",), "a number stands here twice"
-            yield from self.unknown(face, "face")
-        if face and self.center not in ("midpoint", *face):
-            yield ("center",), f"marker {self.center} is not on the face; face: {_listed(face)}"
-        if len(set(face)) < len(face):
-            yield ("face",), "a marker stands here twice"
-
-    def unknown(self, numbers: Sequence[int], *path: str) -> Iterator[Finding]:
-        """Numbers at a path that no marker has, as far as markers are known."""
-        for i, number in enumerate(numbers):
-            if self.known is not None and number not in self.known:
-                yield (*path, i), f"there is no marker {number}; markers: {_listed(self.known)}"
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    shown = ", ".join(map(str, numbers[:20]))
-    return shown + (" …" if len(numbers) > 20 else "")
-
-
 class _Screw(BaseModel):
     """A unit axis w with v = −w × point, or w zero and a unit direction v."""
 
@@ -403,7 +354,7 @@ class _Believed(BaseModel):
         for name in ("camera_left", "camera_right"):
             if np.linalg.matrix_rank(np.array(getattr(self, name))) < 3:
                 yield name, "a camera matrix has three independent rows"
-        if what := _not_rigid(self.T_base_tool_at_reference):
+        if what := not_rigid(self.T_base_tool_at_reference):
             yield "T_base_tool_at_reference", what
 
 

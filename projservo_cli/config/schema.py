@@ -23,7 +23,7 @@ def json_schema() -> dict[str, Any]:
     keys = schema["properties"]
     keys["plant"] = {  # the short forms of plant.use
         "anyOf": [keys["plant"], {"type": "string"}],
-        "description": "What is driven; module:Class is short for plant.use.",
+        "description": "What is driven; mujoco or module:Class is short for plant.use.",
     }
     keys["law"] = {  # and of control.laws
         **schema["$defs"]["Control"]["properties"]["laws"]["items"],

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.delay import comes_again
-from projservo_cli.records import ByteArray, FloatArray, WorkFailed
+from projservo_cli.records import ByteArray, FloatArray, InputError, WorkFailed
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -252,7 +252,7 @@ class ForeignRobot:
                 f"{self.name}: {what}() did not return within {seconds:g} s: look what it waits for, or "
                 f"raise plant.{key}"
             ) from None
-        if isinstance(error, KeyboardInterrupt):
+        if isinstance(error, (KeyboardInterrupt, InputError)):
             raise error
         if error is not None:
             raise WorkFailed(f"{self.name}: {what}() failed: {what_failed(error)}") from error

@@ -17,7 +17,7 @@ from projservo_cli.robots.driven import DrivenRobot, Known, Steered
 from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
-from projservo_cli.stages.simulation import FaultyRobot, World
+from projservo_cli.stages.simulation import FaultyRobot, Points, robot_of
 from projservo_cli.stages.world import Joints, length_of
 
 # What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
@@ -236,9 +236,9 @@ def _in_the_loop(scenario: Scenario) -> FaultyRobot:
         s[:, face + others] = ordered
         return s
 
-    start, sigma_px, period = scenario.exact.q_start, config.noise.servo_px, config.control.period_s
-    world = World(truth, start, see, False, sigma_px, period, config.seed, SERVO_NOISE)
-    return FaultyRobot(world, config.disturbance)
+    points = Points(truth, see, False, config.noise.servo_px)
+    drawn = config.seed, SERVO_NOISE
+    return robot_of(config, truth, scenario.exact.q_start, points, drawn, config.disturbance)
 
 
 def connected(scenario: Scenario, law: str) -> DrivenRobot:

@@ -29,7 +29,6 @@ from projservo_cli.stages.simulation import robot_by_itself
 from projservo_cli.stages.world import (
     FAULTS,
     Truth,
-    has_faults,
     is_ideal,
     joints_of,
     limit_passed,
@@ -40,7 +39,15 @@ from projservo_cli.tables import JointList, read_table, recording_of, write_tabl
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
 DEPENDS_ON = (
-    *("seed", "robot", "rig", "markers.positions_m", "markers.numbers", "noise.calibration_px"),
+    *(
+        "seed",
+        "robot",
+        "rig",
+        "markers.positions_m",
+        "markers.numbers",
+        "markers.tags",
+        "noise.calibration_px",
+    ),
     *("plant.use", "plant.options", "plant.frames", "plant.settle_s"),
     *(f"disturbance.{name}" for name in FAULTS),
 )
@@ -176,7 +183,7 @@ def _random_pose(
     config: Config, reference: FloatArray, amplitude: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
     """Joints (n,) within the amplitudes and the limits, which show the markers of a simulated robot."""
-    joints, truth = joints_of(config), truth_of(config) if config.plant.use is None else None
+    joints, truth = joints_of(config), truth_of(config) if config.plant.simulated else None
     for draw in range(_DRAWS):
         q = reference + amplitude * _SHRINKING**draw * rng.uniform(-1.0, 1.0, len(reference))
         if limit_passed(q, joints.lower, joints.upper):
@@ -223,7 +230,7 @@ def new_recording(
     force : begin anew, whatever stands at ``path``; else a table of another configuration is refused.
     redo : begin anew also where ``path`` is a recording of the same plant with another configuration.
     """
-    if config.plant.use is None:
+    if config.plant.simulated:
         truth_of(config)  # refuses what lacks a part of the simulation
     targets, joints = trial_motions(config), joints_of(config)
     numbers = config.markers.known if config.markers is not None else None
@@ -309,9 +316,9 @@ def record(
 def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
     """The robot that is to be driven; None for one that need not be."""
     joints = joints_of(config)
-    if config.plant.use is not None:
+    if not config.plant.simulated:
         return foreign_robot(config, joints, len(recording.marker))
-    if not has_faults(config):
+    if is_ideal(config):
         return None
     first, sigma_px = recording.targets[recording.pending[0]], config.noise.calibration_px
     seed = seed_of_trials(config)
@@ -321,7 +328,7 @@ def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
 
 def observed(config: Config, *, progress: Progress = silent) -> tuple[Observation, float | None]:
     """What the trial motions of the simulated robot show, and the noise of its pixels, px, if any."""
-    if config.plant.use is not None:
+    if not config.plant.simulated:
         raise InputError(
             f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
             "name one with --data"
@@ -334,6 +341,8 @@ def observed(config: Config, *, progress: Progress = silent) -> tuple[Observatio
     with at_rest_after(robot):
         for _ in _recorded(robot, config, recording):
             progress("trial motions", len(recording.done), len(recording.targets))
+    if config.plant.rendered is not None:
+        return recording.observation(), None
     return recording.observation(), sigma_px / math.sqrt(config.plant.frames) or None
 
 

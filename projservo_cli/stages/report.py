@@ -183,7 +183,7 @@ def view(run: "Run", progress: Progress = silent) -> Path:
     config = load_config(run.path, text=run.configuration)
     truth, traces = truth_of(config), _moved(run)
     plant = plant_of(config, truth, run.plan.q_start)
-    joints = "simulated joints" if config.plant.use is None else "joints that the robot itself reported"
+    joints = "simulated joints" if config.plant.simulated else "joints that the robot itself reported"
     known = f"Robot, rig and face as the configuration describes them, moved by the {joints}."
     path = run.path.parent / VIEW_FILE
     progress("view", 0, 1)

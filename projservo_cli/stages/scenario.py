@@ -27,6 +27,8 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
+from projservo_cli.stages.simulation import shown_in_frames
+from projservo_cli.stages.verdicts import VIEWS
 from projservo_cli.stages.world import (
     Joints,
     Truth,
@@ -44,7 +46,7 @@ from projservo_cli.task.target import Shown
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
-TRIAL_POSES, TAUGHT_NOISE = 6, 7
+TRIAL_POSES, TAUGHT_NOISE, START_FRAMES, GOAL_FRAMES = range(6, 10)
 
 
 def generator(seed: int, stream: int) -> np.random.Generator:
@@ -145,6 +147,8 @@ class Scenario:
 
     def shown_at(self, seed: int) -> Shown:
         """Start and goal as the images of a seed show them, which are averages."""
+        if self.config.plant.rendered is not None and self.truth is not None:
+            return self._rendered(seed)
         sigma = self.config.noise.servo_px / math.sqrt(self.config.noise.shown_frames)
         if sigma == 0.0 or self.truth is None:
             return self.exact
@@ -159,6 +163,26 @@ class Scenario:
             images[:drawn, :, m:] += sigma * noise[:, :, which]
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
+    def _rendered(self, seed: int) -> Shown:
+        """Start and goal as rendered frames show them; images of the goal that are given stay as they are."""
+        start = self._frames("task.start", self.exact.q_start, (seed, START_FRAMES))
+        if not len(self.q_shown):
+            return self.exact._replace(s_start=start)
+        goal = self._frames("task.goal", self.q_shown[0], (seed, GOAL_FRAMES))
+        return self.exact._replace(s_start=start, s_star=goal)
+
+    def _frames(self, key: str, q: FloatArray, drawn: tuple[int, int]) -> FloatArray:
+        """Pixels (2, b, 2) in rendered frames at the joints (n,) of a key; a WorkFailed without the face."""
+        assert self.truth is not None
+        which = [self.truth.number.index(number) for number in self.numbers]
+        s = np.ascontiguousarray(shown_in_frames(self.config, self.truth, q, drawn)[:, which])
+        for view, k in np.argwhere(np.isnan(s[:, : self.m, 0])).tolist():
+            raise WorkFailed(
+                f"{key}: the {VIEWS[view]} camera does not see marker {self.numbers[k]} of the face: turn it "
+                "towards both cameras, or bring it nearer"
+            )
+        return s
+
 
 def scenario_of(
     config: Config, calibration: Calibration | None = None, *, joints: Joints | None = None
@@ -170,7 +194,7 @@ def scenario_of(
     configuration lacks a part of it, naming the key to set; WorkFailed if the goal cannot be reached or
     seen, or the body not be measured with.
     """
-    truth = truth_of(config) if config.plant.use is None and joints is None else None
+    truth = truth_of(config) if config.plant.simulated and joints is None else None
     face = face_numbers(config)
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
@@ -182,6 +206,7 @@ def scenario_of(
     else:
         assert calibration is not None
         observed = _observed(config, calibration)
+    if calibration is not None and (truth is None or config.plant.rendered is not None):
         sigma_px = max(sigma_px, calibration.sigma_fitted_px)
     body = NO_BODY
     pins: tuple[int, ...] = ()
@@ -257,7 +282,7 @@ def _limits(config: Config, joints: Joints, sigma_px: float) -> Limits:
 
 def _ends_at_joint_limits(config: Config) -> bool:
     """Whether a run ends at a joint limit; a robot that is not simulated is never driven beyond one."""
-    return config.plant.use is not None or config.plant.joint_limits == "stop"
+    return not config.plant.simulated or config.plant.joint_limits == "stop"
 
 
 def _by_points(config: Config, calibration: Calibration | None) -> bool:

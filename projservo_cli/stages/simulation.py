@@ -9,15 +9,21 @@ Rolling shutters are not modelled.
 import bisect
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import lru_cache
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from projservo_cli.calibration import REACH_M, REACH_RAD
 from projservo_cli.config import Config
-from projservo_cli.config.models import Disturbance, FrozenJoint, LostMarkers
+from projservo_cli.config.markers import Markers
+from projservo_cli.config.models import Disturbance, FrozenJoint, LostMarkers, RenderedOptions
+from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, FloatArray
+from projservo_cli.rendered.frames import Frames, GreyImage
+from projservo_cli.rendered.physics import Physics
+from projservo_cli.rendered.scene import Scene, scene_of
 from projservo_cli.robots.simulated import Arm
 from projservo_cli.stages.world import FAULTS, Truth
 
@@ -31,31 +37,165 @@ _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
 
 
+class Eyes(Protocol):
+    """Both cameras."""
+
+    @property
+    def borders(self) -> bool:
+        """Whether markers outside an image are unseen."""
+
+    def open(self) -> None:
+        """Make ready to look, in the thread that looks."""
+
+    def close(self) -> None:
+        """Let go of what was made ready."""
+
+    def look(
+        self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
+    ) -> FloatArray:
+        """Pixels (m, 2) in a frame of a view, NaN where unseen.
+
+        q : (k, n) joints at instants of its exposure, rad or m.
+        moved : number of a marker that was moved, and by how much in the frame of the tool, (3,) m.
+        """
+
+
+class Points(NamedTuple):
+    """Cameras that see points, with noise."""
+
+    truth: Truth
+    # pixels (2, m, 2) of markers (m, 4), given at the reference, at joints (n,); NaN where unseen
+    see: Callable[[FloatArray, FloatArray], FloatArray]
+    borders: bool
+    sigma_px: float  # noise of a coordinate of each frame
+
+    def open(self) -> None:
+        """Nothing is to be opened."""
+
+    def close(self) -> None:
+        """Nothing is left open."""
+
+    def look(
+        self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
+    ) -> FloatArray:
+        """As of all cameras."""
+        M = self.truth.M
+        if moved is not None:
+            M = M.copy()
+            M[self.truth.number.index(moved[0]), :3] += self.truth.robot.base_tool[:3, :3] @ moved[1]
+        shown = [self.see(joints, M)[view] for joints in q]
+        noise = self.sigma_px * rng.standard_normal(shown[0].shape)
+        return np.asarray(np.mean(shown, axis=0) + noise)
+
+
+class Servos(Protocol):
+    """What moves the joints.
+
+    ``setpoint``: (n,) where they are sent, rad or m.
+    """
+
+    setpoint: FloatArray
+
+    @property
+    def motor(self) -> FloatArray:
+        """Where the encoders are (n,), rad or m."""
+
+    def follow(self, setpoint: FloatArray, seconds: float) -> None:
+        """Let so much time pass, s, while the set-point goes evenly to joints (n,), rad or m."""
+
+    def strike(self, by: FloatArray) -> None:
+        """Move joints, and where they are sent, by (n,), rad or m, at once."""
+
+
 class World(NamedTuple):
     """A simulated robot and its rig while nothing is wrong."""
 
     truth: Truth
     q_start: FloatArray  # (n,) first readings, rad or m
-    # pixels (2, m, 2) of markers (m, 4), given at the reference, at joints (n,); NaN where unseen
-    see: Callable[[FloatArray, FloatArray], FloatArray]
-    borders: bool  # whether markers outside an image are unseen
-    sigma_px: float  # noise of a coordinate of each frame
+    eyes: Eyes
     period: float  # of the loop, s
     seed: int
     stream: int  # of the random numbers of the seed
+    servos: Servos | None = None  # at rest at q_start; None for those of first order
 
     def random(self, view: int, k: int) -> np.random.Generator:
         """Random numbers of a frame of a view."""
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(self.stream, view, k)))
+        return _random(self.seed, self.stream, view, k)
+
+
+def _random(*key: int) -> np.random.Generator:
+    """Random numbers of a seed, a stream of it, a view and a frame."""
+    return np.random.default_rng(np.random.SeedSequence(key[0], spawn_key=key[1:]))
 
 
 def robot_by_itself(
     config: Config, truth: Truth, q_start: FloatArray, sigma_px: float, seed: int, stream: int
 ) -> "FaultyRobot":
     """The simulated robot at joints (n,), rad or m, that nothing befalls and whose images have borders."""
-    world = World(truth, q_start, truth.images, True, sigma_px, config.control.period_s, seed, stream)
+    points = Points(truth, truth.images, True, sigma_px)
     events = [name for name in type(config.disturbance).model_fields if name not in FAULTS]
-    return FaultyRobot(world, config.disturbance.model_copy(update=dict.fromkeys(events)))
+    given = config.disturbance.model_copy(update=dict.fromkeys(events))
+    return robot_of(config, truth, q_start, points, (seed, stream), given)
+
+
+def robot_of(
+    config: Config,
+    truth: Truth,
+    q_start: FloatArray,
+    points: Points,
+    drawn: tuple[int, int],
+    given: Disturbance,
+) -> "FaultyRobot":
+    """The simulated robot at joints (n,), rad or m, before the cameras of the plant.
+
+    points : cameras that see points, for a plant that is not rendered.
+    drawn : seed, and stream of its random numbers; given : what is wrong with it, and what befalls it.
+    """
+    period = config.control.period_s
+    if config.plant.rendered is None:
+        return FaultyRobot(World(truth, q_start, points, period, *drawn), given)
+    scene = _scene(config, truth)
+    servos = Physics(scene, q_start, given.lag_s, math.radians(given.sag_deg))
+    return FaultyRobot(World(truth, q_start, Frames(scene), period, *drawn, servos), given)
+
+
+def shown_in_frames(config: Config, truth: Truth, q: FloatArray, drawn: tuple[int, int]) -> FloatArray:
+    """Pixels (2, m, 2) that frames of the robot at rest at joints (n,), rad or m, show on average.
+
+    drawn : seed, and stream of its random numbers.
+    Markers that most frames of a view do not show are NaN.
+    """
+    return _looked(_scene(config, truth), config.noise.shown_frames, q.tobytes(), drawn)
+
+
+@lru_cache(maxsize=256)
+def _looked(scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]) -> FloatArray:
+    eyes, q, found = (
+        Frames(scene),
+        np.frombuffer(q_bytes)[None],
+        np.full((frames, 2, len(scene.numbers), 2), np.nan),
+    )
+    eyes.open()
+    try:
+        for k, view in np.ndindex(frames, 2):
+            found[k, view] = eyes.look(view, q, None, _random(*drawn, view, k))
+    finally:
+        eyes.close()
+    count = np.isfinite(found[..., :1]).sum(axis=0)
+    return np.where(2 * count > frames, np.nansum(found, axis=0) / np.maximum(count, 1), np.nan)
+
+
+def _scene(config: Config, truth: Truth) -> Scene:
+    assert config.arm is not None
+    assert config.rig is not None
+    assert config.markers is not None
+    assert config.plant.rendered is not None
+    return _built(truth, config.arm, config.rig, config.markers, config.plant.rendered)
+
+
+@lru_cache(maxsize=4)
+def _built(truth: Truth, robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions) -> Scene:
+    return scene_of(robot, truth.robot, rig, truth.P, markers, options)
 
 
 class FaultyRobot:
@@ -63,6 +203,7 @@ class FaultyRobot:
 
     world : the robot and its rig; given : what is wrong with it, and what befalls it.
     ``taken``: (2,) when both frames of the last look were taken, s, which no robot knows.
+    ``frames``: (2, height, width) the last frames of rendered cameras; None of others.
     """
 
     def __init__(self, world: World, given: Disturbance) -> None:
@@ -73,7 +214,8 @@ class FaultyRobot:
         self.taken = np.full(2, math.nan)
 
     def open(self) -> None:
-        """Nothing is to be opened."""
+        """Open the cameras, in the thread that drives."""
+        self.world.eyes.open()
 
     def read(self) -> tuple[FloatArray, FloatArray] | tuple[FloatArray, FloatArray, float, float, float]:
         """Joint readings (n,), rad or m, and pixels (2, m, 2), with stamps, s, where frames carry them."""
@@ -94,6 +236,11 @@ class FaultyRobot:
         """Time since the opening, s."""
         return self._joints.times[-1]
 
+    @property
+    def frames(self) -> GreyImage | None:
+        """The last frames of both cameras as they were searched, where they are rendered."""
+        return self.world.eyes.last if isinstance(self.world.eyes, Frames) else None
+
     def truth(self) -> FloatArray:
         """True joints (n,), rad or m."""
         return self._joints.links[-1].copy()
@@ -102,11 +249,12 @@ class FaultyRobot:
         """Nothing moves between commands."""
 
     def close(self) -> None:
-        """Nothing is left open."""
+        """Close the cameras."""
+        self.world.eyes.close()
 
     def _reading(self) -> FloatArray:
         """Joint readings (n,) as encoders count them."""
-        q, frozen = _whole(self._joints.motor, self._joints.tick), self._given.frozen_joint
+        q, frozen = _whole(self._joints.servos.motor, self._joints.tick), self._given.frozen_joint
         if frozen is not None and _lasts(frozen, _step(self.now(), self.world.period)):
             self._frozen = q[frozen.joint - 1] if self._frozen is None else self._frozen
             q[frozen.joint - 1] = self._frozen
@@ -144,28 +292,56 @@ def _step(time: float, period: float) -> int:
     return math.floor(time / period + 1e-6)
 
 
+class _FirstOrder:
+    """Servos that follow with a lag of first order, less what the load of the tool costs them."""
+
+    def __init__(
+        self, load: Callable[[FloatArray], FloatArray], q: FloatArray, lag_s: float, sag: float
+    ) -> None:
+        self._load, self._lag, self._sag = load, lag_s, sag
+        self.motor = np.array(q, dtype=np.float64)
+        self.setpoint = self.motor - sag * load(self.motor)
+
+    def follow(self, setpoint: FloatArray, seconds: float) -> None:
+        """Let so much time pass, s, while the set-point goes evenly to joints (n,), rad or m.
+
+        m' = (u - m) / lag has the solution m = u - v lag + (m_0 - u_0 + v lag) exp(-t / lag) where u goes at
+        the pace v; the load of the posture is taken as constant meanwhile.
+        """
+        if seconds > 0.0:
+            load, lag = self._sag * self._load(self.motor), self._lag
+            before, after = self.setpoint + load, setpoint + load
+            behind = (after - before) * (lag / seconds)
+            fades = math.exp(-seconds / lag) if lag > 0.0 else 0.0
+            self.motor = after - behind + (self.motor - before + behind) * fades if lag > 0.0 else after
+        self.setpoint = setpoint
+
+    def strike(self, by: FloatArray) -> None:
+        """Move joints, and where they are sent, by (n,), rad or m, at once."""
+        self.setpoint, self.motor = self.setpoint + by, self.motor + by
+
+
 class _Joints:
     """Servos, play and links over time.
 
-    ``times, links``: every instant so far, s, and the true joints (n,) there. ``motor``: (n,) where the
-    encoders are now. ``tick``: (n,) of the encoders, 0 for none. All rad or m.
+    ``servos``: what moves them. ``times, links``: every instant so far, s, and the true joints (n,) there.
+    ``tick``: (n,) of the encoders, 0 for none. All rad or m.
     """
 
     def __init__(self, world: World, given: Disturbance) -> None:
-        self.arm, self._lag, self._bump = world.truth.robot, given.lag_s, given.bump
+        self.arm, self._bump = world.truth.robot, given.bump
         self._struck_at = math.inf if given.bump is None else given.bump.at_step * world.period
         scale = np.where(self.arm.joint_types == PRISMATIC, _M_PER_RAD, 1.0)
         self.tick = scale * (2.0 * math.pi / given.encoder_ticks if given.encoder_ticks else 0.0)
         self._play = 0.5 * math.radians(given.play_deg) * scale
         # What gravity costs a joint that holds the tool at full reach, rad.
-        self._sag, self._flex = math.radians(given.sag_deg), math.radians(given.flex_deg)
-        self._loaded = self._sag > 0.0 or self._flex > 0.0
+        sag, self._flex = math.radians(given.sag_deg), math.radians(given.flex_deg)
+        self._loaded = sag > 0.0 or self._flex > 0.0
         self._reach = full_reach(self.arm) if self._loaded else 1.0
-        self.motor = np.array(world.q_start, dtype=np.float64)
-        self._link, self._slip = self.motor.copy(), np.zeros(len(self.motor))  # beyond the play; beyond both
-        load = self._load(self.motor)
-        self._setpoint = self.motor - self._sag * load
-        self.times, self.links = [0.0], [self._link + self._flex * load]
+        self.servos = world.servos or _FirstOrder(self._load, world.q_start, given.lag_s, sag)
+        self._link = self.servos.motor.copy()  # beyond the play
+        self._slip = np.zeros(len(self._link))  # beyond both
+        self.times, self.links = [0.0], [self._link + self._flex * self._load(self._link)]
 
     def go(self, target: FloatArray, due: float) -> None:
         """Move the set-point to joints (n,) by a time, s."""
@@ -173,8 +349,8 @@ class _Joints:
         parts = max(1, math.ceil((due - begun) / _GRID_S - 1e-6))
         for left in range(parts, 0, -1):
             time = max(begun, due - (due - begun) * (left - 1) / parts)
-            share = (target - self._setpoint) / left
-            self._advance(time, self._setpoint + share if left > 1 else target)
+            share = (target - self.servos.setpoint) / left
+            self._advance(time, self.servos.setpoint + share if left > 1 else target)
 
     def at(self, time: float) -> FloatArray:
         """True joints (n,) at a time so far, s; before the opening they stood still."""
@@ -185,34 +361,23 @@ class _Joints:
         return np.asarray((1.0 - x) * self.links[i - 1] + x * self.links[i])
 
     def _advance(self, time: float, setpoint: FloatArray) -> None:
-        """To a time, s, while the set-point goes evenly to joints (n,).
-
-        m' = (u - m) / lag has the solution m = u - v lag + (m_0 - u_0 + v lag) exp(-t / lag) where u goes at
-        the pace v; the load of the posture is taken as constant meanwhile.
-        """
-        lag, passed = self._lag, time - self.times[-1]
-        load = self._load(self.links[-1])
-        before, after = self._setpoint + self._sag * load, setpoint + self._sag * load
-        self._setpoint = setpoint
-        if lag > 0.0 and passed > 0.0:
-            behind = (after - before) * (lag / passed)
-            self.motor = after - behind + (self.motor - before + behind) * math.exp(-passed / lag)
-        elif passed > 0.0:
-            self.motor = after
+        """To a time, s, while the set-point goes evenly to joints (n,)."""
+        self.servos.follow(setpoint, time - self.times[-1])
         if time >= self._struck_at - 1e-9:
             self._strike()
-        self._link = np.clip(self._link, self.motor - self._play, self.motor + self._play)
+        motor = self.servos.motor
+        self._link = np.clip(self._link, motor - self._play, motor + self._play)
         self.times.append(time)
-        self.links.append(self._link + self._slip + self._flex * load)
+        self.links.append(self._link + self._slip + self._flex * self._load(self._link))
 
     def _strike(self) -> None:
         """A joint is knocked aside, or slips."""
         assert self._bump is not None
-        by, turn = np.zeros_like(self.motor), self._bump.by_deg
+        by, turn = np.zeros(len(self._link)), self._bump.by_deg
         by[self._bump.joint - 1] = self._bump.by_m or 0.0 if turn is None else math.radians(turn)
         self._struck_at = math.inf
         if self._bump.read:
-            self._setpoint, self.motor = self._setpoint + by, self.motor + by
+            self.servos.strike(by)
         else:
             self._slip = by
 
@@ -271,20 +436,18 @@ class _Camera:
     def _exposed(self, k: int, middle: float) -> _Frame:
         """The frame of a number, its exposure half over at a time, s."""
         world, given, step = self._world, self._given, _step(middle, self._world.period)
-        truth, M = world.truth, world.truth.M
-        if (moved := given.marker_moved) is not None and step >= moved.at_step:
-            M = M.copy()
-            M[truth.number.index(moved.marker), :3] += truth.robot.base_tool[:3, :3] @ moved.by_m
+        truth, befell, moved = world.truth, given.marker_moved, None
+        if befell is not None and step >= befell.at_step:
+            moved = befell.marker, np.array(befell.by_m)
         many = _EXPOSED if given.exposure_s else 1
         instants = middle + given.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
-        shown = [world.see(self._joints.at(t), M)[self._view] for t in instants]
         rng = world.random(self._view, _BEFORE + k)
         rng.standard_normal()  # that of the jitter
-        pixels = np.mean(shown, axis=0) + world.sigma_px * rng.standard_normal(shown[0].shape)
+        pixels = world.eyes.look(self._view, np.array([self._joints.at(t) for t in instants]), moved, rng)
         if (knocked := given.camera_moved) is not None and step >= knocked.at_step:
             pixels += knocked.by_view()[self._view]
         if (lost := given.lost_markers) is not None and _lasts(lost, step):
             pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
-        if world.borders:
+        if world.eyes.borders:
             pixels[~((pixels >= -0.5) & (pixels <= truth.image_size - 0.5)).all(axis=1)] = math.nan
         return _Frame(middle, middle + self._clock, pixels)

@@ -82,7 +82,7 @@ def teach(
     if numbers is None:
         raise InputError("teach needs to know which markers the robot observes: set markers.numbers")
     joints = joints_of(config)
-    if config.plant.use is not None:
+    if not config.plant.simulated:
         if at is not None:
             raise InputError("--at is where a simulated robot is put to; move yours by hand")
         robot = foreign_robot(config, joints, len(numbers))

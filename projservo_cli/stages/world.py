@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import NamedTuple
 
@@ -11,10 +11,21 @@ from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration import REACH_M, REACH_RAD
 from projservo_cli.config import Config
+from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import Goal
-from projservo_cli.config.robot import Camera, JointVector, Markers, Rig, RobotSettings
+from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
-from projservo_cli.records import PRISMATIC, REVOLUTE, Calibration, FloatArray, InputError, Model, WorkFailed
+from projservo_cli.records import (
+    NO_LENS,
+    PRISMATIC,
+    REVOLUTE,
+    Calibration,
+    FloatArray,
+    InputError,
+    Model,
+    WorkFailed,
+)
+from projservo_cli.rendered.scene import lens_of
 from projservo_cli.robots.simulated import Arm, Ends, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
 
@@ -37,9 +48,9 @@ def has_faults(config: Config) -> bool:
     return any(getattr(given, name) != getattr(none, name) for name in FAULTS)
 
 
-def is_disturbed(config: Config) -> bool:
-    """Whether anything is wrong with the simulated robot or befalls it."""
-    return config.disturbance != type(config.disturbance)()
+def is_by_contract(config: Config) -> bool:
+    """Whether a law drives a robot of the contract: none that stands wherever it is sent."""
+    return config.plant.use is not None or config.disturbance != type(config.disturbance)()
 
 
 def is_ideal(config: Config) -> bool:
@@ -134,11 +145,12 @@ class Truth:
     face: tuple[int, ...]  # indices of the face markers; none where the configuration has no face
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
     image_size: FloatArray  # (2,) px
+    lens: FloatArray = field(default_factory=NO_LENS.copy)  # (2, 5) true lenses
 
     @cached_property
     def model(self) -> Model:
         """Metric model, for the plant and for the law that is given one."""
-        return self.robot.model(self.P)
+        return self.robot.model(self.P)._replace(lens=self.lens)
 
     @cached_property
     def M_face(self) -> FloatArray:
@@ -162,7 +174,7 @@ class Truth:
 
     def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
         """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
-        return project(self.P, M @ self.displacement(q).T)
+        return project(self.P, M @ self.displacement(q).T, self.lens)
 
     def displacement(self, q: FloatArray) -> FloatArray:
         """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
@@ -188,17 +200,17 @@ class Truth:
 
 def face_numbers(config: Config) -> tuple[int, ...]:
     """Numbers of the face markers."""
-    if config.markers is None or config.markers.face is None:
+    if config.markers is None or config.markers.front is None:
         raise InputError(
             "this stage needs to know the face: set markers.face to three marker numbers or more"
         )
-    return config.markers.face
+    return config.markers.front
 
 
 def center_index(markers: Markers) -> int:
     """Position of the centre marker within the face, or ``MIDPOINT``."""
     return (
-        MIDPOINT if markers.center == "midpoint" or not markers.face else markers.face.index(markers.center)
+        MIDPOINT if markers.center == "midpoint" or not markers.front else markers.front.index(markers.center)
     )
 
 
@@ -208,26 +220,28 @@ def truth_of(config: Config) -> Truth:
         raise InputError("this stage drives a simulated robot: set robot.dh or robot.screws")
     if config.rig is None:
         raise InputError("this stage needs a simulated rig: set rig.left, rig.right and rig.image_size_px")
-    if config.markers is None or config.markers.positions_m is None:
+    if config.markers is None or config.markers.points is None:
         raise InputError("this stage needs the markers of the simulated robot: set markers.positions_m")
-    return _built(config.arm, config.rig, config.markers)
+    rendered = config.plant.rendered
+    return _built(config.arm, config.rig, config.markers, 0.0 if rendered is None else rendered.k1)
 
 
 @lru_cache(maxsize=16)
-def _built(described: RobotSettings, rig: Rig, markers: Markers) -> Truth:
-    robot = _robot_of(described)
+def _built(described: RobotSettings, rig: Rig, markers: Markers, k1: float) -> Truth:
+    robot, P = _robot_of(described), np.array([_camera_of(rig.left), _camera_of(rig.right)])
     numbers = markers.known
     assert numbers is not None
-    points = np.c_[np.array(markers.positions_m), np.ones(len(numbers))]
-    face = markers.face or ()
+    points = np.c_[markers.points, np.ones(len(numbers))]
+    face = markers.front or ()
     return Truth(
         robot,
-        np.array([_camera_of(rig.left), _camera_of(rig.right)]),
+        P,
         points @ robot.base_tool.T,
         numbers,
         tuple(numbers.index(number) for number in face),
         center_index(markers),
         np.array(rig.image_size_px, dtype=np.float64),
+        lens_of(P, k1) if k1 else NO_LENS,
     )
 
 

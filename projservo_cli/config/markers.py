@@ -1,0 +1,168 @@
+"""Points fixed to the tool, and tags whose corners they are."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, PlainValidator, StringConstraints, WithJsonSchema
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.config.robot import Finding, Matrix44, Positive, Section, Vector3, Whole, not_rigid
+from projservo_cli.records import FloatArray
+
+CORNERS = 4
+"""Of a tag; corner k of tag t is marker 4 t + k."""
+
+GROUND = 4.0 / 3.0
+"""How much wider a tag of six cells is with a bright margin of one cell than without."""
+
+_TILT = math.radians(35.0)  # of the four tags around the middle one of a roof
+_CORNERS = ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))  # as they are detected, in sides of the tag
+
+
+class Tag(Section):
+    """A tag on the tool."""
+
+    number: Whole = Field(description="of the tag in its dictionary; its corners are markers 4 t to 4 t + 3")
+    size_m: Positive = Field(description="side of its black square")
+    pose: Matrix44 = Field(description="in the frame of the tool, m: the tag looks along z, y is up on it")
+
+    def contradictions(self) -> Iterator[Finding]:
+        """A tag that is nowhere."""
+        if what := not_rigid(self.pose):
+            yield ("pose",), what
+
+    @property
+    def corners(self) -> FloatArray:
+        """Its corners (4, 3) in the frame of the tool, m, in the order in which they are detected."""
+        T = np.array(self.pose)
+        return np.asarray(self.size_m * np.array(_CORNERS) @ T[:3, :2].T + T[:3, 3])
+
+
+def _tag(number: int, size_m: float, R: Rotation, t: Sequence[float]) -> Tag:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R.as_matrix(), t
+    pose = tuple(tuple(row) for row in T.tolist())
+    return Tag.model_validate({"number": number, "size_m": size_m, "pose": pose})
+
+
+def _roof(size_m: float) -> tuple[Tag, ...]:
+    """A tag that looks forward and four around it, tilted away from it; their margins meet."""
+    half = 0.5 * GROUND * size_m
+    tags = [_tag(0, size_m, Rotation.identity(), [0.0, 0.0, 1.5 * half])]
+    for k in range(4):
+        turn = Rotation.from_euler("z", 0.5 * math.pi * k)
+        place = turn.apply([half + half * math.cos(_TILT), 0.0, 1.5 * half - half * math.sin(_TILT)])
+        tags.append(_tag(1 + k, size_m, turn * Rotation.from_euler("y", _TILT), place.tolist()))
+    return tuple(tags)
+
+
+def _plate(size_m: float) -> tuple[Tag, ...]:
+    """Two by two tags in a plane that look forward; their margins meet."""
+    half = 0.5 * GROUND * size_m
+    places = [(-half, half), (half, half), (half, -half), (-half, -half)]
+    return tuple(_tag(k, size_m, Rotation.identity(), [*at, 1.5 * half]) for k, at in enumerate(places))
+
+
+_TOOLS = {"roof": _roof, "plate": _plate}
+
+
+def _center(value: Any) -> Any:
+    if value == "midpoint" or (type(value) is int and 0 <= value < 2**63):
+        return value
+    raise ValueError("must be midpoint or the number of a marker of the face")
+
+
+_Center = Annotated[
+    Literal["midpoint"] | int,
+    PlainValidator(_center),
+    WithJsonSchema({"anyOf": [{"const": "midpoint", "type": "string"}, {"type": "integer", "minimum": 0}]}),
+]
+
+
+class Markers(Section):
+    """Points fixed to the tool; the face is the part of them that must stay visible."""
+
+    positions_m: tuple[Vector3, ...] | None = Field(
+        None, min_length=1, max_length=10_000, description="in the frame of the tool"
+    )
+    numbers: tuple[Whole, ...] | None = Field(
+        None, min_length=1, description="number of each marker; null for 0, 1, 2 ..."
+    )
+    tags: (
+        Literal["roof", "plate"] | Annotated[tuple[Tag, ...], Field(min_length=1, max_length=250)] | None
+    ) = Field(
+        None, description="tags whose corners are the markers, instead of positions_m: a tool or a list"
+    )
+    tag_size_m: Positive = Field(0.06, description="side of the black square of each tag of a roof or plate")
+    dictionary: Annotated[str, StringConstraints(min_length=1)] = Field(
+        "4X4_50", description="of the tags, as OpenCV names it"
+    )
+    face: tuple[Whole, ...] | None = Field(
+        None,
+        min_length=3,
+        description="numbers of those in a plane that must stay visible; null for the tag that looks forward",
+    )
+    center: _Center = Field("midpoint", description="of the face: midpoint, or a number")
+
+    @property
+    def all_tags(self) -> tuple[Tag, ...]:
+        """Each tag; none where markers are no corners of tags."""
+        return _TOOLS[self.tags](self.tag_size_m) if isinstance(self.tags, str) else self.tags or ()
+
+    @property
+    def points(self) -> FloatArray | None:
+        """Positions (m, 3) of all markers in the frame of the tool, m; None where they are not known."""
+        if self.tags is not None:
+            return np.concatenate([tag.corners for tag in self.all_tags])
+        return None if self.positions_m is None else np.array(self.positions_m)
+
+    @property
+    def known(self) -> tuple[int, ...] | None:
+        """Numbers of all markers, in the order of ``points``; None where a table will tell."""
+        if self.tags is not None:
+            return tuple(CORNERS * tag.number + k for tag in self.all_tags for k in range(CORNERS))
+        if self.numbers is None and self.positions_m is not None:
+            return tuple(range(len(self.positions_m)))
+        return self.numbers
+
+    @property
+    def front(self) -> tuple[int, ...] | None:
+        """Numbers of the face: those given, else of the tag that looks most where all of them look."""
+        if self.face is not None or self.tags is None:
+            return self.face
+        normals = np.array([np.array(tag.pose)[:3, 2] for tag in self.all_tags])
+        first = CORNERS * self.all_tags[int(np.argmax((normals @ normals.sum(axis=0)).round(6)))].number
+        return tuple(range(first, first + CORNERS))
+
+    def contradictions(self) -> Iterator[Finding]:
+        """Markers said twice; numbers that are missing, strange or given twice."""
+        for key in ("positions_m", "numbers") if self.tags is not None else ():
+            if getattr(self, key) is not None:
+                yield (key,), "tags is set as well, whose corners are the markers; keep one"
+        numbers = [tag.number for tag in self.all_tags]
+        if len(set(numbers)) < len(numbers):
+            yield ("tags",), "the number of a tag stands here twice"
+        known, face = self.known, self.front or ()
+        if known is not None:
+            if self.positions_m is not None and len(known) != len(self.positions_m):
+                yield ("numbers",), f"{len(known)} numbers for {len(self.positions_m)} positions_m"
+            if self.numbers is not None and len(set(known)) < len(known):
+                yield ("numbers",), "a number stands here twice"
+            yield from self.unknown(face, "face")
+        if face and self.center not in ("midpoint", *face):
+            yield ("center",), f"marker {self.center} is not on the face; face: {_listed(face)}"
+        if len(set(face)) < len(face):
+            yield ("face",), "a marker stands here twice"
+
+    def unknown(self, numbers: Sequence[int], *path: str) -> Iterator[Finding]:
+        """Numbers at a path that no marker has, as far as markers are known."""
+        for i, number in enumerate(numbers):
+            if self.known is not None and number not in self.known:
+                yield (*path, i), f"there is no marker {number}; markers: {_listed(self.known)}"
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:20]))
+    return shown + (" …" if len(numbers) > 20 else "")

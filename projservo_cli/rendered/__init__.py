@@ -1,0 +1,1 @@
+"""Rendered cameras: a simulated robot in MuJoCo, whose images are searched for tags."""

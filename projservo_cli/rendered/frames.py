@@ -1,0 +1,112 @@
+"""Frames that rendered cameras take, and the tags that are found in them."""
+
+import copy
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from projservo_cli.config.markers import CORNERS
+from projservo_cli.records import FloatArray, InputError
+from projservo_cli.rendered.scene import CAMERAS, Scene, drawn_at, lens_of
+from projservo_cli.robots.described import mujoco, no_gl
+
+GreyImage = npt.NDArray[np.uint8]
+_STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
+
+
+class Frames:
+    """Both cameras of a scene, which a thread opens, looks with and closes.
+
+    ``last``: (2, height, width) the last frames of both, as they were searched.
+    """
+
+    borders = True
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._finder, self._options = scene, scene.finder, scene.options
+        self._places = {number: i for i, number in enumerate(scene.numbers)}
+        width, height = scene.size
+        self.last: GreyImage = np.zeros((2, height, width), dtype=np.uint8)
+        self._maps = self._mapped(scene.P)
+        self._renderer: Any = None
+
+    def open(self) -> None:
+        """Make ready to draw, in the thread that looks; an InputError says what to install for that."""
+        mj, scene = mujoco(), self._scene
+        height, width = self.last.shape[1] + 2 * scene.margin, self.last.shape[2] + 2 * scene.margin
+        try:
+            self._renderer = mj.Renderer(scene.model, height, width)
+        except Exception as error:  # of another kind for each library of GL
+            raise InputError(no_gl(error)) from error
+        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._options.light == "side"
+        self._model = copy.copy(scene.model)
+        self._data = scene.begin(self._model, scene.model.qpos0[scene.places])
+        self._shown = mj.MjvOption()
+        self._shown.sitegroup[:] = 0
+
+    def close(self) -> None:
+        """Let go of what draws."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def look(
+        self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
+    ) -> FloatArray:
+        """Pixels (m, 2) that are found in a frame, NaN where unseen.
+
+        q : (k, n) joints at instants of its exposure, rad or m.
+        moved : number of a marker whose tag was moved, and by how much in the frame of the tool, (3,) m.
+        """
+        self._move(moved)
+        still = np.abs(q - q[len(q) // 2]).max() < _STILL
+        shots = [self._drawn(view, joints) for joints in (q[len(q) // 2 :][:1] if still else q)]
+        image = np.mean(shots, axis=0, dtype=np.float32)
+        cv = self._finder.cv
+        if self._maps is not None:
+            image = cv.remap(image, *self._maps[view], cv.INTER_CUBIC)
+        if self._options.blur_px > 0.0:
+            image = cv.GaussianBlur(image, (0, 0), self._options.blur_px)
+        image += np.float32(self._options.grey_noise) * rng.standard_normal(image.shape, dtype=np.float32)
+        self.last[view] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return self._found(view)
+
+    def _found(self, view: int) -> FloatArray:
+        """Pixels (m, 2) of the corners in the last frame of a view, NaN where unseen."""
+        pixels = np.full((len(self._places), 2), np.nan)
+        tags, _ = self._finder.find(self.last[view].astype(np.float64))
+        for number, corners in tags.items():
+            for k in range(CORNERS):
+                if (place := self._places.get(CORNERS * number + k)) is not None:
+                    pixels[place] = corners[k]
+        return pixels
+
+    def _drawn(self, view: int, q: FloatArray) -> GreyImage:
+        """Grey values (height, width) of what a camera sees at joints (n,), without lens and noise."""
+        mj = mujoco()
+        self._data.qpos[self._scene.places] = q
+        mj.mj_kinematics(self._model, self._data)
+        mj.mj_camlight(self._model, self._data)
+        self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
+        # Tags, what holds them and light have no colour: green alone stands for grey.
+        return np.ascontiguousarray(self._renderer.render()[..., 1])
+
+    def _move(self, moved: tuple[int, FloatArray] | None) -> None:
+        """Put every plate where it is, but for one that was moved."""
+        self._model.geom_pos[:] = self._scene.model.geom_pos
+        if moved is not None:
+            plate = self._scene.plates[self._places[moved[0]] // CORNERS]
+            self._model.geom_pos[list(plate)] += self._scene.tool @ moved[1]
+
+    def _mapped(self, P: FloatArray) -> list[tuple[FloatArray, FloatArray]] | None:
+        """Where each pixel of a frame is in what is drawn, u and v (height, width) of each view, px."""
+        width, height = self._scene.size
+        u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+        pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
+        lens = lens_of(P, self._options.k1)
+        drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
+        if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
+            return None
+        maps = (drawn + self._scene.margin).reshape(2, height, width, 2).astype(np.float32)
+        return [(np.ascontiguousarray(both[..., 0]), np.ascontiguousarray(both[..., 1])) for both in maps]

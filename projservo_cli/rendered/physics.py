@@ -1,0 +1,216 @@
+"""The joints of an arm in MuJoCo: servos under gravity, those of its file or made up."""
+
+import copy
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli.records import PRISMATIC, FloatArray, InputError, WorkFailed
+from projservo_cli.rendered.scene import Scene
+from projservo_cli.robots.described import mujoco
+
+_STEP_S = 0.002  # longest step of the integration
+_RATE = 100.0  # 1/s, at which a servo that need not sag takes back an error
+_LOOP_S = 0.1  # in which whoever sends speeds to a servo takes back an error
+_POSTURES = 200  # that are drawn to see what servos have to move
+
+
+class _Actuator(NamedTuple):
+    """An actuator of a file that drives a joint: force = gain · input + bias · (1, length, its speed).
+
+    It follows lengths where the length has a part in it, else speeds where those have, else it is a motor.
+    """
+
+    number: int
+    state: int  # place of its activation, −1 for none
+    integrates: bool  # whether its control is the speed of its input
+    gear: float
+    gain: float
+    bias: tuple[float, float, float]
+
+    @property
+    def stiffness(self) -> float:
+        """Torque for a radian that the joint is off what it is sent, as it is driven here; 0 for a motor."""
+        _, by_length, by_speed = self.bias
+        return -(self.gear**2) * (by_length or by_speed / _LOOP_S)
+
+    def input_for(self, q: float, x: float, speed: float) -> float:
+        """Input with which a joint at q goes to x, rad or m, that moves at a speed, per s."""
+        constant, by_length, by_speed = self.bias
+        if by_length:
+            return -(constant + by_length * self.gear * x) / self.gain
+        return -(constant + by_speed * self.gear * (speed + (x - q) / _LOOP_S)) / self.gain
+
+
+class Physics:
+    """Servos of the joints of an arm, at first at rest at joints q (n,), rad or m.
+
+    lag_s : by which what they are sent is late. sag : what gravity costs a servo of ours that is loaded most,
+        rad; where it is zero, and in prismatic joints, they compensate gravity.
+    ``setpoint``: (n,) where joints are sent, rad or m.
+    Raises InputError where an actuator of the file cannot be driven, or does not sag as it is told.
+    """
+
+    def __init__(self, scene: Scene, q: FloatArray, lag_s: float, sag: float) -> None:
+        arm, servo = scene.arm, scene.options.servo
+        self._model, self._places, self._rates = copy.copy(scene.model), scene.places, scene.rates
+        self._data = scene.begin(self._model, q)
+        self._step_s, self._lag_s = min(_STEP_S, float(self._model.opt.timestep)), lag_s
+        self._own = {
+            i: actuator
+            for i, joint in enumerate(scene.joints)
+            if (actuator := _take(self._model, int(joint), keep=servo == "own")) is not None
+        }
+        if sag > 0.0 and self._own:
+            raise InputError(
+                "disturbance.sag_deg: servos of robot.mjcf sag as they are: leave it out, or take others, "
+                "plant.options.servo: position"
+            )
+        turning = arm.joint_types != PRISMATIC
+        self._compensated = ~turning if sag > 0.0 else np.ones(len(q), dtype=np.bool_)
+        inertia, load = self._heaviest(scene)
+        loop_s, rate = (_LOOP_S, _RATE) if servo == "velocity" else (None, _RATE)
+        self._stiffness = inertia * (rate**2 if loop_s is None else rate / loop_s)
+        self._stiffness = np.where(self._compensated, self._stiffness, load / max(sag, 1e-9))
+        critical = 2.0 * np.sqrt(self._stiffness * inertia)
+        self._damping = critical if loop_s is None else loop_s * self._stiffness
+        ours = [i for i in range(len(q)) if i not in self._own]
+        self._ours = np.array(ours, dtype=np.int64)
+        self._model.dof_damping[self._rates[self._ours]] += self._damping[self._ours]
+        self._begin(q)
+
+    def _begin(self, q: FloatArray) -> None:
+        """Send each joint to where its servo holds it at rest at joints (n,)."""
+        load, stiffness = self._gravity(), np.where(self._compensated, math.inf, self._stiffness)
+        for i, actuator in self._own.items():
+            stiffness[i] = actuator.stiffness or math.inf
+        self.setpoint = self._sent = q + load / stiffness
+        for i, actuator in self._own.items():
+            if actuator.state >= 0:
+                self._data.act[actuator.state] = actuator.input_for(q[i], self._sent[i], 0.0)
+
+    @property
+    def motor(self) -> FloatArray:
+        """Where the joints are (n,), rad or m."""
+        return np.array(self._data.qpos[self._places])
+
+    def strike(self, by: FloatArray) -> None:
+        """Move joints, and where they are sent, by (n,), rad or m, at once."""
+        self._data.qpos[self._places] += by
+        self.setpoint, self._sent = self.setpoint + by, self._sent + by
+
+    def follow(self, setpoint: FloatArray, seconds: float) -> None:
+        """Let so much time pass, s, while the set-point goes evenly to joints (n,), rad or m.
+
+        Raises WorkFailed where the integration comes to nothing.
+        """
+        if not seconds > 0.0:
+            self.setpoint = setpoint
+            return
+        steps = math.ceil(seconds / self._step_s - 1e-9)
+        h, begun, mj = seconds / steps, self.setpoint, mujoco()
+        self._model.opt.timestep = h
+        for k in range(1, 1 + steps):
+            self.setpoint = begun + (setpoint - begun) * (k / steps)
+            share = -math.expm1(-h / self._lag_s) if self._lag_s > 0.0 else 1.0
+            before, self._sent = self._sent, self._sent + share * (self.setpoint - self._sent)
+            self._drive((self._sent - before) / h, h)
+            mj.mj_step(self._model, self._data)
+        self.setpoint = setpoint
+        if self._data.warning[mj.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(self.motor).all():
+            raise WorkFailed(
+                "plant mujoco: the physics of the arm do not settle: look at masses, armature and servos of "
+                "robot.mjcf, or lower its timestep"
+            )
+
+    def _drive(self, speed: FloatArray, h: float) -> None:
+        """Set what servos do in the next step of h, s, where they are sent moving at a speed (n,), per s."""
+        q, data = self.motor, self._data
+        torque = self._stiffness * (self._sent - q) + self._damping * speed
+        torque += np.where(self._compensated, self._gravity(), 0.0)
+        data.qfrc_applied[self._rates[self._ours]] = torque[self._ours]
+        for i, actuator in self._own.items():
+            if not actuator.stiffness:
+                torque_now = torque[i] - self._damping[i] * data.qvel[self._rates[i]]
+                data.ctrl[actuator.number] = torque_now / (actuator.gear * actuator.gain)
+                continue
+            wanted = actuator.input_for(q[i], self._sent[i], speed[i])
+            if actuator.integrates:
+                wanted = (wanted - data.act[actuator.state]) / h
+            data.ctrl[actuator.number] = wanted
+
+    def _gravity(self) -> FloatArray:
+        """What gravity and motion ask of each joint (n,), N m or N, less what the file compensates."""
+        return np.array((self._data.qfrc_bias - self._data.qfrc_gravcomp)[self._rates])
+
+    def _heaviest(self, scene: Scene) -> tuple[FloatArray, float]:
+        """Most inertia (n,) of each joint, kg m² or kg, and the most gravity asks of any that turns, N m."""
+        mj, rng, arm = mujoco(), np.random.default_rng(0), scene.arm
+        low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.lower, arm.upper))
+        data, turning = scene.begin(self._model, arm.q_reference), arm.joint_types != PRISMATIC
+        unit, moved = np.eye(self._model.nv), np.zeros(self._model.nv)
+        inertia, load = np.zeros(len(low)), 0.0
+        for q in rng.uniform(low, high, (_POSTURES, len(low))):
+            data.qpos[self._places] = q
+            mj.mj_forward(self._model, data)
+            for i, rate in enumerate(self._rates):
+                mj.mj_mulM(self._model, data, moved, unit[rate])
+                inertia[i] = max(inertia[i], moved[rate])
+            load = max(load, float(np.abs(data.qfrc_bias[self._rates][turning]).max(initial=0.0)))
+        return inertia, load
+
+
+def _take(model: Any, joint: int, *, keep: bool) -> _Actuator | None:
+    """The actuator of a file that drives a joint; None where there is none, or none is to be kept.
+
+    Those that are not kept are put out of action.
+    """
+    mj = mujoco()
+    found = []
+    for number in range(model.nu):
+        moves = mj.mjtTrn(int(model.actuator_trntype[number])) in (
+            mj.mjtTrn.mjTRN_JOINT,
+            mj.mjtTrn.mjTRN_JOINTINPARENT,
+        )
+        if moves and int(model.actuator_trnid[number, 0]) == joint:
+            if not keep:
+                model.actuator_gainprm[number], model.actuator_biasprm[number] = 0.0, 0.0
+                continue
+            found.append(_actuator(model, number))
+    # One that follows lengths comes first, then one that follows speeds, which else damps, then a motor.
+    return min(found, key=lambda one: ([b != 0.0 for b in one.bias[1:]] + [True]).index(True), default=None)
+
+
+def _actuator(model: Any, number: int) -> _Actuator:
+    """An actuator of a file; an InputError where it is none that can be driven here."""
+    mj = mujoco()
+    dyn = mj.mjtDyn
+    taken = (dyn.mjDYN_NONE, dyn.mjDYN_INTEGRATOR, dyn.mjDYN_FILTER, dyn.mjDYN_FILTEREXACT)
+    biases = (mj.mjtBias.mjBIAS_NONE, mj.mjtBias.mjBIAS_AFFINE)
+    gain = float(model.actuator_gainprm[number, 0])
+    bias, dynamics = (
+        mj.mjtBias(int(model.actuator_biastype[number])),
+        dyn(int(model.actuator_dyntype[number])),
+    )
+    if (
+        mj.mjtGain(int(model.actuator_gaintype[number])) != mj.mjtGain.mjGAIN_FIXED
+        or bias not in biases
+        or dynamics not in taken
+        or gain == 0.0
+    ):
+        name = model.actuator(number).name or number
+        raise InputError(
+            f"robot.mjcf: actuator {name} is no motor, position, velocity or intvelocity servo: set "
+            "plant.options.servo: position, which moves the joints without it"
+        )
+    affine = bias == mj.mjtBias.mjBIAS_AFFINE
+    constant, by_length, by_speed = model.actuator_biasprm[number, :3].tolist() if affine else (0.0, 0.0, 0.0)
+    return _Actuator(
+        number,
+        int(model.actuator_actadr[number]),
+        dynamics == dyn.mjDYN_INTEGRATOR,
+        float(model.actuator_gear[number, 0]),
+        gain,
+        (constant, by_length, by_speed),
+    )

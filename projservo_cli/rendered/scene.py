@@ -1,0 +1,286 @@
+"""The model of a rendered robot: an arm, tags on its tool, two cameras and light."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import rq
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.config.markers import Markers, Tag
+from projservo_cli.config.models import RenderedOptions
+from projservo_cli.config.robot import Rig, RobotSettings
+from projservo_cli.detection import TagFinder
+from projservo_cli.geometry.lens import straight_views
+from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
+from projservo_cli.robots.described import chain_of, compiled, mujoco, spec_of
+from projservo_cli.robots.simulated import Arm, roll_axis
+
+# Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
+_THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3
+_LINK, _HOLDER = (0.75, 0.5, 0.25, 1.0), (0.3, 0.3, 0.3, 1.0)  # colours of links, and of what holds the tags
+_PLATE_M, _ROD_M = 5e-4, 4e-3  # half the thickness of a tag, and of the rod that holds it
+_TOOL_DENSITY = 500.0  # kg/m³
+_SIDES = ("front", "back")  # of a plate: the tag, and what hides it from behind
+_CELL_PX = 16  # of the picture of a tag
+# Inertia of rotors of joints without, kg m² or kg: at most, and as a share of that of the heaviest joint.
+_ARMATURE, _ARMATURE_SHARE = 0.1, 0.02
+_SENSOR_M = 1e-5  # width of a pixel of a camera's sensor; only ratios to it matter
+_NO_SKEW = 1e-9  # of a camera's pixels, which rounding leaves
+_NEAR_M, _FAR_M = 0.01, 50.0  # what cameras see
+_SAMPLES = 8  # of each pixel of a rendering
+CAMERAS = ("left camera", "right camera")
+"""Names of both in the model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled model, and what in it stands for what."""
+
+    options: RenderedOptions
+    finder: TagFinder
+    numbers: tuple[int, ...]  # of the markers, four corners a tag
+    arm: Arm
+    P: FloatArray  # (2, 3, 4) cameras, px
+    model: Any  # MjModel, which nobody changes
+    key: int  # of the keyframe that is its beginning, −1 for none
+    joints: IntArray  # (n,) its joints of the arm, base to tool
+    plates: tuple[tuple[int, ...], ...]  # for each tag the geoms that are its plate
+    size: tuple[int, int]  # width and height of the images, px
+    margin: int  # by which drawings are wider at each side, px
+    tool: FloatArray  # (3, 3) rotation of the tool in the frame of the body that holds the tags
+
+    @property
+    def places(self) -> IntArray:
+        """Places (n,) of the joints among all positions."""
+        return np.asarray(self.model.jnt_qposadr[self.joints])
+
+    @property
+    def rates(self) -> IntArray:
+        """Places (n,) of the joints among all velocities."""
+        return np.asarray(self.model.jnt_dofadr[self.joints])
+
+    def begin(self, model: Any, q: FloatArray) -> Any:
+        """Data of a model like this one at its beginning, the arm at joints (n,), rad or m."""
+        mj = mujoco()
+        data = mj.MjData(model)
+        if self.key >= 0:
+            mj.mj_resetDataKeyframe(model, data, self.key)
+        data.qpos[self.places] = q
+        mj.mj_forward(model, data)
+        return data
+
+
+def decomposed(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Intrinsic matrix K (3, 3), rotation R (3, 3) and translation t (3,), m, of a metric camera (3, 4)."""
+    K, R = rq(P[:, :3])
+    signs = np.diag(np.sign(np.diag(K)))
+    K, R = K @ signs, signs @ R
+    t = np.linalg.solve(K, P[:, 3])
+    return np.asarray(K / K[2, 2]), np.asarray(R), np.asarray(t)
+
+
+def lens_of(P: FloatArray, k1: float) -> FloatArray:
+    """Lenses (2, 5) of metric cameras (2, 3, 4), with k1 in units of the focal length."""
+    K = np.array([decomposed(camera)[0] for camera in P])
+    radius = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
+    return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, np.full(2, k1), np.zeros(2)])
+
+
+def scene_of(
+    robot: RobotSettings, arm: Arm, rig: Rig, P: FloatArray, markers: Markers, options: RenderedOptions
+) -> Scene:
+    """The scene of a robot, whose kinematics are those of an arm, before cameras P (2, 3, 4).
+
+    Raises InputError if MuJoCo or OpenCV is missing, or the scene cannot be made.
+    """
+    mj, finder = mujoco(), TagFinder(markers.dictionary)
+    spec = mj.MjSpec() if robot.mjcf is None else spec_of(robot.mjcf)
+    where = robot.mjcf or "the arm"
+    if robot.mjcf is None:
+        tip, tool = _add_arm(spec, arm), arm.base_tool
+    else:
+        tip, tool = spec.body(robot.tip), np.eye(4)
+    _add_tags(spec, tip, tool, markers.all_tags, finder)
+    _put_light(spec, options.light, P)
+    K, R, t = (np.array(parts) for parts in zip(*map(decomposed, P), strict=True))
+    width, height = rig.image_size_px
+    margin = _margin(P, options.k1, width, height)
+    K_wide = K + margin * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
+    _add_cameras(spec, K_wide, R, t, (width + 2 * margin, height + 2 * margin))
+    model = compiled(spec, where)
+    joints = np.array(chain_of(model, tip.name, where))
+    rates = model.jnt_dofadr[joints]
+    bare = rates[model.dof_armature[rates] == 0.0]
+    model.dof_armature[bare] = min(_ARMATURE, _ARMATURE_SHARE * float(model.dof_M0[rates].max()))
+    mj.mj_setConst(model, mj.MjData(model))
+    plates = tuple(tuple(model.geom(_name(tag, side)).id for side in _SIDES) for tag in markers.all_tags)
+    assert markers.known is not None
+    return Scene(
+        options,
+        finder,
+        markers.known,
+        arm,
+        P,
+        model,
+        0 if model.nkey else -1,
+        joints,
+        plates,
+        (width, height),
+        margin,
+        tool[:3, :3],
+    )
+
+
+def _add_arm(spec: Any, arm: Arm) -> Any:
+    """Add an arm of capsules, and return its last body.
+
+    Every body has the axes of the base at the reference, where joints have their readings; a link reaches
+    from the point of one joint's axis that is nearest to the link before to that of the next.
+    """
+    mj = mujoco()
+    spec.compiler.degree = False
+    points, axes = [np.zeros(3)], []
+    for twist, kind in zip(arm.H_hat_0, arm.joint_types, strict=True):
+        w, v = np.array([twist[2, 1], twist[0, 2], twist[1, 0]]), twist[:3, 3]
+        axes.append(v if kind == PRISMATIC else w)
+        foot = points[-1] if kind == PRISMATIC else np.cross(w, v)
+        points.append(foot + axes[-1] * (axes[-1] @ (points[-1] - foot)))
+    points.append(arm.base_tool[:3, 3])
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    thickness = np.linspace(_THICK, _THIN, len(lengths)) * max(float(lengths.sum()), _LEAST_LINK_M)
+    body = spec.worldbody
+    for i, radius in enumerate(thickness):
+        if i > 0:
+            body = body.add_body(name=f"link {i}")
+            slides = arm.joint_types[i - 1] == PRISMATIC
+            body.add_joint(
+                name=f"joint {i}",
+                type=mj.mjtJoint.mjJNT_SLIDE if slides else mj.mjtJoint.mjJNT_HINGE,
+                pos=points[i],
+                axis=axes[i - 1],
+                ref=arm.q_reference[i - 1],
+            )
+        looks = {"rgba": _LINK, "contype": 0, "conaffinity": 0}
+        if lengths[i] > _LEAST_LINK_M:
+            ends = [*points[i], *points[i + 1]]
+            body.add_geom(type=mj.mjtGeom.mjGEOM_CAPSULE, size=[radius, 0, 0], fromto=ends, **looks)
+        else:
+            body.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=points[i], **looks)
+    return body
+
+
+def _name(tag: Tag, side: str) -> str:
+    return f"tag {tag.number} {side}"
+
+
+def _add_tags(spec: Any, tip: Any, tool: FloatArray, tags: Sequence[Tag], finder: TagFinder) -> None:
+    """Hang tags on a body of a specification; tool : (4, 4) pose of the tool in its frame, m."""
+    mj = mujoco()
+    body, origin = tip.add_body(name="tool with tags"), tool[:3, 3]
+    spec.add_material(name="tag holder", rgba=_HOLDER, specular=0.0)
+
+    def add(shape: Any, material: str, **values: Any) -> None:
+        """A geom that touches nothing, whatever the defaults of the file."""
+        body.add_geom(
+            type=shape, material=material, group=0, contype=0, conaffinity=0, density=_TOOL_DENSITY, **values
+        )
+
+    for tag in tags:
+        picture = finder.picture(tag.number, _CELL_PX)
+        half = 0.5 * tag.size_m * len(picture) / (len(picture) - 2 * _CELL_PX)
+        pose, name = tool @ np.array(tag.pose), _name(tag, "front")
+        texture = spec.add_texture(
+            name=name, type=mj.mjtTexture.mjTEXTURE_2D, width=len(picture), height=len(picture), nchannel=3
+        )
+        texture.data = np.repeat(picture[..., None], 3, axis=2).tobytes()
+        material = spec.add_material(name=name, specular=0.0)
+        material.textures[mj.mjtTextureRole.mjTEXROLE_RGB] = name
+        quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+        # All faces of a box show its texture.
+        for side, depth, looks in zip(_SIDES, (1.0, 3.0), (name, "tag holder"), strict=True):
+            place = pose[:3, 3] - depth * _PLATE_M * pose[:3, 2]
+            size = [half, half, _PLATE_M]
+            add(mj.mjtGeom.mjGEOM_BOX, looks, name=_name(tag, side), size=size, pos=place, quat=quaternion)
+        behind = pose[:3, 3] - 4.0 * _PLATE_M * pose[:3, 2]
+        if np.linalg.norm(behind - origin) > _LEAST_LINK_M:
+            ends = [*origin, *behind]
+            add(mj.mjtGeom.mjGEOM_CYLINDER, "tag holder", size=[_ROD_M, 0.0, 0.0], fromto=ends)
+
+
+def _put_light(spec: Any, light: str, P: FloatArray) -> None:
+    """Light from all around and a little from above, or hard light from one side of the rig alone."""
+    mj = mujoco()
+    for given in list(spec.lights):
+        spec.delete(given)
+    head, (_, ahead) = spec.visual.headlight, roll_axis(P)
+    soft = light == "soft"
+    head.active = 1
+    head.ambient, head.diffuse, head.specular = (
+        [0.45 if soft else 0.15] * 3,
+        [0.3 if soft else 0.0] * 3,
+        [0.0] * 3,
+    )
+    up = np.array([0.0, 0.0, 1.0])
+    side = np.cross(ahead, up) if abs(ahead @ up) < 0.9 else np.array([0.0, 1.0, 0.0])
+    shines = -up if soft else side / np.linalg.norm(side) + 0.5 * ahead - 0.3 * up
+    spec.worldbody.add_light(
+        type=mj.mjtLightType.mjLIGHT_DIRECTIONAL,
+        dir=shines / np.linalg.norm(shines),
+        pos=-5.0 * shines,
+        diffuse=[0.25 if soft else 0.9] * 3,
+        specular=[0.0] * 3,
+        castshadow=not soft,
+    )
+    if not any(texture.type == mj.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        spec.add_texture(
+            name="far around",
+            type=mj.mjtTexture.mjTEXTURE_SKYBOX,
+            builtin=mj.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=[0.55] * 3,
+            rgb2=[0.35] * 3,
+            width=64,
+            height=384,
+        )
+
+
+def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Where pixels (2, N, 2) of cameras (2, 3, 4) and lenses (2, 5) are drawn without lens and skew."""
+    straight = straight_views(lens, pixels).copy()
+    for view, camera in enumerate(P):
+        K, _, _ = decomposed(camera)
+        skew = K[0, 1] if abs(K[0, 1]) > _NO_SKEW * K[0, 0] else 0.0
+        straight[view, :, 0] -= skew * (straight[view, :, 1] - K[1, 2]) / K[1, 1]
+    return straight
+
+
+def _margin(P: FloatArray, k1: float, width: int, height: int) -> int:
+    """By how much a drawing has to be wider than what a lens makes of it, px."""
+    u, v = np.linspace(0.0, width - 1.0, 65), np.linspace(0.0, height - 1.0, 65)
+    sides = [(x, y) for x in u for y in v[[0, -1]]] + [(x, y) for x in u[[0, -1]] for y in v]
+    drawn = drawn_at(P, lens_of(P, k1), np.array([sides, sides]))
+    if not np.isfinite(drawn).all():
+        raise InputError("plant.options.k1: a lens that bends so much does not show the whole image")
+    beyond = max(-float(drawn.min()), float((drawn - [width - 1.0, height - 1.0]).max()))
+    return 0 if beyond <= 0.0 else math.ceil(beyond) + 2
+
+
+def _add_cameras(spec: Any, K: FloatArray, R: FloatArray, t: FloatArray, size: tuple[int, int]) -> None:
+    """Add the cameras of a rig of (2, 3, 3), (2, 3, 3), (2, 3), m, whose images have a size, px."""
+    mj = mujoco()
+    width, height = size
+    for view in range(2):
+        camera = spec.worldbody.add_camera(name=CAMERAS[view], pos=-R[view].T @ t[view])
+        camera.alt.type = mj.mjtOrientation.mjORIENTATION_XYAXES
+        camera.alt.xyaxes = [*R[view][0], *-R[view][1]]
+        camera.resolution = size
+        camera.sensor_size = [width * _SENSOR_M, height * _SENSOR_M]
+        camera.focal_pixel = [K[view, 0, 0], K[view, 1, 1]]
+        camera.principal_pixel = [0.5 * (width - 1) - K[view, 0, 2], 0.5 * (height - 1) - K[view, 1, 2]]
+    spec.stat.extent = 1.0
+    visual = spec.visual
+    visual.map.znear, visual.map.zfar = _NEAR_M, _FAR_M
+    visual.global_.offwidth, visual.global_.offheight = size
+    visual.quality.offsamples = _SAMPLES
