@@ -20,6 +20,7 @@ from projservo_cli.loop.step import Limits
 from projservo_cli.records import (
     BODY_LAWS,
     METRIC_LAWS,
+    VIEWS,
     Calibration,
     FloatArray,
     InputError,
@@ -28,7 +29,6 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
 from projservo_cli.stages.simulation import shown_in_frames
-from projservo_cli.stages.verdicts import VIEWS
 from projservo_cli.stages.world import (
     Joints,
     Truth,

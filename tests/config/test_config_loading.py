@@ -133,7 +133,7 @@ INCONSISTENT = [
     ("robot.dh.joints.1={type: P, limits_deg: [0, 1]}", "robot.dh.joints.1.limits_deg", "takes limits_m"),
     ("robot.dh.joints.0.limits_rad=[0, 1]", "robot.dh.joints.0.limits_rad", "keep one"),
     (f"robot.screws={{reference: {{joints: [0, 0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}", "robot",
-     "exactly one of dh, screws and"),
+     "exactly one of dh, screws"),
     (f"robot={{screws: {{reference: {{joints: [0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}}}",
      "robot.screws.reference.joints", "1 values for 2 joints"),
     ("robot=null", "robot", "a simulated run needs it"),

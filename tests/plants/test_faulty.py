@@ -8,7 +8,7 @@ import pytest
 from projservo_cli.config.models import Disturbance
 from projservo_cli.records import REVOLUTE
 from projservo_cli.robots.simulated import Arm
-from projservo_cli.stages.simulation import FaultyRobot, World, full_reach
+from projservo_cli.stages.simulation import FaultyRobot, Points, World, full_reach
 from projservo_cli.stages.world import Truth
 from tests.samples import displacement, pixels, revolute, rig
 
@@ -41,7 +41,7 @@ def images(q, M=M):
 
 def robot(sigma_px=0.0, seed=1, q_start=(0.0, 0.0), **disturbance):
     truth = Truth(arm(), CAMERAS, M, (0, 1, 2), (), 0, np.full(2, math.inf))
-    world = World(truth, np.array(q_start), truth.images, True, sigma_px, PERIOD, seed, 0)
+    world = World(truth, np.array(q_start), Points(truth, truth.images, True, sigma_px), PERIOD, seed, 0)
     return FaultyRobot(world, Disturbance.model_validate(disturbance))
 
 
