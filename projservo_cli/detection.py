@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import map_coordinates
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from projservo_cli.records import FloatArray, InputError, Observation, WorkFailed
+from projservo_cli.records import ByteArray, FloatArray, InputError, Observation, WorkFailed
 from projservo_cli.tables import JointList
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
@@ -235,7 +234,7 @@ class TagFinder:
             raise InputError(f"{path}: not an image that OpenCV can read; save it again, as PNG for example")
         return np.asarray(image, dtype=np.float64)
 
-    def picture(self, number: int, cell_px: int) -> npt.NDArray[np.uint8]:
+    def picture(self, number: int, cell_px: int) -> ByteArray:
         """Grey values of a tag with its bright margin of one cell, in cells of so many px.
 
         Raises InputError where the dictionary has no such tag.

@@ -4,14 +4,12 @@ import copy
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from projservo_cli.config.markers import CORNERS
-from projservo_cli.records import FloatArray, InputError
+from projservo_cli.records import ByteArray, FloatArray, InputError
 from projservo_cli.rendered.scene import CAMERAS, Scene, drawn_at, lens_of
 from projservo_cli.robots.described import mujoco, no_gl
 
-GreyImage = npt.NDArray[np.uint8]
 _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 
 
@@ -27,7 +25,7 @@ class Frames:
         self._scene, self._finder, self._options = scene, scene.finder, scene.options
         self._places = {number: i for i, number in enumerate(scene.numbers)}
         width, height = scene.size
-        self.last: GreyImage = np.zeros((2, height, width), dtype=np.uint8)
+        self.last: ByteArray = np.zeros((2, height, width), dtype=np.uint8)
         self._maps = self._mapped(scene.P)
         self._renderer: Any = None
 
@@ -82,7 +80,7 @@ class Frames:
                     pixels[place] = corners[k]
         return pixels
 
-    def _drawn(self, view: int, q: FloatArray) -> GreyImage:
+    def _drawn(self, view: int, q: FloatArray) -> ByteArray:
         """Grey values (height, width) of what a camera sees at joints (n,), without lens and noise."""
         mj = mujoco()
         self._data.qpos[self._scene.places] = q

@@ -20,8 +20,8 @@ from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import Disturbance, FrozenJoint, LostMarkers, RenderedOptions
 from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.geometry.kinematics import joint_operators
-from projservo_cli.records import PRISMATIC, FloatArray
-from projservo_cli.rendered.frames import Frames, GreyImage
+from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
+from projservo_cli.rendered.frames import Frames
 from projservo_cli.rendered.physics import Physics
 from projservo_cli.rendered.scene import Scene, scene_of
 from projservo_cli.robots.simulated import Arm
@@ -237,7 +237,7 @@ class FaultyRobot:
         return self._joints.times[-1]
 
     @property
-    def frames(self) -> GreyImage | None:
+    def frames(self) -> ByteArray | None:
         """The last frames of both cameras as they were searched, where they are rendered."""
         return self.world.eyes.last if isinstance(self.world.eyes, Frames) else None
 
