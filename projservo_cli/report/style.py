@@ -198,15 +198,23 @@ def aspect(pixels: FloatArray, least: float = 0.3, most: float = 1.1) -> float:
 
 
 def log_scale(axes: "Axes") -> None:
-    """Logarithmic vertical scale with plain powers of ten as labels, about five of them."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+    """Logarithmic vertical scale with plain powers of ten as labels, about five of them.
+
+    Where it shows fewer than two of them, there are numbers between.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    def between(value: float, _: object) -> str:
+        low, high = np.log10(axes.get_ylim())
+        few = np.floor(high) - np.ceil(low) < 1.0
+        return f"{value:g}" if few and f"{value:e}"[0] in "235" else ""
 
     axes.set_yscale("log", nonpositive="clip")
     axes.yaxis.set_major_locator(LogLocator(numticks=5))
     axes.yaxis.set_major_formatter(
         FuncFormatter(lambda value, _: power_of_ten(round(float(np.log10(value)))))
     )
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.yaxis.set_minor_formatter(FuncFormatter(between))
 
 
 def power_of_ten(exponent: int) -> str:

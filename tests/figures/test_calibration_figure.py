@@ -3,6 +3,7 @@ import dataclasses
 import numpy as np
 import pytest
 from matplotlib.container import BarContainer
+from scipy.linalg import sqrtm
 
 from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.config import load_config, to_yaml
@@ -190,3 +191,19 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
         spec.name for spec in SPECS.values() if spec.task and not spec.frames
     ]
     assert all("task" in entry["reason"] for entry in made.left_out)
+
+
+def test_with_joint_noise_residuals_are_drawn_as_they_are_tested():
+    material = case()[2]
+    calibration = dataclasses.replace(material.calibration, sigma_q=2e-3)
+    data = SPECS["fig13_calibration"].data(dataclasses.replace(material, calibration=calibration))
+    sigma, expected, h = calibration.sigma_px, [], 1e-6
+    for q, seen in zip(material.observation.q, material.observation.images, strict=True):
+        moved = [predict(calibration, np.stack([q + h * e, q - h * e])) for e in np.eye(6)]
+        G = np.stack([(ahead - behind).ravel() for ahead, behind in moved], axis=1) / (2.0 * h) * 2e-3
+        r = (seen - predict(calibration, q[None])[0]).ravel()
+        expected.append(sigma * np.linalg.solve(sqrtm(sigma**2 * np.eye(len(r)) + G @ G.T), r))
+    assert data["residual"] == pytest.approx(np.concatenate(expected), abs=1e-5)
+    plain = SPECS["fig13_calibration"].data(material)
+    assert (data["pose_predicted_px"] < plain["pose_predicted_px"]).all()
+    assert np.isfinite(data["residual"]).all()

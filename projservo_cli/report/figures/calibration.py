@@ -6,6 +6,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration import predict, prediction_variance
+from projservo_cli.calibration.joint_noise import unit_noise
+from projservo_cli.calibration.prediction import covariance_root, joint_derivative, prediction_derivative
 from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
@@ -29,7 +31,10 @@ def _data(fit: Fit) -> Data:
     read: BoolArray = np.all(np.isfinite(seen), axis=-1)
     out = left_out | ~np.isfinite(predicted).all(axis=-1)
     used = read & ~out
-    residual = seen - predicted
+    residual, variance = seen - predicted, prediction_variance(calibration, observation.q)
+    weighed = calibration.sigma_q or observation.sigma is not None
+    if weighed:
+        residual, variance = _as_tested(fit, residual, used)
     result: Data = {
         "sigma_px": np.array(calibration.sigma_px),
         "chi2_per_dof": np.array(calibration.chi2_per_dof),
@@ -40,9 +45,10 @@ def _data(fit: Fit) -> Data:
         "parameters": np.array(len(calibration.covariance)),
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
+        "weighed": np.array(bool(weighed)),
     }
     if fit.held_out is None:
-        result |= _by_pose(used, residual, prediction_variance(calibration, observation.q))
+        result |= _by_pose(used, residual, variance)
     else:  # from fits that have not seen the pose; predicted with the noise of the held-out reading
         predictable: BoolArray = np.all(np.isfinite(fit.held_out.residual), axis=-1)
         result |= _by_pose(predictable, fit.held_out.residual, fit.held_out.predicted**2)
@@ -57,13 +63,39 @@ def _data(fit: Fit) -> Data:
     return result
 
 
+def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals (K, 2, m, 2), px, that are to scatter as the noise model, and the variance of predictions.
+
+    Those of a pose, weighed where their deviations are stated, have the covariance S = σ² (I + G Gᵀ), with G
+    the derivative by the joints times their noise over σ. With G = U s Vᵀ, σ S^-½ takes the share
+    1 − (1 + s²)^-½ from what lies along U.
+    """
+    calibration, q = fit.calibration, fit.observation.q
+    weight = np.ones(used.shape)
+    if (stated := fit.observation.sigma) is not None:
+        stated = stated[:, :, _columns(calibration, fit.observation)]
+        weight[used] = np.sqrt(np.mean(stated[used] ** 2)) / stated[used]
+    prismatic = np.array([letter == "P" for letter in calibration.joint_types])
+    noise = (calibration.sigma_q or 0.0) * unit_noise(prismatic) / calibration.sigma_px
+    G = weight[..., None, None] * joint_derivative(calibration, q) * noise
+    root = np.full((*residual.shape, 1), np.nan)  # of a method without covariance
+    if np.isfinite(calibration.covariance).all():
+        root = prediction_derivative(calibration, q) @ covariance_root(calibration.covariance)
+    both = np.concatenate([residual[..., None], root], axis=-1) * weight[..., None, None]
+    for k, of_pose in enumerate(used):
+        U, s, _ = np.linalg.svd(G[k][of_pose].reshape(-1, len(q[k])), full_matrices=False)
+        rows = both[k][of_pose].reshape(len(U), -1)
+        rows -= U @ ((1.0 - 1.0 / np.sqrt(1.0 + s**2))[:, None] * (U.T @ rows))
+        both[k][of_pose] = rows.reshape(-1, 2, rows.shape[1])
+    return both[..., 0], (both[..., 1:] ** 2).sum(axis=-1)
+
+
 def _readings(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
     """Pixels (K, 2, m, 2) of the calibrated markers, and which of them (K, 2, m) the fit left out.
 
     Those are outliers, poses whose joints are in doubt, and markers that were read under another number.
     """
-    column = {int(number): j for j, number in enumerate(observation.marker)}
-    seen = observation.images[:, :, [column[int(number)] for number in calibration.marker]]
+    seen = observation.images[:, :, _columns(calibration, observation)]
     out = np.zeros(seen.shape[:3], dtype=np.bool_)
     out[np.isin(observation.pose, calibration.suspect[:, 0])] = True
     renamed = ((pose, number, _BOTH) for pose, number, _ in calibration.swapped)
@@ -71,6 +103,11 @@ def _readings(calibration: Calibration, observation: Observation) -> tuple[Float
         views = np.array([view != _RIGHT, view in (_RIGHT, _BOTH)])
         out |= (observation.pose == pose)[:, None, None] & views[:, None] & (calibration.marker == number)
     return seen, out
+
+
+def _columns(calibration: Calibration, observation: Observation) -> list[int]:
+    """Index of each calibrated marker among those of an observation."""
+    return [observation.marker.tolist().index(number) for number in calibration.marker.tolist()]
 
 
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
@@ -170,7 +207,8 @@ def _histogram(axes: "style.Axes", data: Data) -> None:
     x = np.linspace(-widest, widest, 401)
     axes.plot(x, np.exp(-0.5 * (x / sigma) ** 2) / (sigma * np.sqrt(2.0 * np.pi)), **_MODEL)
     title = f"noise model {sigma:.3g} px, χ²/dof {float(data['chi2_per_dof']):.3g}"
-    axes.set(title=title, xlabel="residual (px)", ylabel="density (1/px)")
+    label = "residual, as tested (px)" if data["weighed"] else "residual (px)"
+    axes.set(title=title, xlabel=label, ylabel="density (1/px)")
 
 
 def _poses(axes: "style.Axes", data: Data) -> None:

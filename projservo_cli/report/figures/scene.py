@@ -109,7 +109,8 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     for name, (a, b) in zip("xyz", extent, strict=True):
         getattr(axes, f"set_{name}lim")(a, b)
         getattr(axes, f"set_{name}label")(f"{name} (m)", labelpad=1 if name == "z" else 10)
-        getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(0.25 if b - a < 0.75 else 0.5))
+        step = next(step for step, most in ((0.1, 0.4), (0.25, 0.75), (0.5, np.inf)) if b - a < most)
+        getattr(axes, f"{name}axis").set_major_locator(MultipleLocator(step))
     axes.tick_params(pad=0)
     towards = data["cameras"].mean(axis=0) - points.mean(axis=0)  # from the side of the rig
     axes.view_init(elev=22, azim=float(np.degrees(np.arctan2(towards[1], towards[0]))) - 62)
