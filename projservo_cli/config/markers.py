@@ -119,6 +119,13 @@ class Markers(Section):
         return None if self.positions_m is None else np.array(self.positions_m)
 
     @property
+    def normals(self) -> FloatArray | None:
+        """Directions (m, 3) that corners of tags look in, in the frame of the tool; None for other markers."""
+        if self.tags is None:
+            return None
+        return np.repeat([np.array(tag.pose)[:3, 2] for tag in self.all_tags], CORNERS, axis=0)
+
+    @property
     def known(self) -> tuple[int, ...] | None:
         """Numbers of all markers, in the order of ``points``; None where a table will tell."""
         if self.tags is not None:
@@ -132,9 +139,11 @@ class Markers(Section):
         """Numbers of the face: those given, else of the tag that looks most where all of them look."""
         if self.face is not None or self.tags is None:
             return self.face
-        normals = np.array([np.array(tag.pose)[:3, 2] for tag in self.all_tags])
-        first = CORNERS * self.all_tags[int(np.argmax((normals @ normals.sum(axis=0)).round(6)))].number
-        return tuple(range(first, first + CORNERS))
+        normals, known = self.normals, self.known
+        assert normals is not None
+        assert known is not None
+        first = int(np.argmax((normals @ normals.sum(axis=0)).round(6)))
+        return known[first : first + CORNERS]
 
     def contradictions(self) -> Iterator[Finding]:
         """Markers said twice; numbers that are missing, strange or given twice."""

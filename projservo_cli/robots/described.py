@@ -86,9 +86,7 @@ def chain_of(model: Any, tip: str, where: str) -> list[int]:
     for joint in chain:
         if mj.mjtJoint(int(model.jnt_type[joint])) not in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE):
             name = model.joint(joint).name or joint
-            raise InputError(
-                f"{where}: joint {name}, on the way to {tip}, neither turns nor slides about one axis"
-            )
+            raise InputError(f"{where}: joint {name}, on the way to {tip}, has more than one axis")
     if not chain:
         raise InputError(f"{where}: no joint moves body {tip}; bodies: {_listed(names)}")
     return chain
@@ -134,16 +132,17 @@ def read_urdf(path: str, tip: str, text: str) -> dict[str, Any]:
     if tip not in links and tip not in above:
         raise InputError(f"{path}: there is no link {tip}; links: {_listed(links)}")
     chain: list[ET.Element] = []
-    while tip in above:
-        chain.insert(0, above.pop(tip))
-        tip = _of(chain[0], "parent", "link", "", path)
+    link = tip
+    while link in above:
+        chain.insert(0, above.pop(link))
+        link = _of(chain[0], "parent", "link", "", path)
     T, joints = np.eye(4), []
     for joint in chain:
         T = T @ _origin(joint, path)
         name, kind = joint.get("name", ""), joint.get("type", "")
         if joint.find("mimic") is not None:
             raise InputError(
-                f"{path}: joint {name} mimics another: such a chain is not of independent joints"
+                f"{path}: joint {name} mimics another, and only joints that move alone are taken"
             )
         if kind == "fixed":
             continue
@@ -203,10 +202,10 @@ def _numbers(joint: ET.Element, tag: str, key: str, default: str, path: str) -> 
         values = np.array([float(part) for part in told.split()])
     except ValueError:
         values = np.array([math.nan])
-    if len(values) != len(default.split()) or not np.isfinite(values).all():
-        raise InputError(
-            f"{path}: joint {joint.get('name', '')}: {key} of its {tag}, {told!r}, is not as it must be"
-        )
+    many = len(default.split())
+    if len(values) != many or not np.isfinite(values).all():
+        name = joint.get("name", "")
+        raise InputError(f"{path}: joint {name}: {key} of its {tag} is {told!r}: expected {many} numbers")
     return values
 
 

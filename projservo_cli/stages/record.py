@@ -39,15 +39,8 @@ from projservo_cli.tables import JointList, read_table, recording_of, write_tabl
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
 DEPENDS_ON = (
-    *(
-        "seed",
-        "robot",
-        "rig",
-        "markers.positions_m",
-        "markers.numbers",
-        "markers.tags",
-        "noise.calibration_px",
-    ),
+    *("seed", "robot", "rig", "markers.positions_m", "markers.numbers", "noise.calibration_px"),
+    *("markers.tags", "markers.tag_size_m", "markers.dictionary"),
     *("plant.use", "plant.options", "plant.frames", "plant.settle_s"),
     *(f"disturbance.{name}" for name in FAULTS),
 )
@@ -56,10 +49,10 @@ _SLACK = 1e-3  # rad or m; how far beyond its sag a reading may be from where th
 _MOST_MOVING = 200  # frames on the way in a table
 
 # Random poses where not given; how far trials are spread, rad, so that no reading repeats its error:
-# a tick of a coarse encoder, 4,096 a turn. Draws of one pose, of which each reaches less far, and the share
-# of markers that both cameras must see.
+# a tick of a coarse encoder, 4,096 a turn. Draws of one pose, of which each reaches less far, and the shares
+# of markers that must be within both images, and look towards both cameras.
 _RANDOM_POSES, _TICKS = 12, 4096
-_DRAWS, _SHRINKING, _LEAST_SEEN = 100, 0.98, 0.75
+_DRAWS, _SHRINKING, _LEAST_SEEN, _LEAST_FACING = 100, 0.98, 0.75, 0.5
 
 
 @dataclass
@@ -190,7 +183,8 @@ def _random_pose(
             continue
         if truth is None:
             return q
-        if np.isfinite(_images_at(truth, q, 0.0)).all(axis=(0, 2)).mean() >= _LEAST_SEEN:
+        inside = np.isfinite(_images_at(truth, q, 0.0)).all(axis=(0, 2))
+        if inside.mean() >= _LEAST_SEEN and truth.faces(q).all(axis=0).mean() >= _LEAST_FACING:
             return q
     return reference
 
@@ -242,7 +236,7 @@ def new_recording(
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
     plant = config.plant.use or "simulated"
-    key = f"{plant} {digest(config, DEPENDS_ON)[:16]}"
+    key = f"{plant} {digest(config, DEPENDS_ON, without=('robot.mjcf',))[:16]}"
     recording = _Recording(path, key, targets, np.array(numbers, dtype=np.int64))
     if path.exists() and force:
         return replace(recording, why="asked for by --force")

@@ -38,10 +38,16 @@ _DEPENDS_ON: dict[str, tuple[str, ...]] = {
 # Where a file lies does not matter, only what it says. Which laws are run, in which modes, and which of
 # them must converge, changes the run of none of them.
 _NOT_HASHED: dict[str, tuple[str, ...]] = {
-    "calibrate": ("data.table", "calibration.init"),
-    "plan": ("data.table",),
-    "servo": ("data.table", "control.laws", "control.mode", "control.must_converge"),
+    "calibrate": ("data.table", "calibration.init", "robot.mjcf"),
+    "plan": ("data.table", "robot.mjcf"),
+    "servo": ("data.table", "robot.mjcf", "control.laws", "control.mode", "control.must_converge"),
     "report": ("data.table",),
+}
+# What files that are read hold.
+_EXPECTED = {
+    "table": "a table",
+    "init": "JSON with screws, cameras and markers",
+    "mjcf": "a model of MuJoCo",
 }
 
 
@@ -96,6 +102,8 @@ def steps_for(
 
 def key_of(config: Config, stage: str, **before: Any) -> str:
     """Hash of what a stage depends on: of the configuration, and of JSON values on what it is made from."""
+    if config.plant.rendered is not None and stage in ("calibrate", "plan"):
+        before["options"] = config.plant.rendered.model_dump()  # by which images look
     return digest(config, _DEPENDS_ON[stage], without=_NOT_HASHED[stage], extra=before)
 
 
@@ -110,6 +118,7 @@ def _needed(
 ) -> Iterator[Step]:
     """Every result of the stages with its key, each made from those before."""
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
+    before += [inputs["mjcf_sha256"]] if "mjcf" in inputs else []
     for stage in stages:
         keys = []
         for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
@@ -121,6 +130,8 @@ def _needed(
 def _file_hashes(config: Config, run: Run) -> dict[str, str]:
     """Hashes of the files that are read; the stored one where that very file is gone since."""
     files = {"table": config.data.table if config.data is not None else None, "init": config.calibration.init}
+    if config.plant.rendered is not None and config.arm is not None:
+        files["mjcf"] = config.arm.mjcf
     stored = run.results["calibrate"].inputs if "calibrate" in run.results else {}
     found: dict[str, str] = {}
     for name, given in files.items():
@@ -133,8 +144,7 @@ def _file_hashes(config: Config, run: Run) -> dict[str, str]:
         try:
             found |= {name: given, digested: hashlib.sha256(Path(given).read_bytes()).hexdigest()}
         except OSError as error:
-            expected = "a table" if name == "table" else "JSON with screws, cameras and markers"
-            what = f"cannot be read: {error.strerror or error}; expected {expected}"
+            what = f"cannot be read: {error.strerror or error}; expected {_EXPECTED[name]}"
             raise InputError(f"{given}: {what}") from error
     return found
 

@@ -19,6 +19,7 @@ from projservo_cli.records import (
     NO_LENS,
     PRISMATIC,
     REVOLUTE,
+    BoolArray,
     Calibration,
     FloatArray,
     InputError,
@@ -26,7 +27,7 @@ from projservo_cli.records import (
     WorkFailed,
 )
 from projservo_cli.rendered.scene import lens_of
-from projservo_cli.robots.simulated import Arm, Ends, roll_axis
+from projservo_cli.robots.simulated import Arm, Ends, camera_center, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
 
 
@@ -134,6 +135,9 @@ def image_size_of(config: Config) -> tuple[int, int] | None:
     return config.rig.image_size_px if config.rig is not None else None
 
 
+_EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found
+
+
 @dataclass(frozen=True, eq=False)
 class Truth:
     """Robot, rig and markers as they are."""
@@ -146,6 +150,8 @@ class Truth:
     center: int  # position of the centre marker within the face, or ``MIDPOINT``
     image_size: FloatArray  # (2,) px
     lens: FloatArray = field(default_factory=NO_LENS.copy)  # (2, 5) true lenses
+    # (m, 3) directions that markers look in at the robot's reference; zero where they are seen from anywhere
+    normals: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @cached_property
     def model(self) -> Model:
@@ -175,6 +181,13 @@ class Truth:
     def images(self, q: FloatArray, M: FloatArray) -> FloatArray:
         """True pixels (2, k, 2) of markers M (k, 4), given at the reference, at the joints q (n,)."""
         return project(self.P, M @ self.displacement(q).T, self.lens)
+
+    def faces(self, q: FloatArray) -> BoolArray:
+        """Whether markers look towards each camera (2, m) at the joints q (n,), and are not seen edge-on."""
+        H = self.displacement(q)
+        away = np.array([camera_center(camera) for camera in self.P])[:, None] - (self.M @ H.T)[:, :3]
+        towards = (away * (self.normals @ H[:3, :3].T)).sum(axis=2) / np.linalg.norm(away, axis=2)
+        return np.asarray((towards > _EDGE_ON) | ~self.normals.any(axis=-1))
 
     def displacement(self, q: FloatArray) -> FloatArray:
         """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
@@ -242,6 +255,7 @@ def _built(described: RobotSettings, rig: Rig, markers: Markers, k1: float) -> T
         center_index(markers),
         np.array(rig.image_size_px, dtype=np.float64),
         lens_of(P, k1) if k1 else NO_LENS,
+        np.zeros(3) if markers.normals is None else markers.normals @ robot.base_tool[:3, :3].T,
     )
 
 
