@@ -120,7 +120,7 @@ class Markers(Section):
 
     @property
     def normals(self) -> FloatArray | None:
-        """Directions (m, 3) that corners of tags look in, in the frame of the tool; None for other markers."""
+        """Directions (m, 3) that corners of tags look in, in the frame of the tool; None for others."""
         if self.tags is None:
             return None
         return np.repeat([np.array(tag.pose)[:3, 2] for tag in self.all_tags], CORNERS, axis=0)

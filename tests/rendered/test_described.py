@@ -7,9 +7,13 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
+from projservo_cli.robots import described
 from projservo_cli.stages.world import arm_of
 
-mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed: pip install 'projservo[mujoco]'")
+try:
+    mujoco = described.mujoco()
+except InputError as error:
+    pytest.skip(str(error), allow_module_level=True)
 
 URDF = """<robot name="arm">
   <link name="world"/>
