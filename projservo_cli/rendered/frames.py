@@ -16,13 +16,13 @@ _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 class Frames:
     """Both cameras of a scene, which a thread opens, looks with and closes.
 
-    ``last``: (2, height, width) the last frames of both, as they were searched.
+    ``scene``: what they see. ``last``: (2, height, width) the last frames of both, as they were searched.
     """
 
     borders = True
 
     def __init__(self, scene: Scene) -> None:
-        self._scene, self._finder, self._options = scene, scene.finder, scene.options
+        self.scene, self._finder, self._options = scene, scene.finder, scene.options
         self._places = {number: i for i, number in enumerate(scene.numbers)}
         width, height = scene.size
         self.last: ByteArray = np.zeros((2, height, width), dtype=np.uint8)
@@ -31,7 +31,7 @@ class Frames:
 
     def open(self) -> None:
         """Make ready to draw, in the thread that looks; an InputError says what to install for that."""
-        mj, scene = mujoco(), self._scene
+        mj, scene = mujoco(), self.scene
         height, width = self.last.shape[1] + 2 * scene.margin, self.last.shape[2] + 2 * scene.margin
         try:
             self._renderer = mj.Renderer(scene.model, height, width)
@@ -83,7 +83,7 @@ class Frames:
     def _drawn(self, view: int, q: FloatArray) -> ByteArray:
         """Grey values (height, width) of what a camera sees at joints (n,), without lens and noise."""
         mj = mujoco()
-        self._data.qpos[self._scene.places] = q
+        self._data.qpos[self.scene.places] = q
         mj.mj_kinematics(self._model, self._data)
         mj.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
@@ -92,19 +92,19 @@ class Frames:
 
     def _move(self, moved: tuple[int, FloatArray] | None) -> None:
         """Put every plate where it is, but for one that was moved."""
-        self._model.geom_pos[:] = self._scene.model.geom_pos
+        self._model.geom_pos[:] = self.scene.model.geom_pos
         if moved is not None:
-            plate = self._scene.plates[self._places[moved[0]] // CORNERS]
-            self._model.geom_pos[list(plate)] += self._scene.tool @ moved[1]
+            plate = self.scene.plates[self._places[moved[0]] // CORNERS]
+            self._model.geom_pos[list(plate)] += self.scene.tool @ moved[1]
 
     def _mapped(self, P: FloatArray) -> list[tuple[FloatArray, FloatArray]] | None:
         """Where each pixel of a frame is in what is drawn, u and v (height, width) of each view, px."""
-        width, height = self._scene.size
+        width, height = self.scene.size
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
         pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
         lens = lens_of(P, self._options.k1)
         drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
         if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
             return None
-        maps = (drawn + self._scene.margin).reshape(2, height, width, 2).astype(np.float32)
+        maps = (drawn + self.scene.margin).reshape(2, height, width, 2).astype(np.float32)
         return [(np.ascontiguousarray(both[..., 0]), np.ascontiguousarray(both[..., 1])) for both in maps]
