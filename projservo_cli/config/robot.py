@@ -254,7 +254,7 @@ class RobotSettings(Section):
         None, description="instead: a model of MuJoCo, drawn and moved as it is by the plant mujoco"
     )
     urdf: _File | None = Field(None, description="instead: a URDF, of which the screws alone are taken")
-    tip: str | None = Field(None, description="body of mjcf or link of urdf whose frame is that of the tool")
+    tip: str | None = Field(None, description="body or site of mjcf, or link of urdf, that is the tool")
     limits: _Limits | None = Field(None, description="joint limits, where neither dh nor screws are given")
 
     @property

@@ -15,7 +15,7 @@ from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
-from projservo_cli.robots.described import chain_of, compiled, mujoco, spec_of
+from projservo_cli.robots.described import chain_of, compiled, mujoco, spec_of, tip_of
 from projservo_cli.robots.simulated import Arm, roll_axis
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
@@ -26,7 +26,7 @@ _TOOL_DENSITY = 500.0  # kg/m³
 _SIDES = ("front", "back")  # of a plate: the tag, and what hides it from behind
 _CELL_PX = 16  # of the picture of a tag
 # Inertia of rotors of joints without, kg m² or kg: at most, and as a share of that of the heaviest joint.
-_ARMATURE, _ARMATURE_SHARE = 0.1, 0.02
+_ARMATURE, _ARMATURE_SHARE = 0.1, 0.05
 _SENSOR_M = 1e-5  # width of a pixel of a camera's sensor; only ratios to it matter
 _NO_SKEW = 1e-9  # of a camera's pixels, which rounding leaves
 _NEAR_M, _FAR_M = 0.01, 50.0  # what cameras see
@@ -97,12 +97,16 @@ def scene_of(
     Raises InputError if MuJoCo or OpenCV is missing, or the scene cannot be made.
     """
     mj, finder = mujoco(), TagFinder(markers.dictionary)
-    spec = mj.MjSpec() if robot.mjcf is None else spec_of(robot.mjcf)
-    where = robot.mjcf or "the arm"
+    spec, where = mj.MjSpec() if robot.mjcf is None else spec_of(robot.mjcf), robot.mjcf or "the arm"
     if robot.mjcf is None:
-        tip, tool = _add_arm(spec, arm), arm.base_tool
+        _add_arm(spec, arm)
+    bare = compiled(spec, where)
+    if robot.mjcf is None:
+        holder, tool = bare.nbody - 1, arm.base_tool
     else:
-        tip, tool = spec.body(robot.tip), np.eye(4)
+        holder, tool = tip_of(bare, robot.tip or "", where)
+    joints = np.array(chain_of(bare, holder, where))
+    tip = next(body for body in spec.bodies if body.id == holder)
     _add_tags(spec, tip, tool, markers.all_tags, finder)
     _put_light(spec, options.light, P)
     K, R, t = (np.array(parts) for parts in zip(*map(decomposed, P), strict=True))
@@ -111,10 +115,9 @@ def scene_of(
     K_wide = K + margin * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
     _add_cameras(spec, K_wide, R, t, (width + 2 * margin, height + 2 * margin))
     model = compiled(spec, where)
-    joints = np.array(chain_of(model, tip.name, where))
     rates = model.jnt_dofadr[joints]
-    bare = rates[model.dof_armature[rates] == 0.0]
-    model.dof_armature[bare] = min(_ARMATURE, _ARMATURE_SHARE * float(model.dof_M0[rates].max()))
+    light = rates[model.dof_armature[rates] == 0.0]
+    model.dof_armature[light] = min(_ARMATURE, _ARMATURE_SHARE * float(model.dof_M0[rates].max()))
     mj.mj_setConst(model, mj.MjData(model))
     plates = tuple(tuple(model.geom(_name(tag, side)).id for side in _SIDES) for tag in markers.all_tags)
     assert markers.known is not None
@@ -134,8 +137,8 @@ def scene_of(
     )
 
 
-def _add_arm(spec: Any, arm: Arm) -> Any:
-    """Add an arm of capsules, and return its last body.
+def _add_arm(spec: Any, arm: Arm) -> None:
+    """Add an arm of capsules.
 
     Every body has the axes of the base at the reference, where joints have their readings; a link reaches
     from the point of one joint's axis that is nearest to the link before to that of the next.
@@ -169,7 +172,6 @@ def _add_arm(spec: Any, arm: Arm) -> Any:
             body.add_geom(type=mj.mjtGeom.mjGEOM_CAPSULE, size=[radius, 0, 0], fromto=ends, **looks)
         else:
             body.add_geom(type=mj.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=points[i], **looks)
-    return body
 
 
 def _name(tag: Tag, side: str) -> str:

@@ -68,16 +68,31 @@ def _line(error: BaseException) -> str:
     return " ".join(str(error).split())[:300]
 
 
-def chain_of(model: Any, tip: str, where: str) -> list[int]:
+def tip_of(model: Any, tip: str, where: str) -> tuple[int, FloatArray]:
+    """Body of a compiled MJCF that holds a tip, by its number, and the pose (4, 4) of the tip in it, m.
+
+    tip : a body, or a site on one. Raises InputError if there is none of this name.
+    """
+    mj, pose = mujoco(), np.eye(4)
+    body = int(mj.mj_name2id(model, mj.mjtObj.mjOBJ_BODY, tip))
+    if body > 0:
+        return body, pose
+    site = int(mj.mj_name2id(model, mj.mjtObj.mjOBJ_SITE, tip))
+    if site < 0:
+        bodies = _listed([model.body(i).name for i in range(1, model.nbody)])
+        sites = _listed([model.site(i).name for i in range(model.nsite)])
+        raise InputError(f"{where}: there is no body {tip}; bodies: {bodies}; sites: {sites or 'none'}")
+    pose[:3, :3] = Rotation.from_quat(model.site_quat[site], scalar_first=True).as_matrix()
+    pose[:3, 3] = model.site_pos[site]
+    return int(model.site_bodyid[site]), pose
+
+
+def chain_of(model: Any, body: int, where: str) -> list[int]:
     """Joints of a compiled MJCF from its base to a body, by their numbers.
 
-    Raises InputError if there is no such body, no joint moves it, or one neither turns nor slides.
+    Raises InputError if no joint moves it, or one neither turns nor slides.
     """
-    mj = mujoco()
-    names = [model.body(i).name for i in range(1, model.nbody)]
-    if tip not in names:
-        raise InputError(f"{where}: there is no body {tip}; bodies: {_listed(names)}")
-    body = model.body(tip).id
+    mj, told = mujoco(), model.body(body).name
     chain: list[int] = []
     while body:
         first = int(model.body_jntadr[body])
@@ -86,20 +101,21 @@ def chain_of(model: Any, tip: str, where: str) -> list[int]:
     for joint in chain:
         if mj.mjtJoint(int(model.jnt_type[joint])) not in (mj.mjtJoint.mjJNT_HINGE, mj.mjtJoint.mjJNT_SLIDE):
             name = model.joint(joint).name or joint
-            raise InputError(f"{where}: joint {name}, on the way to {tip}, has more than one axis")
+            raise InputError(f"{where}: joint {name}, on the way to {told}, has more than one axis")
     if not chain:
-        raise InputError(f"{where}: no joint moves body {tip}; bodies: {_listed(names)}")
+        raise InputError(f"{where}: no joint moves body {told}")
     return chain
 
 
 def read_mjcf(path: str, tip: str) -> dict[str, Any]:
-    """Screws of the joints of an MJCF file from its base to a body, as ``robot.screws`` takes them.
+    """Screws of the joints of an MJCF file from its base to a body or site, as ``robot.screws`` takes them.
 
-    Raises InputError as of ``chain_of``, or if there is no such file.
+    Raises InputError as of ``tip_of`` and ``chain_of``, or if there is no such file.
     """
     mj = mujoco()
     model = compiled(spec_of(path), path)
-    chain, data = chain_of(model, tip, path), mj.MjData(model)
+    body, held = tip_of(model, tip, path)
+    chain, data = chain_of(model, body, path), mj.MjData(model)
     mj.mj_kinematics(model, data)
     joints = []
     for i in chain:
@@ -108,9 +124,8 @@ def read_mjcf(path: str, tip: str) -> dict[str, Any]:
         kind = "P" if slides else "R"
         joints.append(_joint(kind, model.joint(i).name, data.xaxis[i], data.xanchor[i], limits))
     tool = np.eye(4)
-    body = model.body(tip).id
     tool[:3, :3], tool[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
-    return _screws(joints, model.qpos0[model.jnt_qposadr[chain]], tool)
+    return _screws(joints, model.qpos0[model.jnt_qposadr[chain]], tool @ held)
 
 
 def read_urdf(path: str, tip: str, text: str) -> dict[str, Any]:

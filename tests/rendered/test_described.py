@@ -9,6 +9,7 @@ from projservo_cli.config import load_config
 from projservo_cli.records import InputError
 from projservo_cli.robots import described
 from projservo_cli.stages.world import arm_of
+from tests.samples import displacement
 
 try:
     mujoco = described.mujoco()
@@ -56,7 +57,7 @@ MJCF = """<mujoco><compiler angle="radian"/><worldbody>
       <body name="finger"><joint name="grip" type="slide"/><geom size="0.02"/></body>
       <body name="fore" pos="0.3 0 0">
         <joint type="slide" axis="0 0 1" range="-0.1 0.2"/><geom size="0.05"/>
-        <body name="hand" pos="0.1 0 0.05" quat="0.5 0.5 -0.5 0.5"/>
+        <body name="hand" pos="0.1 0 0.05" quat="0.5 0.5 -0.5 0.5"><site name="flange" pos="0 0.1 0"/></body>
       </body>
     </body>
   </body>
@@ -102,6 +103,8 @@ def test_an_mjcf_moves_as_mujoco_has_it(tmp_path, rng):
     model = mujoco.MjModel.from_xml_string(MJCF)
     expected = poses(model, "hand", ["b", "a", model.nu + 4], readings)
     assert np.array([arm.pose(q) for q in readings]) == pytest.approx(expected, abs=1e-12)
+    at_site = arm_of(configured(tmp_path, "mjcf", MJCF, "flange"))
+    assert at_site.base_tool == pytest.approx(arm.base_tool @ displacement([0, 0, 0], [0, 0.1, 0]), abs=1e-12)
     assert config.joint_types == "RRP"
     assert arm.q_reference.tolist() == [0.2, 0.0, 0.0]
     assert arm.lower.tolist() == [-1.0, -math.inf, -0.1]

@@ -123,3 +123,29 @@ def test_what_cannot_drive_a_joint_is_named(tmp_path):
             driven(described(tmp_path, "muscle"), Q)
     finally:
         del SERVOS["muscle"]
+
+
+@pytest.mark.usefixtures("needs_mujoco")
+def test_a_real_arm_with_its_meshes(shared_data, small, drawn):
+    """Its own servos hold it with an error of their stiffness; drawn, it does not hide its tags."""
+    file = shared_data / "robots" / "ur5e" / "ur5e.xml"
+    if not file.is_file():
+        pytest.skip(f"{file} is not there: the model of the arm is not shipped")
+    q = np.array([-1.5708, -1.2, 1.5, -1.9, -1.5708, 0.4])
+    camera = "focal_px: [300, 300], principal_point_px: [160, 120], target_m: [0.49, 0.2, 0.6]"
+    config = small(
+        f"robot={{mjcf: {file}, tip: attachment_site}}",
+        f"rig.left={{{camera}, position_m: [0.4, 0.4, -0.4]}}",
+        f"rig.right={{{camera}, position_m: [0.6, 0.4, -0.4]}}",
+        f"task={{start: {{joints: {q.tolist()}, unit: rad}}, goal: {{turn_deg: 10}}}}",
+    )
+    truth, eyes = drawn(config)
+    seen = np.array([eyes.look(view, q[None], None, np.random.default_rng(0)) for view in range(2)])
+    assert np.isfinite(seen).all(axis=2).sum(axis=1).min() >= 8
+    assert np.nanmax(np.abs(seen - truth.images(q, truth.M))) < 0.15
+    assert eyes.scene.model.dof_armature == pytest.approx(0.1)
+    physics = Physics(eyes.scene, q, 0.0, 0.0)
+    physics.follow(q, 2.0)
+    assert q - physics.motor == pytest.approx(
+        physics._gravity() / [2000, 2000, 2000, 500, 500, 500], abs=1e-5
+    )
