@@ -7,14 +7,12 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import map_coordinates
-from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from projservo_cli.records import ByteArray, FloatArray, InputError, Observation, WorkFailed
+from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, Observation, WorkFailed
 from projservo_cli.tables import JointList
 
 _SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp"})
@@ -85,117 +83,273 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
     return chosen
 
 
-_ROUNDS = 3  # samples are taken anew around the sides that were found
-_LEAST_REACH = 1.5  # px on either side of an edge: less is no profile
-_MOST_REACH = 6.0
-_LEAST_BLUR = 0.2  # px: a sharper edge cannot be told
+_LEAST_SIDE, _LEAST_CELL = 6.0, 2.3  # px: a side that is shorter, or a border that is thinner, is none to fit
+_LEAST_REACH, _MOST_REACH = 1.5, 6.0  # px on either side of an edge: less is no profile
+_LEAST_BLUR, _MOST_BLUR = 0.2, 10.0  # px: a sharper edge cannot be told
 _SPOILT = 0.2  # of the contrast: rms residual of a profile that something covers
-_BORDER = 2  # cells of border along a side of a tag, besides those of its code
 _SPOILT_SHARE = 0.25  # of the profiles of a side that may be covered
+_ROUNDS = 3  # of leaving profiles out
+_BORDER = 2  # cells of border along a side of a tag, besides those of its code
+# Of the sides as they were guessed only so many profiles are looked at; least of them; steps of both fits.
+_ROUGH_PROFILES, _LEAST_PROFILES, _STEPS = 16, 3, (6, 3)
+_FAR = 2.0, 0.05  # px, and share of the longest side, that a corner may be from its guess, besides the blur
+# What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
+_FLOOR, _LEAK = 0.003, (0.5, 0.6)
+# Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
+# the blur that is reckoned with where no edge tells it, in cells.
+_UNREFINED, _BY_CELL, _BLURRED = 1.4, -0.75, 0.4
 
 
-def refine_corners(image: FloatArray, corners: FloatArray, cells: int) -> FloatArray:
-    """Corners of a tag from the edges between its black border and the bright ground around it.
+class _Sides(NamedTuple):
+    """Sides of quadrilaterals, four of each one after the other, all arrays (S, …)."""
+
+    start: FloatArray  # (S, 2) corner at which each begins, px
+    along: FloatArray  # (S, 2) unit vector to the next corner
+    normal: FloatArray  # (S, 2) unit vector across, outwards
+    length: FloatArray  # (S,) px
+    cell: FloatArray  # (S,) width of a cell of the tag across the side, px
+
+    @classmethod
+    def of(cls, corners: FloatArray, cells: int) -> "_Sides":
+        """Sides of tags with corners (Q, 4, 2) and so many cells along a side."""
+        start, end = corners.reshape(-1, 2), np.roll(corners, -1, axis=1).reshape(-1, 2)
+        length = np.linalg.norm(end - start, axis=1)
+        along = (end - start) / np.maximum(length, 1e-9)[:, None]
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        depth = ((start - np.repeat(corners.mean(axis=1), 4, axis=0)) * normal).sum(axis=1)
+        outwards = np.where(depth < 0.0, -1.0, 1.0)[:, None] * normal
+        return cls(start, along, outwards, length, 2.0 * np.abs(depth) / cells)
+
+
+class _Strips(NamedTuple):
+    """The pixels along sides, profile by profile: rows or columns of the image, whichever cross the side."""
+
+    grey: FloatArray  # (S, C, R) grey values
+    t: FloatArray  # (S, C, R) place along the side, −½ to ½
+    n: FloatArray  # (S, C, R) place across, px
+    weight: FloatArray  # (S, C, R) one for pixels that count, else zero
+
+    @classmethod
+    def of(
+        cls, image: FloatArray, sides: _Sides, reach: FloatArray, margin: FloatArray, most: int
+    ) -> "_Strips":
+        """Pixels within reach (S,) of sides, less a margin (S,) at either end; at most so many profiles.
+
+        None of a side with too few profiles, or of which a pixel lies outside the image.
+        """
+        s = np.arange(len(reach))
+        main = np.argmax(np.abs(sides.along), axis=1)  # the coordinate that counts the profiles
+        slope = sides.along[s, main]
+        ends = sides.start[s, main] + slope * np.stack([margin, sides.length - margin])
+        first, last = np.ceil(ends.min(axis=0)), np.floor(ends.max(axis=0))
+        stride = np.maximum(1.0, np.ceil((last - first + 1.0) / most))
+        profiles = int(max(1.0, ((last - first) // stride).max() + 1.0))
+        half = int(np.ceil((reach / np.abs(slope)).max())) + 1
+        place = np.empty((2, len(s), profiles, 2 * half + 1))  # by main and other coordinate
+        place[0] = (first[:, None] + stride[:, None] * np.arange(profiles))[..., None]
+        t = (place[0] - sides.start[s, main][:, None, None]) / slope[:, None, None]
+        crossing = sides.start[s, 1 - main][:, None, None] + sides.along[s, 1 - main][:, None, None] * t
+        place[1] = np.rint(crossing) + np.arange(-half, half + 1)
+        u, v = np.where((main == 0)[:, None, None], place, place[::-1])
+        du, dv = u - sides.start[:, 0, None, None], v - sides.start[:, 1, None, None]
+        t = sides.along[:, 0, None, None] * du + sides.along[:, 1, None, None] * dv
+        n = sides.normal[:, 0, None, None] * du + sides.normal[:, 1, None, None] * dv
+        counts = (np.abs(n) <= reach[:, None, None]) & (place[0] <= last[:, None, None])
+        height, width = image.shape
+        inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+        whole = (inside | ~counts).all(axis=(1, 2)) & (last - first + 1.0 >= _LEAST_PROFILES)
+        grey = image[np.clip(v, 0, height - 1).astype(int), np.clip(u, 0, width - 1).astype(int)]
+        weight = (counts & whole[:, None, None]).astype(np.float64)
+        return cls(grey, t / sides.length[:, None, None] - 0.5, n, weight)
+
+
+def _edge_model(x: FloatArray, strips: _Strips) -> tuple[FloatArray, FloatArray]:
+    """Residual (S, C, R) of edges x = (b, a, n_0, k, σ) (S, 5), and derivative (S, 5, C R), weighed both.
+
+    An edge is b + a Φ((n − n_0 − k t)/σ), Φ the normal distribution: straight in t and blurred by σ.
+    """
+    b, a, n_0, k, sigma = x.T[:, :, None, None]
+    z = (strips.n - n_0 - k * strips.t) / sigma
+    phi = ndtr(z)
+    bell = strips.weight * np.exp(-0.5 * z * z) * (-a / (np.sqrt(2.0 * np.pi) * sigma))
+    J = np.stack([strips.weight, strips.weight * phi, bell, bell * strips.t, bell * z], axis=1)
+    return strips.weight * (b + a * phi - strips.grey), J.reshape(
+        len(x), 5, strips.t.shape[1] * strips.t.shape[2]
+    )
+
+
+def _fitted(x: FloatArray, strips: _Strips, steps: int) -> tuple[FloatArray, FloatArray]:
+    """Edges (S, 5) of least squares by Levenberg–Marquardt steps, all at once, and their normal matrices."""
+
+    def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Normal matrices, gradients and sums of squares."""
+        r, J = _edge_model(x, strips)
+        flat = r.reshape(len(r), -1, 1)
+        return J @ J.swapaxes(1, 2), (J @ flat)[..., 0], (r * r).sum(axis=(1, 2))
+
+    A, g, cost = equations(x)
+    damping = np.full(len(x), 1e-3)
+    for _ in range(steps):
+        ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
+        step = np.linalg.solve(A + ridge[:, :, None] * np.eye(5), g[..., None])[..., 0]
+        moved = x - step
+        moved[:, 4] = np.clip(np.abs(moved[:, 4]), _LEAST_BLUR, _MOST_BLUR)
+        new = equations(moved)
+        better = new[2] <= cost
+        x = np.where(better[:, None], moved, x)
+        A, g = np.where(better[:, None, None], new[0], A), np.where(better[:, None], new[1], g)
+        cost, damping = np.where(better, new[2], cost), np.where(better, 0.1 * damping, 10.0 * damping)
+    return x, A
+
+
+def _first_edges(strips: _Strips) -> FloatArray:
+    """Edges (S, 5) to start from: the grey values at the inner and at the outer end of the strips."""
+    far = np.abs(strips.n) > 0.5 * np.where(strips.weight > 0.0, np.abs(strips.n), 0.0).max(
+        axis=(1, 2), keepdims=True
+    )
+    inner, outer = strips.weight * (far & (strips.n < 0.0)), strips.weight * (far & (strips.n > 0.0))
+    low, high = (
+        (part * strips.grey).sum(axis=(1, 2)) / np.maximum(part.sum(axis=(1, 2)), 1.0)
+        for part in (inner, outer)
+    )
+    zero = np.zeros_like(low)
+    return np.stack([low, high - low, zero, zero, zero + 1.0], axis=1)
+
+
+class _Edges(NamedTuple):
+    """Edges through the sides of tags, four of each one after the other; NaN where one is not clean."""
+
+    line: FloatArray  # (S, 3) l·(u, v, 1) = 0, normals of unit length
+    variance: FloatArray  # (S, 2) of the distance from the true edge, at the start and at the end, px²
+    x: FloatArray  # (S, 5) b, a, n_0, k, σ
+    spoilt: BoolArray  # (S,) whether one is not clean though there are pixels enough
+
+
+def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, rough: bool) -> _Edges:
+    """Edges about sides that are nearly where they should be, by edges known before (S, 5) or NaN.
+
+    Roughly by few profiles, else by all but those that something covers, if these are few. Grey values err
+    independently, by what the residuals of the side show. Besides, the model errs by what blur carries over
+    from the next edge, one cell away, which depends on the code.
+    """
+    line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, 5))
+    found = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
+    fits = np.flatnonzero((all_sides.length > _LEAST_SIDE) & (all_sides.cell > _LEAST_CELL))
+    if fits.size == 0:
+        return found
+    sides, blur = _Sides(*(part[fits] for part in all_sides)), before[fits, 4]
+    known = np.isfinite(blur)
+    reach = np.clip(0.5 * sides.cell, _LEAST_REACH, np.where(known, 3.0 * blur + 1.0, _MOST_REACH))
+    margin = np.where(known, np.maximum(0.08 * sides.length, 2.0 * blur) + 1.0, 0.12 * sides.length + 1.0)
+    strips = _Strips.of(image, sides, reach, margin, _ROUGH_PROFILES if rough else image.size)
+    x = _first_edges(strips)
+    x[known, 4] = blur[known]
+    x, A = _fitted(x, strips, _STEPS[0 if rough else 1])
+    clean = tried = strips.weight.any(axis=(1, 2))
+    if not rough:
+        strips, x, A, clean = _uncovered(strips, x, A)
+    count = strips.weight.sum(axis=(1, 2))
+    good = clean & (count > 5.0) & (x[:, 1] > 0.0) & (np.abs(x[:, 2]) + 0.5 * np.abs(x[:, 3]) < reach)
+    found.spoilt[fits] = tried & ~good
+    sides, x, A, fits = _Sides(*(part[good] for part in sides)), x[good], A[good], fits[good]
+    residual = _edge_model(x, _Strips(*(part[good] for part in strips)))[0]
+    C = np.linalg.inv(A) * ((residual**2).sum(axis=(1, 2)) / (count[good] - 5.0))[:, None, None]
+    left_out = _FLOOR**2 + (_LEAK[0] * sides.cell * ndtr(-_LEAK[1] * sides.cell / x[:, 4])) ** 2
+    half = np.array([-0.5, 0.5])
+    ends = C[:, 2, 2, None] + 2.0 * half * C[:, 2, 3, None] + half**2 * C[:, 3, 3, None]
+    middle = sides.start + sides.along * (0.5 * sides.length)[:, None] + sides.normal * x[:, 2:3]
+    direction = sides.along * sides.length[:, None] + sides.normal * x[:, 3:4]
+    across = np.stack([direction[:, 1], -direction[:, 0]], axis=1)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    found.line[fits] = np.column_stack([across, -(across * middle).sum(axis=1)])
+    found.variance[fits], found.x[fits] = ends + left_out[:, None], x
+    return found
+
+
+def _uncovered(
+    strips: _Strips, x: FloatArray, A: FloatArray
+) -> tuple[_Strips, FloatArray, FloatArray, BoolArray]:
+    """Strips without the profiles that something covers, fitted again; whether (S,) these were few."""
+    whole, noise = strips.weight.any(axis=2), _noise(strips)
+    for _ in range(_ROUNDS):
+        residual, _ = _edge_model(x, strips)
+        count = strips.weight.sum(axis=2)
+        rms = np.sqrt((residual**2).sum(axis=2) / np.maximum(count, 1.0))
+        spoilt = rms > np.maximum(_SPOILT * x[:, 1], 3.0 * noise)[:, None]
+        touched = spoilt.any(axis=1)
+        if not touched.any():
+            break
+        strips = strips._replace(weight=strips.weight * ~spoilt[:, :, None])
+        some = _Strips(*(part[touched] for part in strips))
+        x, A = x.copy(), A.copy()
+        x[touched], A[touched] = _fitted(x[touched], some, _STEPS[1])
+    left = strips.weight.any(axis=2).sum(axis=1)
+    return strips, x, A, left >= (1.0 - _SPOILT_SHARE) * np.maximum(whole.sum(axis=1), 1)
+
+
+def _noise(strips: _Strips) -> FloatArray:
+    """Median difference (S,) of neighbours along the sides: about the standard deviation of a pixel."""
+    both = (strips.weight[:, 1:] * strips.weight[:, :-1]).reshape(len(strips.t), -1) > 0.0
+    steps = np.abs(np.diff(strips.grey, axis=1)).reshape(both.shape)
+    middle = both.sum(axis=1, keepdims=True) // 2
+    ordered = np.sort(np.where(both, steps, np.inf), axis=1)
+    return np.take_along_axis(ordered, np.minimum(middle, both.shape[1] - 1), axis=1)[:, 0]
+
+
+class Corners(NamedTuple):
+    """Corners of tags."""
+
+    pixels: FloatArray  # (…, 4, 2) px, in order around the tag; NaN where it is covered or the guess is wrong
+    sigma: FloatArray  # (…, 4) standard deviation of either coordinate, px; NaN there
+    clean: BoolArray  # (…, 4) whether both edges of a corner are clean; else it is where it was guessed
+
+
+def refine_corners(image: FloatArray, guess: FloatArray, cells: int) -> Corners:
+    """Corners of tags from the edges between their black border and the bright ground around them.
+
+    A corner is where two edges cross: their distances from the true ones add up over the sine of the angle
+    between them. Where there are too few pixels for one of them the guess stays, with its own deviation. None
+    is left where something covers one of them, or one passes far from the guess: that is wrong too.
 
     image : (height, width) grey values; pixel centres have whole coordinates.
-    corners : (4, 2) u, v of a first guess within about two pixels, px, in order around the tag.
-    cells : of the tag along a side, border included; the border is one cell wide.
-    Returns (4, 2) px; NaN where one of the two sides of a corner has no clean edge.
+    guess : (Q, 4, 2) u, v of corners as OpenCV finds them, within about two pixels.
+    cells : of a tag along a side, border included; the border is one cell wide.
     """
-    guess = np.asarray(corners, dtype=np.float64)
-    for _ in range(_ROUNDS):
-        lines = [_fit_side(image, guess, side, cells) for side in range(4)]
-        crossings = np.array([np.cross(lines[k - 1], lines[k]) for k in range(4)])
+    corners = np.asarray(guess, dtype=np.float64)
+    x = np.full((4 * len(corners), 5), np.nan)
+    for rough in (True, False):
+        sides = _Sides.of(corners, cells)
+        edges = _edges_along(image, sides, x, rough=rough)
+        x = edges.x
+        line, variance = edges.line.reshape(-1, 4, 3), edges.variance.reshape(-1, 4, 2)
+        last = np.roll(line, 1, axis=1)
+        sine = last[..., 0] * line[..., 1] - last[..., 1] * line[..., 0]
         with np.errstate(divide="ignore", invalid="ignore"):
-            refined = np.asarray(crossings[:, :2] / crossings[:, 2:])
-        guess = np.where(np.isfinite(refined), refined, corners)
-    farthest = 2.0 + 0.05 * float(np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).max())
-    refined[~(np.linalg.norm(refined - corners, axis=1) <= farthest)] = np.nan
-    return refined
+            crossing = np.cross(last, line)[..., :2] / sine[..., None]
+            sigma = np.sqrt(0.5 * (np.roll(variance[..., 1], 1, axis=1) + variance[..., 0])) / np.abs(sine)
+        corners = np.where(np.isfinite(crossing), crossing, guess)
+    blur, longest = x[:, 4].reshape(-1, 4), sides.length.reshape(-1, 4).max(axis=1, keepdims=True)
+    far = _FAR[0] + _FAR[1] * longest + np.nan_to_num(np.fmax(blur, np.roll(blur, 1, axis=1)))
+    passes = [np.abs((edge[..., :2] * guess).sum(axis=2) + edge[..., 2]) for edge in (line, last)]
+    away = np.fmax(np.fmax(*passes), np.linalg.norm(crossing - guess, axis=2))
+    spoilt = edges.spoilt.reshape(-1, 4)
+    away[spoilt | np.roll(spoilt, 1, axis=1)] = np.inf
+    clean = np.isfinite(crossing).all(axis=2) & (away <= far)
+    pixels = np.where(clean[..., None], crossing, np.where((away > far)[..., None], np.nan, guess))
+    deviation = np.where(clean, sigma, np.where(away > far, np.nan, _unrefined(sides.cell, blur)))
+    return Corners(pixels, deviation, clean)
 
 
-def _fit_side(image: FloatArray, corners: FloatArray, side: int, cells: int) -> FloatArray:
-    """Line (3,) of the edge from corner ``side`` to the next, l·(u, v, 1) = 0; NaN without a clean edge.
+def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
+    """Deviation (Q, 4) of corners as OpenCV finds them, by cells (4 Q,) across sides and blurs (Q, 4), px.
 
-    Profiles across the edge are fitted together by b + a Φ((n − n_0 − k t)/σ), Φ the normal
-    distribution: an edge straight in t and blurred by σ.
+    A formula that was fitted to drawn and to rendered tags of all sizes, tilts and blurs.
     """
-    none = np.full(3, np.nan)
-    start, end = corners[side], corners[(side + 1) % 4]
-    length = float(np.linalg.norm(end - start))
-    if not length > 4.0 * _LEAST_REACH:
-        return none
-    along = (end - start) / length
-    normal = np.array([along[1], -along[0]])
-    depth = float(normal @ (start - corners.mean(axis=0)))
-    if depth < 0.0:
-        normal, depth = -normal, -depth
-    reach = min(0.65 * 2.0 * depth / cells, _MOST_REACH)
-    if reach < _LEAST_REACH:
-        return none
-    margin = 0.12 * length + 1.0
-    t = np.linspace(margin, length - margin, max(8, min(64, int(length))))
-    n = np.linspace(-reach, reach, 2 * int(np.ceil(2.0 * reach)) + 1)
-    place = start[:, None, None] + along[:, None, None] * t[:, None] + normal[:, None, None] * n
-    size = np.array(image.shape[::-1])[:, None, None]
-    if ((place < 0.0) | (place > size - 1.0)).any():
-        return none
-    grey = map_coordinates(image, place[::-1], order=1)
-    fit = _fit_edge(grey, t / length - 0.5, n, reach)
-    if fit is None:
-        return none
-    offset, slope = fit
-    middle = start + along * (0.5 * length) + normal * offset
-    direction = along * length + normal * slope
-    return np.asarray(np.cross(np.append(middle, 1.0), np.append(direction, 0.0)))
-
-
-def _fit_edge(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> tuple[float, float] | None:
-    """Offset n_0 and slope k of an edge in its profiles (T, N); None where they show no clean edge.
-
-    Profiles that something covers are left out and the rest fitted again, if few are.
-    """
-    noise = float(np.median(np.abs(np.diff(grey, axis=0))))  # about the standard deviation of a pixel
-    clean = np.ones(len(t), dtype=bool)
-    while clean.mean() >= 1.0 - _SPOILT_SHARE:
-        x = _least_squares(grey[clean], t[clean], n, reach)
-        if x is None:
-            return None
-        residual, _ = _edge_model(x, grey, t, n)
-        spoilt = np.sqrt(np.mean(residual**2, axis=1)) > max(_SPOILT * x[1], 3.0 * noise)
-        if not (spoilt & clean).any():
-            return float(x[2]), float(x[3])
-        clean &= ~spoilt
-    return None
-
-
-def _least_squares(grey: FloatArray, t: FloatArray, n: FloatArray, reach: float) -> FloatArray | None:
-    """Edge (b, a, n_0, k, σ) through all profiles; None where it is not one from dark to bright."""
-    low, high = float(grey[:, : len(n) // 4].mean()), float(grey[:, -(len(n) // 4) :].mean())
-    if not high > low:
-        return None
-    found = least_squares(
-        lambda x, *profiles: _edge_model(x, *profiles)[0].ravel(),
-        [low, high - low, 0.0, 0.0, 1.0],
-        lambda x, *profiles: _edge_model(x, *profiles)[1],
-        method="lm",
-        x_scale=[1.0, 1.0, reach, reach, reach],
-        args=(grey, t, n),
-    )
-    x = found.x
-    return x if x[1] > 0.0 and abs(x[2]) + 0.5 * abs(x[3]) < reach else None
-
-
-def _edge_model(
-    x: FloatArray, grey: FloatArray, t: FloatArray, n: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Residual (T, N) of an edge x = (b, a, n_0, k, σ) and its derivative (T N, 5)."""
-    b, a, n_0, k, sigma = *x[:4], max(x[4], _LEAST_BLUR)
-    z = (n - n_0 - k * t[:, None]) / sigma
-    phi = ndtr(z)
-    bell = -a * np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * sigma)
-    J = np.stack([np.ones_like(z), phi, bell, bell * t[:, None], bell * z], axis=-1)
-    return b + a * phi - grey, J.reshape(-1, 5)
+    cell = np.maximum(cell, 1.0).reshape(-1, 4)
+    cell = np.minimum(cell, np.roll(cell, 1, axis=1))
+    known = blur[np.isfinite(blur)]
+    typical = float(np.median(known)) if known.size else _BLURRED * cell
+    return np.asarray(_UNREFINED * np.where(np.isfinite(blur), blur, typical) * cell**_BY_CELL)
 
 
 class TagFinder:
@@ -245,25 +399,22 @@ class TagFinder:
         tag = self.cv.aruco.generateImageMarker(self._tags, number, self._cells * cell_px)
         return np.pad(tag, cell_px, constant_values=255)
 
-    def find(self, image: FloatArray) -> tuple[dict[int, FloatArray], int]:
-        """Corners (4, 2), px, of each tag in an image, and how many tags were there more than once.
+    def find(self, image: FloatArray) -> tuple[dict[int, Corners], int]:
+        """Corners (4, …) of each tag in an image, and how many tags were there more than once.
 
-        A corner without clean edges is NaN. A tag that is there more than once is left out, since
-        which of them is meant cannot be told.
+        A tag that is there more than once is left out, since which of them is meant cannot be told.
 
         image : (height, width) grey values from 0 to 255.
         """
-        corners, numbers, _ = self._detector.detectMarkers(image.astype(np.uint8))
+        quads, numbers, _ = self._detector.detectMarkers(image.astype(np.uint8))
         if numbers is None:
             return {}, 0
         found = [int(number) for number in np.ravel(numbers)]
         ambiguous = {number for number in found if found.count(number) > 1}
-        tags = {
-            number: refine_corners(image, np.reshape(quad, (4, 2)).astype(np.float64), self._cells)
-            for number, quad in zip(found, corners, strict=True)
-            if number not in ambiguous
-        }
-        return tags, len(ambiguous)
+        corners = refine_corners(image, np.reshape(quads, (-1, 4, 2)).astype(np.float64), self._cells)
+        each = (Corners(*tag) for tag in zip(*corners, strict=True))
+        tags = dict(zip(found, each, strict=True))
+        return {number: tag for number, tag in tags.items() if number not in ambiguous}, len(ambiguous)
 
 
 def _opencv() -> Any:
@@ -282,10 +433,10 @@ def _opencv() -> Any:
 class _Findings:
     """What was found in all images."""
 
-    # pixels (4 or 1, 2) of each tag, by pose, view and number of the tag
+    # pixels and their deviation (4 or 1, 3) of each tag, by pose, view and number of the tag
     images: dict[tuple[int, int, int], FloatArray] = field(default_factory=dict)
     ambiguous: int = 0  # tags left out because they were in an image more than once
-    unrefined: int = 0  # corners (or centres) left out because an edge of their tag is not clean
+    unrefined: int = 0  # corners (or centres) of tags of which an edge is not clean
     empty: int = 0  # images without a tag
 
     @property
@@ -325,10 +476,10 @@ def observe_tags(
             tags, ambiguous = finder.find(image)
             found.ambiguous += ambiguous
             found.empty += not tags
-            for tag, corners in tags.items():
-                pixels = corners if points == "corners" else _crossing(corners)[None]
-                found.unrefined += int(np.isnan(pixels[:, 0]).sum())
-                found.images[k, view, tag] = pixels
+            for number, tag in tags.items():
+                in_corners = points == "corners"
+                found.unrefined += int((~tag.clean).sum()) if in_corners else int(not tag.clean.all())
+                found.images[k, view, number] = np.column_stack(tag[:2]) if in_corners else _center(tag)
         progress("detect", k + 1, len(pairs))
     if not found.images:
         raise WorkFailed(
@@ -336,19 +487,27 @@ def observe_tags(
             "and whether a bright margin of one cell surrounds each"
         )
     numbers, each = found.tags, 4 if points == "corners" else 1
-    images = np.full((len(pairs), 2, len(numbers), each, 2), np.nan)
-    for (k, view, tag), pixels in found.images.items():
-        images[k, view, numbers.index(tag)] = pixels
+    seen = np.full((len(pairs), 2, len(numbers), each, 3), np.nan)
+    for (k, view, number), pixels in found.images.items():
+        seen[k, view, numbers.index(number)] = pixels
     marker = (each * np.array(numbers, dtype=np.int64)[:, None] + np.arange(each)).ravel()
     pose = np.array([number for number, *_ in pairs], dtype=np.int64)
-    observation = Observation(pose, marker, q, images.reshape(len(pairs), 2, len(marker), 2))
+    seen = seen.reshape(len(pairs), 2, len(marker), 3)
+    observation = Observation(pose, marker, q, seen[..., :2], sigma=seen[..., 2])
     if not np.isfinite(observation.images[..., 0]).all(axis=1).any():
         raise WorkFailed("no tag was seen by both cameras at the same pose: look whether the images pair up")
     return observation, found
 
 
-def _crossing(corners: FloatArray) -> FloatArray:
-    """Crossing (2,) of the diagonals of a quadrilateral (4, 2): the image of the centre of a square."""
-    a, b, c, d = np.c_[corners, np.ones(4)]
-    u, v, w = np.cross(np.cross(a, c), np.cross(b, d))
-    return np.array([u / w, v / w])
+def _center(tag: Corners) -> FloatArray:
+    """Crossing of the diagonals of a tag, the image of its centre, and its deviation: (1, 3) px."""
+
+    def crossing(pixels: FloatArray) -> FloatArray:
+        """Of quadrilaterals (…, 4, 2): (…, 2)."""
+        a, b, c, d = np.moveaxis(np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1), -2, 0)
+        p = np.cross(np.cross(a, c), np.cross(b, d))
+        return np.asarray(p[..., :2] / p[..., 2:])
+
+    moved = tag.pixels + np.eye(8).reshape(8, 4, 2) * tag.sigma[:, None]
+    change = crossing(moved) - crossing(tag.pixels)
+    return np.append(crossing(tag.pixels), np.sqrt(0.5 * (change**2).sum()))[None]

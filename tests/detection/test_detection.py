@@ -52,7 +52,8 @@ def test_corners_are_found_to_a_fraction_of_a_pixel(rng, name):
         image = render(cv2, TAGS, SIZE, [(number, corners)], blur=blur, noise=noise, rng=rng)
         found, ambiguous = finder.find(image.astype(float))
         assert (list(found), ambiguous) == ([number], 0)
-        errors.append(found[number] - corners)
+        assert found[number].clean.all()
+        errors.append(found[number].pixels - corners)
     assert np.sqrt(np.mean(np.square(errors))) < rms
     assert np.abs(errors).max() < most
     assert np.abs(np.mean(errors, axis=(0, 1))).max() < rms  # no half pixel of another convention
@@ -67,7 +68,7 @@ def test_dictionaries_by_their_names(rng, name, number):
     corners = square((150, 110), 90, 0.4, (1.0, 0.9))
     image = render(cv2, dictionary, SIZE, [(number, corners)], blur=0.8, noise=2, rng=rng)
     found, _ = TagFinder(name).find(image.astype(float))
-    np.testing.assert_allclose(found[number], corners, atol=0.1)
+    np.testing.assert_allclose(found[number].pixels, corners, atol=0.1)
 
 
 def test_a_tag_that_is_hidden_in_part_gives_no_wrong_corner(rng):
@@ -78,7 +79,7 @@ def test_a_tag_that_is_hidden_in_part_gives_no_wrong_corner(rng):
             cv2, TAGS, SIZE, [(3, corners)], blur=0.8, noise=2, rng=rng, cover=[(int(u), int(v), 14, 14)]
         )
         found, _ = finder.find(image.astype(float))
-        error = found.get(3, np.full((4, 2), np.nan)) - corners
+        error = (found[3].pixels if 3 in found else np.full((4, 2), np.nan)) - corners
         missing += int(np.isnan(error[:, 0]).sum())
         kept += int(np.isfinite(error[:, 0]).sum())
         assert not (np.abs(error) > 0.3).any()

@@ -9,6 +9,12 @@ from projservo_cli.detection import refine_corners
 FACTOR = 10
 
 
+def found_in(image, guess, cells=6):
+    """Corners (4, 2) of one tag that have clean edges, else NaN."""
+    found = refine_corners(image, guess[None], cells)
+    return np.where(found.clean[0, :, None], found.pixels[0], np.nan)
+
+
 def dark_square(corners, size=(120, 100), blur=0.8):
     """Image of a dark convex quadrilateral on a bright ground, and its four corners, px."""
     width, height = size
@@ -26,7 +32,7 @@ CORNERS = np.array([[30.3, 25.8], [85.1, 31.2], [80.7, 75.4], [27.9, 70.0]])
 @pytest.mark.parametrize("blur", [0.5, 0.8, 1.5])
 def test_blur_does_not_move_the_corners(rng, blur):
     guess = CORNERS + rng.uniform(-1, 1, (4, 2))
-    found = refine_corners(dark_square(CORNERS, blur=blur), guess, 6)
+    found = found_in(dark_square(CORNERS, blur=blur), guess)
     # sampling at a tenth of a pixel leaves about 0.005 px on a side; corners blend in at wide blur
     np.testing.assert_allclose(found, CORNERS, atol=0.03)
 
@@ -35,9 +41,9 @@ def test_blur_does_not_move_the_corners(rng, blur):
 def test_a_side_that_is_covered_costs_its_two_corners_unless_it_is_a_little(grey):
     image = dark_square(CORNERS)
     image[20:36, 56:60] = grey  # over the upper side
-    np.testing.assert_allclose(refine_corners(image, CORNERS, 6), CORNERS, atol=0.03)
+    np.testing.assert_allclose(found_in(image, CORNERS), CORNERS, atol=0.03)
     image[20:36, 50:70] = grey
-    found = refine_corners(image, CORNERS, 6)
+    found = found_in(image, CORNERS)
     assert np.isnan(found[:2]).all()
     np.testing.assert_allclose(found[2:], CORNERS[2:], atol=0.03)
 
@@ -54,11 +60,11 @@ UNCLEAN = {
 @pytest.mark.parametrize("name", UNCLEAN)
 def test_no_corner_without_clean_edges(name):
     change, guess = UNCLEAN[name]
-    found = refine_corners(change(dark_square(CORNERS)), guess, 6)
+    found = found_in(change(dark_square(CORNERS)), guess)
     assert np.isnan(found[[0, 3]]).all()  # both ends of the left side
     assert np.isnan(found).all() or name == "at the border"
 
 
 def test_an_edge_far_from_the_guess_is_not_taken_for_it():
-    found = refine_corners(dark_square(CORNERS), CORNERS + np.array([6.0, 0.0]), 6)
+    found = found_in(dark_square(CORNERS), CORNERS + np.array([6.0, 0.0]))
     assert np.isnan(found).all()
