@@ -157,8 +157,8 @@ def _detect(
     """Find ArUco or AprilTag markers in images and write a table.
 
     Finds tags in the images of two folders (or quoted patterns such as 'left/*.png'), with corners to a
-    fraction of a pixel, and writes an observation table for calibrate --data. Needs OpenCV: pip install
-    'projservo[detect]'.
+    fraction of a pixel and how certain each is, and writes an observation table for calibrate --data. Needs
+    OpenCV: pip install 'projservo[detect]'.
 
     The list of joint readings (--joints-csv) says which images belong together. With columns left and right,
     these are the names of the two images. With a column pose, images are those whose name ends in that
@@ -198,8 +198,8 @@ def _detect(
         f"detect: {{poses}} poses, {len(found.tags)} tags, {{markers}} markers",
         "  markers seen by both cameras {both}, left only {left_only}, right only {right_only}, "
         "by none {unseen}",
-        "  left out: {ambiguous} tags twice in an image, {unrefined} points without clean edges; "
-        "images without a tag: {empty_images}",
+        "  {unrefined} points without clean edges: less certain, or left out where something covers them",
+        "  left out: {ambiguous} tags twice in an image; images without a tag: {empty_images}",
     )
     console.tell(value, [*(text.format_map(value) for text in words), f"table: {output}"])
 

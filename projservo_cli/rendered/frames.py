@@ -51,8 +51,8 @@ class Frames:
 
     def look(
         self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
-    ) -> FloatArray:
-        """Pixels (m, 2) that are found in a frame, NaN where unseen.
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (m, 2) that are found in a frame, NaN where unseen, and their deviations (m,), px.
 
         q : (k, n) joints at instants of its exposure, rad or m.
         moved : number of a marker whose tag was moved, and by how much in the frame of the tool, (3,) m.
@@ -70,15 +70,15 @@ class Frames:
         self.last[view] = np.clip(np.rint(image), 0, 255).astype(np.uint8)
         return self._found(view)
 
-    def _found(self, view: int) -> FloatArray:
-        """Pixels (m, 2) of the corners in the last frame of a view, NaN where unseen."""
-        pixels = np.full((len(self._places), 2), np.nan)
+    def _found(self, view: int) -> tuple[FloatArray, FloatArray]:
+        """Pixels (m, 2) of the corners in the last frame of a view, NaN where unseen, and deviations (m,)."""
+        pixels, sigma = np.full((len(self._places), 2), np.nan), np.full(len(self._places), np.nan)
         tags, _ = self._finder.find(self.last[view].astype(np.float64))
-        for number, corners in tags.items():
+        for number, tag in tags.items():
             for k in range(CORNERS):
                 if (place := self._places.get(CORNERS * number + k)) is not None:
-                    pixels[place] = corners[k]
-        return pixels
+                    pixels[place], sigma[place] = tag.pixels[k], tag.sigma[k]
+        return pixels, sigma
 
     def _drawn(self, view: int, q: FloatArray) -> ByteArray:
         """Grey values (height, width) of what a camera sees at joints (n,), without lens and noise."""

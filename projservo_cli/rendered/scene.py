@@ -24,7 +24,9 @@ _LINK, _HOLDER = (0.75, 0.5, 0.25, 1.0), (0.3, 0.3, 0.3, 1.0)  # colours of link
 _PLATE_M, _ROD_M = 5e-4, 4e-3  # half the thickness of a tag, and of the rod that holds it
 _TOOL_DENSITY = 500.0  # kg/m³
 _SIDES = ("front", "back")  # of a plate: the tag, and what hides it from behind
-_CELL_PX = 16  # of the picture of a tag
+# Of the picture of a tag: where it has more pixels than the frame, edges along its rows are drawn a tenth of
+# a pixel off.
+_CELL_PX = 4
 # Inertia of rotors of joints without, kg m² or kg: at most, and as a share of that of the heaviest joint.
 _ARMATURE, _ARMATURE_SHARE = 0.1, 0.05
 _SENSOR_M = 1e-5  # width of a pixel of a camera's sensor; only ratios to it matter

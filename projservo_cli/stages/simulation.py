@@ -10,7 +10,7 @@ import bisect
 import math
 from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -52,8 +52,8 @@ class Eyes(Protocol):
 
     def look(
         self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
-    ) -> FloatArray:
-        """Pixels (m, 2) in a frame of a view, NaN where unseen.
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Pixels (m, 2) in a frame of a view, NaN where unseen, and their deviations (m,), px, if told.
 
         q : (k, n) joints at instants of its exposure, rad or m.
         moved : number of a marker that was moved, and by how much in the frame of the tool, (3,) m.
@@ -77,7 +77,7 @@ class Points(NamedTuple):
 
     def look(
         self, view: int, q: FloatArray, moved: tuple[int, FloatArray] | None, rng: np.random.Generator
-    ) -> FloatArray:
+    ) -> tuple[FloatArray, FloatArray | None]:
         """As of all cameras."""
         M = self.truth.M
         if moved is not None:
@@ -85,7 +85,7 @@ class Points(NamedTuple):
             M[self.truth.number.index(moved[0]), :3] += self.truth.robot.base_tool[:3, :3] @ moved[1]
         shown = [self.see(joints, M)[view] for joints in q]
         noise = self.sigma_px * rng.standard_normal(shown[0].shape)
-        return np.asarray(np.mean(shown, axis=0) + noise)
+        return np.asarray(np.mean(shown, axis=0) + noise), None
 
 
 class Servos(Protocol):
@@ -178,7 +178,7 @@ def _looked(scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]) -
     eyes.open()
     try:
         for k, view in np.ndindex(frames, 2):
-            found[k, view] = eyes.look(view, q, None, _random(*drawn, view, k))
+            found[k, view], _ = eyes.look(view, q, None, _random(*drawn, view, k))
     finally:
         eyes.close()
     count = np.isfinite(found[..., :1]).sum(axis=0)
@@ -217,15 +217,17 @@ class FaultyRobot:
         """Open the cameras, in the thread that drives."""
         self.world.eyes.open()
 
-    def read(self) -> tuple[FloatArray, FloatArray] | tuple[FloatArray, FloatArray, float, float, float]:
-        """Joint readings (n,), rad or m, and pixels (2, m, 2), with stamps, s, where frames carry them."""
+    def read(self) -> tuple[Any, ...]:
+        """Joint readings (n,), rad or m, and pixels (2, m, 2), with stamps and deviations where there are."""
         now, q = self.now(), self._reading()
         frames = [camera.newest(now) for camera in self._cameras]
         self.taken[:] = [frame.middle for frame in frames]
         pixels = np.stack([frame.pixels for frame in frames])
-        if not self._given.stamps:
+        told = [frame.sigma for frame in frames if frame.sigma is not None]
+        if not self._given.stamps and not told:
             return q, pixels
-        return q, pixels, now, frames[0].stamp, frames[1].stamp
+        stamps = (now, frames[0].stamp, frames[1].stamp) if self._given.stamps else (None, None, None)
+        return (q, pixels, *stamps, np.stack(told)) if told else (q, pixels, *stamps)
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Go to joints (n,) by the time that is due, s; where none comes then, they are held."""
@@ -395,6 +397,7 @@ class _Frame(NamedTuple):
     middle: float  # of its exposure, s
     stamp: float  # the same by the clock of the camera
     pixels: FloatArray  # (m, 2), NaN where unseen
+    sigma: FloatArray | None  # (m,) their deviations, px, if they are told
 
 
 class _Camera:
@@ -443,11 +446,12 @@ class _Camera:
         instants = middle + given.exposure_s * ((np.arange(many) + 0.5) / many - 0.5)
         rng = world.random(self._view, _BEFORE + k)
         rng.standard_normal()  # that of the jitter
-        pixels = world.eyes.look(self._view, np.array([self._joints.at(t) for t in instants]), moved, rng)
+        q = np.array([self._joints.at(t) for t in instants])
+        pixels, sigma = world.eyes.look(self._view, q, moved, rng)
         if (knocked := given.camera_moved) is not None and step >= knocked.at_step:
             pixels += knocked.by_view()[self._view]
         if (lost := given.lost_markers) is not None and _lasts(lost, step):
             pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
         if world.eyes.borders:
             pixels[~((pixels >= -0.5) & (pixels <= truth.image_size - 0.5)).all(axis=1)] = math.nan
-        return _Frame(middle, middle + self._clock, pixels)
+        return _Frame(middle, middle + self._clock, pixels, sigma)

@@ -14,6 +14,7 @@ from projservo_cli.stages.record import trial_motions
 from projservo_cli.stages.world import truth_of
 from projservo_cli.tables import read_table
 from tests.detection.rendering import render, square
+from tests.detection.sigma_study import errors
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'projservo[detect]'")
 
@@ -57,6 +58,29 @@ def test_corners_are_found_to_a_fraction_of_a_pixel(rng, name):
     assert np.sqrt(np.mean(np.square(errors))) < rms
     assert np.abs(errors).max() < most
     assert np.abs(np.mean(errors, axis=(0, 1))).max() < rms  # no half pixel of another convention
+
+
+def test_corners_err_as_they_say():
+    """By decade; tags of all sizes and tilts, sharp and blurred."""
+    found = errors(24)
+    assert np.abs(found.error[found.clean].mean(axis=0)).max() < 0.03
+    decades = list(found.by_decade())
+    assert len(decades) >= 2
+    assert all(0.7 < ratio < 1.3 for _, _, ratio in decades), decades
+
+
+def test_a_corner_without_room_for_edges_is_kept_with_a_deviation_of_its_own(rng):
+    """Tags that are thin or at the border of the image."""
+    off = []
+    for k in range(12):
+        corners = square((70, 60), 60, 0.3 * k, (1.0, 0.15))
+        image = render(cv2, TAGS, (140, 120), [(3, corners)], blur=0.6, noise=2, rng=rng)
+        tag = TagFinder("4X4_50").find(image.astype(float))[0].get(3)
+        if tag is not None:
+            assert not tag.clean.any()
+            off.append((tag.pixels - corners) / tag.sigma[:, None])
+    assert len(off) > 3
+    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.6
 
 
 @pytest.mark.parametrize(
