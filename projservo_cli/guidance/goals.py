@@ -256,15 +256,15 @@ def _put_solutions(
 @njit
 def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
     """Whether the goal is shown at joints (n,), but for their limits: ``SHOWN``, ``HIDDEN`` or ``BARRED``."""
-    put_margins(c, q, trial.s, trial.margins)
+    put_margins(c, q, trial)
     for j in range(1, BORDER):
         if not trial.margins[j] > 0.0:
             return HIDDEN
     # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
     H = forward(c.model, q)
     left, right = most_off(c, q, H)
-    doubt = -min(DEVIATIONS * left, FINE_PX), -min(DEVIATIONS * right, FINE_PX)
-    return BARRED if not clear_by(c, H, trial.s, doubt, math.inf) > 0.0 else SHOWN
+    doubt = min(DEVIATIONS * max(left, right), FINE_PX)
+    return SHOWN if clear_by(c, H, trial.s) > -doubt else BARRED
 
 
 def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) -> FloatArray:

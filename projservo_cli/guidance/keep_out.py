@@ -15,7 +15,7 @@ from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.records import FloatArray, IntArray
 
 BOTH = 2
-_Pixel = tuple[float, float]
+Pixel = tuple[float, float]
 
 
 class KeepOut(NamedTuple):
@@ -61,14 +61,14 @@ def only(keep: KeepOut, region: int) -> KeepOut:
 
 
 @merged
-def squared(s: _Pixel, t: _Pixel) -> float:
+def squared(s: Pixel, t: Pixel) -> float:
     """Squared distance of two pixels."""
     du, dv = s[0] - t[0], s[1] - t[1]
     return du * du + dv * dv
 
 
 @merged
-def _away(s: _Pixel, a: _Pixel, b: _Pixel) -> float:
+def _away(s: Pixel, a: Pixel, b: Pixel) -> float:
     """Squared distance of a pixel from the segment between two."""
     dx, dy = b[0] - a[0], b[1] - a[1]
     length = dx * dx + dy * dy
@@ -77,50 +77,23 @@ def _away(s: _Pixel, a: _Pixel, b: _Pixel) -> float:
     return squared(s, (a[0] + x * dx, a[1] + x * dy))
 
 
-@merged
-def bulge(s: _Pixel, middle: _Pixel, t: _Pixel) -> float:
-    """Distance of the middle of a curve from the segment between its ends."""
-    return math.sqrt(_away(middle, s, t))
-
-
-@merged
-def _left(a: _Pixel, b: _Pixel, s: _Pixel) -> bool:
-    """Whether a pixel is to the left of the line from a to b."""
-    return (b[0] - a[0]) * (s[1] - a[1]) - (b[1] - a[1]) * (s[0] - a[0]) > 0.0
-
-
 @internal
-def outside_polygon(corners: FloatArray, first: int, last: int, s: _Pixel, t: _Pixel) -> float:
-    """Distance of a segment, or of a pixel s = t, from a polygon of corners first … last − 1, px.
-
-    Negative for a pixel within; minus infinity for a segment that is not outside all along.
-    """
-    least, within, point = math.inf, False, s == t
+def outside_polygon(corners: FloatArray, first: int, last: int, s: Pixel) -> float:
+    """Distance of a pixel from a polygon of corners first … last − 1, px; negative within."""
+    least, within = math.inf, False
     b = (float(corners[last - 1, 0]), float(corners[last - 1, 1]))
     for i in range(first, last):
         a, b = b, (float(corners[i, 0]), float(corners[i, 1]))
         least = min(least, _away(s, a, b))
-        if not point:
-            if _left(a, b, s) != _left(a, b, t) and _left(s, t, a) != _left(s, t, b):
-                return -math.inf
-            least = min(least, _away(t, a, b), _away(b, s, t))
         if (a[1] > s[1]) != (b[1] > s[1]) and s[0] < a[0] + (s[1] - a[1]) * (b[0] - a[0]) / (b[1] - a[1]):
             within = not within
-    if within:
-        return -math.sqrt(least) if point else -math.inf
-    return math.sqrt(least)
+    return -math.sqrt(least) if within else math.sqrt(least)
 
 
 @merged
-def apart(keep: KeepOut, region: int, view: int, s: _Pixel, t: _Pixel) -> float:
-    """Distance of a segment of one image from the polygon of a region, px; infinite where none is drawn."""
+def clearance(keep: KeepOut, region: int, view: int, s: Pixel) -> float:
+    """Distance of a pixel of one image from the polygon of a region, px; infinite where none is drawn."""
     for p in range(keep.image.shape[0]):
         if keep.region[p] == region and keep.image[p] == view:
-            return outside_polygon(keep.corners, keep.first[p], keep.first[p + 1], s, t)
+            return outside_polygon(keep.corners, keep.first[p], keep.first[p + 1], s)
     return math.inf
-
-
-@merged
-def clearance(keep: KeepOut, region: int, view: int, s: _Pixel) -> float:
-    """Distance of a pixel of one image from the polygon of a region, px; infinite where none is drawn."""
-    return apart(keep, region, view, s, s)

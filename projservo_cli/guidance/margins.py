@@ -19,13 +19,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, mat, mul, put_mat, put_vec, vec
+from projservo_cli.geometry.algebra import (
+    Mat4,
+    Vec4,
+    apply,
+    axpy,
+    dot,
+    mat,
+    meet,
+    mul,
+    put_mat,
+    put_vec,
+    vec,
+)
 from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import COORDINATES, orthogonalize, put_row
 from projservo_cli.geometry.kinematics import backward, forward, image_motion, operators_at, project, row
 from projservo_cli.geometry.lens import bend, bends
 from projservo_cli.geometry.mechanisms import SETTLED, Seen, Work, reach, span_of, workspace
-from projservo_cli.records import FloatArray, Model
+from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
 
@@ -49,12 +61,17 @@ class Demands(NamedTuple):
     image_size: FloatArray  # (2,) width and height of both images, px; infinite where an image has no border
     border_px: float  # least distance of a marker from the border of an image, px
     conditioning: float  # least reciprocal condition of the image Jacobian of the face
+    keep: FloatArray  # (n,) least distance from a joint limit, rad or m, along a way through joint space
+    least_face_px: float = 0.0  # least width of the face in an image along such a way, px
+    # (t, 4) corners of tags, markers of the body in the order of their numbers, of which one is to be seen by
+    # both cameras; none where the face is
+    tags: IntArray = np.zeros((0, 4), np.int64)
 
 
 def limits_alone(lower: FloatArray, upper: FloatArray) -> Demands:
     """Demands of joint limits alone, (n,) rad or m."""
     endless = np.full(len(lower), math.inf)
-    return Demands(lower, upper, endless, np.full(2, math.inf), 0.0, 0.0)
+    return Demands(lower, upper, endless, np.full(2, math.inf), 0.0, 0.0, np.zeros(len(lower)))
 
 
 class Reaching(NamedTuple):
@@ -68,6 +85,9 @@ class Reaching(NamedTuple):
     a: FloatArray  # (4,) its plane
     O: FloatArray  # (2, 4) optical centres
     q_start: FloatArray  # (n,) joints at the start, rad or m
+    body: FloatArray = np.zeros(
+        (0, 4)
+    )  # (b, 4) all markers of the body at the start, those of the face first
 
 
 class Along(NamedTuple):
@@ -314,18 +334,45 @@ def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
 def measured(motion: Motion) -> Motion:
     """The motion with its images, distances and margins, where all else is known."""
     reaching, found = motion.reaching, motion.along
-    demands, model = reaching.demands, reaching.model
-    M = reaching.A @ np.swapaxes(found.H_d, 1, 2)
-    found.s[:] = np.moveaxis(project(model.P, M, model.lens), 0, 1)
+    demands, model, m = reaching.demands, reaching.model, len(reaching.A)
+    A = reaching.body if len(demands.tags) else reaching.A
+    M = A @ np.swapaxes(found.H_d, 1, 2)
+    s = np.moveaxis(project(model.P, M, model.lens), 0, 1)
+    found.s[:] = s[:, :, :m]
     # A camera has a marker before it as long as it has it on the side on which it had it at the start.
-    depth = reaching.A @ model.P[:, 2].T
-    shown = (M @ model.P[:, 2].T) * depth > 1e-9 * depth**2
-    border = np.minimum(found.s + 0.5, demands.image_size - 0.5 - found.s).min(axis=3)
-    border = np.where(np.swapaxes(shown, 1, 2) & np.isfinite(border), border, BEHIND)
-    found.distance[:] = border.min(axis=2)
+    depth = A @ model.P[:, 2].T
+    shown = np.swapaxes((M @ model.P[:, 2].T) * depth > 1e-9 * depth**2, 1, 2)
+    border = np.minimum(s + 0.5, demands.image_size - 0.5 - s).min(axis=3)
+    border = np.where(shown & np.isfinite(border), border, BEHIND)
+    found.distance[:] = border[:, :, :m].min(axis=2)
+    if len(demands.tags):
+        _put_best_tag(reaching, border, found)
     followed = ~np.isnan(found.condition)
     found.margins[:, VISIBILITY] = found.visibility.min(axis=1)
     found.margins[:, IMAGE] = image_margin(demands, found.distance.min(axis=1))
     found.margins[:, JOINTS] = np.where(followed, found.limit, 1.0)
     found.margins[:, CONDITIONING] = np.where(followed, found.condition - demands.conditioning, WORST)
     return motion
+
+
+def tag_planes(tags: IntArray, body: FloatArray, a: FloatArray) -> FloatArray:
+    """Oriented planes (t, 4) of tags (t, 4) of a body (b, 4), one of them the face, with the plane a (4,).
+
+    All tags have their corners in the same sense, as seen from their front: planes through corners have the
+    sign that they have for the face, and a size that lets a·O of one be told beside that of another.
+    """
+    corners = [[vec(A) for A in body[tag]] for tag in tags]
+    planes = np.array([meet(A, B, C) for A, B, C, _ in corners])
+    face = planes[(np.sort(tags) == np.arange(4)).all(axis=1)][0]
+    return np.asarray(planes * (float(a @ face) / float(face @ face)))
+
+
+def _put_best_tag(reaching: Reaching, border: FloatArray, found: Along) -> None:
+    """Write visibility and distance of the tag that keeps them best, of distances (s, 2, b) of markers."""
+    tags = reaching.demands.tags
+    planes = tag_planes(tags, reaching.body, reaching.a)
+    back = np.linalg.inv(found.H_d) @ (reaching.O / (reaching.O @ reaching.a)[:, None]).T
+    side, distance = planes @ back, border[:, :, tags].min(axis=3).swapaxes(1, 2)  # (s, t, 2) both
+    worst = np.minimum(side.min(axis=2), image_margin(reaching.demands, distance.min(axis=2)))
+    best = np.arange(len(worst)), worst.argmax(axis=1)
+    found.visibility[:], found.distance[:] = side[best], distance[best]

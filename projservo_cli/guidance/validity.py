@@ -12,6 +12,8 @@ Each margin is positive where its constraint holds:
 - clear: the least distance from a region that is kept out of, px, less what a prediction may be off: of all
   markers, and of all points between those of the face.
 
+Of a tool with several tags side, width and border are those of the tag that keeps them best.
+
 Joints are valid where each margin is above what is asked for, and that is no more than a share of what start
 and goal have themselves, rising to its full value within ``RISE`` of them.
 """
@@ -23,9 +25,10 @@ import numpy as np
 
 from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
 from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kernels import put_row
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
-from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, apart, bulge, clearance, squared
-from projservo_cli.guidance.margins import Demands, from_border, pixel, straight_pixel
+from projservo_cli.guidance.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
+from projservo_cli.guidance.margins import Demands, from_border, pixel, straight_pixel, tag_planes
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, Model, Spread
 from projservo_cli.task.face import Task, center_of, face_plane
 
@@ -38,10 +41,12 @@ RISE = 0.5
 # Between two checks no marker moves more than this in an image, px, and no joint more than that, rad or m.
 FINE_PX = 4.0
 FINE_STEP = 0.2
-
-
 # So many standard deviations a prediction may be off.
 DEVIATIONS = 3.0
+# No marker of the body is off by so many times as much as the face was at most.
+FAR_OFF = 5.0
+# Half the length, px, of the shortest pieces of a segment that are told apart at a region.
+PIECE = 0.5
 
 
 class Constraints(NamedTuple):
@@ -50,8 +55,9 @@ class Constraints(NamedTuple):
     model: Model  # its cameras scaled so that markers in front have a positive third coordinate
     M: FloatArray  # (b, 4) markers of the body at the reference, those of the face first
     face: int  # how many are of the face
-    a: FloatArray  # (4,) plane of the face at the reference
-    O: FloatArray  # (2, 4) optical centres, a·O = 1 at the start
+    tags: IntArray  # (t, k) markers of the face, or of tags, of which one is to be in sight
+    a: FloatArray  # (t, 4) their planes at the reference
+    O: FloatArray  # (2, 4) optical centres, a·O = 1 of the face at the start
     depth: FloatArray  # (2,) least third coordinate of a marker at the start
     lower: FloatArray
     upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
@@ -66,44 +72,41 @@ class Constraints(NamedTuple):
 
 
 def constraints_of(
-    model: Model, A: FloatArray, task: Task, q_start: FloatArray, asked: "Asked"
+    model: Model,
+    A: FloatArray,
+    task: Task,
+    q_start: FloatArray,
+    demands: Demands,
+    keep_out: KeepOut = NO_KEEP_OUT,
 ) -> Constraints:
     """What joints are held against, of a task whose points (b, 4) are given at the start, face first.
 
     Signs are those at the start: [RH00] section 4.2 carries them along.
     """
-    m = len(task.order)
-    a = np.array(face_plane(A[:m], task.order, center_of(A[:m], task.center)))
+    m, n, tags = len(task.order), len(q_start), demands.tags
+    face = np.array(face_plane(A[:m], task.order, center_of(A[:m], task.center)))
     H = forward_kinematics(model, q_start)
     sides = np.sign((A @ model.P[:, 2].T)[0])
     model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
-    n = len(q_start)
-    demands, steep = asked.demands, asked.least_face_px
-    border = demands.border_px
+    steep, border = demands.least_face_px, demands.border_px
     return Constraints(
         model,
         np.ascontiguousarray(A @ np.linalg.inv(H).T),
         m,
-        H.T @ a,
-        np.ascontiguousarray(task.O / (task.O @ a)[:, None]),
+        tags if len(tags) else np.arange(m)[None],
+        np.ascontiguousarray((tag_planes(tags, A, face) if len(tags) else face[None]) @ H),
+        np.ascontiguousarray(task.O / (task.O @ face)[:, None]),
         (A @ model.P[:, 2].T).min(axis=0),
         demands.lower,
         demands.upper,
         demands.speed,
         demands.image_size,
-        np.maximum(asked.keep, 1e-9),
+        np.maximum(demands.keep, 1e-9),
         np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
         np.zeros((0, n)),
         np.zeros((0, MARGINS)),
+        keep_out=keep_out,
     )
-
-
-class Asked(NamedTuple):
-    """What a way is to keep to."""
-
-    demands: Demands  # limits and speeds of the joints, of which each has one, images and their border
-    keep: FloatArray  # (n,) distance from the joint limits, rad or m
-    least_face_px: float  # width of the face in the images
 
 
 @merged
@@ -115,30 +118,68 @@ def _put_limits(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
 
 
 @merged
-def _put_sides(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
-    back = backward(c.model, q)
+def _put_images(c: Constraints, H: Mat4, s: FloatArray, margins: FloatArray) -> bool:
+    """Write the images (2, b, 2) of the displaced body; False where a marker is behind a camera."""
     for view in range(2):
-        margins[SIDE + view] = dot(vec(c.a), apply(back, vec(c.O[view])))
+        nearest = math.inf
+        for k in range(c.M.shape[0]):
+            A = apply(H, vec(c.M[k]))
+            depth = row(c.model.P[view], 2, A)
+            nearest = min(nearest, depth)
+            if depth > 0.0:
+                s[view, k, 0], s[view, k, 1] = pixel(c.model, view, A)
+        margins[FRONT + view] = nearest / c.depth[view]
+    return bool(margins[FRONT] > 0.0 and margins[FRONT + 1] > 0.0)
 
 
 @internal
-def width(s: FloatArray, m: int) -> float:
-    """Least width of m image points (≥ m, 2), px: between the two nearest parallel lines that hold them.
+def width(s: FloatArray, which: IntArray) -> float:
+    """Least width of some (k,) image points of (b, 2), px: between the nearest parallel lines that hold them.
 
     One of them goes through two of the points.
     """
     least = math.inf
-    for i in range(m):
-        for j in range(i):
+    for i in which:
+        for j in which:
             dx, dy = s[i, 0] - s[j, 0], s[i, 1] - s[j, 1]
             length = math.sqrt(dx * dx + dy * dy)
-            if length > 0.0:
+            if j < i and length > 0.0:
                 low, high = 0.0, 0.0
-                for k in range(m):
+                for k in which:
                     off = (dx * (s[k, 1] - s[j, 1]) - dy * (s[k, 0] - s[j, 0])) / length
                     low, high = min(low, off), max(high, off)
                 least = min(least, high - low)
     return least if math.isfinite(least) else 0.0
+
+
+@internal
+def _put_sight(c: Constraints, tag: int, back: Mat4, shown: bool, s: FloatArray, sight: FloatArray) -> None:
+    """Write side, width and border (6,) of a tag; the latter by images (2, b, 2), if they are shown.
+
+    back : inverse of the forward kinematics.
+    """
+    for view in range(2):
+        sight[view] = dot(vec(c.a[tag]), apply(back, vec(c.O[view])))
+        sight[2 + view] = width(s[view], c.tags[tag]) if shown else -math.inf
+        sight[4 + view] = math.inf if shown else -math.inf
+        for k in c.tags[tag]:
+            border = from_border(c.image_size, s[view, k, 0], s[view, k, 1])
+            sight[4 + view] = min(sight[4 + view], border)
+
+
+@internal
+def _put_best_sight(c: Constraints, q: FloatArray, shown: bool, trial: "Trial") -> None:
+    """Write side, width and border of the tag whose least excess over what is asked for is largest."""
+    best, back = -math.inf, backward(c.model, q)
+    for tag in range(c.tags.shape[0]):
+        _put_sight(c, tag, back, shown, trial.s, trial.sight)
+        least = math.inf
+        for i in range(6):
+            unit = 1.0 if i < 2 else FINE_PX
+            least = min(least, (trial.sight[i] - trial.demands[SIDE + i]) / unit)
+        if tag == 0 or least > best:
+            best = least
+            put_row(trial.margins[SIDE:CLEAR], trial.sight)
 
 
 @merged
@@ -146,57 +187,6 @@ def twin_of(c: Constraints, j: int) -> Model:
     """The calibrated model, off by the deviation j."""
     m = c.model
     return Model(c.spread.P[j], c.spread.H_hat[j], m.joint_types, m.q_reference, m.a_inf, m.lens)
-
-
-@merged
-def _put_views(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray, asked: float) -> bool:
-    """Write the images (2, b, 2) and what they tell; False where a marker is behind a camera.
-
-    asked : what the distance from regions is held against, infinite where it is told.
-    """
-    H = forward(c.model, q)
-    P = c.model.P
-    for view in range(2):
-        nearest, border = math.inf, math.inf
-        for k in range(c.M.shape[0]):
-            A = apply(H, vec(c.M[k]))
-            depth = row(P[view], 2, A)
-            nearest = min(nearest, depth)
-            if not depth > 0.0:
-                continue
-            u, v = pixel(c.model, view, A)
-            s[view, k, 0], s[view, k, 1] = u, v
-            if k < c.face:
-                border = min(border, from_border(c.image_size, u, v))
-        margins[FRONT + view] = nearest / c.depth[view]
-        if not nearest > 0.0:
-            return False
-        margins[WIDTH + view] = width(s[view], c.face)
-        margins[BORDER + view] = border
-    left = right = most = c.spread.most
-    room = min(margins[BORDER] - c.full[BORDER], margins[BORDER + 1] - c.full[BORDER + 1])
-    if most > 0.0 and room < DEVIATIONS * most:  # near enough for the deviation there to tell
-        left, right = most_off(c, q, H)
-    margins[BORDER] -= DEVIATIONS * left
-    margins[BORDER + 1] -= DEVIATIONS * right
-    margins[CLEAR] = _clear(c, q, H, s, asked) if c.keep_out.image.shape[0] > 0 else math.inf
-    return True
-
-
-# No marker of the body is off by so many times as much as the face was at most.
-FAR_OFF = 5.0
-
-
-@internal
-def _clear(c: Constraints, q: FloatArray, H: Mat4, s: FloatArray, asked: float) -> float:
-    """Margin of the regions that are kept out of; near them, or to tell it, by what is off there."""
-    off = DEVIATIONS * FAR_OFF * c.spread.most
-    if off > 0.0 and asked < math.inf:
-        far = clear_by(c, H, s, (off, off), c.full[CLEAR])
-        if far >= c.full[CLEAR]:
-            return far
-    left, right = most_off(c, q, H)
-    return clear_by(c, H, s, (DEVIATIONS * left, DEVIATIONS * right), asked)
 
 
 @internal
@@ -217,77 +207,58 @@ def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
 
 
 @internal
-def clear_by(c: Constraints, H: Mat4, s: FloatArray, off: tuple[float, float], asked: float) -> float:
+def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
     """Least distance, px, of the displaced body with images s (2, b, 2) from regions that are kept out of.
 
-    off : how far predictions may be off in each image, px.
-    asked : what the distance is held against: beyond it, and once it is missed, less is looked at; infinite
-        where the distance itself matters.
     A point is clear where one camera sees it beside a region. Markers of a face that the obstacle may hide
     are so in both images, and all markers in the only image in which a region is drawn.
     """
     keep, least = c.keep_out, math.inf
-    enough = min(asked, c.full[CLEAR]) if asked < math.inf else asked
     for region in range(keep.hides.shape[0]):
+        both = keep.views[region] == BOTH
         for k in range(c.M.shape[0]):
-            u, v, x, y = s[0, k, 0], s[0, k, 1], s[1, k, 0], s[1, k, 1]
-            first = clearance(keep, region, 0, (u, v)) - off[0]
-            second = clearance(keep, region, 1, (x, y)) - off[1]
-            if keep.views[region] != BOTH or (keep.hides[region] == 1 and k < c.face):
+            left, right = (s[0, k, 0], s[0, k, 1]), (s[1, k, 0], s[1, k, 1])
+            first, second = clearance(keep, region, 0, left), clearance(keep, region, 1, right)
+            if not both or (keep.hides[region] == 1 and k < c.face):
                 least = min(least, first, second)
             else:
-                first, second = (
-                    min(first, from_border(c.image_size, u, v) - off[0]),
-                    min(second, from_border(c.image_size, x, y) - off[1]),
-                )
+                first = min(first, from_border(c.image_size, left[0], left[1]))
+                second = min(second, from_border(c.image_size, right[0], right[1]))
                 least = min(least, max(first, second))
-        for k in range(c.face if keep.views[region] == BOTH else 0):
+        for k in range(c.face if both else 0):
+            A = apply(H, vec(c.M[k]))
             for l in range(k):
-                if least < asked < math.inf:
-                    return least
-                A, B = apply(H, vec(c.M[k])), apply(H, vec(c.M[l]))
-                least = min(least, _clear_between(c, region, (A, B), off, enough))
+                least = min(least, _clear_between(c, region, A, apply(H, vec(c.M[l]))))
     return least
 
 
-# Half the length, px, of the pieces of a segment that are told apart at a region.
-PIECE = 0.5
-
-
 @internal
-def _clear_between(
-    c: Constraints, region: int, ends: tuple[Vec4, Vec4], off: tuple[float, float], enough: float
-) -> float:
+def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
     """Least distance, px, of a segment from a region of both images, as above; never too large.
 
-    Pieces of it, of the segment in space and so the same in both images, are halved until one image shows
-    all of each ``enough`` beside the region, or they are short: a distance changes by no more than the way.
+    Pieces of it, of the segment in space and so the same in both images, are halved until their images are
+    short beside the distance of their middles, less so where that is enough: a distance changes by no more
+    than the way.
     """
     least, done, step = math.inf, 0.0, 1.0
     while done < 1.0:
         step = min(step, 1.0 - done)
-        first, last = combined(done, ends[0], ends[1]), combined(done + step, ends[0], ends[1])
-        middle = combined(done + 0.5 * step, ends[0], ends[1])
-        here, all_along, half = -math.inf, -math.inf, 0.0
+        first, middle, last = (
+            combined(done, A, B),
+            combined(done + 0.5 * step, A, B),
+            combined(done + step, A, B),
+        )
+        here, along, half = -math.inf, -math.inf, 0.0
         for view in range(2):
             s, at, t = pixel(c.model, view, first), pixel(c.model, view, middle), pixel(c.model, view, last)
             radius = math.sqrt(max(squared(at, s), squared(at, t)))
-            clear = (
-                min(clearance(c.keep_out, region, view, at), from_border(c.image_size, at[0], at[1]))
-                - off[view]
-            )
-            along = clear - radius
-            if along < enough <= clear:
-                # A lens bends the image of a straight piece: by no more than in its middle.
-                border = min(from_border(c.image_size, s[0], s[1]), from_border(c.image_size, t[0], t[1]))
-                along = min(apart(c.keep_out, region, view, s, t), border) - off[view] - bulge(s, at, t)
-            here, all_along, half = max(here, clear), max(all_along, along), max(half, radius)
-            if all_along >= enough:
-                break
-        if all_along < enough and half > max(PIECE, 0.25 * abs(here)):
+            clear = min(clearance(c.keep_out, region, view, at), from_border(c.image_size, at[0], at[1]))
+            here, along, half = max(here, clear), max(along, clear - radius), max(half, radius)
+        short = 0.5 if along >= c.full[CLEAR] else 0.25
+        if half > max(PIECE, short * abs(here)):
             step *= 0.5
             continue
-        least = min(least, max(all_along, here - half))
+        least = min(least, along)
         done += step
         step *= 2.0
     return least
@@ -300,13 +271,23 @@ def combined(x: float, A: Vec4, B: Vec4) -> Vec4:
 
 
 @njit
-def put_margins(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray) -> None:
-    """Write all margins (10,) at joints (n,), rad or m, and the images (2, b, 2), px."""
-    for i in range(MARGINS):
-        margins[i] = -math.inf
+def put_margins(c: Constraints, q: FloatArray, trial: "Trial") -> None:
+    """Write margins, what is asked of them, and images at joints (n,), rad or m."""
+    margins, s = trial.margins, trial.s
+    put_demands(c, q, trial.demands)
     _put_limits(c, q, margins)
-    _put_sides(c, q, margins)
-    _put_views(c, q, s, margins, math.inf)
+    H = forward(c.model, q)
+    shown = _put_images(c, H, s, margins)
+    _put_best_sight(c, q, shown, trial)
+    margins[CLEAR] = clear_by(c, H, s) if shown else -math.inf
+    # Near enough for what a prediction is off there to tell.
+    near, most = DEVIATIONS * c.spread.most, margins[CLEAR] - c.full[CLEAR]
+    room = min(margins[BORDER] - c.full[BORDER], margins[BORDER + 1] - c.full[BORDER + 1])
+    if shown and near > 0.0 and (room < near or most < FAR_OFF * near):
+        left, right = most_off(c, q, H)
+        margins[BORDER] -= DEVIATIONS * left
+        margins[BORDER + 1] -= DEVIATIONS * right
+        margins[CLEAR] -= DEVIATIONS * max(left, right)
 
 
 @njit
@@ -319,14 +300,6 @@ def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
         if rise < 1.0:
             for i in range(MARGINS):
                 demands[i] = min(demands[i], c.had[e, i] + rise * (c.full[i] - c.had[e, i]))
-
-
-@njit
-def put_along(c: Constraints, q: FloatArray, s: FloatArray, margins: FloatArray, demands: FloatArray) -> None:
-    """Write margins and demands (k, 10) along joints (k, n), and the last images (2, b, 2), px."""
-    for i in range(q.shape[0]):
-        put_margins(c, q[i], s, margins[i])
-        put_demands(c, q[i], demands[i])
 
 
 @merged
@@ -361,6 +334,7 @@ class Trial(NamedTuple):
 
     margins: FloatArray
     demands: FloatArray  # margins, demands: (10,)
+    sight: FloatArray  # (6,) side, width and border of one tag
     s: FloatArray
     s_before: FloatArray  # s, s_before: (2, b, 2) px
     q: FloatArray  # (n,)
@@ -370,32 +344,19 @@ class Trial(NamedTuple):
 def new_trial(n: int, b: int) -> Trial:
     """Workspace for n joints and b markers."""
     one, s = np.zeros(MARGINS), np.zeros((2, b, 2))
-    return Trial(one, one.copy(), s, s.copy(), np.zeros(n), np.zeros(MARGINS + n, np.int64))
+    return Trial(one, one.copy(), np.zeros(6), s, s.copy(), np.zeros(n), np.zeros(MARGINS + n, np.int64))
 
 
 @internal
 def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
     """Whether joints keep all that is asked for; what fails is counted, the images are written."""
-    margins, demands = trial.margins, trial.demands
-    put_demands(c, q, demands)
-    _put_limits(c, q, margins)
-    if not margins[LIMITS] >= demands[LIMITS]:
-        trial.failures[LIMITS] += 1
-        for i in range(q.shape[0]):
-            if not min(q[i] - c.lower[i], c.upper[i] - q[i]) / c.keep[i] >= demands[LIMITS]:
-                trial.failures[MARGINS + i] += 1
-        return False
-    _put_sides(c, q, margins)
-    for view in range(2):
-        if not margins[SIDE + view] > demands[SIDE + view]:
-            trial.failures[SIDE + view] += 1
-            return False
-    if not _put_views(c, q, trial.s, margins, demands[CLEAR]):
-        trial.failures[FRONT if not margins[FRONT] > 0.0 else FRONT + 1] += 1
-        return False
-    for i in (FRONT, FRONT + 1, WIDTH, WIDTH + 1, BORDER, BORDER + 1, CLEAR):
-        if not margins[i] >= demands[i]:
+    put_margins(c, q, trial)
+    for i in range(MARGINS):
+        if not trial.margins[i] > trial.demands[i]:
             trial.failures[i] += 1
+            for j in range(q.shape[0] if i == LIMITS else 0):
+                room = min(q[j] - c.lower[j], c.upper[j] - q[j]) / c.keep[j]
+                trial.failures[MARGINS + j] += not room > trial.demands[LIMITS]
             return False
     return True
 

@@ -15,7 +15,6 @@ from projservo_cli.guidance.validity import (
     DEVIATIONS,
     FRONT,
     LIMITS,
-    MARGINS,
     SHARE,
     Constraints,
     Trial,
@@ -84,9 +83,9 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
 
 def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Margins (10,) and images (2, b, 2), px, at joints (n,)."""
-    s, margins = np.full((2, len(c.M), 2), np.nan), np.zeros(MARGINS)
-    put_margins(c, q, s, margins)
-    return margins, s
+    trial = new_trial(len(q), len(c.M))
+    put_margins(c, q, trial)
+    return trial.margins, trial.s
 
 
 def within_region(c: Constraints, q: FloatArray) -> int:

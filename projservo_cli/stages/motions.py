@@ -16,7 +16,7 @@ from projservo_cli.guidance.keep_out import keep_out_of
 from projservo_cli.guidance.lattice import duration, evenly, plan_path
 from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares
 from projservo_cli.guidance.timing import Pace, joints_at, least_time
-from projservo_cli.guidance.validity import BORDER, CLEAR, Asked, Constraints, constraints_of
+from projservo_cli.guidance.validity import BORDER, CLEAR, Constraints, constraints_of
 from projservo_cli.guidance.way import Budget, Way, find_way, first_within, margins_at, within_region
 from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Plan, Spread, WorkFailed
 from projservo_cli.stages.scenario import Scenario
@@ -152,16 +152,11 @@ def body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> Floa
 _INTERPOLATED_PX = 0.05
 
 
-def joint_constraints(
-    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread
-) -> Constraints:
-    """What joints are held against, for a body at A (b, 4)."""
-    margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
-    keep = np.where(reaching.model.joint_types == PRISMATIC, *margins).astype(np.float64)
-    asked = Asked(reaching.demands, keep, trajectory.least_face_px)
+def joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
+    """What joints are held against."""
     drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
-    c = constraints_of(reaching.model, A, task, reaching.q_start, asked)
-    return c._replace(spread=spread, keep_out=drawn)
+    c = constraints_of(reaching.model, reaching.body, task, reaching.q_start, reaching.demands, drawn)
+    return c._replace(spread=spread)
 
 
 def _entered(c: Constraints, q: FloatArray) -> str:
@@ -176,18 +171,16 @@ def _entered(c: Constraints, q: FloatArray) -> str:
     return f"the body enters region {region} of trajectory.keep_out {at}" if region else ""
 
 
-def kept_out(found: Found, A: FloatArray, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
-    """What was found, infeasible where it enters a region that a body at A (b, 4) is kept out of."""
-    c = joint_constraints(found.motion.reaching, A, task, trajectory, spread)
+def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
+    """What was found, infeasible where it enters a region that the body is kept out of."""
+    c = joint_constraints(found.motion.reaching, task, trajectory, spread)
     entered = _entered(c, found.motion.along.q)
     return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
 
 
-def joint_way(
-    reaching: Reaching, A: FloatArray, task: Task, trajectory: Trajectory, search: JointSearch
-) -> Found:
-    """A way through joint space for a body at A (b, 4); the linear motion where there is none."""
-    c = joint_constraints(reaching, A, task, trajectory, search.spread)
+def joint_way(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
+    """A way through joint space; the linear motion where there is none."""
+    c = joint_constraints(reaching, task, trajectory, search.spread)
     aim = Aim(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
     how = Budget(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
     way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
@@ -223,10 +216,10 @@ class Ways:
         model, shown, self._trajectory = scenario.model, scenario.ends, scenario.config.trajectory
         task, amplitudes = shown.task(model), np.array([plan.tau, plan.theta_r, plan.theta_p])
         self._plan, self._search, self._made = plan, search_of(scenario), 0
-        demands, q_start = scenario.demands, shown.q_start
-        self._reaching = Reaching(model, demands, plan.H_hat, amplitudes, plan.A, plan.a, task.O, q_start)
-        A = body_at_start(model, task, shown, plan.A)
-        self._c = joint_constraints(self._reaching, A, task, self._trajectory, self._search.spread)
+        parts = plan.H_hat, amplitudes, plan.A, plan.a
+        body = body_at_start(model, task, shown, plan.A)
+        self._reaching = Reaching(model, scenario.demands, *parts, task.O, shown.q_start, body)
+        self._c = joint_constraints(self._reaching, task, self._trajectory, self._search.spread)
         self._aim = Aim(task.A_star, straight_views(model.lens, task.s_star), self._search.sigma)
 
     def predicted(self, q: FloatArray) -> FloatArray:

@@ -157,7 +157,6 @@ def plan_task(
 def _found(
     reaching: Reaching,
     task: Task,
-    shown: Shown,
     trajectory: Trajectory,
     search: JointSearch | None,
     tau_limit: float,
@@ -168,16 +167,14 @@ def _found(
         shut = why_closed(reaching.model, reaching.demands, search)
         if search is None or shut:
             raise InputError(f"the profile joint: {shut}")
-        A = body_at_start(reaching.model, task, shown, reaching.A)
-        return joint_way(reaching, A, task, trajectory, search)
+        return joint_way(reaching, task, trajectory, search)
     if profile == "constrained":
         found = coupled(reaching, trajectory)
     else:
         tau = float(reaching.amplitudes[0])
         found = given(profile, reaching, trajectory, tau_limit / tau if tau > 0.0 else 1.0)
     if trajectory.keep_out and found.feasible:
-        A = body_at_start(reaching.model, task, shown, reaching.A)
-        found = kept_out(found, A, task, trajectory, NO_SPREAD if search is None else search.spread)
+        found = kept_out(found, task, trajectory, NO_SPREAD if search is None else search.spread)
     return found
 
 
@@ -191,8 +188,9 @@ def _planned(
     a, amplitudes = np.array(parts.a), np.array([parts.tau, parts.theta_r, parts.theta_p])
     tau_0, theta_0 = _changes(a, H_hat, task)
     tau_limit = min((trajectory.delta * t for t in tau_0 if t > 0.0), default=math.inf)
-    reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start)
-    found = _found(reaching, task, shown, trajectory, search, tau_limit)
+    body = body_at_start(model, task, shown, state.A)
+    reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start, body)
+    found = _found(reaching, task, trajectory, search, tau_limit)
     motion, along, time, way = found.motion, found.motion.along, found.time, found.way
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
     if len(shown.q_start) < COORDINATES and way is None:

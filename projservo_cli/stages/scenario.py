@@ -103,7 +103,10 @@ class Scenario:
         size = np.array(image_size_of(self.config) or (math.inf, math.inf), dtype=np.float64)
         joints, trajectory = self.joints, self.config.trajectory
         limits = joints.lower, joints.upper, joints.speed
-        return Demands(*limits, size, trajectory.border_px, trajectory.least_condition)
+        margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
+        keep = np.array([margins[kind != "P"] for kind in joints.types])
+        border, condition = trajectory.border_px, trajectory.least_condition
+        return Demands(*limits, size, border, condition, keep, trajectory.least_face_px)
 
     def believed_by(self, law: str) -> Model:
         """The model that a law is given: the calibrated one, or for a metric law the true one."""

@@ -16,8 +16,9 @@ from projservo_cli.guidance.validity import (
     MARGINS,
     WIDTH,
     Constraints,
-    put_along,
+    new_trial,
     put_demands,
+    put_margins,
 )
 from projservo_cli.guidance.way import Way, may_start
 from projservo_cli.records import PRISMATIC, VIEWS, FloatArray, IntArray
@@ -61,9 +62,11 @@ def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:
 
 def _along(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Margins and what is asked of them, (s, 10), at joints (s, n)."""
-    margins, asked = np.zeros((len(q), MARGINS)), np.zeros((len(q), MARGINS))
-    put_along(c, np.ascontiguousarray(q), np.zeros((2, len(c.M), 2)), margins, asked)
-    return margins, asked
+    trial, found = new_trial(q.shape[1], len(c.M)), np.zeros((2, len(q), MARGINS))
+    for i, joints in enumerate(q):
+        put_margins(c, joints, trial)
+        found[:, i] = trial.margins, trial.demands
+    return found[0], found[1]
 
 
 def _corners_of(pace: Pace) -> FloatArray:

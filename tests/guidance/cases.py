@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.margins import Demands
-from projservo_cli.guidance.validity import Asked, Constraints, constraints_of
+from projservo_cli.guidance.validity import Constraints, constraints_of
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweep.design import random_tasks
 from projservo_cli.task.target import Shown
@@ -43,7 +43,7 @@ def case(name, k):
     task = Shown(q_start, s_start, s_star, truth.center).task(truth.model)
     A = truth.M_face @ truth.displacement(q_start).T
     speed = np.where(np.isfinite(joints.speed), joints.speed, 1.0)
-    demands = Demands(joints.lower, joints.upper, speed, truth.image_size, 5.0, 0.0)
     keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])
-    c = constraints_of(truth.model, A, task, q_start, Asked(demands, keep, 8.0))
+    demands = Demands(joints.lower, joints.upper, speed, truth.image_size, 5.0, 0.0, keep, 8.0)
+    c = constraints_of(truth.model, A, task, q_start, demands)
     return Case(truth, q_start, q_goal, c, Aim(task.A_star, s_star, 0.0), joints.acceleration)

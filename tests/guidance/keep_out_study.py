@@ -23,7 +23,7 @@ from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
 from projservo_cli.guidance.margins import limits_alone
-from projservo_cli.guidance.validity import Asked, constraints_of
+from projservo_cli.guidance.validity import constraints_of
 from projservo_cli.guidance.way import Budget, find_way, within_region
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots.simulated import METRIC_A_INF
@@ -159,12 +159,12 @@ def true_constraints(config, truth: Truth, task: Drawn, q):
     """What joints are held against from joints (n,) on: the true model, border 0, limits without margin."""
     s_start, s_star = (truth.images(x, truth.M_face) for x in (q, task.q_goal))
     aimed = Shown(q, s_start, s_star, truth.center).task(truth.model)
-    joints, n = joints_of(config), len(q)
+    joints = joints_of(config)
     demands = limits_alone(joints.lower, joints.upper)._replace(
         speed=joints.speed, image_size=truth.image_size
     )
     A = truth.M[[*truth.face, *truth.pins]] @ truth.displacement(q).T
-    c = constraints_of(truth.model, A, aimed, q, Asked(demands, np.zeros(n), 0.0))
+    c = constraints_of(truth.model, A, aimed, q, demands)
     return c._replace(
         full=np.r_[0.0, c.full[1:]],
         keep_out=keep_out_of([(region.left, region.right, region.hides) for region in task.regions]),

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from projservo_cli.config.robot import JointVector
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.margins import limits_alone
-from projservo_cli.guidance.validity import Asked, constraints_of
+from projservo_cli.guidance.validity import constraints_of
 from projservo_cli.guidance.way import Budget, find_way
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweep.design import random_tasks
@@ -55,12 +55,11 @@ def true_search(config, *, margins=False):
     demands = limits_alone(joints.lower, joints.upper)._replace(
         speed=joints.speed, image_size=truth.image_size
     )
-    keep, least_px = np.zeros(len(q_start)), 0.0
     if margins:
-        demands, least_px = demands._replace(border_px=asked.border_px), asked.least_face_px
         deg = np.radians(asked.joint_margin_deg)
         keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])
-    c = constraints_of(truth.model, A, task, q_start, Asked(demands, keep, least_px))
+        demands = demands._replace(border_px=asked.border_px, least_face_px=asked.least_face_px, keep=keep)
+    c = constraints_of(truth.model, A, task, q_start, demands)
     return c, Aim(task.A_star, s_star, 0.0), q_start, q_goal, joints.acceleration
 
 

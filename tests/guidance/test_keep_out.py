@@ -33,7 +33,7 @@ def test_the_distance_from_a_polygon_is_that_to_its_outline(k, seed):
         [(1 - x) * a + x * b for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
     )
     for u, v in rng.uniform(-120.0, 120.0, (8, 2)):
-        found = outside_polygon(corners, 0, len(corners), (u, v), (u, v))
+        found = outside_polygon(corners, 0, len(corners), (u, v))
         assert abs(found) == pytest.approx(np.hypot(*(outline - (u, v)).T).min(), abs=0.1)
         if abs(found) > 1e-6:
             assert (found < 0.0) == Outline(corners).contains_point((u, v))

@@ -53,7 +53,7 @@ def test_signs_are_those_of_the_metric_truth(name):
 @given(st.integers(3, 8), st.integers(0, 10_000))
 def test_width_is_the_least_over_all_directions(m, seed):
     points = np.random.default_rng(seed).uniform(0.0, 100.0, (m, 2))
-    found = width(points, m)
+    found = width(points, np.arange(m))
     # Along each edge of the hull, by another library; no direction is narrower.
     corners = points[ConvexHull(points).vertices]
     edges = np.roll(corners, -1, axis=0) - corners
@@ -64,7 +64,9 @@ def test_width_is_the_least_over_all_directions(m, seed):
 
 
 def test_the_width_of_a_line_is_nothing():
-    assert width(np.array([[0.0, 0.0], [1.0, 1.0], [3.0, 3.0]]), 3) == pytest.approx(0.0, abs=1e-12)
+    assert width(np.array([[0.0, 0.0], [1.0, 1.0], [3.0, 3.0]]), np.arange(3)) == pytest.approx(
+        0.0, abs=1e-12
+    )
 
 
 def test_edges_are_valid_where_dense_samples_are():

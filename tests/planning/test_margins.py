@@ -9,11 +9,11 @@ import pytest
 from projservo_cli.guidance.lattice import shortest, widest
 from projservo_cli.guidance.margins import (
     BEHIND,
-    Demands,
     along_shares,
     image_margin,
     joint_margin,
     limit_margin,
+    limits_alone,
 )
 from projservo_cli.guidance.timing import least_time
 from tests.planning.cases import reaching_of
@@ -66,7 +66,7 @@ def test_a_marker_behind_a_camera_is_as_far_outside_as_can_be():
 
 
 def test_margin_of_joint_limits():
-    demands = Demands(np.array([-1.0, -np.inf]), np.array([3.0, np.inf]), np.ones(2), np.ones(2), 0.0, 0.0)
+    demands = limits_alone(np.array([-1.0, -np.inf]), np.array([3.0, np.inf]))
     for q_0, wanted in ((1.0, 1.0), (2.0, 0.5), (-1.5, -0.25)):
         q = np.array([q_0, 99.0])
         assert [joint_margin(demands, q, i) for i in range(2)] == [wanted, 1.0]
