@@ -355,22 +355,24 @@ def measured(motion: Motion) -> Motion:
     return motion
 
 
-def tag_planes(tags: IntArray, body: FloatArray, a: FloatArray) -> FloatArray:
-    """Oriented planes (t, 4) of tags (t, 4) of a body (b, 4), one of them the face, with the plane a (4,).
+def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> FloatArray:
+    """Oriented planes (t, 4) of tags (t, 4) of a body (b, 4), one on the face, its first m markers.
 
     All tags have their corners in the same sense, as seen from their front: planes through corners have the
     sign that they have for the face, and a size that lets a·O of one be told beside that of another.
+
+    a : (4,) plane of the face.
     """
     corners = [[vec(A) for A in body[tag]] for tag in tags]
     planes = np.array([meet(A, B, C) for A, B, C, _ in corners])
-    face = planes[(np.sort(tags) == np.arange(4)).all(axis=1)][0]
+    face = planes[(tags < m).all(axis=1)][0]
     return np.asarray(planes * (float(a @ face) / float(face @ face)))
 
 
 def _put_best_tag(reaching: Reaching, border: FloatArray, found: Along) -> None:
     """Write visibility and distance of the tag that keeps them best, of distances (s, 2, b) of markers."""
     tags = reaching.demands.tags
-    planes = tag_planes(tags, reaching.body, reaching.a)
+    planes = tag_planes(tags, reaching.body, len(reaching.A), reaching.a)
     back = np.linalg.inv(found.H_d) @ (reaching.O / (reaching.O @ reaching.a)[:, None]).T
     side, distance = planes @ back, border[:, :, tags].min(axis=3).swapaxes(1, 2)  # (s, t, 2) both
     worst = np.minimum(side.min(axis=2), image_margin(reaching.demands, distance.min(axis=2)))

@@ -21,7 +21,7 @@ from projservo_cli.records import FloatArray
 ROOM = 0.9
 # Straight chords by which the validity of a rounded corner is checked.
 CHORDS = 8
-# Halvings of a rounded corner until it counts as sharp.
+# Most halvings of a rounded corner.
 HALVINGS = 12
 # Intervals of the grid on each straight piece and on each rounded corner.
 STRAIGHT, ROUNDED = 64, 24
@@ -74,13 +74,17 @@ def _parabola(corner: FloatArray, slopes: FloatArray, size: float, x: FloatArray
 
 
 def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: float, trial: Trial) -> float:
-    """How far from a corner (n,), s, its largest valid rounding begins and ends: ``size`` at most, or 0."""
+    """How far from a corner (n,), s, its largest valid rounding begins and ends: ``size`` at most.
+
+    The least that is tried leaves the corner by less than what lies between two checks.
+    """
     x = np.linspace(0.0, 1.0, CHORDS + 1)[:, None]
-    for halving in range(HALVINGS):
-        path = _parabola(corner, slopes, size * 0.5**halving, x)
+    for _ in range(HALVINGS):
+        path = _parabola(corner, slopes, size, x)
         if all(reached(c, path[k], path[k + 1], trial) == 1.0 for k in range(CHORDS)):
-            return size * 0.5**halving
-    return 0.0
+            break
+        size *= 0.5
+    return size
 
 
 def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: FloatArray) -> Pace:

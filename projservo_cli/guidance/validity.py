@@ -94,7 +94,7 @@ def constraints_of(
         np.ascontiguousarray(A @ np.linalg.inv(H).T),
         m,
         tags if len(tags) else np.arange(m)[None],
-        np.ascontiguousarray((tag_planes(tags, A, face) if len(tags) else face[None]) @ H),
+        np.ascontiguousarray((tag_planes(tags, A, m, face) if len(tags) else face[None]) @ H),
         np.ascontiguousarray(task.O / (task.O @ face)[:, None]),
         (A @ model.P[:, 2].T).min(axis=0),
         demands.lower,
@@ -237,8 +237,8 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
     """Least distance, px, of a segment from a region of both images, as above; never too large.
 
     Pieces of it, of the segment in space and so the same in both images, are halved until their images are
-    short beside the distance of their middles, less so where that is enough: a distance changes by no more
-    than the way.
+    short, or short beside the distance of their middles and on the same side of what is asked for: a distance
+    changes by no more than the way.
     """
     least, done, step = math.inf, 0.0, 1.0
     while done < 1.0:
@@ -254,8 +254,8 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
             radius = math.sqrt(max(squared(at, s), squared(at, t)))
             clear = min(clearance(c.keep_out, region, view, at), from_border(c.image_size, at[0], at[1]))
             here, along, half = max(here, clear), max(along, clear - radius), max(half, radius)
-        short = 0.5 if along >= c.full[CLEAR] else 0.25
-        if half > max(PIECE, short * abs(here)):
+        told = along >= c.full[CLEAR] or here < c.full[CLEAR]
+        if half > PIECE and not (told and half <= 0.5 * abs(here)):
             step *= 0.5
             continue
         least = min(least, along)
@@ -326,7 +326,7 @@ def _moved(s: FloatArray, before: FloatArray) -> float:
 def _keep_images(trial: "Trial") -> None:
     for view in range(2):
         for k in range(trial.s.shape[1]):
-            trial.s_before[view, k, 0], trial.s_before[view, k, 1] = trial.s[view, k, 0], trial.s[view, k, 1]
+            put_row(trial.s_before[view, k], trial.s[view, k])
 
 
 class Trial(NamedTuple):

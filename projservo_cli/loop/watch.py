@@ -41,7 +41,7 @@ class _Ways(Protocol):
     """Ways to the goal of a task."""
 
     def predicted(self, q: FloatArray) -> FloatArray:
-        """Pixels (2, m, 2) of the face at joints (n,), by the calibration."""
+        """Pixels (2, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
 
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
         """Whether a path of joints (s, n) leaves an image, where images are off by (s, 2, 2), px."""
@@ -149,12 +149,14 @@ class Watch:
         """What both images (2, 2) were off their prediction in the last instants, px; 0 where unseen."""
         rows = slice(max(0, k + 1 - LAST), k + 1)
         predicted = np.array([self.ways.predicted(q) for q in log.read[rows]])
-        off = log.s[rows, :, : predicted.shape[2]] - predicted
+        b = min(log.s.shape[2], predicted.shape[2])
+        off = log.s[rows, :, :b] - predicted[:, :, :b]
         seen = np.isfinite(off)
         return np.asarray(np.where(seen, off, 0.0).sum(axis=(0, 2)) / np.maximum(seen.sum(axis=(0, 2)), 1))
 
     def _leaves_image(self, log: Log, k: int, ahead: FloatArray) -> bool:
         """Whether the face leaves an image along joints (s, n), by what images are off now and there."""
-        at_goal = (self.law.law.task.s_star - self.ways.predicted(ahead[-1])).mean(axis=1)
+        s_star = self.law.law.task.s_star
+        at_goal = (s_star - self.ways.predicted(ahead[-1])[:, : s_star.shape[1]]).mean(axis=1)
         x = np.linspace(0.0, 1.0, len(ahead))[:, None, None]
         return self.ways.leaves(ahead, (1.0 - x) * self._off(log, k) + x * at_goal)

@@ -223,9 +223,9 @@ class Ways:
         self._aim = Aim(task.A_star, straight_views(model.lens, task.s_star), self._search.sigma)
 
     def predicted(self, q: FloatArray) -> FloatArray:
-        """Pixels (2, m, 2) of the face at joints (n,), by the calibration."""
-        c = self._c
-        return project(c.model.P, c.M[: c.face] @ forward_kinematics(c.model, q).T, c.model.lens)
+        """Pixels (2, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
+        model = self._c.model
+        return project(model.P, self._c.M @ forward_kinematics(model, q).T, model.lens)
 
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
         """Whether a path of joints (s, n) leaves an image, where images are off by (s, 2, 2), px."""

@@ -70,6 +70,8 @@ class Scenario:
     noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
     gains: Gains
     limits: Limits  # gains, limits: of the laws, and when a run ends
+    # (4,) numbers of the corners of each tag, of which one is to be in sight; none where the face is
+    tags: tuple[tuple[int, ...], ...]
 
     @cached_property
     def ends(self) -> Shown:
@@ -106,7 +108,12 @@ class Scenario:
         margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
         keep = np.array([margins[kind != "P"] for kind in joints.types])
         border, condition = trajectory.border_px, trajectory.least_condition
-        return Demands(*limits, size, border, condition, keep, trajectory.least_face_px)
+        seen = [tag for tag in self.tags if set(tag) <= set(self.numbers)]
+        tags = np.array([[self.numbers.index(number) for number in tag] for tag in seen]).reshape(-1, 4)
+        if not (tags < self.m).all(axis=1).any():  # none by which the others are told to look forward
+            tags = tags[:0]
+        least = trajectory.least_face_px
+        return Demands(*limits, size, border, condition, keep, least, tags.astype(np.int64))
 
     def believed_by(self, law: str) -> Model:
         """The model that a law is given: the calibrated one, or for a metric law the true one."""
@@ -235,6 +242,7 @@ def scenario_of(
         sigma_px,
         _gains(config, joints),
         _limits(config, joints, sigma_px),
+        (),
     )
 
 
