@@ -12,6 +12,7 @@ import numpy as np
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config
+from projservo_cli.config.markers import CORNERS
 from projservo_cli.config.models import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
@@ -24,6 +25,7 @@ from projservo_cli.records import (
     Calibration,
     FloatArray,
     InputError,
+    IntArray,
     Model,
     WorkFailed,
 )
@@ -70,8 +72,6 @@ class Scenario:
     noise_px: float  # of the images in the loop; no less than what a calibration leaves of recorded ones
     gains: Gains
     limits: Limits  # gains, limits: of the laws, and when a run ends
-    # (4,) numbers of the corners of each tag, of which one is to be in sight; none where the face is
-    tags: tuple[tuple[int, ...], ...]
 
     @cached_property
     def ends(self) -> Shown:
@@ -108,12 +108,17 @@ class Scenario:
         margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
         keep = np.array([margins[kind != "P"] for kind in joints.types])
         border, condition = trajectory.border_px, trajectory.least_condition
-        seen = [tag for tag in self.tags if set(tag) <= set(self.numbers)]
-        tags = np.array([[self.numbers.index(number) for number in tag] for tag in seen]).reshape(-1, 4)
-        if not (tags < self.m).all(axis=1).any():  # none by which the others are told to look forward
-            tags = tags[:0]
-        least = trajectory.least_face_px
-        return Demands(*limits, size, border, condition, keep, least, tags.astype(np.int64))
+        return Demands(*limits, size, border, condition, keep, trajectory.least_face_px, self._tags())
+
+    def _tags(self) -> IntArray:
+        """Corners (t, 4) of tags among the markers; none for tools of which no tag is on the face."""
+        markers, order = self.config.markers, self.numbers
+        known = (markers.known or ()) if markers is not None and markers.tags is not None else ()
+        whole = [known[i : i + CORNERS] for i in range(0, len(known), CORNERS)]
+        tags = [[order.index(k) for k in tag] for tag in whole if set(tag) <= set(order)]
+        if not any(max(tag) < self.m for tag in tags):
+            tags = []
+        return np.array(tags, dtype=np.int64).reshape(-1, CORNERS)
 
     def believed_by(self, law: str) -> Model:
         """The model that a law is given: the calibrated one, or for a metric law the true one."""
@@ -242,7 +247,6 @@ def scenario_of(
         sigma_px,
         _gains(config, joints),
         _limits(config, joints, sigma_px),
-        (),
     )
 
 

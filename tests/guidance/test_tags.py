@@ -1,12 +1,8 @@
 """Tools with several tags: one in sight is enough, by metric truth, in plans and in the loop."""
 
-import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.guidance.validity import BORDER, FINE_PX, SIDE, constraints_of
@@ -19,21 +15,9 @@ from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.servo import drive
 from tests.known import configured
 
-TAGS = tuple(tuple(range(4 * t, 4 * t + 4)) for t in range(5))
 # Joint 4 alone leads from start to goal, deg, and turns the middle tag away from both cameras on the way.
 START = [135.19, -81.51, -99.29, -86.65, 116.76, 88.12]
 GOAL = [135.19, -81.51, -99.29, -241.35, 116.76, 88.12]
-
-
-def corners():
-    """Corners (20, 3) of a tag of 6 cm and four around it that are tilted away by 35°, m."""
-    square = 0.03 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    tags = [square + np.array([0.0, 0.0, 0.06])]
-    for k in range(4):
-        turn = Rotation.from_euler("z", 90.0 * k, degrees=True)
-        tilted = Rotation.from_euler("y", 35.0, degrees=True).apply(square) + np.array([0.08, 0.0, 0.03])
-        tags.append(turn.apply(tilted))
-    return np.concatenate(tags)
 
 
 def vector(degrees):
@@ -47,9 +31,9 @@ def scenario(*overrides, calibrated=False):
         f"task.start={{joints: {START}, unit: deg}}",
         f"task.goal={{joints: {{joints: {GOAL}, unit: deg}}}}",
     ]
-    tool = (f"markers.positions_m={json.dumps(corners().tolist())}", "markers.face=[0, 1, 2, 3]")
+    tool = ("markers.positions_m=null", "markers.face=null", "markers.tags=roof")
     config = configured("ur5", *tool, *ends, "control.observation=body", "control.mode=track", *overrides)
-    return replace(scenario_of(config, calibrate.run(config)[1] if calibrated else None), tags=TAGS)
+    return scenario_of(config, calibrate.run(config)[1] if calibrated else None)
 
 
 def in_truth(truth, q):
@@ -134,4 +118,4 @@ def test_a_run_that_sees_another_tag_alone_for_a_while_arrives():
     trace = drive(made, plan, "exact_track").trace()
     assert np.isnan(trace.s[10:40, :, :4]).all()
     assert trace.verdict == "converged"
-    assert trace.position_error_mm < 0.5
+    assert trace.position_error_mm < 1.0
