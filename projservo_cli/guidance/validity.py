@@ -280,14 +280,17 @@ def put_margins(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     shown = _put_images(c, H, s, margins)
     _put_best_sight(c, q, shown, trial)
     margins[CLEAR] = clear_by(c, H, s) if shown else -math.inf
-    # Near enough for what a prediction is off there to tell.
-    near, most = DEVIATIONS * c.spread.most, margins[CLEAR] - c.full[CLEAR]
+    # What a prediction is off, at most or, where that may tell, there.
+    left = right = most = c.spread.most
+    anywhere = FAR_OFF * most
     room = min(margins[BORDER] - c.full[BORDER], margins[BORDER + 1] - c.full[BORDER + 1])
-    if shown and near > 0.0 and (room < near or most < FAR_OFF * near):
+    near = room < DEVIATIONS * most or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
+    if shown and most > 0.0 and near:
         left, right = most_off(c, q, H)
-        margins[BORDER] -= DEVIATIONS * left
-        margins[BORDER + 1] -= DEVIATIONS * right
-        margins[CLEAR] -= DEVIATIONS * max(left, right)
+        anywhere = max(left, right)
+    margins[BORDER] -= DEVIATIONS * left
+    margins[BORDER + 1] -= DEVIATIONS * right
+    margins[CLEAR] -= DEVIATIONS * anywhere
 
 
 @njit
