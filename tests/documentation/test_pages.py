@@ -12,6 +12,7 @@ import pytest
 import projservo_cli
 from projservo_cli import cli
 from projservo_cli.config import load_config
+from projservo_cli.robots.described import mujoco
 from projservo_cli.stages.world import truth_of
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, run_page
@@ -19,9 +20,9 @@ from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, run_page
 PAGES = sorted(DOCS.glob("*.md"))
 # Those that run laws or plan: only with the compiler.
 DRIVING = {"api", "commands", "guidance", "law", "report", "run-file", "sweeps", "tutorial"}
-LANGUAGES = {"sh", "python", "text", "yaml"}
+LANGUAGES = {"sh", "python", "text", "xml", "yaml"}
 # What cannot be run by a test, and how often it stands there.
-NOT_RUN = {"installation": 1, "sweeps": 1}
+NOT_RUN = {"installation": 1, "rendered": 1, "sweeps": 1}
 
 
 @pytest.fixture
@@ -69,6 +70,32 @@ def put_robot(folder):
         (text,) = (block.text for block in blocks_of(ROOT / "README.md") if mark in block.text)
         (folder / file).write_text(text)
     put_sheet(folder, "ur5", "truth.json")
+
+
+def require_gl():
+    """Skip where nothing can be drawn."""
+    try:
+        mujoco().Renderer(mujoco().MjModel.from_xml_string("<mujoco/>"), 8, 8).close()
+    except Exception as error:
+        pytest.skip(f"nothing can be drawn: {error}")
+
+
+def check_rendered(folder, names, read):
+    """Frames show the markers, and what was taught is where the true cameras project them."""
+    table = np.genfromtxt("few.csv", delimiter=",", names=True)
+    assert np.isfinite(table["u_left"]).mean() > 0.8
+    for name, file, q in (
+        ("configs/rendered", "goal", [3.6, -1.6, -1.9, 0.3, 1.2, 3.4]),
+        ("arm", "there", [0.1, 0.1, 0.2]),
+    ):
+        config = load_config(f"{name}.yaml", [f"task.goal={folder / file}.yaml"])
+        truth, images = truth_of(config), config.task.goal.images
+        expected = truth.images(np.array(q), truth.of(images.markers))
+        for told, s in zip((images.left, images.right), expected, strict=True):
+            seen = [k for k, pixel in enumerate(told) if pixel is not None]
+            assert len(seen) >= 8
+            off = np.array([told[k] for k in seen]) - s[seen]
+            assert np.abs(off).max() < (0.3 if name == "configs/rendered" else 3.0)  # sag and play
 
 
 def check_installation(folder, names, read):
@@ -167,6 +194,7 @@ CHECK = {
     "report": check_report,
     "api": check_api,
     "guidance": check_guidance,
+    "rendered": check_rendered,
     "robot": check_robot,
     "run-file": check_run_file,
 }
@@ -185,6 +213,8 @@ def test_page(folder, page, capsys):
         pytest.importorskip("h5netcdf")
     if page.stem == "report":
         pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    if page.stem == "rendered":
+        require_gl()
     for put in HAS.get(page.stem, ()):
         put(folder)
 
