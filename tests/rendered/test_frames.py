@@ -20,7 +20,7 @@ def misses(truth, eyes, postures, seed=0):
     found = []
     for i, q in enumerate(postures):
         rngs = [np.random.default_rng((seed, i, view)) for view in range(2)]
-        seen = np.array([eyes.look(view, q[None], None, rng) for view, rng in enumerate(rngs)])
+        seen = np.array([eyes.look(view, q[None], None, rng)[0] for view, rng in enumerate(rngs)])
         found.append(seen - truth.images(q, truth.M))
     return np.array(found)
 
@@ -56,7 +56,7 @@ def test_an_exposure_is_the_mean_of_the_frames_in_it(small, drawn):
     for step in way:
         eyes.look(1, (q + step)[None], None, rng)
         single.append(eyes.last[1].astype(float))
-    seen = eyes.look(1, q + way, None, rng)
+    seen, _ = eyes.look(1, q + way, None, rng)
     assert np.abs(eyes.last[1] - np.mean(single, axis=0)).max() <= 1.0
     assert np.nanmean(np.abs(seen - truth.images(q, truth.M)[1])) < 0.1
 
@@ -66,7 +66,7 @@ def test_a_tag_that_is_moved_is_seen_to_be_moved(small, drawn):
     q, by = POSTURES[7], np.array([0.01, 0.0, 0.005])
     moved = truth.M.copy()
     moved[4:8, :3] += truth.robot.base_tool[:3, :3] @ by
-    seen = eyes.look(1, q[None], (6, by), np.random.default_rng(0))
+    seen, _ = eyes.look(1, q[None], (6, by), np.random.default_rng(0))
     assert seen == pytest.approx(truth.images(q, moved)[1], abs=0.15, nan_ok=True)
     assert np.isfinite(seen[4:8]).all()
 
@@ -94,7 +94,7 @@ config = load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.
 truth = truth_of(config)
 eyes = Frames(scene_of(config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered))
 eyes.open()
-seen = [eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view)) for view in range(2)]
+seen = [eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)]
 print(hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest())
 eyes.close()
 """
@@ -103,7 +103,9 @@ eyes.close()
 def test_processes_draw_the_same_to_the_bit(small, drawn):
     config = small("plant.options={k1: -0.1}")
     _, eyes = drawn(config)
-    seen = [eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view)) for view in range(2)]
+    seen = [
+        eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)
+    ]
     here = hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest()
     there = subprocess.run(
         [sys.executable, "-c", HASHED], input=to_yaml(config), capture_output=True, text=True, check=True
