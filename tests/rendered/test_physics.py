@@ -140,7 +140,8 @@ def test_a_real_arm_with_its_meshes(shared_data, small, drawn):
         f"task={{start: {{joints: {q.tolist()}, unit: rad}}, goal: {{turn_deg: 10}}}}",
     )
     truth, eyes = drawn(config)
-    seen, sigma = zip(*(eyes.look(view, q[None], None, np.random.default_rng(0)) for view in range(2)))
+    looks = [eyes.look(view, q[None], None, np.random.default_rng(0)) for view in range(2)]
+    seen, sigma = zip(*looks, strict=True)
     off, sigma = np.array(seen) - truth.images(q, truth.M), np.array(sigma)[..., None]
     assert np.isfinite(sigma).sum(axis=(1, 2)).min() >= 8
     assert (np.abs(off) < 5.0 * sigma)[np.isfinite(off)].all()
