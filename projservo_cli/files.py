@@ -34,7 +34,8 @@ def replacing(path: Path, *, lasting: bool = True) -> Iterator[Path]:
             if lasting:
                 _synchronise(path.parent)
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing can be written, nothing can be removed
+            temporary.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, content: str | bytes) -> Path:

@@ -76,11 +76,12 @@ def _teach(
             raise InputError(f"--at {at}: expected a number for each joint, with commas") from error
     calibration = option.calibration_of(run, settings)
     asks = not settings.plant.simulated and sys.stdin.isatty()
-    taught = stage.teach(settings, frames, put, console.wait if asks else None)
-    if not start:
-        stage.require_face(settings, taught)
-    check = None if calibration is None or start else stage.checked(settings, calibration, taught)
-    write_whole(output, taught.as_text())
+    with option.writing(output):
+        taught = stage.teach(settings, frames, put, console.wait if asks else None)
+        if not start:
+            stage.require_face(settings, taught)
+        check = None if calibration is None or start else stage.checked(settings, calibration, taught)
+        write_whole(output, taught.as_text())
     _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")
     if check is not None and not check.reached:
         raise WorkFailed(f"{output}: by the calibration, {check.reason}")

@@ -126,6 +126,13 @@ def require_new(path: Path, *, force: bool) -> None:
         raise click.UsageError(f"{path}: exists already; choose another, or replace it with --force")
 
 
+def writing(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Make sure, before any work, that a file can be written, and keep other processes from it."""
+    from projservo_cli.files import working_in
+
+    return working_in(path.parent, name=f".{path.name}.lock")
+
+
 def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
     """The run that is named, as an argument or with ``-o``; None where none is."""
     if run is not None and output is not None:

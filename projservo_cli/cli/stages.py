@@ -66,7 +66,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
     poses = _motions(config, options)
     recording = new_recording(config, path, motions=poses, force=options["force"])
     if not options["dry_run"]:
-        with _writing(path):
+        with option.writing(path):
             recording = new_recording(config, path, motions=poses, force=options["force"])
             _drive(console, config, recording, confirm=options["confirm"])
     console.tell(recording.told, [*words_of("record", recording.told), f"table: {path}"])
@@ -81,13 +81,6 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
         return None
     types = config.robot.joint_types if config.robot is not None else None
     return read_joint_list(options["motions"], types, options["joint_unit"])
-
-
-def _writing(table: Path) -> AbstractContextManager[None]:
-    """Keep other processes from writing a table."""
-    from projservo_cli.files import working_in
-
-    return working_in(table.parent, name=f".{table.name}.lock")
 
 
 def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> None:
@@ -255,7 +248,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
     with working_in(folder, _FIGURES):
         if chain.recording is None:  # anew, since another process may have written the run until now
             return _work(_asked(console, names, options))
-        with _writing(chain.recording.path):
+        with option.writing(chain.recording.path):
             return _work(_recorded(_asked(console, names, options)))
 
 

@@ -138,3 +138,16 @@ def test_a_full_disk_is_told_and_the_old_file_stays(little_disk):
             write()
     assert path.read_bytes() == b"old"
     assert {found.name for found in little_disk.iterdir()} <= {"file", "filling"}
+
+
+def test_a_file_system_that_takes_nothing_back_is_told_in_one_line(tmp_path, monkeypatch):
+    def refuse(path, **options):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(Path, "touch", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with (
+        pytest.raises(InputError, match=r"a.txt: cannot be written: Read-only file system$"),
+        replacing(tmp_path / "a.txt"),
+    ):
+        pass
