@@ -223,7 +223,7 @@ def _delays(value: dict[str, Any]) -> Iterator[str]:
     """By how much images of each view are late, with the interval and by how much single ones differ, ms."""
     for i, view in enumerate(("left", "right")):
         late = value["delay_s"][i], *value["delay_interval_s"][i], value["delay_jitter_s"][i]
-        delay, low, high, jitter = (1e3 * seconds for seconds in late)
+        delay, low, high, jitter = (round(1e3 * seconds, 1) + 0.0 for seconds in late)  # no -0.0
         yield f"{delay:.1f} ms {view} (95 %: {low:.1f} to {high:.1f}; single ones ± {jitter:.1f})"
 
 

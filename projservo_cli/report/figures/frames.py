@@ -10,7 +10,7 @@ from projservo_cli.report.material import VIEWS, Data, Material, registered, tit
 
 _MOMENTS = ("start", "on the way", "end")
 _HALO = 1.2  # points, by which lines over a frame are wider in white
-_FOUND: style.Look = {"color": style.ORANGE, "marker": "+", "linestyle": "none", "markersize": 5.0}
+_FOUND: style.Look = {"color": style.ORANGE, "marker": "+", "linestyle": "none", "markersize": 4.0}
 _FACE: style.Look = {"color": style.GREEN, "linewidth": 1.2}
 _PATH: style.Look = {"color": style.VERMILION, "linewidth": 0.9}
 
@@ -86,8 +86,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     """A row a camera, a column a moment."""
     frames = data["frames"]
     height, width = frames.shape[2:]
-    figure.set_figheight(2.0 * style.WIDTH / 3.0 * height / width + 0.95)
-    figure.suptitle(str(data["run"]), fontsize=8.5)
+    figure.set_figheight(2.0 * style.WIDTH / 3.0 * height / width + 1.1)
     panels = figure.subplots(2, 3)
     for row, view in zip(panels, range(2), strict=True):
         for i, panel in enumerate(row):
@@ -100,6 +99,7 @@ def _draw(data: Data, figure: "style.Figure") -> None:
             with_halo(panel)
             panel.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xticks=[], yticks=[])
             seconds = data["instant"][i] * float(data["period_s"])
-            panel.set_title(f"{VIEWS[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
+            run = f"{data['run']}\n" if not (view or i) else ""
+            panel.set_title(f"{run}{VIEWS[view]} camera, {_MOMENTS[i]}, {seconds:.2f} s")
     looks = {"markers found": _FOUND, "face": _FACE, "path of a marker": _PATH, "goal": style.GOAL}
     style.legend_below(figure, looks, 4)
