@@ -252,16 +252,13 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.config.plant.speed_scale
-    replans = mode == REPLAN or bool(unplanned)
+    asked = _Asked(scenario, plan, law, mode == REPLAN or bool(unplanned), believed)
     if scenario.truth is None or is_by_contract(scenario.config):
-        assert isinstance(plan, Plan)
-        run = _drive_by_contract(scenario, plan, law, replans)
-    elif isinstance(plan, Plan) and (
-        not _in_compiled_loop(scenario.config, law) or _is_guided(scenario, law, replans)
-    ):
-        run = _drive_simulated(scenario, plan, law, replans)
+        run = asked.by_contract()
+    elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.config, law) or asked.is_guided):
+        run = asked.simulated()
     else:
-        run = _drive_compiled(scenario, plan, law, replans, believed)
+        run = asked.compiled()
     return replace(run, law=law, mode=mode, planned_s=planned_s, unplanned=unplanned)
 
 
@@ -270,128 +267,148 @@ def _in_compiled_loop(config: Config, law: str) -> bool:
     return law in CODES and config.plant.speed_scale == 1.0 and not is_by_contract(config)
 
 
-def _is_guided(scenario: Scenario, law: str, replans: bool) -> bool:
-    """Whether a run follows a plan which gives way to another one where it fails."""
-    guided = scenario.config.trajectory.profile in ("joint", "auto") and not replans and law in CODES
-    return guided and not why_closed(scenario.model, scenario.demands, search_of(scenario))
-
-
 def sense_is_enough(config: Config, name: str) -> bool:
     """Whether a run needs no more of the plan than the sense of its rotations."""
     law, mode = law_and_mode(name)
     return mode == REPLAN and _in_compiled_loop(config, law)
 
 
-def _task_for(scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, model: Model) -> Task:
-    """The task as a built-in law with a model is given it, with the plan where it follows that."""
-    task = scenario.shown_to(law).task(model)
-    if replans:
-        return task
-    assert isinstance(plan, Plan)
-    return followed(model, task, plan, scenario.gains.period, scenario.config.plant.speed_scale)
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """A run that is to be driven."""
 
+    scenario: Scenario
+    plan: Plan | FloatArray  # of the task, or the joint motions (2, n) of its rotations where that is enough
+    law: str
+    replans: bool  # whether the law goes its own way instead of following the plan
+    believed: Model | None  # what the law takes for robot and rig; None for what a law of its kind is given
 
-def _drive_compiled(
-    scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, believed: Model | None
-) -> _Outcome:
-    """Drive a built-in law on the simulated robot in the compiled loop."""
-    controller = _built_in(scenario, plan, law, replans, believed)
-    q_start, limits, observed = scenario.ends.q_start, scenario.limits, len(scenario.numbers_of(law))
-    parts = MOST_PARTS if scenario.gains.substeps else 0
-    log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
-    plant, state = scenario.plant_of(law), controller.state
-    noise = scenario.noise_of(law, scenario.config.seed, limits.max_steps + 1)
-    course = Course(plant, limits, q_start.copy())
-    code, steps = run_compiled(controller.law, course, noise, state, log)
-    return _Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
+    @property
+    def is_guided(self) -> bool:
+        """Whether the run follows a plan which gives way to another one where it fails."""
+        scenario = self.scenario
+        if (
+            self.replans
+            or self.law not in CODES
+            or scenario.config.trajectory.profile not in ("joint", "auto")
+        ):
+            return False
+        return not why_closed(scenario.model, scenario.demands, search_of(scenario))
 
+    def compiled(self) -> _Outcome:
+        """Drive a built-in law on the simulated robot in the compiled loop."""
+        scenario, controller = self.scenario, self._built_in()
+        q_start, limits, observed = scenario.ends.q_start, scenario.limits, len(scenario.numbers_of(self.law))
+        parts = MOST_PARTS if scenario.gains.substeps else 0
+        log = new_log(len(q_start), observed, limits.max_steps, len(ERRORS), parts)
+        plant, state = scenario.plant_of(self.law), controller.state
+        noise = scenario.noise_of(self.law, scenario.config.seed, limits.max_steps + 1)
+        course = Course(plant, limits, q_start.copy())
+        code, steps = run_compiled(controller.law, course, noise, state, log)
+        return _Outcome(scenario, VERDICTS[code], "", steps, log, float(state.limited[0]), plant)
 
-def _drive_simulated(scenario: Scenario, plan: Plan, law: str, replans: bool) -> _Outcome:
-    """Drive a law on the simulated robot without a fault in the Python loop."""
-    controller = _law_for(scenario, plan, law, replans)
-    noise = scenario.noise_of(law, scenario.config.seed, scenario.limits.max_steps + 1)
-    simulated = AnalyticPlant(scenario.plant_of(law), scenario.ends.q_start, noise)
-    watch = _watch(scenario, plan, law, controller, replans=replans)
-    return _driven_in_python(scenario, controller, simulated, watch)
+    def simulated(self) -> _Outcome:
+        """Drive a law on the simulated robot without a fault in the Python loop."""
+        scenario = self.scenario
+        noise = scenario.noise_of(self.law, scenario.config.seed, scenario.limits.max_steps + 1)
+        plant = AnalyticPlant(scenario.plant_of(self.law), scenario.ends.q_start, noise)
+        return self._in_python(self._controller(), plant)
 
+    def by_contract(self) -> _Outcome:
+        """Drive a robot of the contract from the start of the task, where a simulated one stands.
 
-def _watch(
-    scenario: Scenario,
-    plan: Plan,
-    law: str,
-    controller: LoopLaw,
-    *,
-    replans: bool,
-    standing: Standing | None = None,
-) -> Watch | None:
-    """What watches over a run that is guided."""
-    if not _is_guided(scenario, law, replans) or not isinstance(controller, BuiltInLaw):
-        return None
-    follow = partial(_task_for, scenario, law=law, replans=False, model=controller.law.model)
-    searches = scenario.config.control.searches_anew
-    return Watch(controller, follow, Ways(scenario, plan), searches, scenario.limits, standing)
+        That of ``plant.use`` is driven there. Before its first motion, what it sees must agree with the
+        calibration where it stands. The robot is stopped and closed on every way out.
+        """
+        scenario = self.scenario
+        own = scenario.truth is None
+        if own and (scenario.calibration is None or not scenario.calibration.usable):
+            raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
+        controller, driven = self._controller(), own_robot.connected(scenario, self.law)
+        with at_rest_after(driven.robot):
+            if own:
+                wrong = driven.fits()
+                if wrong:
+                    raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
+                start, settle_s = scenario.ends.q_start, scenario.config.plant.settle_s
+                for _ in own_robot.way_to(driven.steered, start, settle_s, "servo"):
+                    pass
+            driven.begin()
+            return self._in_python(controller, driven, Standing(driven, scenario.limits))
 
+    def _in_python(
+        self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, standing: Standing | None = None
+    ) -> _Outcome:
+        """Drive a law on a plant, every command scaled; a run that is guided is watched."""
+        scenario, watch = self.scenario, None
+        if self.is_guided and isinstance(law, BuiltInLaw):
+            assert isinstance(self.plan, Plan)
+            follow, searches = partial(self._task, law.law.model), scenario.config.control.searches_anew
+            watch = Watch(law, follow, Ways(scenario, self.plan), searches, scenario.limits, standing)
+        code, steps, log = run_in_python(
+            law,
+            plant,
+            scenario.ends.by_points().s_star,
+            scenario.gains.period,
+            scenario.limits,
+            scenario.config.plant.speed_scale,
+            standing=None if standing is None else standing.ruled,
+            watch=None if watch is None else watch.ruled,
+        )
+        limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
+        driven = plant if isinstance(plant, DrivenRobot) else None
+        if driven is not None:  # it goes from sample to sample, whatever was asked for
+            path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
+            log = log._replace(path=path, parts=np.ones_like(log.parts))
+        return _Outcome(
+            scenario,
+            VERDICTS[code],
+            plant.disturbance or ("" if standing is None else standing.why),
+            steps,
+            log,
+            limited,
+            plant.plant,
+            anew=() if watch is None else tuple(watch.told),
+            driven=driven,
+        )
 
-def _driven_in_python(
-    scenario: Scenario,
-    law: LoopLaw,
-    plant: AnalyticPlant | DrivenRobot,
-    watch: Watch | None,
-    standing: Standing | None = None,
-) -> _Outcome:
-    """Drive any law on any plant, every command scaled."""
-    gains, limits, scale = scenario.gains, scenario.limits, scenario.config.plant.speed_scale
-    code, steps, log = run_in_python(
-        law,
-        plant,
-        scenario.ends.by_points().s_star,
-        gains.period,
-        limits,
-        scale,
-        standing=None if standing is None else standing.ruled,
-        watch=None if watch is None else watch.ruled,
-    )
-    limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
-    driven = plant if isinstance(plant, DrivenRobot) else None
-    if driven is not None:  # it goes from sample to sample, whatever was asked for
-        path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
-        log = log._replace(path=path, parts=np.ones_like(log.parts))
-    return _Outcome(
-        scenario,
-        VERDICTS[code],
-        plant.disturbance or ("" if standing is None else standing.why),
-        steps,
-        log,
-        limited,
-        plant.plant,
-        anew=() if watch is None else tuple(watch.told),
-        driven=driven,
-    )
+    def _task(self, model: Model, plan: Plan) -> Task:
+        """The task as a built-in law with a model is given it, with the plan that it follows."""
+        scenario = self.scenario
+        task, scale = scenario.shown_to(self.law).task(model), scenario.config.plant.speed_scale
+        return followed(model, task, plan, scenario.gains.period, scale)
 
+    def _built_in(self) -> BuiltInLaw:
+        """The built-in law with the model that it is given, and the sense of its rotations."""
+        scenario, plan = self.scenario, self.plan
+        model = self.believed or scenario.believed_by(self.law)
+        if self.replans:
+            task = scenario.shown_to(self.law).task(model)
+        else:
+            assert isinstance(plan, Plan)
+            task = self._task(model, plan)
+        found = BuiltInLaw(CODES[self.law], model, task, scenario.gains)
+        sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
+        found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
+        return found
 
-def _drive_by_contract(scenario: Scenario, plan: Plan, law: str, replans: bool) -> _Outcome:
-    """Drive a robot of the contract under a law from the start of the task, where a simulated one stands.
+    def _controller(self) -> LoopLaw:
+        """The law, ready for the Python loop.
 
-    That of ``plant.use`` is driven there. Before its first motion, what it sees must agree with the
-    calibration where it stands. The robot is stopped and closed on every way out.
-    """
-    own = scenario.truth is None
-    if own and (scenario.calibration is None or not scenario.calibration.usable):
-        raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
-    controller = _law_for(scenario, plan, law, replans)
-    driven = own_robot.connected(scenario, law)
-    with at_rest_after(driven.robot):
-        if own:
-            wrong = driven.fits()
-            if wrong:
-                raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
-            start, settle_s = scenario.ends.q_start, scenario.config.plant.settle_s
-            for _ in own_robot.way_to(driven.steered, start, settle_s, "servo"):
-                pass
-        driven.begin()
-        standing = Standing(driven, scenario.limits)
-        watch = _watch(scenario, plan, law, controller, replans=replans, standing=standing)
-        return _driven_in_python(scenario, controller, driven, watch, standing)
+        Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks,
+        or the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the
+        plan.
+        """
+        if self.law in CODES:
+            return self._built_in()
+        scenario, gains, ends = self.scenario, self.scenario.gains, self.scenario.ends.by_points()
+        assert scenario.calibration is not None
+        assert isinstance(self.plan, Plan)
+        face = np.array(scenario.calibration.places(scenario.numbers[: scenario.m]))
+        model, shown = ImageModel(**vars(scenario.calibration)), (ends.s_start, ends.s_star)
+        # Its own: what a law writes to must not be what other laws are given.
+        setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
+        return ForeignLaw(plugins.make("law", self.law, (setup,), {}), f"law {self.law}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -446,31 +463,3 @@ class ForeignLaw:
                 f"{self.name}: gave {answer!r:.80}: expected {len(q)} finite joint velocities, or None"
             )
         return OK, q_dot
-
-
-def _law_for(scenario: Scenario, plan: Plan, law: str, replans: bool) -> LoopLaw:
-    """A law, ready for the Python loop.
-
-    Raises InputError if there is no such law, it needs a model of the robot that the configuration lacks, or
-    the plan to follow has no time; WorkFailed if it cannot be made, or the joints cannot follow the plan.
-    """
-    gains, ends = scenario.gains, scenario.ends.by_points()
-    if law not in CODES:
-        assert scenario.calibration is not None
-        face = np.array(scenario.calibration.places(scenario.numbers[: scenario.m]))
-        model = ImageModel(**vars(scenario.calibration))
-        # Its own: what a law writes to must not be what other laws are given.
-        setup = copy.deepcopy(LawSetup(model, face, ends.s_start, ends.s_star, plan, gains, gains.period))
-        return ForeignLaw(plugins.make("law", law, (setup,), {}), f"law {law}")
-    return _built_in(scenario, plan, law, replans)
-
-
-def _built_in(
-    scenario: Scenario, plan: Plan | FloatArray, law: str, replans: bool, believed: Model | None = None
-) -> BuiltInLaw:
-    """A built-in law with the model that it is given, or another one, and the sense of its rotations."""
-    model = believed or scenario.believed_by(law)
-    found = BuiltInLaw(CODES[law], model, _task_for(scenario, plan, law, replans, model), scenario.gains)
-    sense = plan.rotation_sense() if isinstance(plan, Plan) else plan
-    found.state.driven[:] = in_span(found.state.work.span, model, scenario.ends.q_start, sense)
-    return found
