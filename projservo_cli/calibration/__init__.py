@@ -20,12 +20,9 @@ from projservo_cli.calibration.prediction import (
     suggest,
 )
 from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate
-from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.calibration.start import Nominal
 
 __all__ = [
-    "REACH_M",
-    "REACH_RAD",
     "WEAK_NOISE",
     "WINDOW",
     "Innovation",

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from projservo_cli.calibration import REACH_M, REACH_RAD, WEAK_NOISE, chi2_band
+from projservo_cli.calibration import WEAK_NOISE, chi2_band
+from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config, load_config
 from projservo_cli.files import lies_inside, replacing
 from projservo_cli.records import Plan, Report, name_of

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration import REACH_M, REACH_RAD
+from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config, digest
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration import REACH_M, REACH_RAD
+from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import Goal
