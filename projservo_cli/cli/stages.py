@@ -500,10 +500,9 @@ def _made(chain: _Chain, step: Any, run: Any) -> tuple[Any, ...]:
 
 def _reported(chain: _Chain, run: Any) -> Any:
     """What a report is about: of the results before it those that the named runs of laws rest on."""
-    from projservo_cli.stages.world import has_task
     from projservo_cli.store import SERVO
 
-    made = ["plan", *(SERVO + law for law in chain.laws)] if has_task(chain.config) else []
+    made = ["plan", *(SERVO + law for law in chain.laws)] if chain.config.has_task else []
     return replace(run, results={name: run.results[name] for name in ["calibrate", *made]})
 
 

@@ -35,7 +35,7 @@ from projservo_cli.config.robot import (
     Vector3,
     Whole,
 )
-from projservo_cli.records import LAWS, REPLAN
+from projservo_cli.records import LAWS, REPLAN, InputError
 from projservo_cli.robots import plugins
 
 
@@ -149,6 +149,12 @@ class Disturbance(Section):
         if self.setpoint_ticks and self.encoder_ticks is None:
             yield ("setpoint_ticks",), "takes the ticks of encoders: set encoder_ticks as well"
 
+
+# Disturbances of joints or of time, which befall trials as well: what a calibration has to reckon with.
+FAULTS = (
+    *("delay_s", "exposure_s", "jitter_s", "frame_rate_hz", "frame_offset_s", "stamps"),
+    *("encoder_ticks", "setpoint_ticks", "lag_s", "sag_deg", "flex_deg", "play_deg"),
+)
 
 # What to do where a robot of somebody's has no joint limits.
 LIMITS_MISSING = "set robot.limits, such as {from_data: 0.1}, or limits in robot.dh or robot.screws"
@@ -818,3 +824,41 @@ class Config(Root):
     def joint_types(self) -> str | None:
         """One letter a joint, R or P; None where only the table tells how many there are."""
         return _joint_types(self.robot, self.data) or None
+
+    @property
+    def reference(self) -> JointVector | None:
+        """Joints around which the trial motions are made."""
+        return self.calibration.reference or (self.task.start if self.task is not None else None)
+
+    @property
+    def has_task(self) -> bool:
+        """Whether there is a robot with a task; a recorded run may be reported on without."""
+        return not self.recorded or None not in (self.arm, self.rig, self.markers, self.task)
+
+    @property
+    def face_numbers(self) -> tuple[int, ...]:
+        """Numbers of the face markers; an InputError where nothing tells them."""
+        if self.markers is None or self.markers.front is None:
+            raise InputError(
+                "this stage needs to know the face: set markers.face to three marker numbers or more"
+            )
+        return self.markers.front
+
+    @property
+    def image_size_px(self) -> tuple[int, int] | None:
+        """Width and height of the images, if they are known."""
+        if self.data is not None and self.data.image_size_px is not None:
+            return self.data.image_size_px
+        return self.rig.image_size_px if self.rig is not None else None
+
+    @property
+    def is_by_contract(self) -> bool:
+        """Whether a law drives a robot of the contract: none that stands wherever it is sent."""
+        return self.plant.use is not None or self.disturbance != Disturbance()
+
+    @property
+    def is_ideal(self) -> bool:
+        """Whether what is driven is known to have the joints that are read, and images of that moment."""
+        none = Disturbance()
+        faults = any(getattr(self.disturbance, name) != getattr(none, name) for name in FAULTS)
+        return self.plant.use is None and not faults

@@ -21,7 +21,7 @@ from projservo_cli.records import Calibration, CrossValidation, FloatArray, Obse
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed, seed_of_trials
 from projservo_cli.stages.scenario import SUGGESTIONS, generator
-from projservo_cli.stages.world import image_size_of, is_ideal, joints_of
+from projservo_cli.stages.world import joints_of
 from projservo_cli.tables import read_table, to_csv
 
 
@@ -35,7 +35,7 @@ def run(
     from projservo_cli.config.robot import read_nominal
 
     settings, seed = config.calibration, seed_of_trials(config)
-    ideal = is_ideal(config) and not config.recorded
+    ideal = config.is_ideal and not config.recorded
     init = Nominal(**read_nominal(settings.init)) if settings.init is not None else None
     noise_deg = 0.0 if ideal and settings.joint_noise_deg is None else settings.joint_noise_deg
     if config.data is not None:
@@ -58,7 +58,7 @@ def run(
         sigma_px=sigma_px,
         # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
         source="simulated" if ideal else "recorded",
-        image_size=image_size_of(config),
+        image_size=config.image_size_px,
         seed=seed,
         lens=settings.lens,
         init=init,
@@ -85,7 +85,7 @@ def suggest_motions(
     row each: q1 … qN, from_pose, delta_q1 … delta_qN, revolute joints in the unit of the recorded table.
     """
     observation = observation.at_rest
-    pixels, size = observation.images, image_size_of(config)
+    pixels, size = observation.images, config.image_size_px
     image = np.stack([np.nanmin(pixels, axis=(0, 2)), np.nanmax(pixels, axis=(0, 2))], axis=1)  # corners, px
     if size is not None:
         image = np.array([[[-0.5, -0.5], np.array(size) - 0.5]] * 2)

@@ -9,7 +9,7 @@ from projservo_cli.config import load_config
 from projservo_cli.config.models import TaskSettings
 from projservo_cli.records import FloatArray, InputError, Plan, WorkFailed
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.world import face_numbers, joints_of
+from projservo_cli.stages.world import joints_of
 from projservo_cli.store import Run
 
 
@@ -18,7 +18,7 @@ def guide(
 ) -> Plan:
     """Plan of the profile ``joint`` from joints to images, by the calibration of a run alone."""
     config, calibration = load_config(run.path, text=run.configuration), run.calibration
-    n, m = len(calibration.q_reference), len(face_numbers(config))
+    n, m = len(calibration.q_reference), len(config.face_numbers)
     joints = joints_of(config, calibration.joint_types, calibration)
     if limits is not None:
         lower, upper = _array("limits", limits, (n, 2)).T.copy()

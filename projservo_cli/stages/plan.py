@@ -39,7 +39,7 @@ from projservo_cli.stages.motions import (
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.told import reason_of, told_of
 from projservo_cli.stages.verdicts import least_of, verdict_of
-from projservo_cli.stages.world import Joints, face_numbers
+from projservo_cli.stages.world import Joints
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import Shown
@@ -111,7 +111,7 @@ def run(config: Config, calibration: Calibration, joints: Joints | None = None) 
     partitioned.
     """
     known = set(calibration.marker.tolist())
-    missing = [number for number in face_numbers(config) if number not in known]
+    missing = [number for number in config.face_numbers if number not in known]
     if missing:
         raise WorkFailed(
             f"markers.face names marker {missing[0]}, which the calibration has not seen: "

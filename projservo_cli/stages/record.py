@@ -13,6 +13,7 @@ import numpy as np
 
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config, digest
+from projservo_cli.config.models import FAULTS
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.driven import Steered
@@ -26,15 +27,7 @@ from projservo_cli.stages.own_robot import (
 )
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, TRIAL_POSES, generator
 from projservo_cli.stages.simulation import robot_by_itself
-from projservo_cli.stages.world import (
-    FAULTS,
-    Truth,
-    is_ideal,
-    joints_of,
-    limit_passed,
-    reference_of,
-    truth_of,
-)
+from projservo_cli.stages.world import Truth, joints_of, limit_passed, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
@@ -139,7 +132,7 @@ def trial_motions(config: Config) -> FloatArray:
     the trials are spread by fractions of an encoder's tick.
     """
     settings = config.calibration
-    vector = reference_of(config)
+    vector = config.reference
     if vector is None:
         raise InputError("trial motions need a reference: set calibration.reference or task.start")
     joints = joints_of(config)
@@ -160,7 +153,7 @@ def trial_motions(config: Config) -> FloatArray:
             rows.append(q)
     rng = generator(seed_of_trials(config), TRIAL_POSES)
     # The closed form takes joints that are told to stand still to do so.
-    faultless = is_ideal(config) or settings.method == "closed_form"
+    faultless = config.is_ideal or settings.method == "closed_form"
     count = settings.random_poses
     if count is None:
         count = 0 if faultless else _RANDOM_POSES
@@ -312,7 +305,7 @@ def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
     joints = joints_of(config)
     if not config.plant.simulated:
         return foreign_robot(config, joints, len(recording.marker))
-    if is_ideal(config):
+    if config.is_ideal:
         return None
     first, sigma_px = recording.targets[recording.pending[0]], config.noise.calibration_px
     seed = seed_of_trials(config)

@@ -31,7 +31,7 @@ from projservo_cli.stages.studies import (
     metric_plan,
     run_studies,
 )
-from projservo_cli.stages.world import has_task, truth_of
+from projservo_cli.stages.world import truth_of
 from projservo_cli.store import Result
 from projservo_cli.tables import to_csv
 from projservo_cli.task.face import cyclic_order
@@ -54,7 +54,7 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     left_out: list[dict[str, str]] = []
     material: Fit = Fit(run.calibration, run.observation.at_rest, held_out=run.cross_validation)
     studies, share, distance, claims = None, np.zeros(0), np.zeros(0), []
-    if has_task(config):
+    if config.has_task:
         bench = comparison_of(config, run.calibration, run.plan)
         with _unless_it_fails("studies", left_out):
             studies = run_studies(bench, progress=progress)

@@ -31,16 +31,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
 from projservo_cli.stages.simulation import shown_in_frames
-from projservo_cli.stages.world import (
-    Joints,
-    Truth,
-    center_index,
-    face_numbers,
-    image_size_of,
-    joints_of,
-    limit_passed,
-    truth_of,
-)
+from projservo_cli.stages.world import Joints, Truth, center_index, joints_of, limit_passed, truth_of
 from projservo_cli.task.body import NO_BODY, Body, body_of
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import Shown
@@ -102,7 +93,7 @@ class Scenario:
     @cached_property
     def demands(self) -> Demands:
         """What the planned motion must keep to, as configured."""
-        size = np.array(image_size_of(self.config) or (math.inf, math.inf), dtype=np.float64)
+        size = np.array(self.config.image_size_px or (math.inf, math.inf), dtype=np.float64)
         joints, trajectory = self.joints, self.config.trajectory
         limits = joints.lower, joints.upper, joints.speed
         margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
@@ -210,7 +201,7 @@ def scenario_of(
     seen, or the body not be measured with.
     """
     truth = truth_of(config) if config.plant.simulated and joints is None else None
-    face = face_numbers(config)
+    face = config.face_numbers
     if config.task is None:
         raise InputError("this stage needs a task: set task.start and task.goal")
     joints = joints or joints_of(config, "" if calibration is None else calibration.joint_types, calibration)
@@ -319,7 +310,7 @@ def _observed(config: Config, calibration: Calibration) -> tuple[int, ...]:
     """Numbers of the markers that a robot in ``plant.use`` observes, in its order."""
     known = config.markers.known if config.markers is not None else None
     numbers = tuple(calibration.marker.tolist()) if known is None else known
-    for number in face_numbers(config):
+    for number in config.face_numbers:
         if number not in numbers:
             raise InputError(f"markers.face: marker {number} is not among those observed, {[*numbers]}")
     return numbers
@@ -382,7 +373,7 @@ def _predicted_ends(
     """Start and goal of a robot that is not simulated, as the calibration predicts them, as above."""
     task = config.task
     assert task is not None
-    m, columns = len(face_numbers(config)), calibration.places(numbers)
+    m, columns = len(config.face_numbers), calibration.places(numbers)
     for vector, key in ((task.start, "task.start"), (task.goal.joints, "task.goal.joints")):
         if vector is not None and len(vector.joints) != len(joints.types):
             raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")

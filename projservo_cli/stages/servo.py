@@ -42,7 +42,7 @@ from projservo_cli.stages import own_robot
 from projservo_cli.stages.motions import Ways, search_of, why_closed
 from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.world import arm_of, is_by_contract
+from projservo_cli.stages.world import arm_of
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
 
@@ -253,7 +253,7 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.config.plant.speed_scale
     asked = _Asked(scenario, plan, law, mode == REPLAN or bool(unplanned), believed)
-    if scenario.truth is None or is_by_contract(scenario.config):
+    if scenario.truth is None or scenario.config.is_by_contract:
         run = asked.by_contract()
     elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.config, law) or asked.is_guided):
         run = asked.simulated()
@@ -264,7 +264,7 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
 
 def _in_compiled_loop(config: Config, law: str) -> bool:
     """Whether the compiled loop runs a law; the others are run in Python and are given the whole plan."""
-    return law in CODES and config.plant.speed_scale == 1.0 and not is_by_contract(config)
+    return law in CODES and config.plant.speed_scale == 1.0 and not config.is_by_contract
 
 
 def sense_is_enough(config: Config, name: str) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
-from projservo_cli.config.models import Disturbance, FrozenJoint, LostMarkers, RenderedOptions
+from projservo_cli.config.models import FAULTS, Disturbance, FrozenJoint, LostMarkers, RenderedOptions
 from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
@@ -25,7 +25,7 @@ from projservo_cli.rendered.frames import Frames
 from projservo_cli.rendered.physics import Physics
 from projservo_cli.rendered.scene import Scene, scene_of
 from projservo_cli.robots.simulated import Arm
-from projservo_cli.stages.world import FAULTS, Truth
+from projservo_cli.stages.world import Truth
 
 # Joints are worked out this often at least, s, and taken as straight lines between.
 _GRID_S = 0.005

@@ -13,9 +13,9 @@ from typing import Any
 
 from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
+from projservo_cli.config.models import FAULTS
 from projservo_cli.records import InputError, names_of
 from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
-from projservo_cli.stages.world import FAULTS, has_task
 from projservo_cli.store import SERVO, Result, Run
 
 STAGES = ("calibrate", "plan", "servo", "report")
@@ -84,7 +84,7 @@ def steps_for(
     recording : why the table has to be recorded first; keys of what rests on it are not known until then.
     """
     stages = STAGES[: max(map(STAGES.index, named)) + 1]
-    if not has_task(config) and set(named) <= {"calibrate", "report"}:
+    if not config.has_task and set(named) <= {"calibrate", "report"}:
         stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
     steps: list[Step] = []
     inputs = {} if recording else _file_hashes(config, run)

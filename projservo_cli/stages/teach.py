@@ -17,7 +17,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.own_robot import at_rest, averaged, foreign_robot, simulated_robot
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
 from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself
-from projservo_cli.stages.world import face_numbers, joints_of, limit_passed, truth_of
+from projservo_cli.stages.world import joints_of, limit_passed, truth_of
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
@@ -171,7 +171,7 @@ def checked(config: Config, calibration: Calibration, taught: _Taught) -> _Check
 
 def require_face(config: Config, taught: _Taught) -> None:
     """Refuse what does not show the whole face to both cameras, with a WorkFailed."""
-    face = face_numbers(config)
+    face = config.face_numbers
     if unseen := [(number, side) for number, side in taught.unseen if number in face]:
         number, side = unseen[0]
         raise WorkFailed(

@@ -13,7 +13,7 @@ from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import Goal
-from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
+from projservo_cli.config.robot import Camera, Rig, RobotSettings
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.records import (
     NO_LENS,
@@ -29,35 +29,6 @@ from projservo_cli.records import (
 from projservo_cli.rendered.scene import lens_of
 from projservo_cli.robots.simulated import Arm, Ends, camera_center, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
-
-
-def reference_of(config: Config) -> JointVector | None:
-    """Joints around which the trial motions are made."""
-    return config.calibration.reference or (config.task.start if config.task is not None else None)
-
-
-# Disturbances of joints or of time, which befall trials as well: what a calibration has to reckon with.
-FAULTS = (
-    *("delay_s", "exposure_s", "jitter_s", "frame_rate_hz", "frame_offset_s", "stamps"),
-    *("encoder_ticks", "setpoint_ticks", "lag_s", "sag_deg", "flex_deg", "play_deg"),
-)
-
-
-def has_faults(config: Config) -> bool:
-    """Whether joints of the simulated robot are read or followed, or images taken, with faults."""
-    given, none = config.disturbance, type(config.disturbance)()
-    return any(getattr(given, name) != getattr(none, name) for name in FAULTS)
-
-
-def is_by_contract(config: Config) -> bool:
-    """Whether a law drives a robot of the contract: none that stands wherever it is sent."""
-    return config.plant.use is not None or config.disturbance != type(config.disturbance)()
-
-
-def is_ideal(config: Config) -> bool:
-    """Whether joints of what is driven are known to be as they are read, and images to be of that moment."""
-    return config.plant.use is None and not has_faults(config)
-
 
 # Accelerations that the profile joint takes where no limit is given, deg/s² and m/s².
 _ACCELERATION_DEG_S2, _ACCELERATION_M_S2 = 500.0, 2.0
@@ -86,7 +57,7 @@ def joints_of(config: Config, default_types: str = "", calibration: Calibration 
 
     calibration : whose data tell limits, where ``robot.limits`` takes them from there; without, none are.
     """
-    vector = reference_of(config)
+    vector = config.reference
     types = config.joint_types or default_types or "R" * (len(vector.joints) if vector is not None else 0)
     lower, upper = _limits_of(config.robot, types, calibration)
     c = config.control
@@ -121,18 +92,6 @@ def _limits_of(
             raise InputError(f"robot.limits.joints: give a pair for each of {len(types)} joints") from error
     lower, upper = np.array(pairs, dtype=np.float64).reshape(-1, 2).T.copy()
     return lower, upper
-
-
-def has_task(config: Config) -> bool:
-    """Whether there is a robot with a task; a recorded run may be reported on without."""
-    return not config.recorded or None not in (config.arm, config.rig, config.markers, config.task)
-
-
-def image_size_of(config: Config) -> tuple[int, int] | None:
-    """Width and height of the images, px, if they are known."""
-    if config.data is not None and config.data.image_size_px is not None:
-        return config.data.image_size_px
-    return config.rig.image_size_px if config.rig is not None else None
 
 
 _EDGE_ON = math.cos(math.radians(70.0))  # of the angle to a camera from which tags are not found
@@ -209,15 +168,6 @@ class Truth:
     @cached_property
     def _from_tool(self) -> FloatArray:
         return np.asarray(np.linalg.inv(self.robot.base_tool), dtype=np.float64)
-
-
-def face_numbers(config: Config) -> tuple[int, ...]:
-    """Numbers of the face markers."""
-    if config.markers is None or config.markers.front is None:
-        raise InputError(
-            "this stage needs to know the face: set markers.face to three marker numbers or more"
-        )
-    return config.markers.front
 
 
 def center_index(markers: Markers) -> int:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from projservo_cli.config import load_config
+from projservo_cli.config import Config, load_config
 from projservo_cli.stages import record as trials
 from projservo_cli.stages.world import joints_of, truth_of
 
@@ -14,7 +14,7 @@ UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
 
 @pytest.fixture
 def faulty(monkeypatch):
-    monkeypatch.setattr(trials, "is_ideal", lambda config: False)
+    monkeypatch.setattr(Config, "is_ideal", False)
 
 
 def test_poses_of_all_joints_follow_and_no_reading_comes_twice(faulty):
