@@ -75,7 +75,7 @@ class Scene:
         return data
 
 
-def decomposed(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _decomposed(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Intrinsic matrix K (3, 3), rotation R (3, 3) and translation t (3,), m, of a metric camera (3, 4)."""
     K, R = rq(P[:, :3])
     signs = np.diag(np.sign(np.diag(K)))
@@ -86,7 +86,7 @@ def decomposed(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def lens_of(P: FloatArray, k1: float) -> FloatArray:
     """Lenses (2, 5) of metric cameras (2, 3, 4), with k1 in units of the focal length."""
-    K = np.array([decomposed(camera)[0] for camera in P])
+    K = np.array([_decomposed(camera)[0] for camera in P])
     radius = np.sqrt(K[:, 0, 0] * K[:, 1, 1])
     return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, np.full(2, k1), np.zeros(2)])
 
@@ -111,7 +111,7 @@ def scene_of(
     tip = next(body for body in spec.bodies if body.id == holder)
     _add_tags(spec, tip, tool, markers.all_tags, finder)
     _put_light(spec, options.light, P)
-    K, R, t = (np.array(parts) for parts in zip(*map(decomposed, P), strict=True))
+    K, R, t = (np.array(parts) for parts in zip(*map(_decomposed, P), strict=True))
     width, height = rig.image_size_px
     margin = _margin(P, options.k1, width, height)
     K_wide = K + margin * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]])
@@ -254,7 +254,7 @@ def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
     """Where pixels (2, N, 2) of cameras (2, 3, 4) and lenses (2, 5) are drawn without lens and skew."""
     straight = straight_views(lens, pixels).copy()
     for view, camera in enumerate(P):
-        K, _, _ = decomposed(camera)
+        K, _, _ = _decomposed(camera)
         skew = K[0, 1] if abs(K[0, 1]) > _NO_SKEW * K[0, 0] else 0.0
         straight[view, :, 0] -= skew * (straight[view, :, 1] - K[1, 2]) / K[1, 1]
     return straight

@@ -145,7 +145,7 @@ class Material(Fit):
 
 
 @dataclass(frozen=True)
-class FigureSpec:
+class _FigureSpec:
     """One figure, and what it needs."""
 
     name: str  # of its files
@@ -194,17 +194,17 @@ class FigureSpec:
         return [law for law in self.laws if law not in material.traces or material.traces[law].steps < 1]
 
 
-REGISTER: dict[str, FigureSpec] = {}
+REGISTER: dict[str, _FigureSpec] = {}
 _Draw = Callable[[Data, "Figure"], None]
 
 
 def registered(
     name: str, title: str, paper: str, data: Callable[[Any], Data], **needs: Any
 ) -> Callable[[_Draw], _Draw]:
-    """Decorator that registers what a function draws as a figure; arguments are those of ``FigureSpec``."""
+    """Decorator that registers what a function draws as a figure; arguments are those of ``_FigureSpec``."""
 
     def register(draw: _Draw) -> _Draw:
-        REGISTER[name] = FigureSpec(name, title, paper, data, draw, **needs)
+        REGISTER[name] = _FigureSpec(name, title, paper, data, draw, **needs)
         return draw
 
     return register

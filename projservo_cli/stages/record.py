@@ -176,7 +176,7 @@ def _random_pose(
             continue
         if truth is None:
             return q
-        inside = np.isfinite(_images_at(truth, q, 0.0)).all(axis=(0, 2))
+        inside = np.isfinite(truth.within(truth.images(q, truth.M))).all(axis=(0, 2))
         if inside.mean() >= _LEAST_SEEN and truth.faces(q).all(axis=0).mean() >= _LEAST_FACING:
             return q
     return reference
@@ -192,16 +192,8 @@ def simulate(config: Config, truth: Truth, q: FloatArray | None = None) -> Obser
     q = trial_motions(config) if q is None else q
     drawn = generator(seed_of_trials(config), CALIBRATION_NOISE)
     noise = config.noise.calibration_px * drawn.standard_normal((len(q), 2, len(truth.number), 2))
-    images = np.stack([_images_at(truth, *pair) for pair in zip(q, noise, strict=True)])
+    images = truth.within(np.stack([truth.images(row, truth.M) for row in q]) + noise)
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)
-
-
-def _images_at(truth: Truth, q: FloatArray, noise: FloatArray | float) -> FloatArray:
-    """Pixels (2, m, 2) of all markers at the joints q (n,), rad or m, with noise; NaN outside an image."""
-    images = truth.images(q, truth.M) + noise
-    inside = np.all((images >= -0.5) & (images <= truth.image_size - 0.5), axis=-1)
-    images[~inside] = np.nan
-    return images
 
 
 class _OutdatedError(InputError):

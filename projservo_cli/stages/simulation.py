@@ -37,7 +37,7 @@ _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
 
 
-class Eyes(Protocol):
+class _Eyes(Protocol):
     """Both cameras."""
 
     @property
@@ -88,7 +88,7 @@ class Points(NamedTuple):
         return np.asarray(np.mean(shown, axis=0) + noise), None
 
 
-class Servos(Protocol):
+class _Servos(Protocol):
     """What moves the joints.
 
     ``setpoint``: (n,) where they are sent, rad or m.
@@ -112,11 +112,11 @@ class World(NamedTuple):
 
     truth: Truth
     q_start: FloatArray  # (n,) first readings, rad or m
-    eyes: Eyes
+    eyes: _Eyes
     period: float  # of the loop, s
     seed: int
     stream: int  # of the random numbers of the seed
-    servos: Servos | None = None  # at rest at q_start; None for those of first order
+    servos: _Servos | None = None  # at rest at q_start; None for those of first order
 
     def random(self, view: int, k: int) -> np.random.Generator:
         """Random numbers of a frame of a view."""
@@ -453,5 +453,5 @@ class _Camera:
         if (lost := given.lost_markers) is not None and _lasts(lost, step):
             pixels[[truth.number.index(number) for number in lost.markers or truth.number]] = math.nan
         if world.eyes.borders:
-            pixels[~((pixels >= -0.5) & (pixels <= truth.image_size - 0.5)).all(axis=1)] = math.nan
+            pixels = truth.within(pixels)
         return _Frame(middle, middle + self._clock, pixels, sigma)

@@ -148,6 +148,11 @@ class Truth:
         towards = (away * (self.normals @ H[:3, :3].T)).sum(axis=2) / np.linalg.norm(away, axis=2)
         return np.asarray((towards > _EDGE_ON) | ~self.normals.any(axis=-1))
 
+    def within(self, pixels: FloatArray) -> FloatArray:
+        """Pixels (..., 2), NaN where they lie outside an image: their centres reach from −½ to size − ½."""
+        inside = (pixels >= -0.5) & (pixels <= self.image_size - 0.5)
+        return np.where(inside.all(axis=-1, keepdims=True), pixels, np.nan)
+
     def displacement(self, q: FloatArray) -> FloatArray:
         """True displacement (4, 4) of the face from the reference at the joints q (n,)."""
         return self.robot.pose(q) @ self._from_tool
