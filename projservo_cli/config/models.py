@@ -831,6 +831,13 @@ class Config(Root):
         return self.calibration.reference or (self.task.start if self.task is not None else None)
 
     @property
+    def idealized(self) -> "Config":
+        """That of the simulated robot without noise and disturbances in the loop."""
+        noise = self.noise.model_copy(update={"servo_px": 0.0})
+        plant = self.plant.model_copy(update={"use": None, "options": {}})
+        return self.model_copy(update={"noise": noise, "plant": plant, "disturbance": Disturbance()})
+
+    @property
     def has_task(self) -> bool:
         """Whether there is a robot with a task; a recorded run may be reported on without."""
         return not self.recorded or None not in (self.arm, self.rig, self.markers, self.task)

@@ -18,7 +18,7 @@ from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
 from projservo_cli.stages.simulation import FaultyRobot, Points, robot_of
-from projservo_cli.stages.world import Joints, length_of
+from projservo_cli.stages.world import Joints
 
 # What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
 _STILL, _STILL_PX = 2e-5, 0.02
@@ -33,10 +33,10 @@ _WAITED = 5  # looks for each image that is wanted, where the same one comes aga
 def bounds_of(config: Config, joints: Joints) -> Bounds:
     """What no command to a robot may exceed, and what is taken of its servos."""
     plant, period = config.plant, config.control.period_s
-    speed, sag = joints.speed * plant.speed_scale, length_of(plant.sag_deg, joints)
+    speed, sag = joints.speed * plant.speed_scale, joints.length_of(plant.sag_deg)
     lead = speed * (plant.lag_s + period) + sag
     if plant.lead_deg is not None:
-        lead = length_of(plant.lead_deg, joints)
+        lead = joints.length_of(plant.lead_deg)
     return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag)
 
 
@@ -251,7 +251,7 @@ def connected(scenario: Scenario, law: str) -> DrivenRobot:
     else:
         plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
     innovation = None
-    if not untested(scenario):
+    if not scenario.untested:
         noise = config.stop.innovation_factor * scenario.noise_px
         innovation = Innovation(calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
     return DrivenRobot(robot, plant, _known_of(scenario, calibration, law), innovation)
@@ -282,7 +282,7 @@ def _known_of(scenario: Scenario, calibration: Calibration, law: str) -> Known:
         np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
         np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
         scenario.noise_px,
-        length_of(math.degrees(calibration.sigma_q or 0.0), scenario.joints),
+        scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
         _delays_of(config, calibration),
         config.plant.timeout_s,
     )
@@ -300,13 +300,3 @@ def _delays_of(config: Config, calibration: Calibration) -> DelayPrior:
     if given is not None:
         known = known._replace(mean=np.array([given.left, given.right]), sigma=np.zeros(2))
     return known
-
-
-def untested(scenario: Scenario) -> str:
-    """Why images in the loop are not tested against the calibration; empty where they are."""
-    if scenario.config.stop.innovation_factor == 0.0:
-        return "stop.innovation_factor is 0"
-    assert scenario.calibration is not None
-    if not np.isfinite(scenario.calibration.covariance).all():
-        return "the calibration has no covariance, which the method refined gives"
-    return ""

@@ -74,6 +74,16 @@ class Scenario:
         """How many markers are on the face."""
         return len(self.numbers) - self.exact.pins
 
+    @property
+    def untested(self) -> str:
+        """Why images in the loop are not tested against the calibration; empty where they are."""
+        if self.config.stop.innovation_factor == 0.0:
+            return "stop.innovation_factor is 0"
+        assert self.calibration is not None
+        if not np.isfinite(self.calibration.covariance).all():
+            return "the calibration has no covariance, which the method refined gives"
+        return ""
+
     def shown_to(self, law: str) -> Shown:
         """Start and goal as a law measures them: with the body, or point by point."""
         return self.ends if law in BODY_LAWS else self.ends.by_points()
@@ -238,15 +248,6 @@ def scenario_of(
         sigma_px,
         _gains(config, joints),
         _limits(config, joints, sigma_px),
-    )
-
-
-def idealized(config: Config) -> Config:
-    """A configuration of the simulated robot without noise and disturbances in the loop."""
-    noise = config.noise.model_copy(update={"servo_px": 0.0})
-    plant = config.plant.model_copy(update={"use": None, "options": {}})
-    return config.model_copy(
-        update={"noise": noise, "plant": plant, "disturbance": type(config.disturbance)()}
     )
 
 

@@ -40,7 +40,6 @@ from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.stages import own_robot
 from projservo_cli.stages.motions import Ways, search_of, why_closed
-from projservo_cli.stages.own_robot import untested
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.world import arm_of
 from projservo_cli.task.face import Task, center_of
@@ -143,7 +142,7 @@ class _Outcome:
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
-            untested="" if driven is None else untested(scenario),
+            untested="" if driven is None else scenario.untested,
             overruns=None if driven is None else driven.steered.overruns,
             delay=None if driven is None else _whole(driven.delays, rows),
             **({} if driven is None else driven.film.told()),

@@ -23,7 +23,7 @@ from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Pla
 from projservo_cli.report.material import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import plan_task
-from projservo_cli.stages.scenario import Scenario, idealized, scenario_of
+from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.world import Truth, truth_of
 
@@ -85,7 +85,7 @@ def comparison_of(config: Config, calibration: Calibration, plan: Plan) -> Compa
         "control": config.control.model_copy(update={"observation": "points"}),
         "trajectory": config.trajectory.model_copy(update={"keep_out": ()}),
     }
-    scenario = scenario_of(idealized(config).model_copy(update=alone), calibration)
+    scenario = scenario_of(config.idealized.model_copy(update=alone), calibration)
     limits = scenario.limits._replace(stop_at_joint_limit=False, stop_at_border=False)
     scenario = replace(scenario, limits=limits)
     assert scenario.truth is not None

@@ -43,6 +43,11 @@ class Joints(NamedTuple):
     speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
     acceleration: FloatArray  # (n,) most in the profile joint, rad/s² or m/s²
 
+    def length_of(self, degrees: float) -> FloatArray:
+        """An angle as (n,) rad, for prismatic joints the length, m, that makes as much of a difference."""
+        ratio = [REACH_M / REACH_RAD if kind == "P" else 1.0 for kind in self.types]
+        return math.radians(degrees) * np.array(ratio)
+
 
 def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
     """Which of the readings (n,) lies beyond its limits, in words; empty where none does."""
@@ -68,12 +73,6 @@ def joints_of(config: Config, default_types: str = "", calibration: Calibration 
     sliding = c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2
     acceleration = np.array([sliding if kind == "P" else turning for kind in types])
     return Joints(types, lower, upper, speed, acceleration)
-
-
-def length_of(degrees: float, joints: Joints) -> FloatArray:
-    """An angle as (n,) rad, and for prismatic joints the length, m, that makes as much of a difference."""
-    ratio = [REACH_M / REACH_RAD if kind == "P" else 1.0 for kind in joints.types]
-    return math.radians(degrees) * np.array(ratio)
 
 
 def _limits_of(

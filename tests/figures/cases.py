@@ -11,7 +11,6 @@ from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.material import Material
 from projservo_cli.robots.driven import Film
 from projservo_cli.stages import record, studies
-from projservo_cli.stages.scenario import idealized
 from tests.fake_records import fake
 from tests.known import configured, driven, known_scenario, planned
 
@@ -42,7 +41,7 @@ def case(name="paper", steps=SHORT, whole=False):
         followed = name_of(law, MODES_OF[law][1])
         traces[followed] = driven(scenario, plan, followed, model)
     clean = replace(
-        known_scenario(idealized(config)), limits=scenario.limits._replace(stop_at_joint_limit=False)
+        known_scenario(config.idealized), limits=scenario.limits._replace(stop_at_joint_limit=False)
     )
     models = {"true": true.model, "twin": model, "calibrated": model}
     bench = studies.Comparison(clean, models, sense)

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli import files
 from projservo_cli.config import load_config
 from projservo_cli.records import Calibration
-from projservo_cli.stages.own_robot import untested
-from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.store import load
 from projservo_cli.tables import read_table
 from tests.fake_records import fake
@@ -222,9 +221,9 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
 def test_a_calibration_without_covariance_tests_nothing_and_says_so():
     config = load_config(UR5)
     bare = fake(Calibration, covariance=np.full((3, 3), np.nan))
-    assert "has no covariance" in untested(SimpleNamespace(config=config, calibration=bare))
+    assert "has no covariance" in Scenario.untested.fget(SimpleNamespace(config=config, calibration=bare))
     sound = fake(Calibration, covariance=np.eye(3))
-    assert untested(SimpleNamespace(config=config, calibration=sound)) == ""
+    assert Scenario.untested.fget(SimpleNamespace(config=config, calibration=sound)) == ""
 
 
 def test_lost_markers_are_waited_for(servo):

@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 
-from projservo_cli.stages.scenario import idealized
 from tests.known import configured, driven, known_scenario, planned
 
 
@@ -26,7 +25,7 @@ class Case:
 
     def servo(self, law, model=None, gains=None, sense=None, **limits):
         """Trace of one law without noise, by default with the true metric model and the planned sense."""
-        gains, clean = self.gains if gains is None else gains, idealized(self.config)
+        gains, clean = self.gains if gains is None else gains, self.config.idealized
         scenario = replace(self.scenario, config=clean, exact=self.ends, gains=gains)
         sense = self.plan.rotation_sense() if sense is None else sense
         return driven(scenario, sense, law, self.truth.model if model is None else model, **limits)
