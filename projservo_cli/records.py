@@ -41,9 +41,9 @@ SIZES = {
 }
 
 
-def _array(*dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
+def _array(dims: str, units: str = "1", about: str = "", **default: Any) -> Any:
     """Declare an array field: the names of its dimensions, its unit and what it holds."""
-    return field(metadata={"dims": dims, "units": units, "about": about}, **default)
+    return field(metadata={"dims": tuple(dims.split()), "units": units, "about": about}, **default)
 
 
 def _scalar(units: str = "1", about: str = "", **default: Any) -> Any:
@@ -106,23 +106,19 @@ class Observation:
 
     pose: IntArray = _array("pose", about="number of the pose")
     marker: IntArray = _array("marker", about="number of the marker")
-    q: FloatArray = _array("pose", "joint", units="rad or m", about="joint readings")
-    images: FloatArray = _array("pose", "view", "marker", "xy", units="px", about="pixels, NaN where unseen")
+    q: FloatArray = _array("pose joint", "rad or m", "joint readings")
+    images: FloatArray = _array("pose view marker xy", "px", "pixels, NaN where unseen")
     moving: IntArray | None = _array(
         "pose", about="number of the motion that the pose is a moment of, 0 at rest", default=None
     )
-    t_q: FloatArray | None = _array(
-        "pose", units="s", about="when joints were read, NaN where unknown", default=None
-    )
+    t_q: FloatArray | None = _array("pose", "s", "when joints were read, NaN where unknown", default=None)
     t_view: FloatArray | None = _array(
-        "pose", "view", units="s", about="stamps of both images, NaN where there are none", default=None
+        "pose view", "s", "stamps of both images, NaN where there are none", default=None
     )
     sigma: FloatArray | None = _array(
-        "pose",
-        "view",
-        "marker",
-        units="px",
-        about="standard deviation of the pixels, per coordinate, NaN where unseen",
+        "pose view marker",
+        "px",
+        "standard deviation of the pixels, per coordinate, NaN where unseen",
         default=None,
     )
 
@@ -153,25 +149,24 @@ class Calibration:
     usable: bool = _scalar(about="whether the calibration may be used for control")
     reason: str = _scalar(about="why it is usable or not, in words")
     advice: tuple[str, ...] = _scalar(about="what to do next, one sentence each")
-    rms_px: float = _scalar(units="px", about="reprojection residual, rms per marker and view (Euclidean)")
-    sigma_px: float = _scalar(units="px", about="noise per image coordinate: configured, given or estimated")
-    sigma_fitted_px: float = _scalar(units="px", about="noise per coordinate from the residuals of the fit")
+    rms_px: float = _scalar("px", "reprojection residual, rms per marker and view (Euclidean)")
+    sigma_px: float = _scalar("px", "noise per image coordinate: configured, given or estimated")
+    sigma_fitted_px: float = _scalar("px", "noise per coordinate from the residuals of the fit")
     chi2_per_dof: float = _scalar(about="squared residuals over sigma_px squared, per degree of freedom")
     dof: int = _scalar(about="degrees of freedom of the fit")
-    seconds: float = _scalar(units="s", about="time the calibration took")
-    P: FloatArray = _array("view", "image_row", "coordinate", units="px", about="cameras, projective frame")
-    H_hat_0: FloatArray = _array("joint", "row", "coordinate", about="joint operators at the reference")
-    q_reference: FloatArray = _array("joint", units="rad or m", about="joint reading at the reference")
+    seconds: float = _scalar("s", "time the calibration took")
+    P: FloatArray = _array("view image_row coordinate", "px", "cameras, projective frame")
+    H_hat_0: FloatArray = _array("joint row coordinate", about="joint operators at the reference")
+    q_reference: FloatArray = _array("joint", "rad or m", "joint reading at the reference")
     a_inf: FloatArray = _array("coordinate", about="common plane at infinity")
     marker: IntArray = _array("marker", about="number of the marker")
-    M: FloatArray = _array("marker", "coordinate", about="markers at the reference, a_inf @ M = 1")
+    M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
     covariance: FloatArray = _array(
-        "parameter",
-        "parameter_",
+        "parameter parameter_",
         about="of P.ravel(), H_hat_0.ravel(), M.ravel(), gauge fixed, and k1, k2 of both lenses if any",
     )
-    excitation: FloatArray = _array("joint", units="rad or m", about="range of joint motion in the data")
-    lowest: FloatArray = _array("joint", units="rad or m", about="lowest joint reading in the data")
+    excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
+    lowest: FloatArray = _array("joint", "rad or m", "lowest joint reading in the data")
     weak: BoolArray = _array("joint", about="joints whose operator the data hardly determine")
     operator_defect: FloatArray = _array("joint", about="norm of Ĥ³ + Ĥ (revolute) or Ĥ² (prismatic) over Ĥ")
     trace_defect: FloatArray = _array("joint", about="absolute trace of Ĥ")
@@ -182,50 +177,45 @@ class Calibration:
     merged_poses: int = _scalar(about="poses that the fit uses")
     merged_markers: int = _scalar(about="markers that the fit uses")
     outlier: IntArray = _array(
-        "outlier_row",
-        "outlier_column",
-        about="readings left out: pose, marker, view (0 left, 1 right, 2 both)",
+        "outlier_row outlier_column", about="readings left out: pose, marker, view (0 left, 1 right, 2 both)"
     )
     suspect: IntArray = _array(
-        "suspect_row", "suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
+        "suspect_row suspect_column", about="joint readings that no image agrees with: pose, joint from 1"
     )
     swapped: IntArray = _array(
-        "swap_row", "swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
+        "swap_row swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
     )
     predicted_rms_px: float | None = _scalar(
-        units="px",
-        about="expected error of images at poses of all joints within their ranges, rms per marker and view",
+        "px",
+        "expected error of images at poses of all joints within their ranges, rms per marker and view",
         default=None,
     )
     predicted_p99_px: float | None = _scalar(
-        units="px", about="what that rms stays below in 99 of 100 draws of the noise", default=None
+        "px", "what that rms stays below in 99 of 100 draws of the noise", default=None
     )
     lens: FloatArray | None = _array(
-        "view",
-        "lens_term",
+        "view lens_term",
         about="radial distortion, if estimated: image centre u, v and radius in px, k1, k2",
         default=None,
     )
     sigma_q: float | None = _scalar(
-        units="rad",
-        about="rms of joint readings less true joints, prismatic × 0.3 m/rad; 0 where none shows",
+        "rad",
+        "rms of joint readings less true joints, prismatic × 0.3 m/rad; 0 where none shows",
         default=None,
     )
     sigma_q_interval: FloatArray | None = _array(
-        "limit", units="rad", about="95 % interval of sigma_q, if estimated", default=None
+        "limit", "rad", "95 % interval of sigma_q, if estimated", default=None
     )
     delay_s: FloatArray | None = _array(
-        "view", units="s", about="instant of a joint reading less that of its image", default=None
+        "view", "s", "instant of a joint reading less that of its image", default=None
     )
     delay_interval_s: FloatArray | None = _array(
-        "view", "limit", units="s", about="95 % interval of the delay", default=None
+        "view limit", "s", "95 % interval of the delay", default=None
     )
     delay_jitter_s: FloatArray | None = _array(
-        "view", units="s", about="deviation of single images from the delay", default=None
+        "view", "s", "deviation of single images from the delay", default=None
     )
-    model_px: float = _scalar(
-        units="px", about="error of the model per coordinate, 0 within noise", default=0.0
-    )
+    model_px: float = _scalar("px", "error of the model per coordinate, 0 within noise", default=0.0)
 
     def places(self, numbers: Iterable[int]) -> list[int]:
         """Where markers stand in ``marker`` and ``M``, by their numbers; ValueError for one that does not."""
@@ -253,25 +243,20 @@ class CrossValidation:
     failed: tuple[str, ...] = _scalar(about="parts that could not be predicted, each with the reason")
     reason: str = _scalar(about="how the held-out error compares with the predicted one, in words")
     count: int = _scalar(about="marker-view pairs that were predicted")
-    rms_px: float | None = _scalar(units="px", about="held-out residual, root mean square")
-    median_px: float | None = _scalar(units="px", about="held-out residual, median")
-    p95_px: float | None = _scalar(units="px", about="held-out residual, 95th percentile")
+    rms_px: float | None = _scalar("px", "held-out residual, root mean square")
+    median_px: float | None = _scalar("px", "held-out residual, median")
+    p95_px: float | None = _scalar("px", "held-out residual, 95th percentile")
     predicted_rms_px: float | None = _scalar(
-        units="px", about="the same root mean square from noise and covariance of each fit"
+        "px", "the same root mean square from noise and covariance of each fit"
     )
     pose: IntArray = _array("pose", about="number of the pose")
     fold: IntArray = _array("pose", about="part of the pose, from 0")
     marker: IntArray = _array("marker", about="number of the marker")
     residual: FloatArray = _array(
-        "pose", "view", "marker", "xy", units="px", about="seen minus predicted, NaN where there is none"
+        "pose view marker xy", "px", "seen minus predicted, NaN where there is none"
     )
     predicted: FloatArray = _array(
-        "pose",
-        "view",
-        "marker",
-        "xy",
-        units="px",
-        about="deviation of the residual from noise and covariance",
+        "pose view marker xy", "px", "deviation of the residual from noise and covariance"
     )
 
 
@@ -304,62 +289,54 @@ class Plan:
     )
     reason: str = _scalar(about="what makes the plan feasible or not, in words")
     tau: float = _scalar(about="amplitude of the translation, unit-norm kernel of (8)")
-    theta_r: float = _scalar(units="rad", about="angle onto the target plane, in the sense chosen")
-    theta_p: float = _scalar(units="rad", about="angle within the plane")
-    theta_s: float = _scalar(units="rad", about="angle of both rotations together")
+    theta_r: float = _scalar("rad", "angle onto the target plane, in the sense chosen")
+    theta_p: float = _scalar("rad", "angle within the plane")
+    theta_s: float = _scalar("rad", "angle of both rotations together")
     constraint: str = _scalar(
         about="what the motion comes nearest to failing, as a share of its ends' margins"
     )
     duration: float | None = _scalar(
-        units="s",
-        about="time it takes, as asked for or at the joint-speed limit; none without a limit or where "
-        "joints cannot follow",
+        "s",
+        "time it takes, as asked for or at the joint-speed limit; none without a limit or where joints "
+        "cannot follow",
     )
     tau_limit: float = _scalar(about="least delta·tau_0 ahead of the face, infinite where there is none")
     sigma: FloatArray = _array("sample", about="path parameter from 0 to 1")
-    time: FloatArray = _array("sample", units="s", about="when that is reached; NaN where there is no time")
-    mu: FloatArray = _array(
-        "sample", "part", about="shares of t, r, p that are done, NaN in the profile joint"
-    )
-    H_d: FloatArray = _array("sample", "row", "coordinate", about="planned displacement of the face")
-    s: FloatArray = _array("sample", "view", "marker", "xy", units="px", about="predicted images of the face")
-    margin: FloatArray = _array("sample", "view", about="visibility margin a·O, 1 at the start")
+    time: FloatArray = _array("sample", "s", "when that is reached; NaN where there is no time")
+    mu: FloatArray = _array("sample part", about="shares of t, r, p that are done, NaN in the profile joint")
+    H_d: FloatArray = _array("sample row coordinate", about="planned displacement of the face")
+    s: FloatArray = _array("sample view marker xy", "px", "predicted images of the face")
+    margin: FloatArray = _array("sample view", about="visibility margin a·O, 1 at the start")
     border_distance: FloatArray = _array(
-        "sample", "view", units="px", about="least distance of a marker from the image border"
+        "sample view", "px", "least distance of a marker from the image border"
     )
-    q: FloatArray = _array(
-        "sample", "joint", units="rad or m", about="joints that follow the motion, NaN where none can"
-    )
+    q: FloatArray = _array("sample joint", "rad or m", "joints that follow the motion, NaN where none can")
     joint_margin: FloatArray = _array("sample", about="least distance from a joint limit over half the range")
     condition: FloatArray = _array("sample", about="reciprocal condition of the image Jacobian of the face")
     least: FloatArray = _array(
         "constraint",
         about="smallest visibility margin, border distance in px, joint margin, reciprocal condition",
     )
-    least_mu: FloatArray = _array("constraint", "part", about="shares of t, r, p where that is")
-    s_start: FloatArray = _array("view", "marker", "xy", units="px", about="images at the start")
-    s_star: FloatArray = _array("view", "marker", "xy", units="px", about="images at the goal")
-    A: FloatArray = _array("marker", "coordinate", about="face at the start")
-    A_star: FloatArray = _array("marker", "coordinate", about="face at the goal")
-    A_t: FloatArray = _array("marker", "coordinate", about="goal less the translation")
-    A_r: FloatArray = _array(
-        "marker", "coordinate", about="goal less translation and rotation onto the plane"
-    )
+    least_mu: FloatArray = _array("constraint part", about="shares of t, r, p where that is")
+    s_start: FloatArray = _array("view marker xy", "px", "images at the start")
+    s_star: FloatArray = _array("view marker xy", "px", "images at the goal")
+    A: FloatArray = _array("marker coordinate", about="face at the start")
+    A_star: FloatArray = _array("marker coordinate", about="face at the goal")
+    A_t: FloatArray = _array("marker coordinate", about="goal less the translation")
+    A_r: FloatArray = _array("marker coordinate", about="goal less translation and rotation onto the plane")
     a: FloatArray = _array("coordinate", about="plane of the face at the start")
     a_star: FloatArray = _array("coordinate", about="plane of the face at the goal")
     a_t: FloatArray = _array("coordinate", about="plane of the goal less the translation")
     A_c: FloatArray = _array("coordinate", about="centre of the face at the start")
     A_c_star: FloatArray = _array("coordinate", about="centre of the face at the goal")
-    q_start: FloatArray = _array("joint", units="rad or m", about="joint readings at the start")
-    q_hat: FloatArray = _array("part", "joint", about="joint motions t, r, p at the start")
-    H_hat: FloatArray = _array("part", "row", "coordinate", about="operators t, r, p at the start")
-    optical_center: FloatArray = _array("view", "coordinate", about="optical centres")
+    q_start: FloatArray = _array("joint", "rad or m", "joint readings at the start")
+    q_hat: FloatArray = _array("part joint", about="joint motions t, r, p at the start")
+    H_hat: FloatArray = _array("part row coordinate", about="operators t, r, p at the start")
+    optical_center: FloatArray = _array("view coordinate", about="optical centres")
     tau_0: FloatArray = _array("view", about="translation at which visibility changes")
-    theta_0: FloatArray = _array("view", "solution", units="rad", about="angles at which visibility changes")
-    sense: FloatArray = _array("solution", units="rad", about="both senses of the rotation onto the plane")
-    sense_margin: FloatArray = _array(
-        "solution", "view", about="least margin along each sense, 1 at the start"
-    )
+    theta_0: FloatArray = _array("view solution", "rad", "angles at which visibility changes")
+    sense: FloatArray = _array("solution", "rad", "both senses of the rotation onto the plane")
+    sense_margin: FloatArray = _array("solution view", about="least margin along each sense, 1 at the start")
     goals: int | None = _scalar(
         about="joint vectors within the limits that show the goal; none but in the profile joint",
         default=None,
@@ -386,28 +363,22 @@ class Plan:
         about="what start and goal ask less of than the configuration, having less themselves", default=()
     )
     validity: FloatArray | None = _array(
-        "sample",
-        "demand",
+        "sample demand",
         about="in the profile joint: distance from the joint limits over that asked for; of each view least "
         "depth (start = 1), visibility a·O (start = 1), width of the face in px, distance from the image "
         "border less three deviations in px; distance from regions that are kept out of in px",
         default=None,
     )
     validity_asked: FloatArray | None = _array(
-        "sample", "demand", about="what is asked of these, less near start and goals", default=None
+        "sample demand", about="what is asked of these, less near start and goals", default=None
     )
     corner: FloatArray | None = _array(
-        "rounding",
-        "end",
-        units="s",
-        about="in the profile joint: when each rounded corner begins and ends",
-        default=None,
+        "rounding end", "s", "in the profile joint: when each rounded corner begins and ends", default=None
     )
     tree_q: FloatArray | None = _array(
-        "node",
-        "joint",
-        units="rad or m",
-        about="joints of the search trees: that from the start, then that from the goals",
+        "node joint",
+        "rad or m",
+        "joints of the search trees: that from the start, then that from the goals",
         default=None,
     )
     tree_parent: IntArray | None = _array(
@@ -425,34 +396,30 @@ class Trace:
 
     law: str = _scalar(about="name of the control law")
     mode: str = _scalar(about="replan: each step plans anew; track, image_track: the plan is followed")
-    planned_s: float | None = _scalar(units="s", about="when the followed plan arrives; none for replan")
+    planned_s: float | None = _scalar("s", "when the followed plan arrives; none for replan")
     verdict: str = _scalar(about="how the run ended")
     reason: str = _scalar(about="why, in a sentence")
     steps: int = _scalar(about="commands sent")
-    period: float = _scalar(units="s", about="control period")
+    period: float = _scalar("s", "control period")
     observation: str = _scalar(about="how the face is measured: points or body")
     position_error_mm: float | None = _scalar(
-        units="mm", about="true centre to true goal at the end; of the tool where a robot tells its truth"
+        "mm", "true centre to true goal at the end; of the tool where a robot tells its truth"
     )
-    rotation_error_deg: float | None = _scalar(units="deg", about="true rotation to the goal at the end")
+    rotation_error_deg: float | None = _scalar("deg", "true rotation to the goal at the end")
     translation_left: float | None = _scalar(
         about="share of the translation left at the end, as the law measures it"
     )
-    rotation_left_deg: float | None = _scalar(
-        units="deg", about="rotation left at the end, as the law measures it"
-    )
+    rotation_left_deg: float | None = _scalar("deg", "rotation left at the end, as the law measures it")
     self_occluded_steps_left: int = _scalar(about="instants at which the left camera is behind the face")
     self_occluded_steps_right: int = _scalar(about="instants at which the right camera is behind the face")
     center_deviation_mm: float | None = _scalar(
-        units="mm", about="largest distance of the centre from the line, between samples too"
+        "mm", "largest distance of the centre from the line, between samples too"
     )
     center_deviation_at_samples_mm: float | None = _scalar(
-        units="mm", about="largest distance of the centre from the line at the sampling instants"
+        "mm", "largest distance of the centre from the line at the sampling instants"
     )
-    path_length_mm: float | None = _scalar(
-        units="mm", about="length of the path of the centre, from sample to sample"
-    )
-    effort: float = _scalar(units="rad²/s or m²/s", about="integral of the squared joint velocities")
+    path_length_mm: float | None = _scalar("mm", "length of the path of the centre, from sample to sample")
+    effort: float = _scalar("rad²/s or m²/s", "integral of the squared joint velocities")
     plateau_steps: int = _scalar(
         about="longest stretch in which stop_error falls < 1 % in each stop.plateau_steps"
     )
@@ -463,38 +430,36 @@ class Trace:
     limit_joint: int = _scalar(
         about="the joint, from 0, that passed its limit first or stopped the run at it, -1 for none"
     )
-    q: FloatArray = _array("instant", "joint", units="rad or m", about="joints")
-    s: FloatArray = _array("instant", "view", "marker", "xy", units="px", about="measured images of the face")
-    s_star: FloatArray = _array("view", "marker", "xy", units="px", about="target images")
-    image_error: FloatArray = _array("instant", units="px", about="rms over markers and views")
+    q: FloatArray = _array("instant joint", "rad or m", "joints")
+    s: FloatArray = _array("instant view marker xy", "px", "measured images of the face")
+    s_star: FloatArray = _array("view marker xy", "px", "target images")
+    image_error: FloatArray = _array("instant", "px", "rms over markers and views")
     stop_error: FloatArray = _array(
         "instant",
-        units="px",
-        about="the same by which runs end: with the body, of the face where the body was measured to be",
+        "px",
+        "the same by which runs end: with the body, of the face where the body was measured to be",
     )
     tau: FloatArray = _array("instant", about="translation error, unit-norm kernel of (8)")
     tau_affine: FloatArray = _array("instant", about="translation error, scale fixed through a_inf")
-    theta_r: FloatArray = _array("instant", units="rad", about="rotation error onto the plane")
-    theta_p: FloatArray = _array("instant", units="rad", about="rotation error within the plane")
-    theta_s: FloatArray = _array("instant", units="rad", about="rotation error of both together")
+    theta_r: FloatArray = _array("instant", "rad", "rotation error onto the plane")
+    theta_p: FloatArray = _array("instant", "rad", "rotation error within the plane")
+    theta_s: FloatArray = _array("instant", "rad", "rotation error of both together")
     prediction_px: FloatArray = _array(
-        "instant",
-        units="px",
-        about="observed less predicted from the joints, rms per coordinate; NaN for points",
+        "instant", "px", "observed less predicted from the joints, rms per coordinate; NaN for points"
     )
     fit_px: FloatArray = _array(
-        "instant", units="px", about="noise per coordinate that the fit of the body leaves; NaN for points"
+        "instant", "px", "noise per coordinate that the fit of the body leaves; NaN for points"
     )
     views_used: FloatArray = _array("instant", about="markers the body was fitted to, counted once a view")
-    q_dot: FloatArray = _array("step", "joint", units="rad/s or m/s", about="commands after the limit")
+    q_dot: FloatArray = _array("step joint", "rad/s or m/s", "commands after the limit")
     speed_factor: FloatArray = _array("step", about="factor of the joint-speed limit")
-    self_occluded: BoolArray = _array("instant", "view", about="true self-occlusion of the face")
-    pose: FloatArray = _array("instant", "row", "coordinate", units="m", about="true pose of the tool")
-    goal_pose: FloatArray = _array("row", "coordinate", units="m", about="true goal pose, NaN if unknown")
-    center: FloatArray = _array("instant", "axis", units="m", about="true centre of the face")
+    self_occluded: BoolArray = _array("instant view", about="true self-occlusion of the face")
+    pose: FloatArray = _array("instant row coordinate", "m", "true pose of the tool")
+    goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
+    center: FloatArray = _array("instant axis", "m", "true centre of the face")
     success: bool | None = _scalar(
-        about="whether it converged and at every instant, in truth, no joint was past a limit, no camera "
-        "behind the face and every marker of the face in both images; none where the truth is not known",
+        about="whether it converged and at every instant, in truth, no joint was past a limit, no camera behind"
+        " the face and every marker of the face in both images; none where the truth is not known",
         default=None,
     )
     searches_anew: int = _scalar(about="how often a way to the goal was searched anew", default=0)
@@ -502,38 +467,29 @@ class Trace:
         about="why a run that was to follow the plan went without it; empty where it followed", default=""
     )
     untested: str = _scalar(
-        about="why the images of a robot of the contract were not tested against the calibration",
-        default="",
+        about="why the images of a robot of the contract were not tested against the calibration", default=""
     )
     overruns: int | None = _scalar(
         about="periods that reading and thinking did not fit into; none for the ideal simulated robot",
         default=None,
     )
     delay: FloatArray | None = _array(
-        "instant",
-        "view",
-        units="s",
-        about="instant of the joint reading less that of the image, as followed",
-        default=None,
+        "instant view", "s", "instant of the joint reading less that of the image, as followed", default=None
     )
     frame_instant: IntArray | None = _array(
         "frame", about="instants of which frames are kept; absent where the robot shows none", default=None
     )
     frame_s: FloatArray | None = _array(
-        *("frame", "view", "observed", "xy"), units="px", about="all that was found in them", default=None
+        "frame view observed xy", "px", "all that was found in them", default=None
     )
     frame_size: IntArray | None = _array(
-        "frame", "view", about="bytes of each frame among frame_jpeg", default=None
+        "frame view", about="bytes of each frame among frame_jpeg", default=None
     )
     frame_jpeg: ByteArray | None = _array(
         "frame_byte", about="the frames as JPEG, one after the other", default=None
     )
     q_read: FloatArray | None = _array(
-        "instant",
-        "joint",
-        units="rad or m",
-        about="joint readings, where they are not the joints",
-        default=None,
+        "instant joint", "rad or m", "joint readings, where they are not the joints", default=None
     )
 
 
@@ -548,25 +504,23 @@ class Report:
     figures: tuple[str, ...] = _scalar(about="files written, relative to the folder of the run")
     left_out: tuple[dict[str, str], ...] = _scalar(about="figures and studies left out, each with the reason")
     claims: tuple[dict[str, Any], ...] = _scalar(about="claim, source, measured, criterion, holds")
-    step_limit_deg: float = _scalar(units="deg", about="joint motion per step of the limited runs")
+    step_limit_deg: float = _scalar("deg", "joint motion per step of the limited runs")
     gain_per_step: FloatArray = _array("gain_per_step", about="share of the error taken in one step")
     drift_mm: FloatArray = _array(
-        "law", "operators", "limit", "gain_per_step", units="mm", about="largest deviation of the centre"
+        "law operators limit gain_per_step", "mm", "largest deviation of the centre"
     )
     drift_at_samples_mm: FloatArray = _array(
-        "law", "operators", "limit", "gain_per_step", units="mm", about="the same at the sampling instants"
+        "law operators limit gain_per_step", "mm", "the same at the sampling instants"
     )
     drift_converged: BoolArray = _array(
-        "law", "operators", "limit", "gain_per_step", about="whether the run converged"
+        "law operators limit gain_per_step", about="whether the run converged"
     )
-    period: FloatArray = _array("period", units="s", about="control period at the configured gains")
+    period: FloatArray = _array("period", "s", "control period at the configured gains")
     period_drift_mm: FloatArray = _array(
-        "law", "period", units="mm", about="largest deviation of the centre, true operators, no limit"
+        "law period", "mm", "largest deviation of the centre, true operators, no limit"
     )
     share: FloatArray = _array("share", about="share of the task in both sides of (22)")
-    composition_mm: FloatArray = _array(
-        "share", units="mm", about="distance of the centre between both sides of (22)"
-    )
+    composition_mm: FloatArray = _array("share", "mm", "distance of the centre between both sides of (22)")
 
 
 REPLAN, TRACK, IMAGE_TRACK = "replan", "track", "image_track"
