@@ -458,8 +458,8 @@ class Trace:
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
     center: FloatArray = _array("instant axis", "m", "true centre of the face")
     success: bool | None = _scalar(
-        about="whether it converged and at every instant, in truth, no joint was past a limit, no camera behind"
-        " the face and every marker of the face in both images; none where the truth is not known",
+        about="whether it converged and at every instant, in truth, no joint was past a limit, no camera "
+        "behind the face and every marker of the face in both images; none where the truth is not known",
         default=None,
     )
     searches_anew: int = _scalar(about="how often a way to the goal was searched anew", default=0)

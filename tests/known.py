@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from projservo_cli.config import load_config
-from projservo_cli.config.models import Trajectory
+from projservo_cli.config.task import Trajectory
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.servo import drive

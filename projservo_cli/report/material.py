@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.config import Config
-from projservo_cli.config.models import Trajectory
+from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import (
     IMAGE_TRACK,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from projservo_cli.config import load_config
-from projservo_cli.config.models import TaskSettings
+from projservo_cli.config.task import TaskSettings
 from projservo_cli.records import FloatArray, InputError, Plan, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.world import joints_of

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.spread import spread_of
-from projservo_cli.config.models import LIMITS_MISSING, Trajectory
+from projservo_cli.config.models import LIMITS_MISSING
+from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from projservo_cli.config import Config
-from projservo_cli.config.models import Trajectory
+from projservo_cli.config.task import Trajectory
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE

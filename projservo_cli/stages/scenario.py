@@ -13,7 +13,7 @@ import numpy as np
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config
 from projservo_cli.config.markers import CORNERS
-from projservo_cli.config.models import TaskSettings
+from projservo_cli.config.task import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.guidance.margins import Demands

@@ -10,7 +10,7 @@ import numpy as np
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config, plain_yaml
-from projservo_cli.config.models import TaskSettings
+from projservo_cli.config.task import TaskSettings
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Reading, at_rest_after
 from projservo_cli.stages import plan as planning

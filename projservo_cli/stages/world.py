@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
-from projservo_cli.config.models import Goal
 from projservo_cli.config.robot import Camera, Rig, RobotSettings
+from projservo_cli.config.task import Goal
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.records import (
     NO_LENS,

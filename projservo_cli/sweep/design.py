@@ -14,9 +14,9 @@ import numpy as np
 
 from projservo_cli.calibration.forward import displacements, image_points, moved_points
 from projservo_cli.config import Config, Override, load_config, to_yaml
-from projservo_cli.config.models import Goal, TaskSettings
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
+from projservo_cli.config.task import Goal, TaskSettings
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.records import (
     PRISMATIC,

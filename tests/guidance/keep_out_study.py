@@ -17,8 +17,8 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
-from projservo_cli.config.regions import KeptOut
 from projservo_cli.config.robot import JointVector
+from projservo_cli.config.task import KeptOut
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
