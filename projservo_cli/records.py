@@ -228,6 +228,11 @@ class Calibration:
         lens = NO_LENS if self.lens is None else self.lens
         return Model(self.P, self.H_hat_0, types, self.q_reference, self.a_inf, lens)
 
+    @property
+    def prismatic(self) -> BoolArray:
+        """Whether each joint (n,) is prismatic."""
+        return np.array([letter == "P" for letter in self.joint_types])
+
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:

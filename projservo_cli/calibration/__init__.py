@@ -3,8 +3,8 @@
 The path of a calibration: what was seen (``readings``) → the rig (``epipolar``) → a start (``start``) →
 bundle adjustment (``adjustment``) of the ``forward`` model, robustly (``fit``) → what was left out
 (``diagnosis``) → its frame and covariance (``projective``) → the verdict (``quality``); ``estimate`` leads
-through it, and ``prediction`` is what the result is for, with ``spread`` for how far it errs and
-``innovation`` for what contradicts it in the loop.
+through it, and ``prediction`` is what the result is for, with how far it errs, and ``innovation`` for what
+contradicts it in the loop.
 """
 
 from projservo_cli.calibration.diagnosis import findings

@@ -13,9 +13,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import stdtrit
 
-from projservo_cli.calibration.joint_noise import unit_noise
 from projservo_cli.calibration.prediction import joint_derivative, predict
-from projservo_cli.calibration.readings import MAD
+from projservo_cli.calibration.readings import MAD, per_rad
 from projservo_cli.records import Calibration, FloatArray, IntArray, Observation
 
 # Delays that are looked for, s, and their steps; a pixel of what no camera sees, px.
@@ -99,8 +98,7 @@ class _Frames:
         J[unseen], r[unseen] = 0.0, 0.0
         J, r = J.reshape(len(q), -1, q.shape[1]), r.reshape(len(q), -1, 1)
         velocity = -J @ q_dot[..., None]
-        prismatic = np.array([letter == "P" for letter in found.joint_types])
-        G = J * ((found.sigma_q or 0.0) * unit_noise(prismatic))
+        G = J * ((found.sigma_q or 0.0) * per_rad(found.prismatic))
         S = max(found.sigma_px, found.sigma_fitted_px) ** 2 * np.eye(r.shape[1]) + G @ np.swapaxes(G, 1, 2)
         weighted = np.swapaxes(velocity, 1, 2) @ np.linalg.solve(S, np.concatenate([velocity, r], axis=2))
         information = np.maximum(weighted[:, 0, 0], 1e-300)  # of a robot that stands still there is none

@@ -11,8 +11,8 @@ from scipy.special import chdtri
 from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise, unit_noise
-from projservo_cli.calibration.readings import RAYLEIGH
+from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
+from projservo_cli.calibration.readings import RAYLEIGH, per_rad
 from projservo_cli.calibration.start import Nominal, Search, starts
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
@@ -302,7 +302,7 @@ def with_joint_noise(exact: Solution, expected: Expected, given: float | None) -
             return dataclasses.replace(exact, joint_noise=noise)
         if before is not None and abs(noise.sigma_q - before.sigma_q) <= _NOISE_SETTLED * before.sigma_q:
             break
-        problem = exact.problem.with_noise(noise.over_pixels * unit_noise(exact.problem.readings.prismatic))
+        problem = exact.problem.with_noise(noise.over_pixels * per_rad(exact.problem.readings.prismatic))
         # What joints that err did to the scene hides that their noise explains the images.
         scene = minimize(problem, solution.scene, solution.used, robust=True, most=20).scene
         found = fit_inliers(problem, scene, noise.sigma_q / noise.over_pixels)

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import chdtri
 
-from projservo_cli.calibration.forward import CAMERA, Scene
-from projservo_cli.calibration.prediction import covariance_root
-from projservo_cli.calibration.readings import LEAST_SIGMA
+from projservo_cli.calibration.forward import CAMERA
+from projservo_cli.calibration.prediction import covariance_root, scene_of
+from projservo_cli.calibration.readings import LEAST_SIGMA, per_rad
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
 # Looks in a row that must agree on a gross disturbance: one may be blurred, or a marker taken for another.
@@ -25,8 +25,6 @@ _BEYOND_FIRST_ORDER = 0.02
 _LASTING = np.sqrt(2.0)
 # Joints (rad or m) and instants (s) are known no better than this, whatever is said.
 _LEAST_ERROR = 1e-6
-# A prismatic joint errs by so many metres where a revolute one errs by a radian.
-_METRES_PER_RAD = 0.3
 # A direction counts where it keeps this share of its size beside the others; what is added for solving.
 _RANK, _RIDGE = 1e-6, 1e-9
 # Share of what a look is off that the first order leaves out: the cause need not explain more.
@@ -135,8 +133,7 @@ class Innovation:
     def __init__(self, calibration: Calibration, sigma_px: float, observations: int) -> None:
         self.calibration = calibration
         m, n = len(calibration.M), len(calibration.H_hat_0)
-        prismatic = np.array([letter == "P" for letter in calibration.joint_types])
-        self._scene = Scene(calibration.P, calibration.H_hat_0, prismatic, calibration.M, calibration.lens)
+        self._scene = scene_of(calibration)
         self._factor = covariance_root(calibration.covariance)
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(bent, LEAST_SIGMA)
@@ -146,7 +143,7 @@ class Innovation:
         sigma_q = calibration.sigma_q or 0.0
         if calibration.sigma_q_interval is not None:
             sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
-        self._sigma_q = np.maximum(sigma_q * np.where(prismatic, _METRES_PER_RAD, 1.0), _LEAST_ERROR)
+        self._sigma_q = np.maximum(sigma_q * per_rad(calibration.prismatic), _LEAST_ERROR)
         self._delay_sigma = np.full(2, _LEAST_ERROR)
         # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
         self._directions = np.linalg.svd(calibration.a_inf[None])[2][1:]

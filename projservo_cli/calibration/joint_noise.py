@@ -20,7 +20,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import JointErrors, LeastSquares
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.readings import REACH_M, REACH_RAD
+from projservo_cli.calibration.readings import per_rad
 from projservo_cli.records import BoolArray, FloatArray
 
 # Noise of joints that is looked for, rad: of the best encoders, and beyond any robot.
@@ -34,11 +34,6 @@ _SIGNIFICANT, _INTERVAL = 5.412, 3.841
 _CHANCE, _LENIENT = 0.999, 1.5
 # Ticks are no finer than this, rad or m; readings lie on them to this share.
 _LEAST_TICK, _ON_TICK = 1e-5, 0.01
-
-
-def unit_noise(prismatic: BoolArray) -> FloatArray:
-    """Noise (n,) of joints where that of revolute ones is one rad, rad or m."""
-    return np.where(prismatic, REACH_M / REACH_RAD, 1.0)
 
 
 @dataclass(frozen=True)
@@ -103,7 +98,7 @@ class _Likelihood:
 
     def __init__(self, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None) -> None:
         self.given = sigma_px
-        unit, J = unit_noise(problem.readings.prismatic), problem.derivative(scene)
+        unit, J = per_rad(problem.readings.prismatic), problem.derivative(scene)
         A = problem.normal(J, used.astype(np.float64))
         errors, residual = JointErrors(problem, scene, used, unit), problem.residual(scene)
         if problem.tau is not None:  # at the joints as read
@@ -180,7 +175,7 @@ def tick_noise(q: FloatArray, prismatic: BoolArray) -> float:
     ticks = np.array([_tick(column) for column in q.T])
     if (ticks == 0.0).any():
         return 0.0
-    return float(np.sqrt(np.mean((ticks / unit_noise(prismatic)) ** 2) / 12.0))
+    return float(np.sqrt(np.mean((ticks / per_rad(prismatic)) ** 2) / 12.0))
 
 
 def _tick(values: FloatArray) -> float:

@@ -1,12 +1,29 @@
 """What a calibration predicts, how certainly, and which further poses would help."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.records import BoolArray, Calibration, FloatArray, InputError, Observation, WorkFailed
+from projservo_cli.records import (
+    NO_SPREAD,
+    BoolArray,
+    Calibration,
+    FloatArray,
+    InputError,
+    Observation,
+    Spread,
+    WorkFailed,
+)
+
+
+def scene_of(calibration: Calibration) -> Scene:
+    """The scene of a record."""
+    c = calibration
+    return Scene(c.P, c.H_hat_0, c.prismatic, c.M, c.lens)
 
 
 def _scene(calibration: Calibration, q: FloatArray) -> tuple[Scene, FloatArray]:
@@ -17,9 +34,7 @@ def _scene(calibration: Calibration, q: FloatArray) -> tuple[Scene, FloatArray]:
         raise InputError(f"joint readings of shape {q.shape}: expected one row of {n} a pose")
     if not np.isfinite(q).all():
         raise InputError("joint readings must be finite numbers")
-    prismatic = np.array([letter == "P" for letter in calibration.joint_types])
-    scene = Scene(calibration.P, calibration.H_hat_0, prismatic, calibration.M, calibration.lens)
-    return scene, q - calibration.q_reference
+    return scene_of(calibration), q - calibration.q_reference
 
 
 def predict(calibration: Calibration, q: FloatArray) -> FloatArray:
@@ -206,13 +221,10 @@ def _shown(
 
     Rows of what is not seen are zero.
     """
-    scene, _ = _scene(calibration, region.low[None])
+    scene = scene_of(calibration)
     poses: list[FloatArray] = []
     rows: list[FloatArray] = []
-    for _ in range(_BATCHES):
-        q = rng.uniform(region.low, region.high, (_BATCH, len(region.low)))
-        pixels, (low, high) = scene.seen(q - calibration.q_reference), region.image.swapaxes(0, 1)[:, :, None]
-        seen = ((pixels >= low) & (pixels <= high)).all(axis=-1)  # none that is NaN, behind the camera
+    for q, seen in _drawn(calibration, region, _BATCHES, rng):
         enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
         if enough.size:
             J = scene.derivative(q[enough] - calibration.q_reference) @ factor
@@ -230,3 +242,70 @@ def _shown(
             "cameras as far as the calibration can tell; make it better with single-joint trials first"
         )
     return np.array(poses), np.array(rows)
+
+
+def _drawn(
+    calibration: Calibration, region: Region, batches: int, rng: np.random.Generator
+) -> Iterator[tuple[FloatArray, BoolArray]]:
+    """Batches of random poses (k, n) of a region, and which images (k, 2, m) lie within it."""
+    scene, (low, high) = scene_of(calibration), region.image.swapaxes(0, 1)[:, :, None]
+    for _ in range(batches):
+        q = rng.uniform(region.low, region.high, (_BATCH, len(region.low)))
+        pixels = scene.seen(q - calibration.q_reference)
+        yield q, ((pixels >= low) & (pixels <= high)).all(axis=-1)  # none that is NaN, behind the camera
+
+
+# Lower and upper limits of n joints, rad or m, and width and height of both images, px.
+_Bounds = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
+# Directions of the covariance that are told apart; joints at which they are looked for, and batches of them.
+_DIRECTIONS, _LOOKED_AT, _MOST_BATCHES = 8, 150, 40
+
+
+@lru_cache(maxsize=64)
+def spread_of(
+    calibration: Calibration, indices: tuple[int, ...], face: int, bounds: _Bounds, seed: int
+) -> Spread:
+    """How far predictions err, of markers by their indices, those of the face first.
+
+    The directions are those that move the images of the face most, among joints drawn at random that show it;
+    what they leave is taken to be the same everywhere. None without a covariance. It takes 20 ms, once
+    for all tasks of a calibration.
+    """
+    if not np.isfinite(calibration.covariance).all():
+        return NO_SPREAD
+    q = _showing(calibration, indices[:face], bounds, seed)
+    if len(q) == 0:
+        return NO_SPREAD
+    factor = covariance_root(calibration.covariance)
+    J = prediction_derivative(calibration, q)[:, :, list(indices[:face])] @ factor
+    variance = (J**2).sum(axis=-1)
+    rows = J.reshape(-1, J.shape[-1]) / np.maximum(np.sqrt(variance).reshape(-1, 1), 1e-9)
+    # LAPACK's singular value decomposition fails on some of these rows, finite as they are.
+    main = np.linalg.eigh(rows.T @ rows)[1][:, : -_DIRECTIONS - 1 : -1]
+    rest = float(np.sqrt(np.median(np.maximum(variance - ((J @ main) ** 2).sum(axis=-1), 0.0))))
+    moved = (factor @ main).T
+    n, b = calibration.H_hat_0.shape[0], calibration.M.shape[0]
+    P, H_hat, M = np.split(moved[:, : 24 + 16 * n + 4 * b], [24, 24 + 16 * n], axis=1)
+    return Spread(
+        np.concatenate([calibration.P[None], calibration.P + P.reshape(-1, 2, 3, 4)]),
+        np.concatenate([calibration.H_hat_0[None], calibration.H_hat_0 + H_hat.reshape(-1, n, 4, 4)]),
+        np.ascontiguousarray(
+            np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)])[:, list(indices)]
+        ),
+        rest,
+        float(np.sqrt(variance.max())),
+    )
+
+
+def _showing(calibration: Calibration, indices: tuple[int, ...], bounds: _Bounds, seed: int) -> FloatArray:
+    """Joints (k, n) within the limits at which both images hold the markers."""
+    lower, upper, image_size = bounds
+    low = np.where(np.isfinite(lower), lower, calibration.q_reference - np.pi)
+    high = np.where(np.isfinite(upper), upper, calibration.q_reference + np.pi)
+    corners = np.array([[-0.5, -0.5], np.array(image_size) - 0.5])
+    region, found = Region(low, high, np.stack([corners, corners])), np.zeros((0, len(low)))
+    for q, seen in _drawn(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
+        found = np.concatenate([found, q[seen[:, :, list(indices)].all(axis=(1, 2))]])
+        if len(found) >= _LOOKED_AT:
+            break
+    return found[:_LOOKED_AT]

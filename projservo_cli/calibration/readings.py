@@ -198,6 +198,11 @@ _STANDING = 0.1
 _LEAST_SPAN = 1e-6
 
 
+def per_rad(prismatic: BoolArray) -> FloatArray:
+    """How far joints (n,) go, rad or m, that make as much of a difference as a revolute one by one rad."""
+    return np.where(prismatic, REACH_M / REACH_RAD, 1.0)
+
+
 def require_motion(readings: Readings) -> FloatArray:
     """Range of each joint over the poses, (n,) rad or m.
 

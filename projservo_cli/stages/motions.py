@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.spread import spread_of
+from projservo_cli.calibration.prediction import spread_of
 from projservo_cli.config.models import LIMITS_MISSING
 from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.algebra import as_array

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration.readings import REACH_M, REACH_RAD
+from projservo_cli.calibration.readings import per_rad
 from projservo_cli.config import Config, digest
 from projservo_cli.config.models import FAULTS
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
@@ -161,7 +161,7 @@ def trial_motions(config: Config) -> FloatArray:
     if faultless:
         return q
     turn = 2.0 * np.pi / (config.disturbance.encoder_ticks or _TICKS)
-    tick = np.where([kind == "P" for kind in joints.types], REACH_M / REACH_RAD, 1.0) * turn
+    tick = per_rad(np.array([*joints.types]) == "P") * turn
     return np.clip(q + tick * rng.uniform(-1.0, 1.0, q.shape), joints.lower, joints.upper)
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.readings import REACH_M, REACH_RAD
+from projservo_cli.calibration.readings import per_rad
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.models import FAULTS, Disturbance, FrozenJoint, LostMarkers, RenderedOptions
@@ -31,7 +31,6 @@ from projservo_cli.stages.world import Truth
 _GRID_S = 0.005
 _EXPOSED = 5  # instants of an exposure that are averaged
 # What a prismatic joint moves where a revolute one turns by a radian, m.
-_M_PER_RAD = REACH_M / REACH_RAD
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # how far clocks of cameras are off at most
@@ -333,7 +332,7 @@ class _Joints:
     def __init__(self, world: World, given: Disturbance) -> None:
         self.arm, self._bump = world.truth.robot, given.bump
         self._struck_at = math.inf if given.bump is None else given.bump.at_step * world.period
-        scale = np.where(self.arm.joint_types == PRISMATIC, _M_PER_RAD, 1.0)
+        scale = per_rad(self.arm.joint_types == PRISMATIC)
         self.tick = scale * (2.0 * math.pi / given.encoder_ticks if given.encoder_ticks else 0.0)
         self._play = 0.5 * math.radians(given.play_deg) * scale
         # What gravity costs a joint that holds the tool at full reach, rad.

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.readings import REACH_M, REACH_RAD
+from projservo_cli.calibration.readings import per_rad
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
 from projservo_cli.config.robot import Camera, Rig, RobotSettings
@@ -45,8 +45,7 @@ class Joints(NamedTuple):
 
     def length_of(self, degrees: float) -> FloatArray:
         """An angle as (n,) rad, for prismatic joints the length, m, that makes as much of a difference."""
-        ratio = [REACH_M / REACH_RAD if kind == "P" else 1.0 for kind in self.types]
-        return math.radians(degrees) * np.array(ratio)
+        return math.radians(degrees) * per_rad(np.array([*self.types]) == "P")
 
 
 def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:

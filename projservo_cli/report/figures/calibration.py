@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration import predict, prediction_variance
-from projservo_cli.calibration.joint_noise import unit_noise
 from projservo_cli.calibration.prediction import covariance_root, joint_derivative, prediction_derivative
+from projservo_cli.calibration.readings import per_rad
 from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
@@ -39,7 +39,7 @@ def _data(fit: Fit) -> Data:
         "sigma_px": np.array(calibration.sigma_px),
         "chi2_per_dof": np.array(calibration.chi2_per_dof),
         "excitation": calibration.excitation,
-        "prismatic": np.array([letter == "P" for letter in calibration.joint_types]),
+        "prismatic": calibration.prismatic,
         "weak": calibration.weak,
         "information": _information(calibration.covariance),
         "parameters": np.array(len(calibration.covariance)),
@@ -75,8 +75,7 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
     if (stated := fit.observation.sigma) is not None:
         stated = stated[:, :, _columns(calibration, fit.observation)]
         weight[used] = np.sqrt(np.mean(stated[used] ** 2)) / stated[used]
-    prismatic = np.array([letter == "P" for letter in calibration.joint_types])
-    noise = (calibration.sigma_q or 0.0) * unit_noise(prismatic) / calibration.sigma_px
+    noise = (calibration.sigma_q or 0.0) * per_rad(calibration.prismatic) / calibration.sigma_px
     G = weight[..., None, None] * joint_derivative(calibration, q) * noise
     root = np.full((*residual.shape, 1), np.nan)  # of a method without covariance
     if np.isfinite(calibration.covariance).all():
