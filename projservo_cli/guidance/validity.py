@@ -294,6 +294,15 @@ def put_margins(c: Constraints, q: FloatArray, trial: "Trial") -> None:
 
 
 @njit
+def put_along(c: Constraints, q: FloatArray, trial: "Trial", found: FloatArray) -> None:
+    """Write margins and what is asked of them (2, k, 10) along joints (k, n)."""
+    for i in range(q.shape[0]):
+        put_margins(c, q[i], trial)
+        put_row(found[0, i], trial.margins)
+        put_row(found[1, i], trial.demands)
+
+
+@njit
 def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
     """Write what is asked for (10,) at joints (n,): the full margins, or less near start and goals."""
     for i in range(MARGINS):

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.guidance.search import Tree
 from projservo_cli.guidance.timing import Pace
 from projservo_cli.guidance.validity import (
     BORDER,
@@ -17,10 +16,10 @@ from projservo_cli.guidance.validity import (
     WIDTH,
     Constraints,
     new_trial,
+    put_along,
     put_demands,
-    put_margins,
 )
-from projservo_cli.guidance.way import Way, may_start
+from projservo_cli.guidance.way import Tree, Way, may_start
 from projservo_cli.records import PRISMATIC, VIEWS, FloatArray, IntArray
 
 # Joint vectors of each tree that are stored: those that it grew first.
@@ -62,10 +61,8 @@ def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:
 
 def _along(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Margins and what is asked of them, (s, 10), at joints (s, n)."""
-    trial, found = new_trial(q.shape[1], len(c.M)), np.zeros((2, len(q), MARGINS))
-    for i, joints in enumerate(q):
-        put_margins(c, joints, trial)
-        found[:, i] = trial.margins, trial.demands
+    found = np.zeros((2, len(q), MARGINS))
+    put_along(c, np.ascontiguousarray(q), new_trial(q.shape[1], len(c.M)), found)
     return found[0], found[1]
 
 
