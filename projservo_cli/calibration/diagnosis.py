@@ -189,7 +189,9 @@ def blamed_joint(search: Search, most_px: float) -> str:
             seen = changed.readings.seen
             for start in islice(starts(dataclasses.replace(search, problem=changed), changed.readings), 1):
                 scene = minimize(changed, start, seen, robust=True, cameras=False, most=_SCREW_STEPS).scene
-                candidates.append((_level(changed, scene) + handicap, words, changed, scene))
+                # By logarithms neither a few gross errors nor many small ones outweigh the rest.
+                level = np.mean(np.log(np.linalg.norm(changed.residual(scene)[seen], axis=1) + 1e-9))
+                candidates.append((float(level) + handicap, words, changed, scene))
     except WorkFailed:
         return ""
     candidates.sort(key=lambda candidate: candidate[0])
@@ -219,12 +221,6 @@ def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, 
         )
         found.append((words, LeastSquares.of(fewer, np.delete(q_reference, i)), 0.0))
     return found
-
-
-def _level(problem: LeastSquares, scene: Scene) -> float:
-    """Mean logarithm of the residuals: neither a few gross errors nor many small ones outweigh the rest."""
-    distance = np.linalg.norm(problem.residual(scene)[problem.readings.seen], axis=1)
-    return float(np.mean(np.log(distance + 1e-9)))
 
 
 def _describes(problem: LeastSquares, scene: Scene, epipolar: Epipolar, most_px: float) -> bool:

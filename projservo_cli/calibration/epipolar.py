@@ -52,15 +52,15 @@ class Epipolar:
         a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
         picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
         candidates = _eight_point(a[picks], b[picks])
-        medians = np.median(np.abs(_sampson(candidates, a, b, weight)), axis=1)
+        medians = np.median(np.abs(_sampson(candidates, a, b, weight)[0]), axis=1)
         F = candidates[np.argmin(medians)]
         for _ in range(10):
-            r, slope = _sampson_and_slope(F, a, b, weight)
+            r, slope = _sampson(F, a, b, weight)
             F = _eight_point(a, b, 1.0 / (slope * np.sqrt(1.0 + (r / (2.0 * _deviation(r, 1e-12))) ** 2)))
         F = _refine(F, a, b, weight)
         product = T_.T @ F @ T
         in_pixels: FloatArray = product / float(np.linalg.norm(product))
-        residual = _sampson(in_pixels, _homogeneous(left), _homogeneous(right), weight)
+        residual, _ = _sampson(in_pixels, _homogeneous(left), _homogeneous(right), weight)
         inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
         if inlier.sum() <= _PARAMETERS:
             raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
@@ -87,7 +87,7 @@ class Epipolar:
     def within(self, readings: Readings, deviations: float) -> BoolArray:
         """Which of readings (N,) that both views saw obey the geometry to so many standard deviations."""
         left, right = _homogeneous(readings.pixels)
-        return np.abs(_sampson(self.F, left, right, readings.weight)) <= deviations * self.sigma_px
+        return np.abs(_sampson(self.F, left, right, readings.weight)[0]) <= deviations * self.sigma_px
 
 
 def _deviation(r: FloatArray, least: float) -> float:
@@ -107,7 +107,7 @@ def _normalization(pixels: FloatArray) -> FloatArray:
     return np.array([[1.0, 0.0, -center[0]], [0.0, 1.0, -center[1]], [0.0, 0.0, spread]]) / spread
 
 
-def _sampson_and_slope(
+def _sampson(
     F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Signed first-order distances (…, N) of points (N, 3) from F (…, 3, 3), the root of [HZ04] eq. (11.9).
@@ -119,11 +119,6 @@ def _sampson_and_slope(
     square = by_right / weight[1] ** 2 + by_left / weight[0] ** 2
     slope = np.sqrt(np.maximum(square, np.finfo(float).tiny))
     return (lines_right * right).sum(axis=-1) / slope, slope
-
-
-def _sampson(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArray) -> FloatArray:
-    """The distances alone."""
-    return _sampson_and_slope(F, left, right, weight)[0]
 
 
 def _eight_point(left: FloatArray, right: FloatArray, weight: FloatArray | None = None) -> FloatArray:
@@ -154,9 +149,9 @@ def _refine(F: FloatArray, left: FloatArray, right: FloatArray, weight: FloatArr
         return np.asarray((U @ turn * [np.cos(phi + x[6]), np.sin(phi + x[6]), 0.0]) @ turn_.T @ Vt)
 
     def distances(x: FloatArray) -> FloatArray:
-        return _sampson(turned(x), left, right, weight)
+        return _sampson(turned(x), left, right, weight)[0]
 
-    scale = 2.0 * _deviation(_sampson(F, left, right, weight), 1e-12)
+    scale = 2.0 * _deviation(_sampson(F, left, right, weight)[0], 1e-12)
     found = least_squares(
         distances, np.zeros(7), "3-point", loss="cauchy", f_scale=scale, ftol=_TIGHT, xtol=_TIGHT, gtol=_TIGHT
     )

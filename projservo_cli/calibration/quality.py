@@ -54,9 +54,18 @@ class _Uncertainty:
         low, high = (low - wide)[:, None, None], (high + wide)[:, None, None]
         return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
 
-    def spread(self, q: FloatArray, shown: BoolArray) -> FloatArray:
-        """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one."""
+    def spread(self, q: FloatArray, *, nearer: bool = False) -> FloatArray:
+        """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one.
+
+        Where no image would count, poses may be taken nearer to the reference, half the way each time.
+        """
         problem, scene = self.solution.problem, self.solution.scene
+        shown = self.shown(q)
+        for _ in range(_HALVINGS if nearer else 0):
+            if shown.any():
+                break
+            q = 0.5 * (q + problem.q_reference)
+            shown = self.shown(q)
         there = LeastSquares.of(problem.readings.everywhere(q), problem.q_reference, scene.lens is not None)
         shown = shown.swapaxes(1, 2).reshape(2, -1)  # sightings are in the order of markers
         J = there.dense(there.derivative(scene), shown)
@@ -70,17 +79,6 @@ class _Uncertainty:
     def reach(self, i: int) -> float:
         """Reach of joint i at which predictions are judged, rad or m."""
         return REACH_M if self.solution.scene.prismatic[i] else REACH_RAD
-
-    def reach_spread(self, i: int) -> FloatArray:
-        """``spread`` with joint i at its reach, to either side; halved where no image would count."""
-        reach = self.reach(i)
-        for _ in range(_HALVINGS):
-            q = self.at(i, np.array([reach, -reach]))
-            shown = self.shown(q)
-            if shown.any():
-                break
-            reach *= 0.5
-        return self.spread(q, shown)
 
 
 def _needed_spans(sure: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
@@ -106,7 +104,7 @@ def _rms(T: FloatArray) -> float:
 def _noise_after(sure: _Uncertainty, i: int, span: float, T: FloatArray) -> float:
     """Noise at the reach after a trial over a span: rms of T (I + Cᵀ C)⁻¹ Tᵀ, C the trial's ``spread``."""
     q = sure.at(i, np.linspace(-0.5 * span, 0.5 * span, _FRAMES))
-    C = sure.spread(q, sure.shown(q))
+    C = sure.spread(q)
     root = np.asarray(np.linalg.qr(np.vstack([np.eye(C.shape[1]), C]), mode="r"))
     return _rms(np.linalg.solve(root.T, T.T).T)
 
@@ -119,15 +117,10 @@ def _predicted_error(sure: _Uncertainty) -> tuple[float, float]:
     are halved about the reference. No residual shows on which side of the expectation a calibration came
     to lie: to first order the error of a maximum of the likelihood does not depend on what it leaves.
     """
-    q, q_reference = sure.solution.problem.readings.q, sure.solution.problem.q_reference
+    q = sure.solution.problem.readings.q
     poses = np.random.default_rng(0).uniform(q.min(axis=0), q.max(axis=0), (_POSES, q.shape[1]))
-    for _ in range(_HALVINGS):
-        shown = sure.shown(poses)
-        if shown.any():
-            break
-        poses = 0.5 * (poses + q_reference)
-    spread = sure.spread(poses, shown)
-    variances = np.linalg.eigvalsh(spread.T @ spread) / max(int(shown.sum()), 1)
+    spread = sure.spread(poses, nearer=True)
+    variances = np.linalg.eigvalsh(spread.T @ spread) / max(len(spread) // 2, 1)
     return float(np.sqrt(variances.sum())), float(np.sqrt(quantile(variances, _SURE)))
 
 
@@ -166,7 +159,8 @@ def judged(
     noise, error, advice = np.full(len(span), np.nan), None, []
     if spread is not None:
         sure = _Uncertainty(solution, spread)
-        spreads = [sure.reach_spread(i) for i in range(len(span))]
+        sides = np.array([1.0, -1.0])
+        spreads = [sure.spread(sure.at(i, sure.reach(i) * sides), nearer=True) for i in range(len(span))]
         noise = np.array([_rms(T) for T in spreads])
         typical, bound = _predicted_error(sure)
         error = (sigma * typical, sigma * bound)

@@ -79,16 +79,8 @@ class Readings:
         """All markers at other joint readings (K, n), rad or m, as if both views had seen them at zero."""
         marker_of, pose_of = np.divmod(np.arange(self.marker.size * len(q)), len(q))
         pixels, weight = np.zeros((2, marker_of.size, 2)), np.ones((2, marker_of.size))
-        return dataclasses.replace(
-            self,
-            q=q,
-            pose=np.arange(len(q)),
-            pose_of=pose_of,
-            marker_of=marker_of,
-            pixels=pixels,
-            seen=weight > 0.0,
-            weight=weight,
-        )
+        where = np.arange(len(q)), self.marker, pose_of, marker_of
+        return Readings(q, self.prismatic, *where, pixels, weight > 0.0, weight, None)
 
     def grid(self) -> FloatArray:
         """Pixels (2, K, m, 2), NaN where not seen."""
