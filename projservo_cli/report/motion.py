@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from markupsafe import Markup
 
-from projservo_cli.files import replacing
+from projservo_cli.files import replacing, write_whole
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
     BODY_LAWS,
@@ -157,8 +157,7 @@ def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
     )
     key = _KEY + (_TREES if motion.trees else ())
     text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    write_whole(path, text)
 
 
 def _figure(motion: _Motion) -> Any:

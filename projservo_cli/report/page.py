@@ -18,7 +18,7 @@ from markupsafe import Markup
 from projservo_cli.calibration import WEAK_NOISE, chi2_band
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config, load_config
-from projservo_cli.files import lies_inside, replacing
+from projservo_cli.files import lies_inside, write_whole
 from projservo_cli.records import Plan, Report, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.drift import drift_rows
@@ -66,12 +66,6 @@ def _calibration_words(found: Mapping[str, Any], *, estimated: bool) -> Iterator
             + (" The noise is itself an estimate from these images." if estimated else "")
         )
     yield _worst_joint(found)
-    if found["predicted_rms_px"] is not None and found["predicted_p99_px"] is not None:
-        rms, bound = _short(found["predicted_rms_px"]), _short(found["predicted_p99_px"])
-        yield (
-            f"Within the ranges of the joints images are expected to err by {rms} px rms, and in 99 of 100 "
-            f"calibrations by less than {bound} px."
-        )
     for name, what, one, many in (
         ("outliers", "reading", "left out as an outlier", "left out as outliers"),
         ("suspect_joint_readings", "joint reading", "contradicts the images", "contradict the images"),
@@ -104,18 +98,12 @@ def _worst_joint(found: Mapping[str, Any]) -> str:
 
 
 def _law_words(trace: Mapping[str, Any]) -> str:
-    """Verdict of a law, its reason, and where it ended, in one sentence."""
+    """Verdict of a law and its reason, in one sentence."""
     steps, reason = trace["steps"], trace["reason"]
     took = f"{steps} step{'s' * (steps != 1)} ({_short(steps * trace['period'])} s)"
-    text = f"{title(name_of(trace['law'], trace['mode']))}: {trace['verdict']} after {took}"
-    if reason:
-        text += f", because the {reason}" if reason.startswith("image error") else f": {reason}"
-    if trace["position_error_mm"] is not None and trace["rotation_error_deg"] is not None:
-        text += (
-            f"; the face is then {_short(trace['position_error_mm'])} mm and "
-            f"{_short(trace['rotation_error_deg'])}° from its goal"
-        )
-    return f"{text}."
+    because = ", because the " if reason.startswith("image error") else ": "
+    why = because + reason if reason else ""
+    return f"{title(name_of(trace['law'], trace['mode']))}: {trace['verdict']} after {took}{why}."
 
 
 SECTIONS = ("calibration", "plan", "control")
@@ -270,6 +258,8 @@ def _calibration(found: dict[str, Any], config: Config) -> dict[str, Any]:
         ("residual, rms per marker and view", found["rms_px"], "px"),
         ("noise per coordinate, as taken", found["sigma_px"], "px"),
         ("noise per coordinate, from the residuals", found["sigma_fitted_px"], "px"),
+        ("predicted error within the ranges of the joints, rms", found["predicted_rms_px"], "px"),
+        ("the same, in 99 of 100 calibrations below", found["predicted_p99_px"], "px"),
         ("χ² per degree of freedom", found["chi2_per_dof"], ""),
         ("degrees of freedom", found["dof"], ""),
         ("poses", found["merged_poses"], ""),
@@ -398,8 +388,5 @@ def _write(path: Path, views: list[_View]) -> None:
     for section in SECTIONS:
         numbered = _side_by_side((v.pictures[section] for v in views), attrgetter("number"))
         pictures[section] = [numbered[number] for number in sorted(numbered, key=int)]
-    text = template("page.html").render(
-        views=views, claims=claims, differences=_differences(views), pictures=pictures
-    )
-    with replacing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
+    told = {"views": views, "claims": claims, "differences": _differences(views), "pictures": pictures}
+    write_whole(path, template("page.html").render(told))
