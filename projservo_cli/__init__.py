@@ -75,6 +75,6 @@ def guide(
     projservo_cli.records.WorkFailed
         When no way was found; the message says what was in the way.
     """
-    from projservo_cli.stages.guide import guide as found  # so that importing the package stays light
+    from projservo_cli.stages.plan import plan_between  # so that importing the package stays light
 
-    return found(run, q_start, goal, limits, speed)
+    return plan_between(run, q_start, goal, limits, speed)

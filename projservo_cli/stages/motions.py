@@ -153,7 +153,7 @@ def body_at_start(model: Model, task: Task, shown: Shown, A: FloatArray) -> Floa
 _INTERPOLATED_PX = 0.05
 
 
-def joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
+def _joint_constraints(reaching: Reaching, task: Task, trajectory: Trajectory, spread: Spread) -> Constraints:
     """What joints are held against."""
     drawn = keep_out_of([(region.left, region.right, region.hides) for region in trajectory.keep_out])
     c = constraints_of(reaching.model, reaching.body, task, reaching.q_start, reaching.demands, drawn)
@@ -174,14 +174,14 @@ def _entered(c: Constraints, q: FloatArray) -> str:
 
 def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -> Found:
     """What was found, infeasible where it enters a region that the body is kept out of."""
-    c = joint_constraints(found.motion.reaching, task, trajectory, spread)
+    c = _joint_constraints(found.motion.reaching, task, trajectory, spread)
     entered = _entered(c, found.motion.along.q)
     return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
 
 
 def joint_way(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
     """A way through joint space; the linear motion where there is none."""
-    c = joint_constraints(reaching, task, trajectory, search.spread)
+    c = _joint_constraints(reaching, task, trajectory, search.spread)
     aim = Aim(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
     how = Budget(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
     way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
@@ -191,7 +191,7 @@ def joint_way(reaching: Reaching, task: Task, trajectory: Trajectory, search: Jo
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
         return Found(linear.judged, motion, unknown, False, "", way)
-    motion = sampled_way(reaching, way.pace, trajectory.samples)
+    motion = _sampled_way(reaching, way.pace, trajectory.samples)
     least = float(way.pace.time[-1])
     asked = least if trajectory.duration_s is None else trajectory.duration_s
     _require_time(asked, least)
@@ -199,7 +199,7 @@ def joint_way(reaching: Reaching, task: Task, trajectory: Trajectory, search: Jo
     return Found(motion, motion, time, True, "", way)
 
 
-def sampled_way(reaching: Reaching, pace: Pace, samples: int) -> Motion:
+def _sampled_way(reaching: Reaching, pace: Pace, samples: int) -> Motion:
     """The motion at so many places even in time, or more where joints between them were too far off."""
     while True:
         q = joints_at(pace, np.linspace(0.0, float(pace.time[-1]), 2 * samples - 1))
@@ -220,7 +220,7 @@ class Ways:
         parts = plan.H_hat, amplitudes, plan.A, plan.a
         body = body_at_start(model, task, shown, plan.A)
         self._reaching = Reaching(model, scenario.demands, *parts, task.O, shown.q_start, body)
-        self._c = joint_constraints(self._reaching, task, self._trajectory, self._search.spread)
+        self._c = _joint_constraints(self._reaching, task, self._trajectory, self._search.spread)
         self._aim = Aim(task.A_star, straight_views(model.lens, task.s_star), self._search.sigma)
 
     def predicted(self, q: FloatArray) -> FloatArray:
@@ -253,7 +253,7 @@ class Ways:
         way = find_way(c, self._aim, start, self._search.q_shown, how, self._search.acceleration)
         if way.pace is None:
             return None
-        found = sampled_way(self._reaching, way.pace, asked.samples)
+        found = _sampled_way(self._reaching, way.pace, asked.samples)
         H, H_start = (forward_kinematics(self._reaching.model, q) for q in (start, plan.q_start))
         sigma, duration = np.linspace(0.0, 1.0, len(found.mu)), float(way.pace.time[-1])
         return replace(
