@@ -206,6 +206,7 @@ class Calibration:
     sigma_q_interval: FloatArray | None = _array(
         "limit", "rad", "95 % interval of sigma_q, if estimated", default=None
     )
+    ticks: bool = _scalar(about="whether sigma_q is that of encoder ticks that were counted", default=False)
     delay_s: FloatArray | None = _array(
         "view", "s", "instant of a joint reading less that of its image", default=None
     )

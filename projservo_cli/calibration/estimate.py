@@ -279,5 +279,6 @@ def _record(
         lens=scene.lens,
         sigma_q=None if joint_noise is None else joint_noise.sigma_q,
         sigma_q_interval=None if joint_noise is None else joint_noise.interval,
+        ticks=joint_noise is not None and joint_noise.ticks,
         model_px=float(np.sqrt(over)),
     )

@@ -23,6 +23,11 @@ _LONGER = 1.5
 _BEYOND_FIRST_ORDER = 0.02
 # Lasting errors of a joint, by play and ticks, differ between two times by √2 of their deviation.
 _LASTING = np.sqrt(2.0)
+# Errors of joints that last, by play, are bounded by so many deviations of each joint in every look.
+_WANDERS = 1.0
+# Between readings joints are taken to go straight: they are off by this share of the time times the change of
+# their speed at most.
+_STRAIGHT = 1.0 / 8.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is said.
 _LEAST_ERROR = 1e-6
 # A direction counts where it keeps this share of its size beside the others; what is added for solving.
@@ -35,7 +40,7 @@ _CLEAR, _PATIENCE, _LEFT = 2.0 * np.log(100.0), 12, 0.25
 # What a joint slipped by is told once it differs by no more than this share from what it was looks before.
 _STEADY = 0.1
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
-_FLEXIBLE = np.radians(1.0)
+_FLEXIBLE, _MOST_FLEXIBLE = np.radians(1.0), np.radians(3.0)
 # Frames of both views so near to each other, s, are one look; so many are kept for those of the other view.
 _TOGETHER_S, _WAITING = 0.025, 25
 # Frames that are so near show joints of one reading.
@@ -144,12 +149,14 @@ class Innovation:
         if calibration.sigma_q_interval is not None:
             sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
         self._sigma_q = np.maximum(sigma_q * per_rad(calibration.prismatic), _LEAST_ERROR)
+        self._wanders = _WANDERS if sigma_q > 0.0 and not calibration.ticks else 0.0
         self._delay_sigma = np.full(2, _LEAST_ERROR)
         # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
         self._directions = np.linalg.svd(calibration.a_inf[None])[2][1:]
         self._twists = _rigid_motions(calibration.H_hat_0, self._directions, calibration.a_inf)
         self._cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
         self._causes, self._f = _table_of(n, m, len(self._twists))
+        self._is_flexible = np.array([cause.kind == "flexible" for cause in self._causes])
         self._sizes = np.array([len(cause.columns) for cause in self._causes])
         self._by_size = [
             (which, np.array([self._causes[i].columns for i in which]))
@@ -163,6 +170,7 @@ class Innovation:
         self._sums = [_Sums(0, 0.0, np.zeros((c, c)), np.zeros((2, m)))]
         self._pending: list[tuple[BoolArray, _Sums]] = []
         self._readings: list[FloatArray] = []
+        self._last: _Frame | None = None
         self._doubtful = 0
         self._amounts: list[tuple[int, float]] = []
         self._waiting: tuple[list[_Frame], list[_Frame]] = ([], [])
@@ -237,7 +245,7 @@ class Innovation:
         self._start = one.t if self._start is None else self._start
         self._t = np.array([frame.t for frame in both]) - self._start
         q, q_dot, images, noise = (np.stack([frame[i] for frame in both]) for i in (1, 2, 4, 5))
-        look = self._look(q, q_dot, images, noise)
+        look = self._look(q, q_dot, images, noise, self._curved(one))
         self._readings.append(q[0])
         beyond, off = self._beyond_chance(look)
         self._pending.append((beyond, self._added(look, off)))
@@ -250,7 +258,14 @@ class Innovation:
             return self._named(look, gross)
         return ""
 
-    def _look(self, q: FloatArray, q_dot: FloatArray, images: FloatArray, noise: FloatArray) -> _Look:
+    def _curved(self, frame: _Frame) -> FloatArray:
+        """How far joints (n,) may be off since they do not go straight between readings, rad or m."""
+        last, self._last = self._last or frame, frame
+        return np.asarray(_STRAIGHT * np.abs(frame.q_dot - last.q_dot) * abs(frame.t - last.t))
+
+    def _look(
+        self, q: FloatArray, q_dot: FloatArray, images: FloatArray, noise: FloatArray, curved: FloatArray
+    ) -> _Look:
         """Residuals and derivatives of one look: each view at its own joints (2, n), noise (2, m) px."""
         scene, away, views = self._scene, q - self.calibration.q_reference, np.arange(2)
         m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
@@ -265,7 +280,9 @@ class Innovation:
         for part in (r, B, F):
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
-        new = F[:, [*range(n), 2 * n, 2 * n + 1]] * np.append(self._sigma_q, self._delay_sigma)
+        new = F[:, [*range(n), 2 * n, 2 * n + 1]] * np.append(
+            np.hypot(self._sigma_q, curved), self._delay_sigma
+        )
         late = new[:, n:]
         if abs(self._t[0] - self._t[1]) > _AT_ONCE_S:  # joints were read anew for the other view
             left = np.arange(rows)[:, None] < rows // 2
@@ -384,7 +401,12 @@ class Innovation:
         """Which causes (h,) are beyond what chance and errors of the model allow; what stands still must."""
         tail = self._chance / (len(self._readings) + _SOON) / len(self._sizes)
         most = np.sqrt(chdtri(self._sizes, tail)) + self._floor * np.sqrt(evidence.touched)
-        possible = np.sqrt(evidence.gain) > most
+        looks = len(self._readings) - evidence.since.looks
+        # Joints move all markers together: of what they do, a cause explains what it touches.
+        share = evidence.touched / max(evidence.rows, 1.0)
+        most += self._wanders * np.sqrt(len(self._sigma_q) * looks * share)
+        flexed = np.abs(evidence.amount).max(axis=1) <= _MOST_FLEXIBLE
+        possible = (np.sqrt(evidence.gain) > most) & (flexed | ~self._is_flexible)
         if possible.any():
             # It may have begun while the first look of them was taken.
             rows = self._readings[min(evidence.since.looks + 1, len(self._readings) - 1) :]

@@ -100,7 +100,7 @@ class Standing:
         moved, sent = (np.ptp(rows[-window:], axis=0) for rows in (self._read, self._sent))
         moved_since, sent_since = (np.ptp(rows[self._since :], axis=0) for rows in (self._read, self._sent))
         stands, sag = bool((moved <= self._still).all()), self._robot.robot.bounds.sag
-        short: BoolArray = np.all(self._short[-window:], axis=0) & stands
+        short: BoolArray = np.all(self._short[-window:], axis=0) & (moved <= self._still)
         stays = (moved_since <= self._still) & (sent_since > _STAYS * np.maximum(sag, self._still)) | short
         if stays.any():
             self._say_who_stays(stays)
