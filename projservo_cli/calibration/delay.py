@@ -47,6 +47,7 @@ class _Frames:
     way: IntArray  # (f,) the motion of each frame
     t: FloatArray  # (f,) s, of the clock of the readings: an instant which it is late after
     s: FloatArray  # (f, m, 2) px, markers as in the calibration, NaN where unseen
+    sigma: FloatArray  # (f, m) deviation of these pixels: as stated, times what the calibration found of that
 
     @classmethod
     def of(
@@ -57,6 +58,10 @@ class _Frames:
         known = observation.marker.tolist()
         columns = [known.index(number) if number in known else -1 for number in calibration.marker.tolist()]
         s = np.where(np.array(columns)[:, None] >= 0, observation.images[:, view, columns], np.nan)
+        sigma = np.full(s.shape[:2], max(calibration.sigma_px, calibration.sigma_fitted_px))
+        if (stated := observation.sigma) is not None:
+            stated = stated[:, view, columns] * (sigma / calibration.sigma_px)
+            sigma = np.where(stated > 0.0, stated, sigma)
         seen = np.isfinite(s[..., 0]).sum(axis=1) >= min(_LEAST_MARKERS, s.shape[1])
         rows = np.flatnonzero(np.isin(moving, list(ways)) & np.isfinite(t_q) & seen)
         rows = rows[np.lexsort((t_q[rows], moving[rows]))]
@@ -68,7 +73,7 @@ class _Frames:
             len(rows) and np.isfinite(late).all() and np.ptp(late) < _LATEST - _EARLIEST
         ):  # both clocks went on
             t = stamps[rows] + late.mean()  # by the clock of the readings
-        return cls(calibration, view, ways, moving[rows], t, s[rows])
+        return cls(calibration, view, ways, moving[rows], t, s[rows], sigma[rows])
 
     def joints(self, delay: FloatArray | float) -> FloatArray:
         """Joints (f, n) of each frame at a delay of its own, s: straight between readings, else at rest."""
@@ -99,7 +104,8 @@ class _Frames:
         J, r = J.reshape(len(q), -1, q.shape[1]), r.reshape(len(q), -1, 1)
         velocity = -J @ q_dot[..., None]
         G = J * ((found.sigma_q or 0.0) * per_rad(found.prismatic))
-        S = max(found.sigma_px, found.sigma_fitted_px) ** 2 * np.eye(r.shape[1]) + G @ np.swapaxes(G, 1, 2)
+        noise = np.repeat(self.sigma, 2, axis=1)[..., None] ** 2 * np.eye(r.shape[1])
+        S = noise + G @ np.swapaxes(G, 1, 2)
         weighted = np.swapaxes(velocity, 1, 2) @ np.linalg.solve(S, np.concatenate([velocity, r], axis=2))
         information = np.maximum(weighted[:, 0, 0], 1e-300)  # of a robot that stands still there is none
         return weighted[:, 0, 1] / information, 1.0 / information
