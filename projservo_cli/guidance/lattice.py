@@ -27,6 +27,7 @@ from projservo_cli.guidance.margins import (
     limit_margin,
     measured,
     put_displaced,
+    put_joint_margins,
     room_along,
 )
 from projservo_cli.guidance.timing import least_time
@@ -87,6 +88,9 @@ def plan_path(reaching: Reaching) -> Motion:
         for amplitudes in _senses(reaching.amplitudes):
             if short and good > 0.0:
                 break
+            # Only one sense of the rotation onto the plane can be in view, [RH00] eqs. (13), (14).
+            if best[0] > 0.0 and amplitudes[1] != best[1].amplitudes[1]:
+                continue
             lattice = _in_view(reaching._replace(amplitudes=amplitudes), size)
             best = max(best, (lattice.worth, lattice.nodes.reaching, size), key=lambda found: found[0])
             if lattice.worth > good:  # no joints make up for what is not in view
@@ -154,7 +158,8 @@ def _with_joints(view: _Lattice) -> _Lattice:
     reaching, mu, found = view.nodes
     value = widest(view.least(view.nodes))
     _put_joints(carrier_of(reaching), mu, value, _size(value), found)
-    return _Lattice(measured(view.nodes), True)
+    put_joint_margins(reaching.demands, found)
+    return _Lattice(view.nodes, True)
 
 
 def _quickest(lattice: _Lattice) -> Motion:

@@ -347,12 +347,17 @@ def measured(motion: Motion) -> Motion:
     found.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):
         _put_best_tag(reaching, border, found)
-    followed = ~np.isnan(found.condition)
     found.margins[:, VISIBILITY] = found.visibility.min(axis=1)
     found.margins[:, IMAGE] = image_margin(demands, found.distance.min(axis=1))
+    put_joint_margins(demands, found)
+    return motion
+
+
+def put_joint_margins(demands: Demands, found: Along) -> None:
+    """Write the margins of joint limits and conditioning."""
+    followed = ~np.isnan(found.condition)
     found.margins[:, JOINTS] = np.where(followed, found.limit, 1.0)
     found.margins[:, CONDITIONING] = np.where(followed, found.condition - demands.conditioning, WORST)
-    return motion
 
 
 def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> FloatArray:
