@@ -28,6 +28,9 @@ _WANDERS = 1.0
 # Between readings joints are taken to go straight: they are off by this share of the time times the change of
 # their speed at most.
 _STRAIGHT = 1.0 / 8.0
+# Much of what a finder states of a corner is the same while the view of it is: it does not average away, and
+# of many corners some are off by so many deviations.
+_LASTING_CORNER = 2.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is said.
 _LEAST_ERROR = 1e-6
 # A direction counts where it keeps this share of its size beside the others; what is added for solving.
@@ -212,6 +215,7 @@ class Innovation:
         noise = np.full(images.shape[:2], self._sigma)
         if stated is not None:
             noise = np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), noise)
+            self._floor = max(self._floor, _LASTING_CORNER)
         self._first = q[0] if self._first is None else self._first
         if self._at_rest:
             self._at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
