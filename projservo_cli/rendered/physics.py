@@ -70,13 +70,11 @@ class Physics:
         turning = arm.joint_types != PRISMATIC
         self._compensated = ~turning if sag > 0.0 else np.ones(len(q), dtype=np.bool_)
         inertia, load = self._heaviest(scene)
-        loop_s, rate = (_LOOP_S, _RATE) if servo == "velocity" else (None, _RATE)
-        self._stiffness = inertia * (rate**2 if loop_s is None else rate / loop_s)
-        self._stiffness = np.where(self._compensated, self._stiffness, load / max(sag, 1e-9))
+        stiff = inertia * (_RATE / _LOOP_S if servo == "velocity" else _RATE**2)
+        self._stiffness = np.where(self._compensated, stiff, load / sag if sag > 0.0 else 0.0)
         critical = 2.0 * np.sqrt(self._stiffness * inertia)
-        self._damping = critical if loop_s is None else loop_s * self._stiffness
-        ours = [i for i in range(len(q)) if i not in self._own]
-        self._ours = np.array(ours, dtype=np.int64)
+        self._damping = _LOOP_S * self._stiffness if servo == "velocity" else critical
+        self._ours = np.array([i for i in range(len(q)) if i not in self._own], dtype=np.int64)
         self._model.dof_damping[self._rates[self._ours]] += self._damping[self._ours]
         self._begin(q)
 

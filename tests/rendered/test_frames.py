@@ -124,10 +124,7 @@ def test_what_lacks_gl_is_told_what_to_install(small):
         check=False,
     )
     assert done.returncode == 1
-    told = done.stderr.splitlines()[-1]
-    assert told.startswith(
-        "projservo_cli.records.InputError: MuJoCo finds no OpenGL to draw with: apt-get install"
-    )
+    assert "InputError: MuJoCo finds no OpenGL to draw with: apt-get install libegl1" in done.stderr
 
 
 @pytest.mark.usefixtures("needs_mujoco")
