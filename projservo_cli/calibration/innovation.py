@@ -152,7 +152,7 @@ class Innovation:
         if calibration.sigma_q_interval is not None:
             sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
         self._sigma_q = np.maximum(sigma_q * per_rad(calibration.prismatic), _LEAST_ERROR)
-        self._wanders = _WANDERS if sigma_q > 0.0 and not calibration.ticks else 0.0
+        self._wanders = _WANDERS if calibration.sigma_q and not calibration.ticks else 0.0
         self._delay_sigma = np.full(2, _LEAST_ERROR)
         # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
         self._directions = np.linalg.svd(calibration.a_inf[None])[2][1:]
