@@ -24,8 +24,6 @@ SEEDS = range(1, 31)
 ARM = SHARED / "robots" / "ur5e" / "ur5e.xml"
 # Joints, rad, at which the tool stands upright before the cameras of rendered.yaml.
 FRONT = (-1.6568, -1.5713, 1.6684, -0.0971, 1.4848, 1.5708)
-# Pose of the flange in the frame of the last body: the arm's site for tools.
-FLANGE = np.array([[-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.1], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 LEAST_PX = 40.0  # width of the middle tag at start and goal
 SHOWN_FRAMES = 8
 FRAMES = 2  # of each pose of a recording
@@ -47,14 +45,10 @@ LATEST = 300  # steps of classical laws
 
 def base_of(condition):
     """Configuration of the arm with its meshes under a condition."""
-    roof = [tag.model_dump(mode="json") for tag in configured("rendered").markers.all_tags]
-    for tag in roof:
-        tag["pose"] = (FLANGE @ np.array(tag["pose"])).tolist()
     front = f"{{joints: {list(FRONT)}, unit: rad}}"
     return configured(
         "rendered",
-        f"robot={{mjcf: {ARM}, tip: wrist_3_link}}",
-        f"markers={{tags: {roof}}}",
+        f"robot={{mjcf: {ARM}, tip: attachment_site}}",
         *(f"calibration.reference={front}", f"task={{start: {front}, goal: {{joints: {front}}}}}"),
         *(f"noise.shown_frames={SHOWN_FRAMES}", "trajectory.profile=auto", "plant.joint_limits=stop"),
         *("control.laws=[exact]", "control.mode=track", f"plant.frames={FRAMES}", "plant.settle_s=0.3"),

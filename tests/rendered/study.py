@@ -31,6 +31,7 @@ from tests.rendered.conditions import CONDITIONS, LATEST, SEEDS, TAUGHT, base_of
 CLASSICAL = ("stacked", "blockwise", "euclidean_points")
 CLASSICAL_TASKS = 10
 DECADES = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, np.inf])  # of stated deviations, px
+LENS = "lens"
 LOOKS = 3  # after which hand–eye calibration corrects the tool
 STREAM = 6  # of random numbers of the robot that hand–eye calibration drives
 
@@ -39,6 +40,7 @@ class Watched(FaultyRobot):
     """It keeps by how much corners are off where they truly are, in stated deviations, by decade of these."""
 
     counts, squares = np.zeros(len(DECADES) - 1), np.zeros(len(DECADES) - 1)
+    condition = ""
 
     def read(self):
         answer = super().read()
@@ -63,7 +65,7 @@ def recorded(condition):
     config = base_of(condition)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("projservo_cli.stages.simulation.FaultyRobot", Watched)
-        Watched.counts[:], Watched.squares[:] = 0.0, 0.0
+        Watched.counts[:], Watched.squares[:], Watched.condition = 0.0, 0.0, condition
         seen, sigma_px = record.observed(config)
         patch.setattr("projservo_cli.stages.calibrate.observed", lambda *args, **kwargs: (seen, sigma_px))
         try:
