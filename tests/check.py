@@ -1,4 +1,4 @@
-"""Every check of the project: `python -m tests.check [NAME ...]`."""
+"""Every check of the project, or those that are named: `python -m tests.check [NAME ...]`."""
 
 import os
 import subprocess
@@ -47,18 +47,22 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
     "tests": ([*PYTEST, "--cov-append", "--cov-report=term", "--cov-fail-under=90"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
+# An hour: only where it is asked for by name.
+STUDIES: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
+    "rendered": ([PYTHON, "-m", "tests.rendered.study"], {}),
+}
 
 
 def main(names: Sequence[str]) -> int:
     """Run the named checks, or all, and return how many failed."""
-    unknown = [name for name in names if name not in CHECKS]
+    known = CHECKS | STUDIES
+    unknown = [name for name in names if name not in known]
     if unknown:
-        print(f"unknown check {unknown[0]!r}: choose among {', '.join(CHECKS)}", file=sys.stderr)
+        print(f"unknown check {unknown[0]!r}: choose among {', '.join(known)}", file=sys.stderr)
         return 2
     failed = []
-    for name, (command, environment) in CHECKS.items():
-        if names and name not in names:
-            continue
+    for name in names or CHECKS:
+        command, environment = known[name]
         print(f"── {name}: {' '.join(str(Path(part).name) for part in command)}", flush=True)
         start = time.monotonic()
         code = subprocess.run(
