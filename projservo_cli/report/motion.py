@@ -292,7 +292,7 @@ SEEN, HIDDEN = style.GREEN, style.ORANGE
 _PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
 _BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
 _PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
-_COLORS = 128
+_COLORS, _NEAR_WHITE = 128, 240  # beside greys, which frames need
 _FILM_WIDTH = 320  # px, of which a panel shows most
 
 
@@ -321,9 +321,10 @@ def write_animation(
         progress("animation", len(images), FRAMES)
     # The last frame has all colours; one palette for all keeps what does not move the same.
     palette = images[-1].quantize(_COLORS, method=Image.Quantize.MAXCOVERAGE)
-    if any(run.frame_jpeg is not None for run in columns.values()):
-        greys = np.repeat(np.arange(0, 256, 256 // (256 - _COLORS)), 3).tolist()
-        palette.putpalette([*(palette.getpalette() or ())[: 3 * _COLORS], *greys])
+    colors = np.array((palette.getpalette() or [])[: 3 * _COLORS]).reshape(-1, 3)
+    greys = np.linspace(0, _NEAR_WHITE, 256 - len(colors)).round().astype(np.int64)[:, None].repeat(3, axis=1)
+    colors[colors.min(axis=1) >= _NEAR_WHITE] = 255  # else paper takes the nearest shade of them
+    palette.putpalette(np.concatenate([colors, greys]).ravel().tolist())
     first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     with replacing(path) as temporary:
         durations = [*[FRAME_MS] * len(others), LAST_MS]

@@ -91,7 +91,7 @@ def test_covariance_is_that_of_the_parameters():
     scene = Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers)
     solution = Solution(problem, scene, problem.residual(scene), readings.seen, 1)
     spread = solution.spread_factor()
-    direct = problem.dense(problem.derivative(scene)[1], readings.seen) @ spread
+    direct = problem.dense(problem.derivative(scene), readings.seen) @ spread
     result = Projective.of(solution)
     chained = result.scene.derivative(problem.q) @ result.covariance_factor(solution, spread)
     chained = chained[readings.pose_of, :, readings.marker_of].transpose(1, 0, 2, 3).reshape(direct.shape)
