@@ -36,7 +36,6 @@ from tests.rendered.conditions import CONDITIONS, LATEST, SEEDS, TAUGHT, base_of
 CLASSICAL = ("stacked", "blockwise", "euclidean_points")
 CLASSICAL_TASKS = 10
 DECADES = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, np.inf])  # of stated deviations, px
-LENS = "lens"
 LOOKS = 3  # after which hand–eye calibration corrects the tool
 STREAM = 6  # of random numbers of the robot that hand–eye calibration drives
 
@@ -45,16 +44,13 @@ class Watched(FaultyRobot):
     """It keeps by how much corners are off where they truly are, in stated deviations, by decade of these."""
 
     counts, squares = np.zeros(len(DECADES) - 1), np.zeros(len(DECADES) - 1)
-    condition = ""
+    lens = False
 
     def read(self):
         answer = super().read()
-        truth, k1 = (
-            self.world.truth,
-            self.world.eyes.distortion if hasattr(self.world.eyes, "distortion") else 0,
-        )
-        if k1 or len(answer) < 6 or answer[5] is None:
+        if self.lens or len(answer) < 6 or answer[5] is None:  # the truth knows no lens
             return answer
+        truth = self.world.truth
         for view, t in enumerate(self.taken):
             off = answer[1][view] - truth.images(self._joints.at(t), truth.M)[view]
             sigma = answer[5][view]
@@ -70,26 +66,27 @@ def recorded(condition):
     config = base_of(condition)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("projservo_cli.stages.simulation.FaultyRobot", Watched)
-        Watched.counts[:], Watched.squares[:], Watched.condition = 0.0, 0.0, condition
+        Watched.counts[:], Watched.squares[:], Watched.lens = 0.0, 0.0, condition == "lens"
         seen, sigma_px = record.observed(config)
         patch.setattr("projservo_cli.stages.calibrate.observed", lambda *args, **kwargs: (seen, sigma_px))
         try:
             calibration, why = calibrate.run(config)[1], ""
         except WorkFailed as error:
             calibration, why = None, str(error)
-    return condition, calibration, why, seen, Watched.counts.copy(), Watched.squares.copy()
+    known = known_by_hand_eye(config, seen)
+    return condition, calibration, why, known, Watched.counts.copy(), Watched.squares.copy()
 
 
 def driven(job):
     """Rows of all that drives a task."""
-    condition, seed, calibration, seen = job
+    condition, seed, calibration, known = job
     config = task_config(base_of(condition), seed, taught=condition == TAUGHT)
     told = {"condition": condition, "seed": seed}
     laws = ["exact_track"]
     if condition == "ideal" and seed <= CLASSICAL_TASKS:
         laws += list(CLASSICAL)
     rows = [told | {"by": law} | run_of(config, calibration, law, seed) for law in laws]
-    for by, row in by_hand_eye(config, seen, seed):
+    for by, row in by_hand_eye(config, known, seed):
         rows.append(told | {"by": by} | row)
     return rows
 
@@ -118,13 +115,20 @@ def judged(config, pose, seed, verdict):
     return {"verdict": verdict, "mm": mm, "deg": deg, "arrived": arrived}
 
 
-def by_hand_eye(config, seen, seed):
-    """Rows of hand–eye calibration with inverse kinematics: straight, and after so many looks."""
-    truth, still = truth_of(config), seen.moving is None or seen.moving == 0
-    arm, points = truth.robot, np.linalg.solve(truth.robot.base_tool, truth.M.T).T[:, :3]
-    hands, images = np.array([arm.pose(q) for q in seen.q[still]]), seen.images[still]
+def known_by_hand_eye(config, seen):
+    """Both cameras, points of the tool, m, and how it sits on the hand, by the poses at rest."""
+    truth = truth_of(config)
+    still = np.ones(len(seen.q), dtype=bool) if seen.moving is None else seen.moving == 0
+    points = np.linalg.solve(truth.robot.base_tool, truth.M.T).T[:, :3]
+    hands, images = np.array([truth.robot.pose(q) for q in seen.q[still]]), seen.images[still]
     views = [hand_eye.calibrated(P, points, hands, images[:, v]) for v, P in enumerate(truth.P)]
-    mount = hand_eye.mount_of(views, points, hands, images)
+    return views, points, hand_eye.mount_of(views, points, hands, images)
+
+
+def by_hand_eye(config, known, seed):
+    """Rows of hand–eye calibration with inverse kinematics: straight, and after so many looks."""
+    (views, points, mount), truth = known, truth_of(config)
+    arm = truth.robot
     start, goal = tasks_of()[seed]
     wanted = hand_eye.tool_in_base(views, points, shown_in_frames(config, truth, goal, (seed, 7)))
     hand, rows = wanted @ np.linalg.inv(mount), []
@@ -199,13 +203,13 @@ def main():
     run_chain()
     made = {}
     counts, squares = np.zeros(len(DECADES) - 1), np.zeros(len(DECADES) - 1)
-    for condition, calibration, why, seen, n, square in in_two_processes(
+    for condition, calibration, why, known, n, square in in_two_processes(
         recorded, given.conditions, "recordings"
     ):
         if calibration is None:
             print(f"{condition}: no calibration: {why}", flush=True)
             continue
-        made[condition] = calibration, seen
+        made[condition] = calibration, known
         counts, squares = counts + n, squares + square
         print(
             f"{condition}: usable {calibration.usable}, chi2 {calibration.chi2_per_dof:.2f}, "
