@@ -94,7 +94,7 @@ _BORDER = 2  # cells of border along a side of a tag, besides those of its code
 _ROUGH_PROFILES, _LEAST_PROFILES, _STEPS = 16, 3, (6, 3)
 _FAR = 2.0, 0.05  # px, and share of the longest side, that a corner may be from its guess, besides the blur
 # What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
-_FLOOR, _LEAK = 0.003, (0.5, 0.6)
+_FLOOR, _LEAK = 0.004, (0.5, 0.6)
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
 # the blur that is reckoned with where no edge tells it, in cells.
 _UNREFINED, _BY_CELL, _BLURRED = 1.4, -0.75, 0.4

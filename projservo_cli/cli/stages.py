@@ -569,11 +569,11 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
         yield f"calibrate: {beside['suggestions_reason']}", True
     must = chain.config.control.must_converge
     for trace in (chain.run.traces[law] for law in chain.laws_done):
-        missed = trace.law in must and trace.verdict != "converged"
-        if missed or trace.verdict == "disturbed":
+        wanted = trace.law in must
+        if (wanted and trace.verdict != "converged") or trace.verdict == "disturbed":
             reason = f": {trace.reason}" if trace.reason else ""
-            but = " must converge, but" if trace.law in must else ""
-            yield f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason}", True
+            but = " must converge, but" if wanted else ""
+            yield f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason}", wanted
     # Other profiles are those of the paper, of which the margins are only measured.
     searched = "plan" in results and chain.run.plan.profile in ("constrained", "joint")
     if searched and not chain.run.plan.feasible:

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.config.markers import CORNERS
 from projservo_cli.records import ByteArray, FloatArray, InputError
-from projservo_cli.rendered.scene import CAMERAS, Scene, drawn_at, lens_of
+from projservo_cli.rendered.scene import CAMERAS, FINER, Scene, drawn_at, lens_of
 from projservo_cli.robots.described import mujoco, no_gl
 
 _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
@@ -34,7 +34,7 @@ class Frames:
         mj, scene = mujoco(), self.scene
         height, width = self.last.shape[1] + 2 * scene.margin, self.last.shape[2] + 2 * scene.margin
         try:
-            self._renderer = mj.Renderer(scene.model, height, width)
+            self._renderer = mj.Renderer(scene.model, FINER * height, FINER * width)
         except Exception as error:  # of another kind for each library of GL
             raise InputError(no_gl(error)) from error
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._options.light == "side"
@@ -88,7 +88,9 @@ class Frames:
         mj.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
         # Tags, what holds them and light have no colour: green alone stands for grey.
-        return np.ascontiguousarray(self._renderer.render()[..., 1])
+        fine, cv = np.ascontiguousarray(self._renderer.render()[..., 1]), self._finder.cv
+        size = fine.shape[1] // FINER, fine.shape[0] // FINER
+        return np.asarray(cv.resize(fine, size, interpolation=cv.INTER_AREA))
 
     def _move(self, moved: tuple[int, FloatArray] | None) -> None:
         """Put every plate where it is, but for one that was moved."""

@@ -216,7 +216,7 @@ def main():
             f"{calibration.reason}",
             flush=True,
         )
-    for low, high, n, square in zip(DECADES, DECADES[1:], counts, squares, strict=True):
+    for low, high, n, square in zip(DECADES[:-1], DECADES[1:], counts, squares, strict=True):
         if n:
             print(f"corners of {low} to {high} px: {n:.0f}, off over stated {math.sqrt(square / n):.2f}")
     jobs = [(name, seed, *both) for name, both in made.items() for seed in list(SEEDS)[: given.tasks]]
