@@ -93,8 +93,12 @@ _BORDER = 2  # cells of border along a side of a tag, besides those of its code
 # Of the sides as they were guessed only so many profiles are looked at; least of them; steps of both fits.
 _ROUGH_PROFILES, _LEAST_PROFILES, _STEPS = 16, 3, (6, 3)
 _FAR = 2.0, 0.05  # px, and share of the longest side, that a corner may be from its guess, besides the blur
+_EDGE = 6  # numbers of an edge
+# Height of the arc that a lens makes of a side, px, as a deviation; least noise of grey values, and one
+# beside which no bow is seen.
+_BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
 # What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
-_FLOOR, _LEAK = 0.004, (0.5, 0.6)
+_FLOOR, _LEAK = 0.002, (0.5, 0.6)
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
 # the blur that is reckoned with where no edge tells it, in cells.
 _UNREFINED, _BY_CELL, _BLURRED = 1.4, -0.75, 0.4
@@ -164,34 +168,43 @@ class _Strips(NamedTuple):
 
 
 def _edge_model(x: FloatArray, strips: _Strips) -> tuple[FloatArray, FloatArray]:
-    """Residual (S, C, R) of edges x = (b, a, n_0, k, σ) (S, 5), and derivative (S, 5, C R), weighed both.
+    """Residual (S, C, R) of edges x = (b, a, n_0, k, σ, c) (S, 6), and derivative (S, 6, C R), weighed both.
 
-    An edge is b + a Φ((n − n_0 − k t)/σ), Φ the normal distribution: straight in t and blurred by σ.
+    An edge is b + a Φ((n − n_0 − k t − c (4 t² − ⅓))/σ), Φ the normal distribution: blurred by σ, and in t
+    straight but for a bow c, the height of its arc, which a lens makes of it.
     """
-    b, a, n_0, k, sigma = x.T[:, :, None, None]
-    z = (strips.n - n_0 - k * strips.t) / sigma
+    b, a, n_0, k, sigma, c = x.T[:, :, None, None]
+    arc = 4.0 * strips.t**2 - 1.0 / 3.0
+    z = (strips.n - n_0 - k * strips.t - c * arc) / sigma
     phi = ndtr(z)
     bell = strips.weight * np.exp(-0.5 * z * z) * (-a / (np.sqrt(2.0 * np.pi) * sigma))
-    J = np.stack([strips.weight, strips.weight * phi, bell, bell * strips.t, bell * z], axis=1)
+    J = np.stack([strips.weight, strips.weight * phi, bell, bell * strips.t, bell * z, bell * arc], axis=1)
     return strips.weight * (b + a * phi - strips.grey), J.reshape(
-        len(x), 5, strips.t.shape[1] * strips.t.shape[2]
+        len(x), _EDGE, strips.t.shape[1] * strips.t.shape[2]
     )
 
 
-def _fitted(x: FloatArray, strips: _Strips, steps: int) -> tuple[FloatArray, FloatArray]:
-    """Edges (S, 5) of least squares by Levenberg–Marquardt steps, all at once, and their normal matrices."""
+def _fitted(x: FloatArray, strips: _Strips, noise: FloatArray, steps: int) -> tuple[FloatArray, FloatArray]:
+    """Edges (S, 6) of least squares by Levenberg–Marquardt steps, all at once, and their normal matrices.
+
+    Bows are held to what lenses make, by the noise (S,) of grey values.
+    """
+    stiff = np.zeros((len(x), _EDGE))
+    stiff[:, -1] = np.square(np.clip(noise, _LEAST_NOISE, _RIGID) / _BOW)
 
     def equations(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal matrices, gradients and sums of squares."""
         r, J = _edge_model(x, strips)
         flat = r.reshape(len(r), -1, 1)
-        return J @ J.swapaxes(1, 2), (J @ flat)[..., 0], (r * r).sum(axis=(1, 2))
+        A = J @ J.swapaxes(1, 2) + stiff[:, :, None] * np.eye(_EDGE)
+        cost = (r * r).sum(axis=(1, 2)) + (stiff * x * x).sum(axis=1)
+        return A, (J @ flat)[..., 0] + stiff * x, cost
 
     A, g, cost = equations(x)
     damping = np.full(len(x), 1e-3)
     for _ in range(steps):
         ridge = damping[:, None] * np.diagonal(A, axis1=1, axis2=2) + 1e-9
-        step = np.linalg.solve(A + ridge[:, :, None] * np.eye(5), g[..., None])[..., 0]
+        step = np.linalg.solve(A + ridge[:, :, None] * np.eye(_EDGE), g[..., None])[..., 0]
         moved = x - step
         moved[:, 4] = np.clip(np.abs(moved[:, 4]), _LEAST_BLUR, _MOST_BLUR)
         new = equations(moved)
@@ -203,7 +216,7 @@ def _fitted(x: FloatArray, strips: _Strips, steps: int) -> tuple[FloatArray, Flo
 
 
 def _first_edges(strips: _Strips) -> FloatArray:
-    """Edges (S, 5) to start from: the grey values at the inner and at the outer end of the strips."""
+    """Edges (S, 6) to start from: the grey values at the inner and at the outer end of the strips."""
     far = np.abs(strips.n) > 0.5 * np.where(strips.weight > 0.0, np.abs(strips.n), 0.0).max(
         axis=(1, 2), keepdims=True
     )
@@ -213,7 +226,7 @@ def _first_edges(strips: _Strips) -> FloatArray:
         for part in (inner, outer)
     )
     zero = np.zeros_like(low)
-    return np.stack([low, high - low, zero, zero, zero + 1.0], axis=1)
+    return np.stack([low, high - low, zero, zero, zero + 1.0, zero], axis=1)
 
 
 class _Edges(NamedTuple):
@@ -221,18 +234,18 @@ class _Edges(NamedTuple):
 
     line: FloatArray  # (S, 3) l·(u, v, 1) = 0, normals of unit length
     variance: FloatArray  # (S, 2) of the distance from the true edge, at the start and at the end, px²
-    x: FloatArray  # (S, 5) b, a, n_0, k, σ
+    x: FloatArray  # (S, 6) b, a, n_0, k, σ, c
     spoilt: BoolArray  # (S,) whether one is not clean though there are pixels enough
 
 
 def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, rough: bool) -> _Edges:
-    """Edges about sides that are nearly where they should be, by edges known before (S, 5) or NaN.
+    """Edges about sides that are nearly where they should be, by edges known before (S, 6) or NaN.
 
     Roughly by few profiles, else by all but those that something covers, if these are few. Grey values err
     independently, by what the residuals of the side show. Besides, the model errs by what blur carries over
     from the next edge, one cell away, which depends on the code.
     """
-    line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, 5))
+    line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, _EDGE))
     found = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
     fits = np.flatnonzero((all_sides.length > _LEAST_SIDE) & (all_sides.cell > _LEAST_CELL))
     if fits.size == 0:
@@ -244,10 +257,11 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     strips = _Strips.of(image, sides, reach, margin, _ROUGH_PROFILES if rough else image.size)
     x = _first_edges(strips)
     x[known, 4] = blur[known]
-    x, A = _fitted(x, strips, _STEPS[0 if rough else 1])
+    noise = np.full(len(x), _RIGID) if rough else _noise(strips)
+    x, A = _fitted(x, strips, noise, _STEPS[0 if rough else 1])
     clean = tried = strips.weight.any(axis=(1, 2))
     if not rough:
-        strips, x, A, clean = _uncovered(strips, x, A)
+        strips, x, A, clean = _uncovered(strips, noise, x, A)
     count = strips.weight.sum(axis=(1, 2))
     good = clean & (count > 5.0) & (x[:, 1] > 0.0) & (np.abs(x[:, 2]) + 0.5 * np.abs(x[:, 3]) < reach)
     found.spoilt[fits] = tried & ~good
@@ -255,9 +269,11 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     residual = _edge_model(x, _Strips(*(part[good] for part in strips)))[0]
     C = np.linalg.inv(A) * ((residual**2).sum(axis=(1, 2)) / (count[good] - 5.0))[:, None, None]
     left_out = _FLOOR**2 + (_LEAK[0] * sides.cell * ndtr(-_LEAK[1] * sides.cell / x[:, 4])) ** 2
-    half = np.array([-0.5, 0.5])
-    ends = C[:, 2, 2, None] + 2.0 * half * C[:, 2, 3, None] + half**2 * C[:, 3, 3, None]
-    middle = sides.start + sides.along * (0.5 * sides.length)[:, None] + sides.normal * x[:, 2:3]
+    by_place = np.array([[1.0, -0.5, 2.0 / 3.0], [1.0, 0.5, 2.0 / 3.0]])  # of n at both ends by n_0, k, c
+    C = C[:, [2, 3, 5]][:, :, [2, 3, 5]]
+    ends = (by_place @ C * by_place).sum(axis=2)
+    chord = x[:, 2:3] + by_place[0, 2] * x[:, 5:6]
+    middle = sides.start + sides.along * (0.5 * sides.length)[:, None] + sides.normal * chord
     direction = sides.along * sides.length[:, None] + sides.normal * x[:, 3:4]
     across = np.stack([direction[:, 1], -direction[:, 0]], axis=1)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
@@ -267,10 +283,10 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
 
 
 def _uncovered(
-    strips: _Strips, x: FloatArray, A: FloatArray
+    strips: _Strips, noise: FloatArray, x: FloatArray, A: FloatArray
 ) -> tuple[_Strips, FloatArray, FloatArray, BoolArray]:
     """Strips without the profiles that something covers, fitted again; whether (S,) these were few."""
-    whole, noise = strips.weight.any(axis=2), _noise(strips)
+    whole = strips.weight.any(axis=2)
     for _ in range(_ROUNDS):
         residual, _ = _edge_model(x, strips)
         count = strips.weight.sum(axis=2)
@@ -282,7 +298,7 @@ def _uncovered(
         strips = strips._replace(weight=strips.weight * ~spoilt[:, :, None])
         some = _Strips(*(part[touched] for part in strips))
         x, A = x.copy(), A.copy()
-        x[touched], A[touched] = _fitted(x[touched], some, _STEPS[1])
+        x[touched], A[touched] = _fitted(x[touched], some, noise[touched], _STEPS[1])
     left = strips.weight.any(axis=2).sum(axis=1)
     return strips, x, A, left >= (1.0 - _SPOILT_SHARE) * np.maximum(whole.sum(axis=1), 1)
 
@@ -316,7 +332,7 @@ def refine_corners(image: FloatArray, guess: FloatArray, cells: int) -> Corners:
     cells : of a tag along a side, border included; the border is one cell wide.
     """
     corners = np.asarray(guess, dtype=np.float64)
-    x = np.full((4 * len(corners), 5), np.nan)
+    x = np.full((4 * len(corners), _EDGE), np.nan)
     for rough in (True, False):
         sides = _Sides.of(corners, cells)
         edges = _edges_along(image, sides, x, rough=rough)

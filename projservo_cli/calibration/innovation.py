@@ -31,6 +31,8 @@ _STRAIGHT = 1.0 / 8.0
 # Much of what a finder states of a corner is the same while the view of it is: it does not average away, and
 # of many corners some are off by so many deviations.
 _LASTING_CORNER = 2.0
+# A corner that is so many times less certain than most is not tested: its error is the finder's, and lasts.
+_VAGUE = 10.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is said.
 _LEAST_ERROR = 1e-6
 # A direction counts where it keeps this share of its size beside the others; what is added for solving.
@@ -215,6 +217,9 @@ class Innovation:
         noise = np.full(images.shape[:2], self._sigma)
         if stated is not None:
             noise = np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), noise)
+            seen = np.isfinite(images[..., 0])
+            vague = noise > _VAGUE * np.median(noise[seen]) if seen.any() else ~seen
+            images = np.where(vague[..., None], np.nan, images)
             self._floor = max(self._floor, _LASTING_CORNER)
         self._first = q[0] if self._first is None else self._first
         if self._at_rest:

@@ -556,7 +556,7 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
 
 def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
     """What is not as it was asked for, and whether that ends the call with exit code 1."""
-    from projservo_cli.records import name_of
+    from projservo_cli.records import POINT_LAWS, name_of
 
     if chain.failed:
         yield f"{chain.failed}: {chain.reason}", True
@@ -569,11 +569,13 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
         yield f"calibrate: {beside['suggestions_reason']}", True
     must = chain.config.control.must_converge
     for trace in (chain.run.traces[law] for law in chain.laws_done):
-        wanted = trace.law in must
-        if (wanted and trace.verdict != "converged") or trace.verdict == "disturbed":
+        disturbed = trace.verdict == "disturbed"
+        if disturbed or (trace.law in must and trace.verdict != "converged"):
             reason = f": {trace.reason}" if trace.reason else ""
-            but = " must converge, but" if wanted else ""
-            yield f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason}", wanted
+            but = " must converge, but" if trace.law in must else ""
+            said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason}"
+            # Classical laws lead where nothing can be expected of them, images included.
+            yield said, trace.law in must or trace.law not in POINT_LAWS
     # Other profiles are those of the paper, of which the margins are only measured.
     searched = "plan" in results and chain.run.plan.profile in ("constrained", "joint")
     if searched and not chain.run.plan.feasible:

@@ -54,12 +54,17 @@ class _GoalImages(Section):
         each = zip(self.markers or face, self.left, self.right, strict=True)
         return {number: (left or unseen, right or unseen) for number, left, right in each}
 
+    def deviations(self, numbers: Sequence[int], face: Sequence[int]) -> list[list[float]]:
+        """Standard deviation of markers in the left and in the right image, px; NaN where it is not told."""
+        own = list(self.markers or face)
+        sides = [side or (None,) * len(own) for side in (self.sigma_left_px, self.sigma_right_px)]
+        told = [dict(zip(own, side, strict=True)) for side in sides]
+        return [[math.nan if (x := side.get(number)) is None else x for number in numbers] for side in told]
+
     def sigma_px(self, face: Sequence[int]) -> float | None:
         """Standard deviation of a coordinate of the markers of the face, rms; None where it is not told."""
-        numbers, sides = self.markers or face, (self.sigma_left_px, self.sigma_right_px)
-        told = [side[numbers.index(number)] for side in sides if side is not None for number in face]
-        known = [sigma**2 for sigma in told if sigma is not None]
-        return math.sqrt(sum(known) / len(known)) if len(known) == 2 * len(face) else None
+        told = [sigma**2 for side in self.deviations(face, face) for sigma in side]
+        return None if any(map(math.isnan, told)) else math.sqrt(sum(told) / len(told))
 
 
 class Goal(Section):

@@ -62,8 +62,6 @@ class Frames:
         shots = [self._drawn(view, joints) for joints in (q[len(q) // 2 :][:1] if still else q)]
         image = np.mean(shots, axis=0, dtype=np.float32)
         cv = self._finder.cv
-        if self._maps is not None:
-            image = cv.remap(image, *self._maps[view], cv.INTER_CUBIC)
         if self._options.blur_px > 0.0:
             image = cv.GaussianBlur(image, (0, 0), self._options.blur_px)
         image += np.float32(self._options.grey_noise) * rng.standard_normal(image.shape, dtype=np.float32)
@@ -81,7 +79,7 @@ class Frames:
         return pixels, sigma
 
     def _drawn(self, view: int, q: FloatArray) -> ByteArray:
-        """Grey values (height, width) of what a camera sees at joints (n,), without lens and noise."""
+        """Grey values (height, width) of what a camera sees at joints (n,), without blur and noise."""
         mj = mujoco()
         self._data.qpos[self.scene.places] = q
         mj.mj_kinematics(self._model, self._data)
@@ -89,8 +87,9 @@ class Frames:
         self._renderer.update_scene(self._data, CAMERAS[view], self._shown)
         # Tags, what holds them and light have no colour: green alone stands for grey.
         fine, cv = np.ascontiguousarray(self._renderer.render()[..., 1]), self._finder.cv
-        size = fine.shape[1] // FINER, fine.shape[0] // FINER
-        return np.asarray(cv.resize(fine, size, interpolation=cv.INTER_AREA))
+        if self._maps is not None:
+            fine = cv.remap(fine, *self._maps[view], cv.INTER_LANCZOS4)
+        return np.asarray(cv.resize(fine, self.scene.size, interpolation=cv.INTER_AREA))
 
     def _move(self, moved: tuple[int, FloatArray] | None) -> None:
         """Put every plate where it is, but for one that was moved."""
@@ -100,13 +99,14 @@ class Frames:
             self._model.geom_pos[list(plate)] += self.scene.tool @ moved[1]
 
     def _mapped(self, P: FloatArray) -> list[tuple[FloatArray, FloatArray]] | None:
-        """Where each pixel of a frame is in what is drawn, u and v (height, width) of each view, px."""
-        width, height = self.scene.size
+        """Where each finer pixel of a frame is in what is drawn, u and v of each view, in finer pixels."""
+        width, height = FINER * self.scene.size[0], FINER * self.scene.size[1]
+        offset = 0.5 * (FINER - 1)  # centres of pixels have whole coordinates
         u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
-        pixels = np.stack([u, v], axis=-1).reshape(-1, 2)
+        pixels = (np.stack([u, v], axis=-1).reshape(-1, 2) - offset) / FINER
         lens = lens_of(P, self._options.k1)
         drawn = drawn_at(P, lens, np.stack([pixels, pixels]))
         if np.array_equal(drawn[0], pixels) and np.array_equal(drawn[1], pixels):
             return None
-        maps = (drawn + self.scene.margin).reshape(2, height, width, 2).astype(np.float32)
+        maps = (FINER * (drawn + self.scene.margin) + offset).reshape(2, height, width, 2).astype(np.float32)
         return [(np.ascontiguousarray(both[..., 0]), np.ascontiguousarray(both[..., 1])) for both in maps]

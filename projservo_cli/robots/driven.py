@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.calibration import WINDOW, Innovation
+from projservo_cli.calibration.readings import LEAST_SIGMA
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
@@ -250,7 +251,7 @@ class DrivenRobot:
         shown, stated = self.known.shown, None
         if reading.sigma_px is not None:
             stated = reading.sigma_px[:, order]
-            self.weight = _weights(reading.sigma_px[:, shown], reading.s[:, shown])
+            self.weight = weights(reading.sigma_px[:, shown], reading.s[:, shown])
         frames = self._instants.look(reading.t_view, images, history)
         q_then = history.at(frames.t)
         if self.innovation is not None:
@@ -308,10 +309,11 @@ class DrivenRobot:
         self.robot.stop()
 
 
-def _weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
+def weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
     """Weights (2, k) of pixels (2, k, 2) of deviations (2, k) in a fit: the rms of those seen over each."""
     seen = np.isfinite(s[..., 0])
     weight = np.ones(seen.shape)
     if seen.any():
+        sigma = np.maximum(sigma, LEAST_SIGMA)
         weight[seen] = np.sqrt(np.mean(sigma[seen] ** 2)) / sigma[seen]
     return weight

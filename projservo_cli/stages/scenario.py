@@ -29,6 +29,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
+from projservo_cli.robots.driven import weights
 from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
 from projservo_cli.stages.simulation import shown_in_frames
 from projservo_cli.stages.world import Joints, Truth, center_index, joints_of, limit_passed, truth_of
@@ -180,24 +181,39 @@ class Scenario:
         return self.exact._replace(s_start=images[0], s_star=images[1])
 
     def _rendered(self, seed: int) -> Shown:
-        """Start and goal as rendered frames show them; images of the goal that are given stay as they are."""
-        start = self._frames("task.start", self.exact.q_start, (seed, START_FRAMES))
-        if not len(self.q_shown):
-            return self.exact._replace(s_start=start)
-        goal = self._frames("task.goal", self.q_shown[0], (seed, GOAL_FRAMES))
-        return self.exact._replace(s_start=start, s_star=goal)
+        """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
 
-    def _frames(self, key: str, q: FloatArray, drawn: tuple[int, int]) -> FloatArray:
-        """Pixels (2, b, 2) in rendered frames at the joints (n,) of a key; a WorkFailed without the face."""
+        The body is fitted to both by the deviations of their pixels, whichever is the larger.
+        """
+        start, sigma = self._frames("task.start", self.exact.q_start, (seed, START_FRAMES))
+        shown = self.exact._replace(s_start=start)
+        if len(self.q_shown):
+            goal, there = self._frames("task.goal", self.q_shown[0], (seed, GOAL_FRAMES))
+            shown = shown._replace(s_star=goal)
+        else:
+            assert self.config.task is not None
+            assert self.config.task.goal.images is not None
+            face = self.numbers[: self.m]
+            there = np.array(self.config.task.goal.images.deviations(self.numbers, face))
+        if not len(shown.body.M):
+            return shown
+        sigma = np.fmax(sigma, there)
+        return shown._replace(body=shown.body._replace(weight=weights(sigma, sigma[..., None])))
+
+    def _frames(self, key: str, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Pixels (2, b, 2) in rendered frames at the joints (n,) of a key, and their deviations (2, b).
+
+        Raises WorkFailed without the face.
+        """
         assert self.truth is not None
         which = [self.truth.number.index(number) for number in self.numbers]
-        s = np.ascontiguousarray(shown_in_frames(self.config, self.truth, q, drawn)[:, which])
+        s, sigma = (part[:, which] for part in shown_in_frames(self.config, self.truth, q, drawn))
         for view, k in np.argwhere(np.isnan(s[:, : self.m, 0])).tolist():
             raise WorkFailed(
                 f"{key}: the {VIEWS[view]} camera does not see marker {self.numbers[k]} of the face: turn it "
                 "towards both cameras, or bring it nearer"
             )
-        return s
+        return np.ascontiguousarray(s), sigma
 
 
 def scenario_of(

@@ -158,30 +158,35 @@ def robot_of(
     return FaultyRobot(World(truth, q_start, Frames(scene), period, *drawn, servos), given)
 
 
-def shown_in_frames(config: Config, truth: Truth, q: FloatArray, drawn: tuple[int, int]) -> FloatArray:
+def shown_in_frames(
+    config: Config, truth: Truth, q: FloatArray, drawn: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
     """Pixels (2, m, 2) that frames of the robot at rest at joints (n,), rad or m, show on average.
 
+    And their standard deviations (2, m), of which averaging takes nothing: the same view errs alike. Both are
+    NaN where most frames of a view do not show a marker.
+
     drawn : seed, and stream of its random numbers.
-    Markers that most frames of a view do not show are NaN.
     """
     return _looked(_scene(config, truth), config.noise.shown_frames, q.tobytes(), drawn)
 
 
 @lru_cache(maxsize=256)
-def _looked(scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]) -> FloatArray:
-    eyes, q, found = (
-        Frames(scene),
-        np.frombuffer(q_bytes)[None],
-        np.full((frames, 2, len(scene.numbers), 2), np.nan),
-    )
+def _looked(
+    scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
+) -> tuple[FloatArray, FloatArray]:
+    eyes, q = Frames(scene), np.frombuffer(q_bytes)[None]
+    found = np.full((frames, 2, len(scene.numbers), 3), np.nan)
     eyes.open()
     try:
         for k, view in np.ndindex(frames, 2):
-            found[k, view], _ = eyes.look(view, q, None, _random(*drawn, view, k))
+            pixels, sigma = eyes.look(view, q, None, _random(*drawn, view, k))
+            found[k, view] = np.column_stack([pixels, sigma])
     finally:
         eyes.close()
     count = np.isfinite(found[..., :1]).sum(axis=0)
-    return np.where(2 * count > frames, np.nansum(found, axis=0) / np.maximum(count, 1), np.nan)
+    mean = np.where(2 * count > frames, np.nansum(found, axis=0) / np.maximum(count, 1), np.nan)
+    return np.ascontiguousarray(mean[..., :2]), np.ascontiguousarray(mean[..., 2])
 
 
 def _scene(config: Config, truth: Truth) -> Scene:

@@ -83,9 +83,11 @@ def task_config(config, seed, *, taught=False):
 def taught_images(config, q: FloatArray, seed):
     """What ``teach`` writes of images at joints (n,)."""
     truth = truth_of(config)
-    s = shown_in_frames(config, truth, q, (seed, 7))
+    s, sigma = shown_in_frames(config, truth, q, (seed, 7))
     pixels = [[None if np.isnan(uv).any() else uv.tolist() for uv in view] for view in s]
-    return {"markers": list(truth.number), "left": pixels[0], "right": pixels[1]}
+    told = [[None if np.isnan(x) else float(x) for x in view] for view in sigma]
+    sides = {"left": pixels[0], "right": pixels[1], "sigma_left_px": told[0], "sigma_right_px": told[1]}
+    return {"markers": list(truth.number)} | sides
 
 
 def drawn():
@@ -111,7 +113,7 @@ def _shows(config, truth, q):
     sides = np.linalg.norm(face - np.roll(face, 1, axis=1), axis=2)
     if sides.max(axis=1).min() < LEAST_PX:
         return False
-    s = shown_in_frames(config.model_copy(update={"noise": type(config.noise)()}), truth, q, (0, 0))
+    s, _ = shown_in_frames(config.model_copy(update={"noise": type(config.noise)()}), truth, q, (0, 0))
     return bool(np.isfinite(s[:, list(truth.face)]).all())
 
 

@@ -37,6 +37,7 @@ CLASSICAL = ("stacked", "blockwise", "euclidean_points")
 CLASSICAL_TASKS = 10
 DECADES = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, np.inf])  # of stated deviations, px
 LOOKS = 3  # after which hand–eye calibration corrects the tool
+VAGUE_PX = 0.2  # of a corner that hand–eye calibration is not shown
 STREAM = 6  # of random numbers of the robot that hand–eye calibration drives
 
 
@@ -130,7 +131,9 @@ def by_hand_eye(config, known, seed):
     (views, points, mount), truth = known, truth_of(config)
     arm = truth.robot
     start, goal = tasks_of()[seed]
-    wanted = hand_eye.tool_in_base(views, points, shown_in_frames(config, truth, goal, (seed, 7)))
+    shown, sigma = shown_in_frames(config, truth, goal, (seed, 7))
+    shown = np.where((sigma <= VAGUE_PX)[..., None], shown, np.nan)
+    wanted = hand_eye.tool_in_base(views, points, shown)
     hand, rows = wanted @ np.linalg.inv(mount), []
     robot = robot_by_itself(config, truth, start, 0.0, seed, STREAM)
     robot.open()
