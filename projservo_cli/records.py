@@ -18,6 +18,9 @@ BoolArray = npt.NDArray[np.bool_]
 ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
+# Why a marker is left out whole: it stands still in the images, is of another body, slips, or hardly any
+# of its readings fits.
+WHY_LOST = ("still", "other body", "drifting", "hardly seen")
 
 # Dimensions that have the same size in every record.
 SIZES = {
@@ -33,6 +36,7 @@ SIZES = {
     "outlier_column": 3,
     "suspect_column": 2,
     "swap_column": 3,
+    "lost_column": 2,
     "law": 2,
     "operators": 2,
     "limit": 2,
@@ -184,6 +188,14 @@ class Calibration:
     )
     swapped: IntArray = _array(
         "swap_row swap_column", about="markers that changed numbers: pose, marker read, marker that it is"
+    )
+    lost: IntArray | None = _array(
+        "lost_row lost_column",
+        about="markers left out whole: number, and why, an index into WHY_LOST",
+        default=None,
+    )
+    lost_poses: IntArray | None = _array(
+        "lost_pose", about="poses left out whole, of which no joint reading could be named", default=None
     )
     predicted_rms_px: float | None = _scalar(
         "px",

@@ -17,7 +17,7 @@ from projservo_cli.calibration.forward import LENS, Scene
 from projservo_cli.calibration.readings import RAYLEIGH, Readings
 from projservo_cli.calibration.start import Search, starts
 from projservo_cli.geometry.lens import straight_views, within
-from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, WorkFailed
+from projservo_cli.records import WHY_LOST, BoolArray, Calibration, FloatArray, IntArray, WorkFailed
 
 # A pose is explained by a corrected joint reading when its median residual falls below so many σ.
 _CORRECTED = 3.0
@@ -154,17 +154,31 @@ def findings(calibration: Calibration) -> dict[str, Any]:
     """Single observations that do not fit, and how many do, as plain lists for people and JSON.
 
     calibration : the record.
-    Returns ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``.
+    Returns ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``, and
+    ``left_out`` by kind: counts of ``sightings`` and of those ``swapped``, numbers of the ``tracks``
+    (markers) left out whole by why, and of the ``poses`` left out whole.
     """
     outliers, suspects, swaps = (
         rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.swapped)
     )
+    lost, poses = (
+        [] if rows is None else rows.tolist() for rows in (calibration.lost, calibration.lost_poses)
+    )
+    tracks = {why: [j for j, w in lost if w == code] for code, why in enumerate(WHY_LOST)}
+    whole = {j for numbers in tracks.values() for j in numbers}
+    left_out = {
+        "sightings": sum(marker not in whole for _, marker, _ in outliers),
+        "swapped": len(swaps),
+        "tracks": tracks,
+        "poses": sorted({p for p, _ in suspects} | set(poses)),
+    }
     return {
         "outliers": [{"pose": p, "marker": m, "view": _VIEWS[v]} for p, m, v in outliers],
         "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
         "swapped": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
         "merged_poses": calibration.merged_poses,
         "merged_markers": calibration.merged_markers,
+        "left_out": left_out,
     }
 
 

@@ -95,3 +95,37 @@ def robot_of(truth):
     markers = np.c_[np.array(truth["markers_tool"]), np.ones(len(truth["markers_tool"]))] @ tool.T
     cameras = np.array([truth["camera_left"], truth["camera_right"]])
     return Robot(truth["joint_types"], twists, cameras, markers, np.array(truth["q_reference"]))
+
+
+def errors_of_the_best(mistaken):
+    """Errors (K, 2, m) px of held-out images of the best estimator, to first order, from what is right alone.
+
+    Of the very noise that is in the data: markers are eliminated one by one, so that thousands are no matter.
+    """
+    robot, right = mistaken.robot, mistaken.kind == 0
+    by_shared, by_marker = _parts(robot, mistaken.observation.q)
+    ahead_shared, ahead_marker = _parts(robot, mistaken.ahead)
+    rows, back = [], []
+    for j, seen in enumerate(right.T):
+        A = by_shared[seen][:, :, j].reshape(-1, by_shared.shape[-1])
+        B, noise = by_marker[seen][:, :, j].reshape(-1, 3), mistaken.noise[seen][:, :, j].ravel()
+        inverse = np.linalg.pinv(B)
+        rows.append(np.c_[A, noise] - B @ (inverse @ np.c_[A, noise]))
+        back.append(inverse @ np.c_[A, noise])
+    stacked, back = np.concatenate(rows), np.array(back)
+    scale = np.maximum(np.linalg.norm(stacked[:, :-1], axis=0), 1e-300)
+    shared = np.linalg.lstsq(stacked[:, :-1] / scale, stacked[:, -1], rcond=1e-9)[0] / scale
+    marker = back[:, :, -1] - back[:, :, :-1] @ shared
+    error = ahead_shared @ shared + np.einsum("kvmij,mj->kvmi", ahead_marker, marker)
+    return np.linalg.norm(error, axis=-1)
+
+
+def _parts(robot, q):
+    """Derivatives of images (K, 2, m, 2, …) by what all markers share, and by the marker itself."""
+    x, dq, m = parameters(robot), q - robot.q_reference, len(robot.markers)
+    first = len(x) - 3 * m
+    steps = [np.arange(len(x)) == k for k in range(first)]
+    steps += [(np.arange(len(x)) >= first) & ((np.arange(len(x)) - first) % 3 == i) for i in range(3)]
+    columns = [images(x + 1j * STEP * step, robot.joint_types, m, dq).imag / STEP for step in steps]
+    J = np.stack(columns, axis=-1)
+    return J[..., :first], J[..., first:]
