@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, WorkFailed
-from projservo_cli.rendered.scene import Scene
+from projservo_cli.rendered.model import RenderedModel
 from projservo_cli.robots.described import mujoco
 
 _STEP_S = 0.002  # longest step of the integration
@@ -52,7 +52,7 @@ class Physics:
     Raises InputError where an actuator of the file cannot be driven, or does not sag as it is told.
     """
 
-    def __init__(self, scene: Scene, q: FloatArray, lag_s: float, sag: float) -> None:
+    def __init__(self, scene: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
         arm, servo = scene.arm, scene.options.servo
         self._model, self._places, self._rates = copy.copy(scene.model), scene.places, scene.rates
         self._data = scene.begin(self._model, q)
@@ -142,7 +142,7 @@ class Physics:
         """What gravity and motion ask of each joint (n,), N m or N, less what the file compensates."""
         return np.array((self._data.qfrc_bias - self._data.qfrc_gravcomp)[self._rates])
 
-    def _heaviest(self, scene: Scene) -> tuple[FloatArray, float]:
+    def _heaviest(self, scene: RenderedModel) -> tuple[FloatArray, float]:
         """Most inertia (n,) of each joint, kg m² or kg, and the most gravity asks of any that turns, N m."""
         mj, rng, arm = mujoco(), np.random.default_rng(0), scene.arm
         low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.lower, arm.upper))

@@ -21,9 +21,9 @@ from projservo_cli.config.models import FAULTS, Disturbance, FrozenJoint, LostMa
 from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.geometry.kinematics import joint_operators
 from projservo_cli.records import PRISMATIC, ByteArray, FloatArray
-from projservo_cli.rendered.frames import Frames
+from projservo_cli.rendered.cameras import Frames
+from projservo_cli.rendered.model import RenderedModel, rendered_model
 from projservo_cli.rendered.physics import Physics
-from projservo_cli.rendered.scene import Scene, scene_of
 from projservo_cli.robots.simulated import Arm
 from projservo_cli.stages.world import Truth
 
@@ -173,7 +173,7 @@ def shown_in_frames(
 
 @lru_cache(maxsize=256)
 def _looked(
-    scene: Scene, frames: int, q_bytes: bytes, drawn: tuple[int, int]
+    scene: RenderedModel, frames: int, q_bytes: bytes, drawn: tuple[int, int]
 ) -> tuple[FloatArray, FloatArray]:
     eyes, q = Frames(scene), np.frombuffer(q_bytes)[None]
     found = np.full((frames, 2, len(scene.numbers), 3), np.nan)
@@ -189,7 +189,7 @@ def _looked(
     return np.ascontiguousarray(mean[..., :2]), np.ascontiguousarray(mean[..., 2])
 
 
-def _scene(config: Config, truth: Truth) -> Scene:
+def _scene(config: Config, truth: Truth) -> RenderedModel:
     assert config.arm is not None
     assert config.rig is not None
     assert config.markers is not None
@@ -198,8 +198,10 @@ def _scene(config: Config, truth: Truth) -> Scene:
 
 
 @lru_cache(maxsize=4)
-def _built(truth: Truth, robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions) -> Scene:
-    return scene_of(robot, truth.robot, rig, truth.P, markers, options)
+def _built(
+    truth: Truth, robot: RobotSettings, rig: Rig, markers: Markers, options: RenderedOptions
+) -> RenderedModel:
+    return rendered_model(robot, truth.robot, rig, truth.P, markers, options)
 
 
 class FaultyRobot:

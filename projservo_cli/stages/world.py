@@ -26,7 +26,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.rendered.scene import lens_of
+from projservo_cli.rendered.model import lens_of
 from projservo_cli.robots.simulated import Arm, Ends, camera_center, roll_axis
 from projservo_cli.task.face import MIDPOINT, center_of
 

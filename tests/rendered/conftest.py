@@ -5,8 +5,8 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.rendered.frames import Frames
-from projservo_cli.rendered.scene import scene_of
+from projservo_cli.rendered.cameras import Frames
+from projservo_cli.rendered.model import rendered_model
 from projservo_cli.robots.described import mujoco
 from projservo_cli.stages.world import truth_of
 
@@ -53,7 +53,7 @@ def eyes_of(config):
     """The cameras of a configuration, not open."""
     truth = truth_of(config)
     return Frames(
-        scene_of(config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered)
+        rendered_model(config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered)
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.config.markers import CORNERS
 from projservo_cli.records import ByteArray, FloatArray, InputError
-from projservo_cli.rendered.scene import CAMERAS, FINER, Scene, drawn_at, lens_of
+from projservo_cli.rendered.model import CAMERAS, FINER, RenderedModel, drawn_at, lens_of
 from projservo_cli.robots.described import mujoco, no_gl
 
 _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
@@ -21,7 +21,7 @@ class Frames:
 
     borders = True
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: RenderedModel) -> None:
         self.scene, self._finder, self._options = scene, scene.finder, scene.options
         self._places = {number: i for i, number in enumerate(scene.numbers)}
         width, height = scene.size

@@ -39,7 +39,7 @@ CAMERAS = ("left camera", "right camera")
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderedModel:
     """A compiled model, and what in it stands for what."""
 
     options: RenderedOptions
@@ -92,9 +92,9 @@ def lens_of(P: FloatArray, k1: float) -> FloatArray:
     return np.column_stack([K[:, 0, 2], K[:, 1, 2], radius, np.full(2, k1), np.zeros(2)])
 
 
-def scene_of(
+def rendered_model(
     robot: RobotSettings, arm: Arm, rig: Rig, P: FloatArray, markers: Markers, options: RenderedOptions
-) -> Scene:
+) -> RenderedModel:
     """The scene of a robot, whose kinematics are those of an arm, before cameras P (2, 3, 4).
 
     Raises InputError if MuJoCo or OpenCV is missing, or the scene cannot be made.
@@ -124,7 +124,7 @@ def scene_of(
     mj.mj_setConst(model, mj.MjData(model))
     plates = tuple(tuple(model.geom(_name(tag, side)).id for side in _SIDES) for tag in markers.all_tags)
     assert markers.known is not None
-    return Scene(
+    return RenderedModel(
         options,
         finder,
         markers.known,
