@@ -92,7 +92,8 @@ from projservo_cli.rendered.model import rendered_model
 from projservo_cli.stages.world import truth_of
 config = load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.read())
 truth = truth_of(config)
-eyes = Frames(rendered_model(config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered))
+given = config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered
+eyes = Frames(rendered_model(*given))
 eyes.open()
 seen = [eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)]
 print(hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest())
