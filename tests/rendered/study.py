@@ -35,7 +35,7 @@ from tests.rendered.conditions import CONDITIONS, LATEST, SEEDS, TAUGHT, base_of
 
 CLASSICAL = ("stacked", "blockwise", "euclidean_points")
 CLASSICAL_TASKS = 10
-DECADES = np.array([0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, np.inf])  # of stated deviations, px
+DECADES = np.array([0.0, 0.01, 0.1, 1.0, np.inf])  # of stated deviations, px
 LOOKS = 3  # after which hand–eye calibration corrects the tool
 VAGUE_PX = 0.2  # of a corner that hand–eye calibration is not shown
 STREAM = 6  # of random numbers of the robot that hand–eye calibration drives
