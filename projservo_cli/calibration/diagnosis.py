@@ -12,15 +12,17 @@ from scipy.special import fdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
-from projservo_cli.calibration.fit import Misfit, Solution, fit_from
+from projservo_cli.calibration.fit import Solution, fit_from, median_px
 from projservo_cli.calibration.forward import LENS, Scene
 from projservo_cli.calibration.readings import RAYLEIGH, Readings
-from projservo_cli.calibration.start import Search, starts
+from projservo_cli.calibration.start import Search, carrying, starts, still
 from projservo_cli.geometry.lens import straight_views, within
 from projservo_cli.records import WHY_LOST, BoolArray, Calibration, FloatArray, IntArray, WorkFailed
 
 # A pose is explained by a corrected joint reading when its median residual falls below so many σ.
 _CORRECTED = 3.0
+# Sightings of a pose by which wrong joint readings are told; least readings of a marker to judge it.
+_SHOWN, _SEEN = 50, 3
 # Sightings both views agree on, in units of the epipolar noise, are no errors of detection.
 _CONSISTENT = 3.0
 # Shares of sightings both views agree on, and of poses, that may be left out of a fit.
@@ -34,62 +36,90 @@ class Outliers:
 
     suspect: IntArray  # (S, 2) row of the pose and index of the joint whose reading no image agrees with
     swapped: IntArray  # (W, 3) row of the pose, index of the marker that was read and of the one it is
+    poses: IntArray  # (P,) rows of poses whose images are of other joints than those read
     explained: BoolArray  # (2, N) readings that these explain
 
     @classmethod
     def nothing(cls, readings: Readings) -> "Outliers":
         """No explanation of anything."""
         rows = np.zeros((0, 3), dtype=np.int64)
-        return cls(rows[:, :2], rows, np.zeros_like(readings.seen))
+        return cls(rows[:, :2], rows, rows[:, 0], np.zeros_like(readings.seen))
 
     @classmethod
-    def of(cls, solution: Solution, epipolar: Epipolar) -> "Outliers":
-        """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings.
-
-        Raises Misfit where too much is left, by the geometry of what projective cameras would have seen.
-        """
+    def of(cls, solution: Solution) -> "Outliers":
+        """Explain the readings left out by exchanged marker numbers first, then by wrong joint readings."""
         problem, scene, used = solution.problem, solution.scene, solution.used
         readings, sigma = problem.readings, solution.sigma_px
         out = readings.seen & ~used
         swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
         suspects: list[tuple[int, int]] = []
+        poses = []
         for k in np.flatnonzero(readings.count_at(used) == 0):
             here = readings.pose_of == k
             pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
-            if int(pose.seen.any(axis=0).sum()) < 3:
+            rows = np.flatnonzero(pose.seen.any(axis=0))
+            if rows.size < 3:
                 continue
-            alone = LeastSquares.of(pose, problem.q_reference).with_noise(problem.tau)
+            some = np.isin(np.arange(len(pose.pose_of)), rows[:: max(1, rows.size // _SHOWN)])
+            alone = LeastSquares.of(pose.rows(some), problem.q_reference).with_noise(problem.tau)
             joints = _wrong_joints(alone, scene, sigma)
             suspects += [(int(k), i) for i in joints]
-            if joints:
+            if joints or _is_elsewhere(alone, scene, problem.q, sigma):
                 explained[:, here] |= out[:, here]
-        found = cls(np.array(suspects, dtype=np.int64).reshape(-1, 2), swapped, explained)
-        _require_explained(_straight(readings, scene.lens), used, found, epipolar)
-        return found
+                poses += [] if joints else [int(k)]
+        pairs = np.array(suspects, dtype=np.int64).reshape(-1, 2)
+        return cls(pairs, swapped, np.array(poses, dtype=np.int64), explained)
 
 
 def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
-    """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N)."""
+    """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N).
+
+    The other is itself not seen there, or left out.
+    """
     readings = problem.readings
-    predicted = scene.seen(problem.joints(settled(problem, scene)))
-    rows = np.flatnonzero(out.any(axis=0))
-    distance = np.linalg.norm(
-        predicted[readings.pose_of[rows]] - readings.pixels[:, rows].transpose(1, 0, 2)[:, :, None], axis=3
-    )
-    # A view that did not see the marker has no say.
-    distance = distance * readings.weight[:, rows].T[..., None]
-    distance = np.where(readings.seen[:, rows].T[..., None], distance, 0.0)
-    fits: BoolArray = np.max(distance, axis=1) <= limit
-    fits[np.arange(rows.size), readings.marker_of[rows]] = False
-    matched = fits.sum(axis=1) == 1
+    joints, rows = problem.joints(settled(problem, scene)), np.flatnonzero(out.any(axis=0))
+    found = set()
     explained = np.zeros_like(out)
-    explained[:, rows[matched]] = out[:, rows[matched]]
-    hit = rows[matched]
-    columns = readings.pose_of[hit], readings.marker_of[hit], np.argmax(fits[matched], axis=1)
-    found = set(zip(*(column.tolist() for column in columns), strict=True))
+    for k in np.unique(readings.pose_of[rows]):
+        here = readings.pose_of == k
+        free = np.ones(readings.marker.size, dtype=bool)
+        free[readings.marker_of[here & ~out.any(axis=0)]] = False
+        predicted = np.nan_to_num(scene.seen(joints[k : k + 1])[0], nan=np.inf)[:, free]
+        others = np.flatnonzero(free)
+        for row in rows[here[rows]]:
+            # A view that did not see the marker has no say.
+            v = np.flatnonzero(readings.seen[:, row])
+            distance = np.linalg.norm(predicted[v] - readings.pixels[v, None, row], axis=2)
+            fits = (distance * readings.weight[v, None, row]).max(axis=0) <= limit
+            fits &= others != readings.marker_of[row]
+            if fits.sum() == 1:
+                found.add((int(k), int(readings.marker_of[row]), int(others[np.argmax(fits)])))
+                explained[:, row] = out[:, row]
     # An exchange shows in both markers and is one finding.
     listed = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
     return np.array(listed, dtype=np.int64).reshape(-1, 3), explained
+
+
+def _is_elsewhere(pose: LeastSquares, scene: Scene, q: FloatArray, sigma: float) -> bool:
+    """Whether other joints explain the images of a pose: those of another one (K, n), or near these."""
+    levels = []
+    for values in q:
+        moved = dataclasses.replace(pose, q=pose.q * 0.0 + values, tau=None)
+        levels.append(median_px(moved.residual(scene), moved.readings.seen))
+    best = dataclasses.replace(pose, q=pose.q * 0.0 + q[int(np.argmin(levels))], tau=None)
+    joints = list(range(q.shape[1]))
+    level = min(min(levels), _corrected_level(best, scene, joints, sigma))
+    return level <= _CORRECTED * RAYLEIGH * sigma
+
+
+def why_lost(solution: Solution, kept: BoolArray) -> IntArray:
+    """Markers left out whole, (T, 2): index, and why, an index into ``WHY_LOST``; others (m,) are kept."""
+    readings = solution.problem.readings
+    near = np.linalg.norm(solution.residual, axis=2) <= OUTLIER * solution.sigma_px
+    fits = readings.count_of(readings.seen & near)
+    seen = readings.count_of(readings.seen)
+    why = np.select([still(readings, solution.sigma_px), seen < _SEEN, fits > seen / _SEEN], [0, 3, 2], 1)
+    return np.stack([np.flatnonzero(~kept), why[~kept]], axis=1)
 
 
 def _wrong_joints(pose: LeastSquares, scene: Scene, sigma: float) -> tuple[int, ...]:
@@ -120,24 +150,26 @@ def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma:
     return float(np.median(np.linalg.norm(images.reshape(-1, 2), axis=1)))
 
 
-def _require_explained(readings: Readings, used: BoolArray, found: Outliers, epipolar: Epipolar) -> None:
-    """Refuse a fit that leaves out too many sightings both views agree on, or poses for their readings."""
+def unexplained(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+    """What speaks against a fit: sightings left out that both views agree on, poses; in words, else empty."""
+    readings, used = _straight(solution.problem.readings, solution.scene.lens), solution.used
     # Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
     both = readings.both
     out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
     agree = epipolar.within(readings.rows(both), _CONSISTENT)
-    unexplained, sightings = int((out & agree).sum()), int(both.sum())
-    if unexplained > max(3.0, _MOST_UNEXPLAINED * sightings):
-        raise Misfit(
-            f"the fit does not describe the data: in {unexplained} of {sightings} sightings both cameras "
-            "agree with each other but not with the robot; check the joint readings and types (R or P)"
+    count, sightings = int((out & agree).sum()), int(both.sum())
+    if count > max(3.0, _MOST_UNEXPLAINED * sightings):
+        return (
+            f"in {count} of {sightings} sightings both cameras agree with each other but not with the robot; "
+            "check the joint readings and types (R or P)"
         )
-    suspects, poses = len(np.unique(found.suspect[:, 0])), len(readings.q)
+    suspects, poses = len(np.union1d(found.suspect[:, 0], found.poses)), len(readings.q)
     if suspects > _MOST_SUSPECT * poses:
-        raise Misfit(
-            f"the fit does not describe the data: {suspects} of {poses} poses contradict their joint "
-            "readings; check the joint readings, their units and types (R or P)"
+        return (
+            f"{suspects} of {poses} poses contradict their joint readings; check the joint readings, their "
+            "units and types (R or P)"
         )
+    return ""
 
 
 def listed(readings: Readings, out: BoolArray) -> IntArray:
@@ -195,7 +227,9 @@ def blamed_joint(search: Search, most_px: float) -> str:
     All changes are compared first; the best are followed to the maximum of the likelihood and believed only
     where that passes as a calibration would and leaves no more than a noise, px.
     """
-    changes = _hypotheses(search.problem.readings, search.problem.q_reference)
+    readings = search.problem.readings
+    few = readings.of_markers(carrying(readings, search.epipolar.noise_px, search.rng))
+    changes = _hypotheses(few, search.problem.q_reference)
     candidates = []
     try:
         for done, (words, changed, handicap) in enumerate(changes):
@@ -242,17 +276,14 @@ def _describes(problem: LeastSquares, scene: Scene, epipolar: Epipolar, most_px:
     found = fit_from(problem, scene, epipolar)
     if found is None or found.sigma_px > most_px:
         return False
-    try:
-        _require_explained(problem.readings, found.used, Outliers.nothing(problem.readings), epipolar)
-    except WorkFailed:
-        return False
-    return True
+    return not unexplained(found, Outliers.nothing(problem.readings), epipolar)
 
 
 # A lens is suspected where it explains this share of the squared residuals and chance, with its tail
 # probability, would not.
 _LEAST_SHARE, _TAIL = 0.02, 1e-3
 _LEAST_CHI2 = 1e-20
+_JUDGES = 100  # markers that are asked about a lens
 
 
 def share_explained(solution: Solution, frame: ImageFrame) -> float:
@@ -265,6 +296,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     """
     if solution.scene.lens is not None:
         return 0.0
+    solution = solution.of_some(_JUDGES)
     readings = solution.problem.readings
     poses = np.unique(readings.pose_of[solution.used.any(axis=0)])
     K, d = poses.size, 2 * LENS

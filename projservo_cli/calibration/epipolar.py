@@ -17,7 +17,8 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Correspondences and readings farther than this many standard deviations do not count.
 OUTLIER = 5.0
-_SAMPLES = 500
+# Most correspondences that are taken; random eights of them, and by how many these are judged.
+_CORRESPONDENCES, _SAMPLES, _JUDGES = 20_000, 500, 1000
 _PARAMETERS = 7  # of a fundamental matrix
 _TIGHT = 1e-14  # relative change of the loss, the parameters and the gradient at the end of its search
 # Least median distance of the right view from a homography of the left one, in units of the noise.
@@ -30,7 +31,7 @@ class Epipolar:
 
     F: FloatArray  # (3, 3) with rightᵀ F left = 0, unit norm, px
     sigma_px: float  # noise per image coordinate from the residuals, px
-    inlier: BoolArray  # (N,) which correspondences agree with F
+    inlier: BoolArray  # (N,) which of the correspondences taken agree with F
 
     @classmethod
     def of(cls, readings: Readings, rng: np.random.Generator) -> "Epipolar":
@@ -49,10 +50,14 @@ class Epipolar:
                 "rows hold the pixels of both views"
             )
         T, T_ = _normalization(left), _normalization(right)
+        if count > _CORRESPONDENCES:
+            some = rng.choice(count, _CORRESPONDENCES, replace=False)
+            left, right, weight, count = left[some], right[some], weight[:, some], _CORRESPONDENCES
         a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
-        picks = rng.permuted(np.broadcast_to(np.arange(count), (_SAMPLES, count)), axis=1)[:, :8]
+        picks = np.stack([rng.choice(count, 8, replace=False, shuffle=False) for _ in range(_SAMPLES)])
         candidates = _eight_point(a[picks], b[picks])
-        medians = np.median(np.abs(_sampson(candidates, a, b, weight)[0]), axis=1)
+        judges = np.arange(count) if count <= _JUDGES else rng.choice(count, _JUDGES, replace=False)
+        medians = np.median(np.abs(_sampson(candidates, a[judges], b[judges], weight[:, judges])[0]), axis=1)
         F = candidates[np.argmin(medians)]
         for _ in range(10):
             r, slope = _sampson(F, a, b, weight)
@@ -162,7 +167,7 @@ def _transfer(left: FloatArray, right: FloatArray) -> FloatArray:
     """Distance (N,) of the right points from a homography of the left ones, in their units: [HZ04] 4.1."""
     zero = np.zeros_like(left)
     rows = np.block([[left, zero, -right[:, :1] * left], [zero, left, -right[:, 1:2] * left]])
-    H = np.linalg.svd(rows)[2][8].reshape(3, 3)
+    H = np.linalg.svd(rows, full_matrices=False)[2][8].reshape(3, 3)
     moved = left @ H.T
     return np.asarray(np.linalg.norm(moved[:, :2] / moved[:, 2:] - right[:, :2], axis=1))
 
@@ -212,6 +217,7 @@ def _isotropic_frame(points: FloatArray) -> FloatArray:
 
 
 _WHITENINGS = 30
+_PAIRED = 20  # markers a pose of which all pairs are compared
 # Focal lengths tried, in units of the image size: from a fisheye's centre to a long lens. Without an
 # image size the extent of the data stands in for it, which may be several times smaller.
 _SHORTEST, _LONGEST, _TRIALS, _MOST_GUESSES = 0.4, 24.0, 28, 3
@@ -251,7 +257,7 @@ def metric_guesses(
     Raises WorkFailed if no two markers were seen together at two poses.
     """
     both = readings.both
-    pairs = _marker_pairs(readings.pose_of[both], readings.marker_of[both])
+    pairs = marker_pairs(readings.pose_of[both], readings.marker_of[both])
 
     def guess(log_focal: float, factor: float) -> tuple[FloatArray, FloatArray]:
         return _guess_at(epipolar.F, readings, frame, factor * float(np.exp(log_focal)))
@@ -312,21 +318,36 @@ def _ray_depths(R: FloatArray, t: FloatArray, x: FloatArray, y: FloatArray) -> t
     return (xy * yt - yy * xt) / determinant, (xx * yt - xy * xt) / determinant
 
 
-def _marker_pairs(pose_of: IntArray, marker_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Two markers seen at the same pose: rows of the first, of the second, and which two markers they are."""
-    rows = [np.flatnonzero(pose_of == k) for k in np.unique(pose_of)]
-    pairs = [here[np.stack(np.triu_indices(here.size, 1))] for here in rows]
+def marker_pairs(pose_of: IntArray, marker_of: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Two markers seen at the same pose: rows of the first, of the second, and which two markers they are.
+
+    Of at most so many markers a pose: by one order for all poses, so that the same pairs come again.
+    """
+    rank = np.random.default_rng(0).permutation(int(marker_of.max()) + 1)
+    pairs = []
+    for k in np.unique(pose_of):
+        here = np.flatnonzero(pose_of == k)
+        here = np.sort(here[np.argsort(rank[marker_of[here]])[:_PAIRED]])
+        pairs.append(here[np.stack(np.triu_indices(here.size, 1))])
     first, second = np.concatenate(pairs, axis=1)
-    pair = marker_of[first] * (int(marker_of.max()) + 1) + marker_of[second]
+    pair = marker_of[first] * rank.size + marker_of[second]
     return first, second, np.unique(pair, return_inverse=True)[1]
+
+
+def log_distances(
+    points: FloatArray, pairs: tuple[IntArray, IntArray, IntArray]
+) -> tuple[FloatArray, BoolArray]:
+    """|log distance − its median over the poses| of pairs of points (N, 3), and which are seen twice."""
+    first, second, pair = pairs
+    log = np.log(np.maximum(np.linalg.norm(points[first] - points[second], axis=1), 1e-12))
+    order = np.lexsort((log, pair))
+    count = np.bincount(pair)
+    start = np.cumsum(count) - count
+    middle = 0.5 * (log[order[start + (count - 1) // 2]] + log[order[start + count // 2]])
+    return np.abs(log - middle[pair]), count[pair] > 1
 
 
 def _distance_spread(points: FloatArray, pairs: tuple[IntArray, IntArray, IntArray]) -> float:
     """Median over poses and pairs of points (N, 3) of |log distance − its median over the poses|."""
-    first, second, pair = pairs
-    distance = np.linalg.norm(points[first] - points[second], axis=1)
-    log = np.log(np.maximum(distance, 1e-12))
-    order = np.argsort(pair, kind="stable")
-    groups = np.split(log[order], np.flatnonzero(np.diff(pair[order])) + 1)
-    deviations = [np.abs(g - np.median(g)) for g in groups if g.size > 1]
-    return float(np.median(np.concatenate(deviations))) if deviations else np.inf
+    deviation, compared = log_distances(points, pairs)
+    return float(np.median(deviation[compared])) if compared.any() else np.inf

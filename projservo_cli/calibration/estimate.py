@@ -11,11 +11,19 @@ from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.delay import with_delay
-from projservo_cli.calibration.diagnosis import Outliers, blamed_joint, listed, share_explained, with_lens
+from projservo_cli.calibration.diagnosis import (
+    Outliers,
+    blamed_joint,
+    listed,
+    share_explained,
+    unexplained,
+    why_lost,
+    with_lens,
+)
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve, with_joint_noise
 from projservo_cli.calibration.projective import Projective, closed_form_operators
-from projservo_cli.calibration.quality import WEAK_NOISE, judged
+from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate, judged
 from projservo_cli.calibration.readings import Readings, require_images, require_motion
 from projservo_cli.calibration.start import Nominal, Search, Tell
 from projservo_cli.geometry.lens import FIRST
@@ -28,6 +36,10 @@ _DOUBTFUL_RATIO, _DOUBTFUL_SHARE = 2.0, 0.5
 # Share of the residuals that makes a lens the likely reason of a refusal, and the probability with which
 # noise alone exceeds coefficients that show no lens.
 _DECISIVE_SHARE, _NO_LENS_TAIL = 0.5, 0.01
+# A fit that leaves out what both views agree on must keep this share of the readings and of all motions, and
+# err by no more than this ratio of what is expected, in its residuals and when it predicts each of so many
+# parts of the poses.
+_KEPT, _DOUBTED_RATIO, _PARTS = 0.5, 1.3, 3
 # Share of readings that may lie outside the images: they are outliers.
 _STRAYS = 0.01
 
@@ -163,7 +175,10 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
         refusal = expected.refusal(solution)
         if refusal is not None:
             raise Misfit(refusal)
-        found = Outliers.of(solution, epipolar)
+        found = Outliers.of(solution)
+        doubt = unexplained(solution, found, epipolar)
+        if doubt and (share >= _DECISIVE_SHARE or not _verified(whole, solution, expected)):
+            raise Misfit(f"the fit does not describe the data: {doubt}")
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
             raise
@@ -176,12 +191,27 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     if kept.all():
         return dataclasses.replace(record, advice=advice)
     readings = whole.problem.readings
-    lost = listed(readings, readings.seen & ~kept[readings.marker_of])
     names = ", ".join(str(number) for number in readings.marker[~kept])
     seldom = f"hardly any reading of marker {names} fits: it is not part of the model; see it more often"
-    outlier = np.concatenate([record.outlier, lost])
+    outlier = np.concatenate([record.outlier, listed(readings, readings.seen & ~kept[readings.marker_of])])
     outlier = outlier[np.lexsort(outlier.T[::-1])]
-    return dataclasses.replace(record, outlier=outlier, advice=(*advice, seldom))
+    lost = why_lost(whole, kept)
+    lost[:, 0] = readings.marker[lost[:, 0]]
+    return dataclasses.replace(record, outlier=outlier, lost=lost, advice=(*advice, seldom))
+
+
+def _verified(whole: Solution, solution: Solution, expected: Expected) -> bool:
+    """Whether what is kept is most, leaves nothing but noise, and predicts what it has not seen."""
+    if solution.used.sum() < _KEPT * whole.problem.readings.seen.sum():
+        return False
+    readings = solution.problem.readings
+    span = np.ptp(readings.q[np.unique(readings.pose_of[solution.used.any(axis=0)])], axis=0)
+    if expected.ratio(solution) > _DOUBTED_RATIO or (span < _KEPT * np.ptp(readings.q, axis=0)).any():
+        return False
+    held_out = cross_validate(solution.kept(), expected.noise_px(solution), _PARTS, 0)
+    if held_out.failed or held_out.rms_px is None or held_out.predicted_rms_px is None:
+        return False
+    return held_out.rms_px <= _DOUBTED_RATIO * held_out.predicted_rms_px
 
 
 def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tuple[str, ...]:
@@ -234,7 +264,7 @@ def _record(
         factor = expected.noise_px(solution) * result.covariance_factor(solution, spread)
         covariance = factor @ factor.T
     outlier = listed(readings, readings.seen & ~solution.used & ~found.explained)
-    counts = (len(outlier), len(found.suspect), len(found.swapped))
+    counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.swapped))
     verdict = judged(solution, spread, expected, counts, suspicion)
     operator_defect, trace_defect, plane_defect = result.defects()
     used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
@@ -271,6 +301,7 @@ def _record(
         merged_markers=int(np.unique(readings.marker_of[used_rows]).size),
         outlier=outlier,
         suspect=np.stack([readings.pose[found.suspect[:, 0]], found.suspect[:, 1] + 1], axis=1),
+        lost_poses=readings.pose[found.poses],
         swapped=np.concatenate(
             [readings.pose[found.swapped[:, :1]], readings.marker[found.swapped[:, 1:]]], axis=1
         ),

@@ -13,7 +13,8 @@ from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
 from projservo_cli.calibration.readings import RAYLEIGH, per_rad
-from projservo_cli.calibration.start import Nominal, Search, starts
+from projservo_cli.calibration.start import Nominal, Search, carrying, starts
+from projservo_cli.calibration.tracks import Tracks
 from projservo_cli.records import BoolArray, FloatArray, WorkFailed
 
 # Fitted noise over the noise expected: above the first, or so many standard errors above one where that
@@ -73,22 +74,42 @@ class Solution:
     @property
     def typical_px(self) -> float:
         """Median residual over all readings seen, outliers included, px."""
-        return _median_px(self.residual, self.problem.readings.seen)
+        return median_px(self.residual, self.problem.readings.seen)
 
     def determined(self) -> tuple["Solution", BoolArray]:
         """The solution without markers of which hardly any reading counts, and which markers (m,) stay."""
-        problem, scene, readings = self.problem, self.scene, self.problem.readings
+        readings = self.problem.readings
         # One reading is less than a marker's three coordinates; a few among many wrong ones agree by chance.
         keep = readings.count_of(self.used) >= np.maximum(2, _LEAST_SHARE * readings.count_of(readings.seen))
         if keep.all():
             return self, keep
-        rows = keep[readings.marker_of]
-        smaller = LeastSquares.of(readings.of_markers(keep), problem.q_reference, scene.lens is not None)
-        smaller = smaller.with_noise(problem.tau)
-        scene = dataclasses.replace(scene, M=scene.M[keep])
+        return self._of_markers(keep), keep
+
+    def _of_markers(self, keep: BoolArray) -> "Solution":
+        """What it says of some of the markers (m,)."""
+        rows = keep[self.problem.readings.marker_of]
+        smaller, scene = _of_markers(self.problem, self.scene, keep)
         used = self.used[:, rows]
         dof = _degrees_of_freedom(smaller, scene, used)
-        return Solution(smaller, scene, self.residual[:, rows], used, dof, self.joint_noise), keep
+        return Solution(smaller, scene, self.residual[:, rows], used, dof, self.joint_noise)
+
+    def of_some(self, most: int) -> "Solution":
+        """What it says of at most so many of the markers, evenly chosen."""
+        m = self.problem.readings.marker.size
+        chosen = np.linspace(0, m - 1, most).astype(np.int64)
+        return self if m <= most else self._of_markers(np.isin(np.arange(m), chosen))
+
+    def kept(self) -> "Solution":
+        """The solution of the readings that count alone."""
+        readings, rows = self.problem.readings, np.asarray(self.used.any(axis=0))
+        some = dataclasses.replace(readings, seen=self.used).rows(rows)
+        problem = LeastSquares.of(some, self.problem.q_reference, self.scene.lens is not None)
+        return dataclasses.replace(
+            self,
+            problem=problem.with_noise(self.problem.tau),
+            residual=self.residual[:, rows],
+            used=self.used[:, rows],
+        )
 
     def spread_factor(self) -> FloatArray:
         """Factor L of the inverse information, L Lᵀ = (JᵀS⁻¹J)⁺, on the directions that readings determine.
@@ -175,6 +196,11 @@ def chi2_band(dof: int) -> tuple[float, float]:
 
 
 _MASK_ROUNDS = 4
+# Share of the sightings that are wrong beyond which tracks are, too; of the readings that may come and go
+# between rounds; least readings of a marker that speak for each other where others do not.
+_MANY, _FLICKER, _VERIFIED = 0.01, 2e-4, 3
+# Noise over that of the rig beyond which the model errs, and what does not fit it need not be wrong.
+_RIG = 1.5
 # Chance with which noise alone makes the readings of a pose count for nothing.
 _POSE_TAIL = 1e-7
 # Least share of the readings of a marker that must count for it to be part of the model.
@@ -186,7 +212,7 @@ _HOPELESS = 10.0
 _CRAWL, _PATIENCE = 0.01, 10
 
 
-def _median_px(residual: FloatArray, mask: BoolArray) -> float:
+def median_px(residual: FloatArray, mask: BoolArray) -> float:
     """Median length of the residuals (2, N, 2) in a mask (2, N), px."""
     return float(np.median(np.linalg.norm(residual[mask], axis=1)))
 
@@ -196,7 +222,7 @@ def _crawling(seen: BoolArray, far: float) -> Callable[[FloatArray], bool]:
     levels: list[float] = []
 
     def stalled(residual: FloatArray) -> bool:
-        levels.append(_median_px(residual, seen))
+        levels.append(median_px(residual, seen))
         if len(levels) <= _PATIENCE or levels[-1] <= RAYLEIGH * far:
             return False
         return levels[-1] > (1.0 - _CRAWL) * levels[-1 - _PATIENCE]
@@ -207,7 +233,7 @@ def _crawling(seen: BoolArray, far: float) -> Callable[[FloatArray], bool]:
 def fit_from(problem: LeastSquares, scene: Scene, epipolar: Epipolar) -> Solution | None:
     """The fit that a scene leads to: a robust search, then ``fit_inliers``."""
     searched, level = _robust_search(problem, scene, problem.readings.seen, epipolar)
-    return fit_inliers(problem, searched, level / RAYLEIGH, epipolar)
+    return fit_inliers(problem, searched, level / RAYLEIGH, epipolar.noise_px, hopeless=_HOPELESS)
 
 
 def _robust_search(
@@ -217,61 +243,107 @@ def _robust_search(
     scene = minimize(problem, scene, rows, robust=True, cameras=False, most=20).scene
     stalled = _crawling(rows, REFUSE_RATIO * epipolar.noise_px)
     fit = minimize(problem, scene, rows, robust=True, most=100, stalled=stalled)
-    return fit.scene, _median_px(fit.residual, rows)
+    return fit.scene, median_px(fit.residual, rows)
 
 
 def fit_inliers(
-    problem: LeastSquares, scene: Scene, sigma: float, epipolar: Epipolar | None = None
+    problem: LeastSquares, scene: Scene, sigma: float, rig_px: float = 0.0, *, hopeless: float = np.inf
 ) -> Solution | None:
-    """Least squares of the readings within 5σ, in rounds until they no longer change.
+    """Least squares of the readings that count, in rounds until they no longer change.
 
-    Where the robust noise σ at the start, px, is many times that of an epipolar geometry it is not worth the
-    time. None where the fit does not put the points in front of both cameras.
+    Those within 5σ, from a robust noise σ, px; at no more than the noise of the rig, px, also by track.
+    Where the first is hopelessly many times the second it is not worth the time. None where the fit does
+    not put the points in front of both cameras.
     """
-    residual, seen = problem.residual(scene), problem.readings.seen
-    if epipolar is not None and sigma > _HOPELESS * epipolar.noise_px:
+    if sigma > hopeless * rig_px:
+        if (lost := ~np.isfinite(scene.M[:, 0])).any():
+            scene = dataclasses.replace(scene, M=Tracks(problem, scene).placed(lost, sigma))
+        residual, seen = problem.residual(scene), problem.readings.seen
         dof = _degrees_of_freedom(problem, scene, seen)
         return Solution(problem, scene, residual, seen, dof) if dof > 0 else None
-    within = _within(problem, scene, OUTLIER * max(sigma, 1e-9))
+    scene, within = _within(problem, scene, max(sigma, 1e-9), max(sigma, 1e-9), rig_px)
     for _ in range(_MASK_ROUNDS):
         used = within
-        fit = minimize(problem, scene, used, robust=False)
-        scene = fit.scene
-        dof = _degrees_of_freedom(problem, scene, used)
+        keep = problem.readings.count_of(used) > 0
+        some, smaller = _of_markers(problem, scene, keep)
+        fit = minimize(some, smaller, used[:, keep[problem.readings.marker_of]], robust=False)
+        M = scene.M.copy()
+        M[keep] = fit.scene.M
+        scene = dataclasses.replace(fit.scene, M=M)
+        dof = _degrees_of_freedom(some, fit.scene, used)
         if dof <= 0:
             return None
-        within = _within(problem, scene, OUTLIER * max(float(np.sqrt(fit.cost / dof)), 1e-9))
-        if np.array_equal(used, within):
+        # Wrong ones that are still among them widen the tail and hardly the middle.
+        share = float(np.sqrt(2.0 * np.count_nonzero(used) / dof))
+        middle = max(share * median_px(problem.residual(scene), used) / RAYLEIGH, 1e-9)
+        sigma = max(float(np.sqrt(fit.cost / dof)), 1e-9)
+        judged, within = _within(problem, scene, sigma, middle, rig_px)
+        if np.count_nonzero(used != within) <= _FLICKER * used.size:
             break
+        scene = judged
     _, depth = problem.pixels(scene)
-    sign, ahead = _sides(depth)
+    sign, ahead = _sides(depth, used)
     if not ahead[used].all():
         return None
     scene = dataclasses.replace(scene, P=scene.P * sign[:, None, None])
-    return Solution(problem, scene, fit.residual, used, dof)
+    return Solution(problem, scene, problem.residual(scene), used, dof)
 
 
-def _sides(depth: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Signs (2,) of the cameras, and which points of depths (2, N) lie on the side of most."""
-    sign = np.sign(depth.sum(axis=1))
+def _of_markers(problem: LeastSquares, scene: Scene, keep: BoolArray) -> tuple[LeastSquares, Scene]:
+    """The problem and the scene of some of the markers (m,)."""
+    if keep.all():
+        return problem, scene
+    some = problem.readings.of_markers(keep)
+    smaller = LeastSquares.of(some, problem.q_reference, scene.lens is not None).with_noise(problem.tau)
+    return smaller, dataclasses.replace(scene, M=scene.M[keep])
+
+
+def _sides(depth: FloatArray, used: BoolArray) -> tuple[FloatArray, BoolArray]:
+    """Signs (2,) of the cameras, and which points of depths (2, N) lie on the side of most of those used."""
+    sign = np.sign((depth * used).sum(axis=1))
     return sign, np.sign(depth) == sign[:, None]
 
 
-def _within(problem: LeastSquares, scene: Scene, limit: float) -> BoolArray:
-    """Readings (2, N) within a limit, px, at poses where at least half of those seen are.
+def _within(
+    problem: LeastSquares, scene: Scene, sigma: float, middle: float, rig_px: float
+) -> tuple[Scene, BoolArray]:
+    """Readings (2, N) that count at a noise σ, px, and the scene with markers where most of theirs agree.
 
-    And where joints have noise, at poses that it explains: a wrong reading hides among many small errors.
+    Those within 5σ; where more are not than single wrong ones, those that agree with the others of their
+    marker, but of markers of which most agree. All of them at poses where not far less than elsewhere agrees,
+    and where joints have noise, at poses that it explains: a wrong reading hides among many small errors.
     """
-    readings, scene = problem.readings, settled(problem, scene)
-    residual = problem.residual(scene)
-    good = readings.seen & (np.linalg.norm(residual, axis=2) <= limit)
-    most = readings.count_at(good) >= 0.5 * readings.count_at(readings.seen)
+    readings, limit = problem.readings, OUTLIER * sigma
+    if (lost := ~np.isfinite(scene.M[:, 0])).any():
+        scene = dataclasses.replace(scene, M=Tracks(problem, scene).placed(lost, sigma))
+    rested = settled(problem, scene)
+    good = _near(problem, rested, limit)
+    many = np.mean((readings.seen & ~good).any(axis=0)) > _MANY and middle <= _RIG * rig_px
+    if many:
+        sigma = min(sigma, middle)
+        doubtful = readings.count_of(readings.seen & ~good) > 0
+        M = Tracks(problem, rested).placed(doubtful, sigma)
+        rested = dataclasses.replace(rested, M=M)
+        M, good = Tracks(problem, rested).tested(sigma, _near(problem, rested, OUTLIER * sigma))
+        scene, rested = (dataclasses.replace(one, M=M) for one in (scene, rested))
+    share = readings.count_at(good) / np.maximum(readings.count_at(readings.seen), 1)
+    most = share >= 0.5 * np.median(share[np.unique(readings.pose_of)])
     if problem.tau is not None:
-        strain = problem.strain(scene)
+        residual, strain = problem.residual(rested), problem.strain(rested)
         square = problem.at_poses((residual**2 * good[..., None]).sum(axis=(0, 2))) + (strain**2).sum(axis=1)
-        allowed = chdtri(np.maximum(2 * readings.count_at(good), 1), _POSE_TAIL) * (limit / OUTLIER) ** 2
+        allowed = chdtri(np.maximum(2 * readings.count_at(good), 1), _POSE_TAIL) * sigma**2
         most &= (np.abs(strain) <= limit).all(axis=1) & (square <= allowed)
-    return np.asarray(good & most[readings.pose_of])
+    good &= most[readings.pose_of]
+    if many:
+        kept, of = (readings.count_of(part & most[readings.pose_of]) for part in (good, readings.seen))
+        good &= ((kept >= 0.5 * of) & ((kept >= _VERIFIED) | (kept == of)))[readings.marker_of]
+    return scene, np.asarray(good)
+
+
+def _near(problem: LeastSquares, scene: Scene, limit: float) -> BoolArray:
+    """Readings (2, N) within a limit, px."""
+    near = np.linalg.norm(problem.residual(scene), axis=2) <= limit
+    return np.asarray(problem.readings.seen & near)
 
 
 def _degrees_of_freedom(problem: LeastSquares, scene: Scene, used: BoolArray) -> int:
@@ -334,7 +406,7 @@ def solve(search: Search, expected: Expected, nominal: Nominal | None) -> tuple[
     problem, found = search.problem, None
     scene = nominal.scene(problem.readings, problem.q_reference)
     pixels, depth = problem.pixels(scene)
-    if np.isfinite(pixels).all() and _sides(depth)[1][problem.readings.seen].all():
+    if np.isfinite(pixels).all() and _sides(depth, problem.readings.seen)[1][problem.readings.seen].all():
         found = fit_from(problem, scene, search.epipolar)
     if found is not None:
         explained = with_joint_noise(found, expected, search.joint_noise)
@@ -364,8 +436,10 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
 
     Raises Misfit if no start leads anywhere; WorkFailed if too little was seen to start from.
     """
-    problem, epipolar = search.problem, search.epipolar
-    readings = problem.readings
+    whole, epipolar = search.problem, search.epipolar
+    few = carrying(whole.readings, epipolar.noise_px, search.rng)
+    problem = whole if few.all() else LeastSquares.of(whole.readings.of_markers(few), whole.q_reference)
+    search, readings = dataclasses.replace(search, problem=problem), problem.readings
     best: Solution | None = None
     trusted = np.ones(len(readings.q), dtype=bool)
     levels: list[float] = []
@@ -382,8 +456,11 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
                     return best
                 continue
             levels.append(level)
-            hopeful = epipolar if search.joint_noise == 0.0 else None
-            found = fit_inliers(problem, scene, level / RAYLEIGH, hopeful)
+            hopeless = _HOPELESS if search.joint_noise == 0.0 else np.inf
+            M = np.full((len(few), 4), np.nan)
+            M[few] = scene.M
+            scene = dataclasses.replace(scene, M=M)
+            found = fit_inliers(whole, scene, level / RAYLEIGH, epipolar.noise_px, hopeless=hopeless)
             if found is None:
                 continue
             if best is None or found.typical_px < best.typical_px:

@@ -234,6 +234,7 @@ def _require_joints_seen(solution: Solution, sigma_px: float) -> FloatArray:
 # Readings of a joint this near, rad or m, are one: a robot that holds a joint still reads it with jitter.
 _SAME_JOINT = 1e-3
 _LEAST_FOLDS = 2
+_LEAST_READINGS = 4  # of a marker in the other poses, for it to be predicted
 _OPEN = "the other poses do not determine the robot"
 
 
@@ -336,7 +337,7 @@ def _predicted(
     """
     whole, q_reference = solution.problem.readings, solution.problem.q_reference
     training = whole.of_poses(~held_out)
-    known = training.count_of(training.seen) > 0
+    known = training.count_of(training.seen) >= _LEAST_READINGS
     lens = solution.scene.lens is not None
     tau = solution.problem.tau
     problem = LeastSquares.of(training.of_markers(known), q_reference, lens).with_noise(tau)

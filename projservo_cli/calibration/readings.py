@@ -148,6 +148,12 @@ class Readings:
         return np.asarray(self.q[row].copy())
 
 
+def per_marker(marker_of: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """Sums (m, …) over the sightings of each marker of values (N, …)."""
+    sums = [np.bincount(marker_of, column, count) for column in values.reshape(len(values), -1).T]
+    return np.stack(sums, axis=1).astype(np.float64).reshape(count, *values.shape[1:])
+
+
 def _require_shapes(observation: Observation) -> None:
     """Refuse an observation whose arrays do not fit each other, naming the array and its shape."""
     if observation.q.ndim != 2:

@@ -10,9 +10,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix
-from projservo_cli.calibration.epipolar import Epipolar, ImageFrame, metric_guesses
+from projservo_cli.calibration.epipolar import (
+    Epipolar,
+    ImageFrame,
+    log_distances,
+    marker_pairs,
+    metric_guesses,
+)
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.readings import MAD, SAME_READING, Readings
+from projservo_cli.calibration.readings import MAD, SAME_READING, Readings, per_marker
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
     PRISMATIC,
@@ -42,19 +48,61 @@ class Search:
 
 # Shared markers that carry an alignment: four resist one wrong marker, three are the least.
 _SAFE, _LEAST = 4, 3
-_ROUNDS = 8
+_ROUNDS, _TRIPLES = 8, 60
+# Markers that scatter so much more than most are not of the body; poses so full may be the first.
+_LOOSE, _FULL = 6.0, 0.8
+
+
+# Sightings by both views wanted at each pose of markers to start from; markers below which all are taken.
+_WANTED, _FEW = 25, 40
+# Motion in the images below which a marker stands still: in units of the noise, and of that of most markers.
+_STILL, _STILL_SHARE = 6.0, 0.05
+
+
+def still(readings: Readings, noise_px: float) -> BoolArray:
+    """Which markers (m,) move in no image, as what is no part of the robot."""
+    move = np.zeros((readings.marker.size, 2))
+    for v in (0, 1):
+        rows = np.flatnonzero(readings.seen[v])
+        low, high = np.full((2, readings.marker.size, 2), [[[np.inf]], [[-np.inf]]])
+        np.minimum.at(low, readings.marker_of[rows], readings.pixels[v, rows])
+        np.maximum.at(high, readings.marker_of[rows], readings.pixels[v, rows])
+        move[:, v] = np.where(np.isfinite(low), high - low, 0.0).max(axis=1)
+    moved = move.max(axis=1)
+    often = readings.count_of(readings.seen) > 2
+    limit = max(_STILL * noise_px, _STILL_SHARE * float(np.percentile(moved, 75)))
+    return np.asarray(often & (moved <= limit))
+
+
+def carrying(readings: Readings, noise_px: float, rng: np.random.Generator) -> BoolArray:
+    """Markers (m,) to start from: moving ones, long seen, and no more than each pose needs."""
+    m, both = readings.marker.size, readings.both
+    moving = ~still(readings, noise_px)
+    if m <= _FEW:
+        return moving if moving.sum() >= _WANTED else np.ones(m, dtype=bool)
+    rows = np.flatnonzero(both)
+    count = np.bincount(readings.marker_of[rows], minlength=m)
+    edge = np.cumsum(count) - count
+    lack = np.full(len(readings.q), _WANTED)
+    chosen = np.zeros(m, dtype=bool)
+    for j in np.lexsort((rng.random(m), -np.minimum(count, np.median(count)), ~moving)):
+        poses = readings.pose_of[rows[edge[j] : edge[j] + count[j]]]
+        if count[j] > 1 and (lack[poses] > 0).any():
+            chosen[j] = True
+            lack[poses] -= 1
+    return chosen
 
 
 @dataclass(frozen=True, eq=False)
 class _Alignment:
     """The body in its own frame and its rigid motion to each pose."""
 
-    body: FloatArray  # (m, 3) markers, NaN where never merged
+    body: FloatArray  # (m, 3) markers, NaN where never merged, or not rigid
     R: FloatArray  # (K, 3, 3) rotations from the body to the pose
     merged: BoolArray  # (K,) poses whose rotation is known
 
 
-def _merged(reconstructed: FloatArray, readings: Readings) -> _Alignment:
+def _merged(reconstructed: FloatArray, readings: Readings, rng: np.random.Generator) -> _Alignment:
     """Body and poses from the points (N, 3) that both cameras saw, grown from the fullest pose."""
     K, both = len(readings.q), readings.both
     points = np.zeros((K, readings.marker.size, 3))
@@ -62,7 +110,7 @@ def _merged(reconstructed: FloatArray, readings: Readings) -> _Alignment:
     where = readings.pose_of[both], readings.marker_of[both]
     points[where], seen[where] = reconstructed, True
     R, t = np.tile(np.eye(3), (K, 1, 1)), np.zeros((K, 3))
-    seed = _seed(points, seen)
+    seed = _seed(reconstructed, *where)
     body = np.where(seen[seed][:, None], points[seed], np.nan)
     found = np.arange(K) == seed
     for shared in (_SAFE, _LEAST, _LEAST):
@@ -71,31 +119,42 @@ def _merged(reconstructed: FloatArray, readings: Readings) -> _Alignment:
             known = np.isfinite(body[:, 0])
             usable = seen & known
             rows = usable.sum(axis=1) >= max(min(shared, int(known.sum())), _LEAST)
+            for k in np.flatnonzero(rows & ~found):
+                R[k], t[k] = _consensus(body[usable[k]], points[k, usable[k]], rng)
             if rows.any():
                 filled = np.where(known[:, None], body, 0.0)
-                R[rows], t[rows] = _robust_align(filled, points[rows], usable[rows])
+                R[rows], t[rows] = _robust_align(filled, points[rows], usable[rows], (R[rows], t[rows]))
             grown = bool((rows & ~found).any())
             found |= rows
             local = np.einsum("kji,kmj->kmi", R, points - t[:, None])
-            here = seen & found[:, None]
-            body = np.full_like(body, np.nan)
-            for j in np.flatnonzero(here.any(axis=0)):
-                body[j] = np.median(local[here[:, j], j], axis=0)
+            body = _rigid(np.where((seen & found[:, None])[..., None], local, np.nan))
             grown |= int(np.isfinite(body[:, 0]).sum()) > int(known.sum())
     return _Alignment(body, R, found)
 
 
+def _rigid(local: FloatArray) -> FloatArray:
+    """Median places (m, 3) of what poses show (K, m, 3), NaN where they scatter much more than most."""
+    body = np.full(local.shape[1:], np.nan)
+    some = np.isfinite(local[..., 0]).any(axis=0)
+    body[some] = np.nanmedian(local[:, some], axis=0)
+    scatter = np.full(len(body), np.nan)
+    scatter[some] = np.nanmedian(np.linalg.norm(local[:, some] - body[some], axis=2), axis=0)
+    twice = np.isfinite(local[..., 0]).sum(axis=0) > 1
+    if twice.any():
+        body[twice & (scatter > _LOOSE * np.median(scatter[twice]))] = np.nan
+    return body
+
+
 def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rigid motions (K, 3, 3), (K, 3) of least squares of a body (m, 3) to points (K, m, 3), weights (K, m).
+    """Rigid motions (K, 3, 3), (K, 3) of bodies (…, m, 3) to points (K, m, 3) of weights (K, m).
 
     Source: S. Umeyama, "Least-squares estimation of transformation parameters between two point
     patterns", PAMI 13(4), 1991. All poses at once: ``Rotation.align_vectors`` takes them one by one.
     """
-    total = weight.sum(axis=1)[:, None]
-    center_body = (weight @ body) / total
-    center_points = np.einsum("km,kmi->ki", weight, points) / total
-    moments = np.einsum(
-        "km,kmi,kmj->kij", weight, points - center_points[:, None], body[None] - center_body[:, None]
+    share = (weight / weight.sum(axis=1)[:, None])[:, None]
+    center_body, center_points = (share @ body)[:, 0], (share @ points)[:, 0]
+    moments = np.swapaxes(points - center_points[:, None], 1, 2) @ (
+        weight[..., None] * (body - center_body[:, None])
     )
     U, _, Vt = np.linalg.svd(moments)
     U[:, :, 2] *= np.sign(np.linalg.det(U) * np.linalg.det(Vt))[:, None]
@@ -103,9 +162,26 @@ def _align(body: FloatArray, points: FloatArray, weight: FloatArray) -> tuple[Fl
     return R, center_points - np.einsum("kij,kj->ki", R, center_body)
 
 
-def _robust_align(body: FloatArray, points: FloatArray, seen: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """``_align`` under a Cauchy loss by reweighting, its scale the median residual of all poses."""
-    R, t = _align(body, points, seen.astype(np.float64))
+def _consensus(
+    body: FloatArray, points: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """The rigid motion of three of the places (m, 3) that leaves the least median distance of points (m, 3).
+
+    P. J. Rousseeuw, "Least median of squares regression", JASA 79, 1984: half of them may be wrong.
+    """
+    m = len(body)
+    three = np.argsort(rng.random((_TRIPLES, m)), axis=1)[:, :_LEAST]
+    R, t = _align(body[three], points[three], np.ones(three.shape))
+    distance = np.sort(np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2), axis=1)
+    best = int(np.argmin(distance[:, min(max(m // 2, _LEAST + 1), m - 1)]))
+    return R[best], t[best]
+
+
+def _robust_align(
+    body: FloatArray, points: FloatArray, seen: BoolArray, motion: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """``_align`` under a Cauchy loss by reweighting from some motions, its scale the median residual."""
+    R, t = motion
     for _ in range(_ROUNDS):
         residual = np.linalg.norm(points - body @ np.swapaxes(R, 1, 2) - t[:, None], axis=2)
         scale = max(float(np.median(residual[seen])) / MAD, 1e-12)
@@ -113,17 +189,17 @@ def _robust_align(body: FloatArray, points: FloatArray, seen: BoolArray) -> tupl
     return R, t
 
 
-def _seed(points: FloatArray, seen: BoolArray) -> int:
-    """The fullest pose whose markers lie most nearly as in the other poses that show them."""
-    full = np.flatnonzero(seen.sum(axis=1) == seen.sum(axis=1).max())
-    distance = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
-    together = seen[:, :, None] & seen[:, None]
-    # A pair that is never seen together has a distance of zero, for it is nowhere compared.
-    masked = np.where(together | ~together.any(axis=0), np.where(together, distance, 0.0), np.nan)
-    typical = np.array(np.nanmedian(masked, axis=0))
-    others = ~np.eye(seen.shape[1], dtype=bool)
-    deviation = [float(np.median(np.abs(distance[k] - typical)[together[k] & others])) for k in full]
-    return int(full[np.argmin(deviation)])
+def _seed(points: FloatArray, pose_of: IntArray, marker_of: IntArray) -> int:
+    """Of the full poses that whose points (N, 3) lie most nearly as in the other poses that show them."""
+    pairs = marker_pairs(pose_of, marker_of)
+    deviation, compared = log_distances(points, pairs)
+    count = np.bincount(pose_of)
+    full = np.flatnonzero(count >= _FULL * count.max())
+    at = pose_of[pairs[0]]
+    typical = [
+        np.median(deviation[(at == k) & compared]) if (compared & (at == k)).any() else np.inf for k in full
+    ]
+    return int(full[np.argmin(typical)])
 
 
 _STARTS, _TURNS, _MOST_SETS = 20, 60, 3
@@ -276,49 +352,62 @@ _RIDGE = 0.03
 _LEAST_SCALE = 1e-3
 
 
-def _place(w: FloatArray, guess: tuple[FloatArray, FloatArray], readings: Readings, q: FloatArray) -> Scene:
+def _place(
+    w: FloatArray, guess: tuple[FloatArray, FloatArray], readings: Readings, q: FloatArray, rigid: BoolArray
+) -> Scene:
     """Axis points, directions of translation and markers, linear in the points once all axes are known.
 
     A point of marker j at pose k is R̄_n X_j + Σ R̄_{i−1} ((I − R_i) p_i, or q_i v_i if prismatic):
-    least squares under a Cauchy loss with a small ridge. Translations get one common speed. Joint values
-    (K, n) are from the reference; the readings of both views are those of the guess.
+    least squares under a Cauchy loss with a small ridge, from the markers that are rigid (m,). Turned back by
+    R̄_n, the unknown X_j of a marker is the mean of what the rest leaves. Translations get one common speed.
+    Joint values (K, n) are from the reference; the readings of both views are those of the guess.
     """
     (P, points), prismatic = guess, readings.prismatic
     n, m = w.shape[0], readings.marker.size
     pose_of, marker_of = readings.pose_of[readings.both], readings.marker_of[readings.both]
     chain = _chain(w, q, prismatic)
-    A = np.zeros((len(points), 3, n + m, 3))
-    for i in range(n):
-        by_joint = chain[i] * q[:, i, None, None] if prismatic[i] else chain[i] - chain[i + 1]
-        A[:, :, i] = by_joint[pose_of]
-    A[np.arange(len(points)), :, n + marker_of] = chain[n][pose_of]
+    back = np.swapaxes(chain[n], 1, 2)
+    by_joint = [
+        back @ (chain[i] * q[:, i, None, None] if slides else chain[i] - chain[i + 1])
+        for i, slides in enumerate(prismatic)
+    ]
+    rows = np.concatenate(by_joint, axis=2)[pose_of]
     # Axis points and markers are sought from the centre of the points; R̄_n 0 and R̄_i p vanish there
     # only after the centre's own motion is taken out.
-    turns = np.r_[~prismatic, np.zeros(m, dtype=bool)]
-    shift = np.where(np.r_[~prismatic, np.ones(m, dtype=bool)][:, None], np.median(points, axis=0), 0.0)
-    ridge = np.where(turns[:, None], _RIDGE**2, np.zeros((1, 3)))
-    rows = A.reshape(3 * len(points), -1)
-    x = _robust_solve(rows, points.ravel() - rows @ shift.ravel(), ridge.ravel()).reshape(n + m, 3) + shift
+    center = np.median(points, axis=0)
+    shift = np.where(prismatic[:, None], 0.0, center)
+    target = (back[pose_of] @ points[..., None])[..., 0] - center - rows @ shift.ravel()
+    ridge = np.where(prismatic, 0.0, _RIDGE**2).repeat(3) + 1e-9 * len(points)
+    places, X = _robust_solve(rows, target, ridge, marker_of, rigid)
+    places, X = places.reshape(n, 3) + shift, X + center
     H_hat = np.zeros((n, 4, 4))
     H_hat[~prismatic, :3, :3] = cross_matrix(w[~prismatic])
-    H_hat[~prismatic, :3, 3] = -np.cross(w, x[:n])[~prismatic]
-    length = np.linalg.norm(x[:n], axis=1)[prismatic]
+    H_hat[~prismatic, :3, 3] = -np.cross(w, places)[~prismatic]
+    length = np.linalg.norm(places, axis=1)[prismatic]
     if prismatic.any():
-        H_hat[prismatic, :3, 3] = x[:n][prismatic] / length[:, None] * np.median(length)
-    return Scene(P, H_hat, prismatic, np.hstack([x[n:], np.ones((m, 1))]))
+        H_hat[prismatic, :3, 3] = places[prismatic] / length[:, None] * np.median(length)
+    return Scene(P, H_hat, prismatic, np.hstack([X, np.ones((m, 1))]))
 
 
-def _robust_solve(rows: FloatArray, target: FloatArray, ridge: FloatArray) -> FloatArray:
-    """Least squares of three equations a point under a Cauchy loss by reweighting."""
-    weight = np.ones(target.size // 3)
+def _robust_solve(
+    rows: FloatArray, target: FloatArray, ridge: FloatArray, marker_of: IntArray, trusted: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Least squares of three equations a point under a Cauchy loss by reweighting: x, and markers (m, 3).
+
+    The residual target − rows x (N, 3) less the marker's own place; from the markers that are trusted (m,).
+    """
+    whole = np.concatenate([rows, target[..., None]], axis=2)
+    weight = trusted[marker_of].astype(np.float64)
     for _ in range(10):
-        W = np.repeat(weight, 3)
-        A = (rows.T * W) @ rows + np.diag(ridge + 1e-9 * len(weight))
-        x = np.linalg.solve(A, (rows.T * W) @ target)
-        residual = np.linalg.norm((target - rows @ x).reshape(-1, 3), axis=1)
+        sums = np.maximum(np.bincount(marker_of, weight, len(trusted)), 1e-12)[:, None, None]
+        means = per_marker(marker_of, weight[:, None, None] * whole, len(trusted)) / sums
+        left = whole - means[marker_of]
+        A = np.tensordot(left * weight[:, None, None], left, axes=((0, 1), (0, 1)))
+        x = np.linalg.solve(A[:-1, :-1] + np.diag(ridge), A[:-1, -1])
+        residual = np.linalg.norm(left[..., -1] - left[..., :-1] @ x, axis=1)
         scale = max(float(np.median(residual)) / MAD, _LEAST_SCALE)
         weight = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
-    return np.asarray(x)
+    return np.asarray(x), np.asarray(means[..., -1] - means[..., :-1] @ x)
 
 
 def starts(search: Search, readings: Readings, factors: tuple[float, ...] = (1.0,)) -> Iterator[Scene]:
@@ -328,14 +417,15 @@ def starts(search: Search, readings: Readings, factors: tuple[float, ...] = (1.0
     """
     for factor in factors:
         for guess in metric_guesses(search.epipolar, readings, search.frame, factor):
-            alignment = _merged(guess[1], readings)
-            if int(np.isfinite(alignment.body[:, 0]).sum()) < _LEAST:
+            alignment = _merged(guess[1], readings, search.rng)
+            rigid = np.isfinite(alignment.body[:, 0])
+            if int(rigid.sum()) < _LEAST:
                 raise WorkFailed(
                     "no three markers are seen together by both cameras: more must be seen at once"
                 )
             q = search.problem.q
             for w in _rotation_axes(alignment, q, readings.prismatic, search.rng):
-                scene = _place(w, guess, readings, q)
+                scene = _place(w, guess, readings, q, rigid)
                 if np.isfinite(scene.H_hat).all() and np.isfinite(scene.M).all():
                     yield scene
 

@@ -41,6 +41,7 @@ def left_out(mistaken, calibration):
         # An exchange of two shows in both and is told once.
         out[pose, numbers[1]] |= mistaken.kind[pose, numbers[1]] == 1
     out[calibration.suspect[:, 0]] = True
+    out[calibration.lost_poses] = True
     gone = np.setdiff1d(mistaken.observation.marker, calibration.marker)
     out[:, gone] = True
     return out & (mistaken.kind >= 0)
@@ -100,5 +101,9 @@ if __name__ == "__main__":
     given = sys.argv[1:]
     main(
         *(of(text) for of, text in zip((int, float), given, strict=False)),
-        *([given[2:]] if given[2:] else []),
+        *(
+            [[name.replace("_", " ") for name in given[2:]]]
+            if [name.replace("_", " ") for name in given[2:]]
+            else []
+        ),
     )
