@@ -308,8 +308,8 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     by_pose = np.stack([np.bincount(readings.pose_of, score)[poses] for score in scores])
     total = by_pose.sum(axis=1)
     flat = columns.reshape(d, -1)
-    share = float(total @ np.linalg.solve(flat @ flat.T, total)) / max(solution.chi2, _LEAST_CHI2)
-    square = float(total @ np.linalg.solve(K * np.cov(by_pose), total))
+    share = float(total @ np.linalg.lstsq(flat @ flat.T, total)[0]) / max(solution.chi2, _LEAST_CHI2)
+    square = float(total @ np.linalg.lstsq(K * np.cov(by_pose), total)[0])
     chance = float(fdtri(d, K - d, 1.0 - _TAIL)) * d * (K - 1) / (K - d)
     return share if square > chance and share >= _LEAST_SHARE else 0.0
 

@@ -320,7 +320,8 @@ def _within(
     good = _near(problem, rested, limit)
     many = np.mean((readings.seen & ~good).any(axis=0)) > _MANY and middle <= _RIG * rig_px
     if many:
-        sigma = min(sigma, middle)
+        # What slips along both views alike shows in this noise and not in that of the rig.
+        sigma = min(sigma, middle if middle > WARN_RATIO * rig_px else min(middle, rig_px))
         doubtful = readings.count_of(readings.seen & ~good) > 0
         M = Tracks(problem, rested).placed(doubtful, sigma)
         rested = dataclasses.replace(rested, M=M)

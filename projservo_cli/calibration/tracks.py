@@ -58,7 +58,9 @@ class Tracks:
         rows = np.flatnonzero(wanted[readings.marker_of])
         best = np.full(len(M), np.inf)
         for number in range(-1, _PLACES):
-            places = self._shown(number, wanted) if number >= 0 else M.copy()
+            places = self._shown(max(number, 0), wanted)
+            if number < 0:  # where it is, else among the others, if no sighting shows a place
+                places = np.where(np.isfinite(M), M, _middle(np.concatenate([M, places])))
             places, loss = self._improved(places, rows, sigma)
             better = loss < best
             M[better], best[better] = places[better], loss[better]
@@ -146,6 +148,12 @@ class Tracks:
                 break
             used = new
         return np.hstack([M, np.ones((len(M), 1))]), used
+
+
+def _middle(places: FloatArray) -> FloatArray:
+    """Median (3,) of the places (m, 3) that are known."""
+    known = places[np.isfinite(places[:, 0])]
+    return np.median(known, axis=0) if len(known) else np.zeros(3)
 
 
 def _slipping(square: FloatArray, seen: BoolArray, sigma: float) -> bool:
