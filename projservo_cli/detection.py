@@ -386,6 +386,8 @@ class TagFinder:
         self._tags = tags = aruco.getPredefinedDictionary(getattr(aruco, name))
         parameters = aruco.DetectorParameters()
         parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+        # Tags in the shade stand before brighter ground: windows of more sizes, and less contrast.
+        parameters.adaptiveThreshWinSizeStep, parameters.adaptiveThreshConstant = 4, 5
         self._detector = aruco.ArucoDetector(tags, parameters)
         self._cells = int(tags.markerSize) + _BORDER
 

@@ -31,6 +31,8 @@ _STRAIGHT = 1.0 / 8.0
 # Much of what a finder states of a corner is the same while the view of it is: it does not average away, and
 # of many corners some are off by so many deviations.
 _LASTING_CORNER = 2.0
+# Where a finder states deviations, a marker that seems to have moved by less, px, is an edge taken for another.
+_LEAST_MOVED_PX = 1.0
 # A corner that is so many times less certain than most is not tested: its error is the finder's, and lasts.
 _VAGUE = 10.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is said.
@@ -176,7 +178,7 @@ class Innovation:
         self._pending: list[tuple[BoolArray, _Sums]] = []
         self._readings: list[FloatArray] = []
         self._last: _Frame | None = None
-        self._doubtful = 0
+        self._doubtful, self._least_moved = 0, 0.0
         self._amounts: list[tuple[int, float]] = []
         self._waiting: tuple[list[_Frame], list[_Frame]] = ([], [])
         self._reached = np.full(2, -np.inf)
@@ -220,7 +222,7 @@ class Innovation:
             seen = np.isfinite(images[..., 0])
             vague = noise > _VAGUE * np.median(noise[seen]) if seen.any() else ~seen
             images = np.where(vague[..., None], np.nan, images)
-            self._floor = max(self._floor, _LASTING_CORNER)
+            self._floor, self._least_moved = max(self._floor, _LASTING_CORNER), _LEAST_MOVED_PX
         self._first = q[0] if self._first is None else self._first
         if self._at_rest:
             self._at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
@@ -449,6 +451,10 @@ class Innovation:
         self._doubtful += 1
         best, *others = sorted(blamed, key=lambda blame: -blame.score)
         who = self._causes[best.causes[0]][:2]
+        if who[0] == "marker" and self._changed(best, look) < self._least_moved:
+            self._doubtful = 0
+            self._pending.clear()
+            return ""
         others = [blame for blame in others if self._causes[blame.causes[0]][:2] != who]
         clear = not others or best.score - others[0].score >= _CLEAR
         clear &= self._is_steady(best)

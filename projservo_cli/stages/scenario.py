@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config
@@ -38,6 +39,9 @@ from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import Shown
 
 _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera sees
+# Weight of a marker in a fit that was put where others tell it to be. Starts from which joints that show a
+# goal are sought; how near they must come, and how far off it is to be behind a camera, px.
+_GUESSED, _TRIALS, _NEAR_PX, _FAR_PX = 1e-3, 60, 1.0, 1e3
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
 TRIAL_POSES, TAUGHT_NOISE, START_FRAMES, GOAL_FRAMES = range(6, 10)
@@ -183,37 +187,73 @@ class Scenario:
     def _rendered(self, seed: int) -> Shown:
         """Start and goal as rendered frames show them; images of the goal that are given stay as they are.
 
-        The body is fitted to both by the deviations of their pixels, whichever is the larger.
+        The body is fitted to both by the deviations of their pixels, whichever is the larger. Markers of the
+        face that frames do not show are put where those that they show tell them to be.
         """
-        start, sigma = self._frames("task.start", self.exact.q_start, (seed, START_FRAMES))
-        shown = self.exact._replace(s_start=start)
-        if len(self.q_shown):
-            goal, there = self._frames("task.goal", self.q_shown[0], (seed, GOAL_FRAMES))
-            shown = shown._replace(s_star=goal)
+        assert self.config.task is not None
+        numbers, shown, given = self.numbers, self.exact, self.config.task.goal.images
+        start, sigma = self._frames(shown.q_start, (seed, START_FRAMES))
+        if given is None:
+            goal, there = self._frames(self.q_shown[0], (seed, GOAL_FRAMES))
         else:
-            assert self.config.task is not None
-            assert self.config.task.goal.images is not None
-            face = self.numbers[: self.m]
-            there = np.array(self.config.task.goal.images.deviations(self.numbers, face))
+            goal, there = shown.s_star, np.array(given.deviations(numbers, numbers[: self.m]))
+        sigma = np.fmax(sigma, there)
+        start = self._with_face("task.start", start, shown.q_start)
+        shown = shown._replace(s_start=start, s_star=self._with_face("task.goal", goal, None))
         if not len(shown.body.M):
             return shown
-        sigma = np.fmax(sigma, there)
-        return shown._replace(body=shown.body._replace(weight=weights(sigma, sigma[..., None])))
+        weight = weights(sigma, sigma[..., None])
+        weight[np.isnan(sigma)] = _GUESSED
+        return shown._replace(body=shown.body._replace(weight=weight))
 
-    def _frames(self, key: str, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """Pixels (2, b, 2) in rendered frames at the joints (n,) of a key, and their deviations (2, b).
-
-        Raises WorkFailed without the face.
-        """
+    def _frames(self, q: FloatArray, drawn: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+        """Pixels (2, b, 2) in rendered frames at joints (n,), rad or m, and their deviations (2, b)."""
         assert self.truth is not None
         which = [self.truth.number.index(number) for number in self.numbers]
-        s, sigma = (part[:, which] for part in shown_in_frames(self.config, self.truth, q, drawn))
-        for view, k in np.argwhere(np.isnan(s[:, : self.m, 0])).tolist():
-            raise WorkFailed(
-                f"{key}: the {VIEWS[view]} camera does not see marker {self.numbers[k]} of the face: turn it "
-                "towards both cameras, or bring it nearer"
-            )
-        return np.ascontiguousarray(s), sigma
+        s, sigma = shown_in_frames(self.config, self.truth, q, drawn)
+        return np.ascontiguousarray(s[:, which]), sigma[:, which]
+
+    def _with_face(self, key: str, s: FloatArray, q: FloatArray | None) -> FloatArray:
+        """Pixels (2, b, 2) with a whole face, at joints (n,) or, for None, at those that they show.
+
+        Raises WorkFailed where too little of the tool is seen.
+        """
+        unseen = np.isnan(s[..., 0])
+        unseen[:, self.m :] = False
+        if not unseen.any():
+            return s
+        view, k = np.argwhere(unseen)[0]
+        known = self.calibration
+        if known is not None and np.isfinite(s[..., 0]).sum(axis=1).min() > CORNERS - 1:
+            q = _joints_showing(known, self.numbers, s, self.exact.q_start) if q is None else q
+            if q is not None:
+                there = predict(known, q[None])[0][:, known.places(self.numbers)]
+                return np.ascontiguousarray(np.where(unseen[..., None], there, s))
+        raise WorkFailed(
+            f"{key}: the {VIEWS[view]} camera does not see marker {self.numbers[k]} of the face, and too "
+            "little else of the tool: turn it towards both cameras, or bring it nearer"
+        )
+
+
+def _joints_showing(
+    calibration: Calibration, numbers: Sequence[int], s: FloatArray, q_start: FloatArray
+) -> FloatArray | None:
+    """Joints (n,) at which markers are predicted where images (2, b, 2) show them, NaN where unseen.
+
+    Least squares from joints (n,) and from others about them; None where no start leads near enough.
+    """
+    places, seen, rng = calibration.places(numbers), np.isfinite(s), np.random.default_rng(0)
+
+    def off(q: FloatArray) -> FloatArray:
+        """How far predictions are off, px; far where they are behind a camera."""
+        return np.asarray(np.nan_to_num(predict(calibration, q[None])[0][:, places] - s, nan=_FAR_PX)[seen])
+
+    for trial in range(_TRIALS):
+        q = q_start + (trial > 0) * rng.uniform(-np.pi, np.pi, len(q_start))
+        found = least_squares(off, q, loss="soft_l1", f_scale=_NEAR_PX)
+        if np.median(np.abs(off(found.x))) <= _NEAR_PX:
+            return np.asarray(found.x)
+    return None
 
 
 def scenario_of(
