@@ -1,5 +1,6 @@
 """Files of which a reader never meets half, texts read with care, and folders that one process works in."""
 
+import io
 import os
 import re
 import secrets
@@ -11,6 +12,7 @@ from pathlib import Path
 from projservo_cli.records import InputError
 
 _LOCK = ".lock"
+_LONGEST = 10_000_000  # bytes of a line that is a line
 _TEMPORARY = re.compile(r"\..+\.([0-9]+)\.[0-9a-f]{8}\.part")  # with the number of the process
 
 
@@ -62,6 +64,31 @@ def text_of(path: Path | str, expected: str, most: int) -> str:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise InputError(f"{path}:{line}: not UTF-8 text; expected {expected}") from error
+
+
+def lines_of(path: Path | str, expected: str, most: int) -> Iterator[str]:
+    """The lines of a file like that of ``text_of``, with their ends, read one after the other.
+
+    Raises InputError, with the line, where there is none, or one has a NUL byte or no end.
+    """
+    number, size = 1, 0
+    try:
+        with Path(path).open("rb") as file:
+            while content := file.readline(_LONGEST + 1):
+                size += len(content)
+                if size > most:
+                    raise InputError(f"{path}: larger than {most // 1_000_000} MB; expected {expected}")
+                if len(content) > _LONGEST:
+                    raise InputError(f"{path}:{number}: a line without an end; expected {expected}")
+                if b"\0" in content:
+                    raise InputError(f"{path}:{number}: not a text file (it has a NUL byte)")
+                text = content.decode("utf-8-sig" if number == 1 else "utf-8")
+                yield from io.StringIO(text, newline="")
+                number += 1
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}; expected {expected}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}:{number}: not UTF-8 text; expected {expected}") from error
 
 
 @contextmanager

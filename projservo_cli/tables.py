@@ -11,6 +11,7 @@ import csv
 import io
 import math
 import re
+from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -20,13 +21,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from projservo_cli.files import text_of, write_whole
+from projservo_cli.files import lines_of, write_whole
 from projservo_cli.records import FloatArray, InputError, IntArray, Observation
 
 _MAX_JOINTS = 64  # as many as a configuration may have
 _MAX_COLUMNS = 10_000
-_MAX_BYTES = 100_000_000  # of a table; more would not be calibrated from
-_MAX_CELLS = 5_000_000  # poses × markers: mistyped numbers of poses must not fill the memory
+_MAX_BYTES = 1_000_000_000  # of a table; more would not be calibrated from
+_MAX_CELLS = 12_000_000  # poses × markers: mistyped numbers of poses must not fill the memory
 _TWO_TURNS = 4.0 * math.pi  # rad; no arm with stops turns a joint that far from its zero
 _PIXELS, _SIGMAS = ("u_left", "v_left", "u_right", "v_right"), ("sigma_left", "sigma_right")
 _MOVING, _TIMES = "moving", ("t_q", "t_left", "t_right")
@@ -63,39 +64,37 @@ def read_table(
     sheet = _Sheet(path, ["pose", "marker", *_PIXELS], joint_types, optional=optional)
     stated = sheet.has_both(_SIGMAS)
     readings: dict[int, tuple[int, dict[str, float | None]]] = {}
-    seen: dict[tuple[int, int], tuple[int, list[float]]] = {}  # line; pixels, then their deviations
+    lines: dict[int, dict[int, int]] = {}  # of each marker at each pose
+    rows, seen = array("q"), array("d")  # pose and marker; pixels, then their deviations
     for row in sheet.rows():
-        for u, v in (_PIXELS[:2], _PIXELS[2:]):
-            if (row[u] == "") != (row[v] == ""):
-                raise InputError(f"{row.where}: one of {u}, {v} is empty; give both or neither")
         pose, marker = row.integer("pose"), row.integer("marker")
+        seen.extend(row.sighting(stated))
+        rows.extend((pose, marker))
         of_pose = {name: row.number(name) for name in sheet.joints} | row.moment()
-        pixels = [row.number(name) if row[name] else math.nan for name in _PIXELS]
-        pixels += [
-            row.deviation(name) if stated and row[u] else math.nan
-            for name, u in zip(_SIGMAS, _PIXELS[::2], strict=True)
-        ]
         line, first = readings.setdefault(pose, (row.line, of_pose))
-        for name, value in of_pose.items():
-            if value != first[name]:
-                raise InputError(
-                    f"{row.where}: {name} of pose {pose} is {value!r}, but {first[name]!r} in line {line}; "
-                    "a pose has one joint reading"
-                )
-        line, _ = seen.setdefault((pose, marker), (row.line, pixels))
-        if line != row.line:
+        if of_pose != first:
+            name = next(name for name, value in of_pose.items() if value != first[name])
+            raise InputError(
+                f"{row.where}: {name} of pose {pose} is {of_pose[name]!r}, but {first[name]!r} in line "
+                f"{line}; a pose has one joint reading"
+            )
+        if (line := lines.setdefault(pose, {}).setdefault(marker, row.line)) != row.line:
             raise InputError(f"{row.where}: marker {marker} at pose {pose} is already in line {line}")
-    if not seen:
+    if not rows:
         raise InputError(f"{sheet.file}: the table has a header but no rows; nothing was observed")
+    del lines
+    of_row = np.frombuffer(rows, dtype=np.int64).reshape(-1, 2)
     poses = {pose: k for k, pose in enumerate(readings)}
-    markers = {marker: j for j, marker in enumerate(sorted({marker for _, marker in seen}))}
+    markers, j = np.unique(of_row[:, 1], return_inverse=True)
     if len(poses) * len(markers) > _MAX_CELLS:
         raise InputError(f"{sheet.file}: {len(poses)} poses × {len(markers)} markers are too many to hold")
+    k = np.array([poses[pose] for pose in of_row[:, 0].tolist()])
+    of_seen = np.frombuffer(seen).reshape(len(of_row), -1)
     images = np.full((len(poses), 2, len(markers), 2), np.nan)
-    sigma = np.full(images.shape[:3], np.nan)
-    for (pose, marker), (_, pixels) in seen.items():
-        images[poses[pose], :, markers[marker]] = np.reshape(pixels[:4], (2, 2))
-        sigma[poses[pose], :, markers[marker]] = pixels[4:]
+    images[k, :, j] = of_seen[:, :4].reshape(-1, 2, 2)
+    sigma = np.full(images.shape[:3], np.nan) if stated else None
+    if sigma is not None:
+        sigma[k, :, j] = of_seen[:, 4:]
     numbers, values = np.array([*poses], dtype=np.int64), [of_pose for _, of_pose in readings.values()]
     # (K, columns); what is not known becomes NaN
     q_read, moving, times = (
@@ -104,13 +103,13 @@ def read_table(
     )
     return Observation(
         numbers,
-        np.array([*markers], dtype=np.int64),
+        markers,
         sheet.in_radians(numbers, q_read, joint_unit),
         images,
         moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
         times[:, 0] if np.isfinite(times[:, 0]).any() else None,
         times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
-        sigma if stated else None,
+        sigma,
     )
 
 
@@ -214,10 +213,27 @@ def _shown(value: Any) -> str:
 
 
 class _Row(dict[str, str]):
-    """Cells of one line by the names of their columns; ``where`` is the file with that line."""
+    """Cells of one line of a file by the names of their columns."""
 
-    where: str
+    file: str
     line: int
+
+    @property
+    def where(self) -> str:
+        """The file with the line."""
+        return f"{self.file}:{self.line}"
+
+    def sighting(self, stated: bool) -> list[float]:
+        """Pixels of both views, perhaps followed by their deviations, NaN where unseen."""
+        pixels, sigmas = [], []
+        for u, v, deviation in zip(_PIXELS[::2], _PIXELS[1::2], _SIGMAS, strict=True):
+            seen = self[u] != ""
+            if seen != (self[v] != ""):
+                raise InputError(f"{self.where}: one of {u}, {v} is empty; give both or neither")
+            pixels += [self.number(u), self.number(v)] if seen else [math.nan, math.nan]
+            if stated:
+                sigmas.append(self.deviation(deviation) if seen else math.nan)
+        return pixels + sigmas
 
     def integer(self, column: str) -> int:
         """A whole number of at most 18 digits."""
@@ -264,11 +280,7 @@ class _Sheet:
         optional: Sequence[str] = (),
     ) -> None:
         self.file = str(path)
-        text = text_of(path, "a table as UTF-8 CSV", _MAX_BYTES)
-        if "\0" in text:
-            line = text.split("\0", 1)[0].count("\n") + 1
-            raise InputError(f"{path}:{line}: not a text file (it has a NUL byte)")
-        self._reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+        self._reader = csv.reader(lines_of(path, "a table as UTF-8 CSV", _MAX_BYTES), strict=True)
         if (header := self._next()) is None:
             expected = [*needed[:2], "q1…qN", *needed[2:]]
             raise InputError(f"{self.file}: the table is empty; expected a header {','.join(expected)}")
@@ -322,7 +334,7 @@ class _Sheet:
                     "cut short or malformed"
                 )
             row = _Row({name: cells[i].strip() for name, i in self.columns.items()})
-            row.where, row.line = f"{self.file}:{line}", line
+            row.file, row.line = self.file, line
             yield row
 
     def _next(self) -> list[str] | None:

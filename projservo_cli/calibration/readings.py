@@ -82,12 +82,6 @@ class Readings:
         where = np.arange(len(q)), self.marker, pose_of, marker_of
         return Readings(q, self.prismatic, *where, pixels, weight > 0.0, weight, None)
 
-    def grid(self) -> FloatArray:
-        """Pixels (2, K, m, 2), NaN where not seen."""
-        result = np.full((2, len(self.q), self.marker.size, 2), np.nan)
-        result[:, self.pose_of, self.marker_of] = np.where(self.seen[..., None], self.pixels, np.nan)
-        return result
-
     @property
     def both(self) -> BoolArray:
         """(N,) whether both views saw the marker."""
@@ -125,13 +119,15 @@ class Readings:
     def home(self) -> int | None:
         """Row of q from which all others differ in at most one joint: the pose of single-joint trials."""
         q = self.q
-        changed = (np.abs(q[:, None] - q[None]) > SAME_READING).sum(axis=2)
-        candidates = np.flatnonzero((changed <= 1).all(axis=1))
+        candidates = np.arange(len(q))
+        for row in q:
+            changed = (np.abs(q[candidates] - row) > SAME_READING).sum(axis=1)
+            candidates = candidates[changed <= 1]
         if candidates.size == 0:
             return None
         # With trials of a single joint every row qualifies: the one in the middle moves least.
-        travel = np.abs(q[:, None] - q[None]).sum(axis=(1, 2))
-        return int(candidates[np.argmin(travel[candidates])])
+        travel = [np.abs(q[candidate] - q).sum() for candidate in candidates]
+        return int(candidates[np.argmin(travel)])
 
     def trials(self, home: int) -> list[IntArray]:
         """Rows of q in which each joint differs from the reference, an array a joint."""
@@ -334,32 +330,55 @@ def _require_moving(readings: Readings, sigma: float) -> None:
         poses[np.append(rows, home)] = True
         # A point that moves evenly along a path of length L has the variance L² / 12; noise alone has that
         # of both coordinates.
-        square = 12.0 * np.nanvar(_tracks(readings.of_poses(poses)), axis=1, ddof=1).sum(axis=1)
+        square = 12.0 * _variances(*_tracks(readings.of_poses(poses))).sum(axis=1)
         path = np.sqrt(max(float(square.mean()) - 24.0 * sigma**2, 0.0)) if square.size else np.inf
         span = float(np.ptp(readings.q[poses, i]))
         require_moved(i, span, bool(readings.prismatic[i]), path, sigma)
 
 
-def _tracks(readings: Readings) -> FloatArray:
-    """Images (L, K, 2) of each marker in each view that shows it twice or more, NaN where not seen."""
-    images = readings.grid().swapaxes(1, 2)
-    return np.asarray(images[np.isfinite(images[..., 0]).sum(axis=2) > 1])
+def _tracks(readings: Readings) -> tuple[FloatArray, IntArray]:
+    """Pixels (L, 2) of each marker in each view that shows it at least twice, and whose track (L,) it is."""
+    views = [np.flatnonzero(seen) for seen in readings.seen]
+    pixels = np.concatenate([readings.pixels[v, rows] for v, rows in enumerate(views)])
+    track = np.concatenate([2 * readings.marker_of[rows] + v for v, rows in enumerate(views)])
+    often = np.bincount(track)[track] > 1
+    return pixels[often], np.unique(track[often], return_inverse=True)[1]
+
+
+def _variances(values: FloatArray, group: IntArray) -> FloatArray:
+    """Unbiased variances (G, d) of the values (L, d) of each group, 0 to G - 1, of two or more."""
+    count = np.bincount(group)
+    mean, square = np.empty((2, count.size, values.shape[1]))
+    for i, column in enumerate(values.T):
+        mean[:, i] = np.bincount(group, column) / count
+        square[:, i] = np.bincount(group, (column - mean[group, i]) ** 2) / (count - 1)
+    return square
+
+
+def _medians(values: FloatArray, group: IntArray) -> FloatArray:
+    """Medians (G, d) of the values (L, d) of each group, 0 to G - 1, none of them empty."""
+    count = np.bincount(group)
+    first = np.cumsum(count) - count
+    ordered = np.stack([column[np.lexsort((column, group))] for column in values.T], axis=1)
+    return np.asarray(0.5 * (ordered[first + (count - 1) // 2] + ordered[first + count // 2]))
 
 
 def _farthest(readings: Readings) -> float:
     """How far sightings are from the median place of their marker in their view, but for the farthest, px."""
-    tracks = _tracks(readings)
-    distance = np.linalg.norm(tracks - np.nanmedian(tracks, axis=1, keepdims=True), axis=2)
-    return float(np.nanquantile(distance, 1.0 - _MOST_WRONG)) if distance.size else np.inf
+    pixels, track = _tracks(readings)
+    distance = np.linalg.norm(pixels - _medians(pixels, track)[track], axis=1)
+    return float(np.quantile(distance, 1.0 - _MOST_WRONG)) if distance.size else np.inf
 
 
 def _require_no_line(readings: Readings, sigma: float) -> None:
     """Refuse a body whose markers lie on a line in most images, up to the noise: some are wrong."""
     off = []
-    for image in readings.grid().reshape(-1, readings.marker.size, 2):
-        pixels = image[np.isfinite(image[:, 0])]
-        if len(pixels) > 2:
-            across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
-            off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
+    for seen, places in zip(readings.seen, readings.pixels, strict=True):
+        rows = np.flatnonzero(seen)
+        rows = rows[np.argsort(readings.pose_of[rows], kind="stable")]
+        for pixels in np.split(places[rows], np.flatnonzero(np.diff(readings.pose_of[rows])) + 1):
+            if len(pixels) > 2:
+                across = np.linalg.svd(pixels - pixels.mean(axis=0), compute_uv=False)[1]
+                off.append(across**2 > sigma**2 * chdtri(len(pixels) - 2, _OFF_LINE_TAIL))
     if off and np.mean(off) < 0.5:
         raise WorkFailed(ON_A_LINE)

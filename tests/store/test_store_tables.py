@@ -1,6 +1,7 @@
 """Observation tables: what is read, what is refused and where, and round trips."""
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -203,3 +204,15 @@ def test_poses_in_motion_and_times_come_back_and_stay_out_of_what_is_at_rest(tmp
     assert found.at_rest.pose.tolist() == [0]
     write_table(found.at_rest, path)
     assert read_table(path).moving is None
+
+
+def test_a_long_table_is_read_line_by_line(tmp_path):
+    """What is held besides the images is little: far less than a table of strings would be."""
+    sightings = ",".join(["0.123456789", "0.987654321", *["123.456789"] * 4])
+    path = written(tmp_path, HEADER, *(f"{row % 10},{row // 10},{sightings}" for row in range(20_000)))
+    tracemalloc.start()
+    table = read_table(path)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert table.images.shape == (10, 2, 2000, 2)
+    assert most - table.images.nbytes < 250 * 20_000  # bytes a row
