@@ -42,6 +42,8 @@ _DECISIVE_SHARE, _NO_LENS_TAIL = 0.5, 0.01
 _KEPT, _DOUBTED_RATIO, _PARTS = 0.5, 1.3, 3
 # Share of readings that may lie outside the images: they are outliers.
 _STRAYS = 0.01
+# As many lines of advice as fit a screen, and as many examples as a line names.
+_MOST_ADVICE, _EXAMPLES = 5, 3
 
 
 def calibrate(
@@ -164,7 +166,7 @@ def _most_likely(
     if not expected.known and expected.ratio(solution) > _DOUBTFUL_RATIO:
         cause = blamed_joint(search, _DOUBTFUL_SHARE * solution.sigma_px)
     advice = tuple(filter(None, (cause, *result.advice, note)))
-    return solution, expected, dataclasses.replace(result, advice=advice)
+    return solution, expected, dataclasses.replace(result, advice=advice[:_MOST_ADVICE])
 
 
 def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: ImageFrame) -> Calibration:
@@ -187,12 +189,14 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     spread = solution.spread_factor()
     suspicion = "lens" if share else "joint readings"
     record = _record(Projective.of(solution), solution, expected, spread, found, suspicion)
-    advice = (*record.advice, *_lens_advice(record, share, frame.known))
+    lens = _lens_advice(record, share, frame.known)
+    advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
         return dataclasses.replace(record, advice=advice)
     readings = whole.problem.readings
-    names = ", ".join(str(number) for number in readings.marker[~kept])
-    seldom = f"hardly any reading of marker {names} fits: it is not part of the model; see it more often"
+    names = ", ".join(map(str, readings.marker[~kept][:_EXAMPLES]))
+    more = f" and {few} more" if (few := np.count_nonzero(~kept) - _EXAMPLES) > 0 else ""
+    seldom = f"hardly any reading of marker {names}{more} fits: not part of the model; see it more often"
     outlier = np.concatenate([record.outlier, listed(readings, readings.seen & ~kept[readings.marker_of])])
     outlier = outlier[np.lexsort(outlier.T[::-1])]
     lost = why_lost(whole, kept)

@@ -16,7 +16,7 @@ from projservo_cli.calibration.readings import (
     REACH_M,
     REACH_RAD,
     Readings,
-    describe_joint,
+    describe_joints,
     require_motion,
     require_moved,
 )
@@ -135,7 +135,7 @@ class _Judgement:
     error: tuple[float, float] | None
     usable: bool
     reason: str  # why it is usable or not, and what limits it
-    advice: tuple[str, ...]  # what to do next
+    advice: tuple[str, ...]  # what to do next, first what limits it
 
 
 def judged(
@@ -165,14 +165,14 @@ def judged(
         typical, bound = _predicted_error(sure)
         error = (sigma * typical, sigma * bound)
         needed = _needed_spans(sure, spreads)
-        moves = [describe_joint(i, *of) for i, of in enumerate(zip(span, prismatic, needed, strict=True))]
         i = int(np.argmax(noise))
         if noise[i] > _UNDETERMINED_NOISE:
             raise WorkFailed(
                 f"joint {i + 1} is not determined: near the reference its images would be wrong by "
-                f"{noise[i]:.3g} times the pixel noise; {moves[i]}"
+                f"{noise[i]:.3g} times the pixel noise; "
+                + "".join(describe_joints(np.array([i]), span, prismatic, needed))
             )
-        advice = [moves[i] for i in np.flatnonzero(noise > WEAK_NOISE)]
+        advice += describe_joints(np.flatnonzero(noise > WEAK_NOISE), span, prismatic, needed)
     warned, share = expected.warns(solution), expected.ratio(solution)
     found = f"{solution.sigma_px:.3g} px a coordinate"
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
@@ -184,9 +184,12 @@ def judged(
     if warned:
         reason = f"more than pixel noise is left: residuals of {found} are {share:.3g} times {wanted}"
         if "joint readings" in suspicion:
-            advice.append("look for joint readings that lag behind the images")
+            advice.insert(0, "look for joint readings that lag behind the images")
     outliers, suspects, swaps = left_out
-    limit = "noise"
+    limit, many = "noise", outliers > _MOST_OUTLIERS * solution.used.shape[1]
+    told = f"{outliers} sightings were left out as outliers: check the detection of markers"
+    if many:
+        advice.append(told)
     if words := _joint_words(solution):
         reason = f"{reason}, with joint readings off by {words}"
         if solution.joint_effect_px > solution.sigma_px:
@@ -198,16 +201,16 @@ def judged(
     elif (weak := noise > WEAK_NOISE).any():
         few = span[weak] < np.where(prismatic[weak], REACH_M, REACH_RAD)
         limit = "amplitude" if few.any() else "geometry"
-    elif outliers > _MOST_OUTLIERS * solution.used.shape[1]:
+    elif many:
         limit = "outliers"
-    if outliers:
-        advice.append(f"{outliers} sightings were left out as outliers: check the detection of markers")
     if suspects:
         advice.append(
             f"{suspects} joint readings disagree with the images: check how poses and images are paired"
         )
     if swaps:
         advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
+    if outliers and not many:
+        advice.append(told)
     return _Judgement(span, noise, error, True, f"{reason}; limited by {limit}", tuple(advice))
 
 

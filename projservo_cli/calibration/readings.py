@@ -219,24 +219,50 @@ def require_motion(readings: Readings) -> FloatArray:
     return span
 
 
-def describe_joint(i: int, span: float, prismatic: bool, needed: float) -> str:
-    """Advice for joint i that moved too little, or never apart from the others, over its range, rad or m.
+def describe_joints(
+    which: IntArray, span: FloatArray, prismatic: BoolArray, needed: FloatArray
+) -> tuple[str, ...]:
+    """Advice for the joints that moved too little, or never apart from the others: a line for all alike.
 
-    ``needed`` is the range of a trial motion that determines it; NaN where none does.
+    ``which`` (k,) are they; of all joints (n,) there is the range and that of a trial motion that determines
+    them, rad or m; NaN where none does. Where there is one joint only, no other is asked for.
     """
-    reach = REACH_M if prismatic else REACH_RAD
-    moved = _amount(span, prismatic)
-    if not needed <= MOST_REACHES * reach:
-        return f"joint {i + 1} moved {moved}; no motion of it alone would do: record trials of every joint"
-    if span >= reach:
-        apart = f"joint {i + 1} moved {moved} but hardly apart from the other joints: move it alone"
-        return f"{apart}, by {_amount(needed, prismatic)} or more"
-    if needed <= span:
-        return (
-            f"joint {i + 1} moved {moved}, in too few poses: record further ones in which it moves alone, by "
-            f"{_amount(needed, prismatic)} or more"
-        )
-    return f"joint {i + 1} moved only {moved}: move it at least {_amount(needed, prismatic)}"
+    single = len(span) == 1
+    reach = np.where(prismatic, REACH_M, REACH_RAD)
+    hopeless = ~(needed <= MOST_REACHES * reach)
+    apart, enough = ~hopeless & (span >= reach) & (not single), ~hopeless & (needed <= span)
+    rest, lines = np.isin(np.arange(len(span)), which), []
+    elsewhere = "markers farther from its axis" if single else "trials of every joint"
+    alone = "" if single else " in which {it} moves alone"
+    only = "" if single else " alone"
+    for alike, text in (
+        (hopeless, f"{{joints}} moved {{moved}}; no motion of {{it}}{only} would do: record {elsewhere}"),
+        (
+            apart,
+            "{joints} moved {moved} but hardly apart from the other joints: move {it} alone, by {needed} or "
+            "more",
+        ),
+        (
+            enough,
+            f"{{joints}} moved {{moved}}, in too few poses: record further ones{alone}, by {{needed}} or more",
+        ),
+        (np.ones_like(rest), "{joints} moved only {moved}: move {it} at least {needed}"),
+    ):
+        rows = np.flatnonzero(rest & alike)
+        rest[rows] = False
+        if rows.size:
+            moved, least = (
+                _listed([_amount(values[i], bool(prismatic[i])) for i in rows]) for values in (span, needed)
+            )
+            joints = f"joint{'s' * (rows.size > 1)} {_listed([str(i + 1) for i in rows])}"
+            it = "it" if rows.size == 1 else "each"
+            lines.append(text.format(joints=joints, moved=moved, needed=least, it=it))
+    return tuple(lines)
+
+
+def _listed(words: list[str]) -> str:
+    """Words in a row, the last after "and"."""
+    return " and ".join(filter(None, (", ".join(words[:-1]), words[-1])))
 
 
 def require_moved(i: int, span: float, prismatic: bool, motion_px: float, sigma_px: float) -> None:
@@ -248,7 +274,10 @@ def require_moved(i: int, span: float, prismatic: bool, motion_px: float, sigma_
     )
     reach = REACH_M if prismatic else REACH_RAD
     if span < _STANDING * reach:
-        advice = describe_joint(i, span, prismatic, 0.5 * reach)
+        advice = (
+            f"joint {i + 1} moved only {_amount(span, prismatic)}: move it at least "
+            f"{_amount(0.5 * reach, prismatic)}"
+        )
         raise WorkFailed(f"too little excitation: the range of joint {i + 1} moves {seen}; {advice}")
     raise WorkFailed(
         f"joint {i + 1} stands still: its readings range over {_amount(span, prismatic)} but move {seen}; "

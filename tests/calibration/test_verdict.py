@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import WEAK_NOISE, calibrate
-from projservo_cli.calibration.readings import describe_joint
+from projservo_cli.calibration.readings import describe_joints
 from projservo_cli.records import Observation
 from tests.calibration.simulated_robot import random_robot, trials
 
@@ -107,4 +107,23 @@ def test_many_outliers_limit():
     ],
 )  # fmt: skip
 def test_advice_in_words(span, prismatic, needed, text):
-    assert describe_joint(3, span, prismatic, needed) == text
+    # The fourth of four joints; the others are not in doubt.
+    spans, ranges = np.full(4, 1.0), np.full(4, 0.1)
+    spans[3], ranges[3] = span, needed
+    which = np.array([3])
+    assert describe_joints(which, spans, np.array([False] * 3 + [prismatic]), ranges) == (text,)
+
+
+def test_joints_alike_share_a_line():
+    span, needed = np.array([0.1, 2.0, 0.2, 0.1, 0.3]), np.array([0.2, 0.3, 0.4, 0.2, 0.5])
+    weak, revolute = np.array([1, 2, 3, 4]), np.zeros(5, dtype=bool)
+    apart, few = describe_joints(weak, span, revolute, np.radians(50.0) * (needed > 0.0))
+    assert apart == "joint 2 moved 115° but hardly apart from the other joints: move it alone, by 50° or more"
+    assert few == "joints 3, 4 and 5 moved only 11.5°, 5.73° and 17.2°: move each at least 50°, 50° and 50°"
+
+
+@pytest.mark.parametrize("needed", [np.nan, 0.2, 2.0])
+def test_a_single_joint_asks_for_no_other(needed):
+    (text,) = describe_joints(np.array([0]), np.array([1.0]), np.array([False]), np.array([needed]))
+    assert text.startswith("joint 1 moved") and "alone" not in text and "other joints" not in text
+    assert "every joint" not in text
