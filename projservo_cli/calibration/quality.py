@@ -156,7 +156,8 @@ def judged(
     # Residuals of a method without covariance are its own doing, not noise of the images.
     sigma = expected.sigma_px if spread is None else expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
-    noise, error, advice = np.full(len(span), np.nan), None, []
+    noise, error = np.full(len(span), np.nan), None
+    advice: list[str] = []
     if spread is not None:
         sure = _Uncertainty(solution, spread)
         sides = np.array([1.0, -1.0])
@@ -208,7 +209,8 @@ def judged(
             f"{suspects} joint readings disagree with the images: check how poses and images are paired"
         )
     if swaps:
-        advice.append(f"{swaps} times a marker was seen under another's number: check the numbering")
+        times = f"{swaps} times" if swaps > 1 else "once"
+        advice.append(f"{times} a marker was seen under another's number: check the numbering")
     if outliers and not many:
         advice.append(told)
     return _Judgement(span, noise, error, True, f"{reason}; limited by {limit}", tuple(advice))

@@ -244,7 +244,8 @@ def describe_joints(
         ),
         (
             enough,
-            f"{{joints}} moved {{moved}}, in too few poses: record further ones{alone}, by {{needed}} or more",
+            f"{{joints}} moved {{moved}}, in too few poses: record further ones{alone}, by {{needed}} "
+            "or more",
         ),
         (np.ones_like(rest), "{joints} moved only {moved}: move {it} at least {needed}"),
     ):

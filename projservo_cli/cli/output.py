@@ -7,7 +7,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -171,9 +171,9 @@ def _of_recording(value: dict[str, Any]) -> Iterator[str]:
 
 
 def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
-    from projservo_cli.report.material import LISTS
-
     yield wrapped(f"calibrate: {'usable' if value['usable'] else 'NOT usable'}: {value['reason']}")
+    for text in value["advice"]:
+        yield wrapped(f"advice: {text}", "  ")
     yield (
         f"  residual {value['rms_px']:.4g} px rms, sigma {value['sigma_px']:.4g} px, "
         f"chi2/dof {value['chi2_per_dof']:.4g}, {value['seconds']:.1f} s"
@@ -188,9 +188,12 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
     if value["delay_s"] is not None:
         yield wrapped(f"images late by {', '.join(_delays(value))}", "  ")
     weak = ", ".join(joint["name"] for joint in value["joints"] if joint["weak"])
-    found = [f"{len(value[name])} {name.replace('_', ' ')}" for name in LISTS if value[name]]
-    if weak or found:
-        yield wrapped("; ".join([f"weak joints: {weak or 'none'}", *found]), "  ")
+    if weak:
+        yield wrapped(f"weak joints: {weak}", "  ")
+    for text in _left_out(value):
+        yield wrapped(f"left out: {text}", "  ")
+    if len(value["joints"]) == 1:
+        yield wrapped(_ONE_JOINT, "  ")
     if value["predicted_rms_px"] is not None:
         rms, bound = _number(value["predicted_rms_px"]), _number(value["predicted_p99_px"])
         text = f"predicted error within the ranges of the joints: {rms} px rms, 99 % below {bound} px"
@@ -201,9 +204,43 @@ def _of_calibration(value: dict[str, Any]) -> Iterator[str]:
         text = f"held out, {held_out['folds']} parts of {held_out['unit']}: rms {rms} px"
         yield wrapped(f"{text} (predicted {predicted}), median {median}, p95 {p95}", "  ")
         yield wrapped(held_out["reason"], "  ")
-    for text in value["advice"]:
-        yield wrapped(f"advice: {text}", "  ")
     yield from _of_suggestions(value)
+
+
+_ONE_JOINT = "one joint: how it moves images is known; directions and lengths in space take more joints"
+_EXAMPLES = 3  # of each kind of what was left out
+
+
+def _left_out(value: dict[str, Any]) -> Iterator[str]:
+    """What a calibration left out: of each kind how many, and the first of them."""
+    counts = value["left_out"]
+    whole = {number for numbers in counts["tracks"].values() for number in numbers}
+    single = [
+        f"marker {one['marker']} at pose {one['pose']}" + ("" if one["view"] == "both" else f" {one['view']}")
+        for one in value["outliers"]
+        if one["marker"] not in whole
+    ]
+    if single:
+        yield _counted(single, "outlier")
+    for why, numbers in counts["tracks"].items():
+        if numbers:
+            yield _counted([str(number) for number in numbers], "marker", f", {why}")
+    if value["swapped"]:
+        swaps = [
+            "{} under the number of {} at pose {}".format(*reversed(one["markers"]), one["pose"])
+            for one in value["swapped"]
+        ]
+        yield _counted(swaps, "swapped sighting")
+    suspect = {one["pose"]: one["joint"] for one in value["suspect_joint_readings"]}
+    if poses := counts["poses"]:
+        named = [f"{pose} by joint {suspect[pose]}" if pose in suspect else str(pose) for pose in poses]
+        yield _counted(named, "pose", " with joint readings that disagree")
+
+
+def _counted(found: Sequence[str], kind: str, what: str = "") -> str:
+    """How many of a kind there are, with the first of them."""
+    more = ", …" if len(found) > _EXAMPLES else ""
+    return f"{len(found)} {kind}{'s' * (len(found) > 1)}{what} ({', '.join(found[:_EXAMPLES])}{more})"
 
 
 def _joint_noise(value: dict[str, Any]) -> str:

@@ -253,7 +253,7 @@ def failed_object(stage: str, run: Run, reason: str, at: str, laws: Sequence[str
     if stage == "calibrate":
         lists: dict[str, Any] = {name: [] for name in ("advice", "joints", *LISTS)}
         numbers = dict.fromkeys(_NUMBERS) | dict.fromkeys(_COUNTS, 0)
-        return found | {"usable": False, "lens": None} | numbers | lists
+        return found | {"usable": False, "lens": None, "left_out": None} | numbers | lists
     if stage == "servo":
         found["laws"] = [_scalars(run.traces[law]) for law in laws]
     return found | {"feasible": False} if stage == "plan" else found

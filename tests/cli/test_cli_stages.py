@@ -180,6 +180,7 @@ def test_of_claims_those_that_do_not_hold_are_named_and_all_of_them_in_detail(pr
 CALIBRATE_KEYS = {
     *("run", "usable", "reason", "advice", "rms_px", "sigma_px", "chi2_per_dof", "seconds", "joints"),
     *("outliers", "suspect_joint_readings", "swapped", "merged_poses", "merged_markers"),
+    "left_out",
 }
 LAW_KEYS = {
     *("law", "verdict", "steps", "position_error_mm", "rotation_error_deg"),
@@ -202,6 +203,7 @@ def test_json_objects_have_the_documented_keys(projservo, stages, tmp_path):
         {"pose": 4, "marker": 2, "view": "both"},
     ]
     assert calibrate["suspect_joint_readings"] == []
+    assert (calibrate["left_out"]["sightings"], calibrate["left_out"]["poses"]) == (2, [])
     assert calibrate["merged_poses"] == 3
     names = [(joint["name"], joint["type"]) for joint in calibrate["joints"]]
     assert names == [("q1", "R"), ("elbow", "R")]

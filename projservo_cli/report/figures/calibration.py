@@ -8,18 +8,32 @@ from scipy.special import chdtri
 from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.calibration.prediction import covariance_root, joint_derivative, prediction_derivative
 from projservo_cli.calibration.readings import per_rad
-from projservo_cli.records import BoolArray, Calibration, FloatArray, Observation
+from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
 
-_RIGHT, _BOTH = 1, 2
+_BOTH = 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a share of the extent of what was seen
 _BAND = (0.025, 0.975)  # shares of χ² between which the residuals of a pose are expected
 _BINS = 40
 _RESIDUAL: style.Look = {"color": style.BLUE}
 _WEAK: style.Look = {"facecolor": style.ORANGE, "edgecolor": style.BLACK, "hatch": "////", "linewidth": 0.6}
-_LEFT_OUT: style.Look = {"color": style.VERMILION, "marker": "x", "linestyle": "none"}
-_LEFT_OUT |= {"markersize": 4, "markeredgewidth": 0.9}
+# Why a reading was left out: by itself, its number, its pose, or its marker as a whole.
+_KINDS = ("outlier", "swapped", "pose", "marker")
+_LEFT_OUT: dict[str, style.Look] = {
+    "outlier": {"color": style.VERMILION, "marker": "x"},
+    "swapped": {"color": style.ORANGE, "marker": "+"},
+    "pose": {"color": style.BLACK, "marker": "1"},
+    "marker": {"color": style.GREEN, "marker": "."},
+}
+_LEFT_OUT = {kind: {**look, "linestyle": "none", "markeredgewidth": 0.9} for kind, look in _LEFT_OUT.items()}
+_NAMES = {
+    "outlier": "outlier",
+    "swapped": "of another number",
+    "pose": "of a pose in doubt",
+    "marker": "of a marker left out whole",
+}
+_LARGE, _SMALL, _MANY = 4.0, 1.5, 300  # sizes of these points, pt, and how many are many
 _MODEL: style.Look = {"color": style.BLACK, "linewidth": 1.2}
 
 
@@ -29,7 +43,7 @@ def _data(fit: Fit) -> Data:
     predicted = predict(calibration, observation.q)
     seen, left_out = _readings(calibration, observation)
     read: BoolArray = np.all(np.isfinite(seen), axis=-1)
-    out = left_out | ~np.isfinite(predicted).all(axis=-1)
+    out = (left_out > 0) | ~np.isfinite(predicted).all(axis=-1)
     used = read & ~out
     residual, variance = seen - predicted, prediction_variance(calibration, observation.q)
     weighed = calibration.sigma_q or observation.sigma is not None
@@ -57,7 +71,12 @@ def _data(fit: Fit) -> Data:
         others = unknown[:, v][np.isfinite(unknown[:, v]).all(axis=-1)]
         result[f"seen_{view}"] = seen[:, v][used[:, v]]
         result[f"residual_{view}"] = residual[:, v][used[:, v]]
-        result[f"left_out_{view}"] = np.concatenate([seen[:, v][(read & out)[:, v]], others])
+        gone = np.maximum(left_out, 1)  # what cannot be predicted is told as outlier
+        places = [seen[:, v][(read & out & (gone == i))[:, v]] for i in range(1, len(_KINDS))]
+        result |= {
+            f"left_out_{kind}_{view}": of_kind
+            for kind, of_kind in zip(_KINDS, (*places, others), strict=True)
+        }
     extent = max(float(np.ptp(seen[:, v][read[:, v]], axis=0).max()) for v in (0, 1))
     result["factor"] = np.array(_magnification(result["residual"], extent))
     return result
@@ -89,24 +108,32 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
     return both[..., 0], (both[..., 1:] ** 2).sum(axis=-1)
 
 
-def _readings(calibration: Calibration, observation: Observation) -> tuple[FloatArray, BoolArray]:
-    """Pixels (K, 2, m, 2) of the calibrated markers, and which of them (K, 2, m) the fit left out.
+def _readings(calibration: Calibration, observation: Observation) -> tuple[FloatArray, IntArray]:
+    """Pixels (K, 2, m, 2) of the calibrated markers, and why the fit left them out (K, 2, m), 0 for not.
 
-    Those are outliers, poses whose joints are in doubt, and markers that were read under another number.
+    Those are outliers (1), markers that were read under another number (2), and poses in doubt (3).
     """
     seen = observation.images[:, :, _columns(calibration, observation)]
-    out = np.zeros(seen.shape[:3], dtype=np.bool_)
-    out[np.isin(observation.pose, calibration.suspect[:, 0])] = True
-    renamed = ((pose, number, _BOTH) for pose, number, _ in calibration.swapped)
-    for pose, number, view in (*calibration.outlier, *renamed):
-        views = np.array([view != _RIGHT, view in (_RIGHT, _BOTH)])
-        out |= (observation.pose == pose)[:, None, None] & views[:, None] & (calibration.marker == number)
+    out = np.zeros(seen.shape[:3], dtype=np.int64)
+    row = {number: k for k, number in enumerate(observation.pose.tolist())}
+    column = {number: j for j, number in enumerate(calibration.marker.tolist())}
+    # The marker that it is was not seen there, or is left out as well: an exchange is listed once.
+    renamed = [(pose, number, _BOTH) for pose, *pair in calibration.swapped.tolist() for number in pair]
+    for why, places in ((2, renamed), (1, calibration.outlier.tolist())):
+        for pose, number, view in places:
+            if pose in row and number in column:
+                out[row[pose], slice(None) if view == _BOTH else view, column[number]] = why
+    doubted = calibration.suspect[:, 0]
+    if calibration.lost_poses is not None:
+        doubted = np.append(doubted, calibration.lost_poses)
+    out[np.isin(observation.pose, doubted)] = _KINDS.index("pose") + 1
     return seen, out
 
 
 def _columns(calibration: Calibration, observation: Observation) -> list[int]:
     """Index of each calibrated marker among those of an observation."""
-    return [observation.marker.tolist().index(number) for number in calibration.marker.tolist()]
+    place = {number: j for j, number in enumerate(observation.marker.tolist())}
+    return [place[number] for number in calibration.marker.tolist()]
 
 
 def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Data:
@@ -177,7 +204,11 @@ def _draw(data: Data, figure: "style.Figure") -> None:
     _spectrum(panels[2, 1], data)
     looks: dict[str, style.Look] = {
         f"residual, {data['factor']:,g} times": _RESIDUAL,
-        "reading left out": _LEFT_OUT,
+        **{
+            f"left out: {_NAMES[kind]}": {**look, "markersize": _LARGE}
+            for kind, look in _LEFT_OUT.items()
+            if any(len(data[f"left_out_{kind}_{view}"]) for view in VIEWS)
+        },
         "noise model": _MODEL,
         "residual of a pose": {"color": style.BLUE, "marker": "o", "linestyle": "none"},
         "95 % of poses in the model": {"color": style.PALE, "linewidth": 6},
@@ -187,14 +218,16 @@ def _draw(data: Data, figure: "style.Figure") -> None:
 
 
 def _arrows(axes: "style.Axes", data: Data, view: str) -> None:
-    seen, out = data[f"seen_{view}"], data[f"left_out_{view}"]
+    seen, out = data[f"seen_{view}"], {kind: data[f"left_out_{kind}_{view}"] for kind in _KINDS}
+    count = sum(map(len, out.values()))
     arrows = float(data["factor"]) * data[f"residual_{view}"]
     pixels: Any = {"angles": "xy", "scale_units": "xy", "scale": 1.0}
     heads: Any = {"width": 0.0022, "headwidth": 4.0, "headlength": 5.0, "headaxislength": 4.0}
     axes.quiver(*seen.T, *arrows.T, **pixels, **heads, **_RESIDUAL)
-    axes.plot(*out.T, **_LEFT_OUT)
-    title = f"{view}: {len(seen)} readings, {len(out)} left out"
-    style.image_axes(axes, title, np.concatenate([seen, seen + arrows, out]))
+    for kind, places in out.items():
+        axes.plot(*places.T, **_LEFT_OUT[kind], markersize=_LARGE if count < _MANY else _SMALL)
+    title = f"{view}: {len(seen):,} readings, {count:,} left out"
+    style.image_axes(axes, title, np.concatenate([seen, seen + arrows, *out.values()]))
 
 
 def _histogram(axes: "style.Axes", data: Data) -> None:
