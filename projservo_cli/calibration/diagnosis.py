@@ -3,11 +3,13 @@
 import dataclasses
 import itertools
 from dataclasses import dataclass
+from functools import reduce
 from itertools import islice
 from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 from scipy.special import fdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
@@ -84,16 +86,20 @@ def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) ->
         here = readings.pose_of == k
         free = np.ones(readings.marker.size, dtype=bool)
         free[readings.marker_of[here & ~out.any(axis=0)]] = False
-        predicted = np.nan_to_num(scene.seen(joints[k : k + 1])[0], nan=np.inf)[:, free]
-        others = np.flatnonzero(free)
+        predicted = np.nan_to_num(scene.seen(joints[k : k + 1])[0], nan=-np.inf)
+        others = np.flatnonzero(free & np.isfinite(predicted).all(axis=(0, 2)))
+        trees = [cKDTree(predicted[v, others]) for v in (0, 1)]
         for row in rows[here[rows]]:
             # A view that did not see the marker has no say.
-            v = np.flatnonzero(readings.seen[:, row])
-            distance = np.linalg.norm(predicted[v] - readings.pixels[v, None, row], axis=2)
-            fits = (distance * readings.weight[v, None, row]).max(axis=0) <= limit
-            fits &= others != readings.marker_of[row]
-            if fits.sum() == 1:
-                found.add((int(k), int(readings.marker_of[row]), int(others[np.argmax(fits)])))
+            near = [
+                trees[v].query_ball_point(readings.pixels[v, row], limit / readings.weight[v, row])
+                for v in np.flatnonzero(readings.seen[:, row])
+            ]
+            fits = set(others[np.array(reduce(np.intersect1d, near), dtype=np.int64)].tolist()) - {
+                int(readings.marker_of[row])
+            }
+            if len(fits) == 1:
+                found.add((int(k), int(readings.marker_of[row]), fits.pop()))
                 explained[:, row] = out[:, row]
     # An exchange shows in both markers and is one finding.
     listed = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
