@@ -438,13 +438,14 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
     Raises Misfit if no start leads anywhere; WorkFailed if too little was seen to start from.
     """
     whole, epipolar = search.problem, search.epipolar
-    few = carrying(whole.readings, epipolar.noise_px, search.rng)
-    problem = whole if few.all() else LeastSquares.of(whole.readings.of_markers(few), whole.q_reference)
-    search, readings = dataclasses.replace(search, problem=problem), problem.readings
     best: Solution | None = None
-    trusted = np.ones(len(readings.q), dtype=bool)
+    trusted = np.ones(len(whole.q), dtype=bool)
     levels: list[float] = []
     for number, factors in enumerate(_FOCAL_FACTORS):
+        # Of many markers other ones each time.
+        few = carrying(whole.readings, epipolar.noise_px, search.rng)
+        problem = whole if few.all() else LeastSquares.of(whole.readings.of_markers(few), whole.q_reference)
+        search, readings = dataclasses.replace(search, problem=problem), problem.readings
         rows = readings.seen & trusted[readings.pose_of]
         scenes = islice(starts(search, readings.of_poses(trusted), factors), _SEARCHES)
         for done, start in enumerate(scenes, number * _SEARCHES):
