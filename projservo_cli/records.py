@@ -30,6 +30,7 @@ SIZES = {
     "row": 4,
     "coordinate": 4,
     "axis": 3,
+    "own": 3,
     "part": 3,
     "solution": 2,
     "lens_term": 5,
@@ -101,6 +102,42 @@ class Spread(NamedTuple):
     most: float  # largest standard deviation of a coordinate that was met with, px
 
 
+class Errors(NamedTuple):
+    """How far parameters are off, by independent errors of unit variance: r all feel, three a marker alone.
+
+    Their covariance is Λ Λᵀ + diag(own ownᵀ), with Λ of ``shared`` over ``marker``: linear in the markers.
+    """
+
+    shared: FloatArray  # (s, r) of parameters before those of the markers
+    marker: FloatArray  # (m, d, r) of the d parameters of each marker, by the same errors
+    own: FloatArray  # (m, d, 3) and by its own, beside the others
+
+    def of(self, markers: IntArray | list[int]) -> "Errors":
+        """Those of some markers, by their indices."""
+        return Errors(self.shared, self.marker[markers], self.own[markers])
+
+    def scaled(self, factor: float) -> "Errors":
+        """So many times as large."""
+        return Errors(factor * self.shared, factor * self.marker, factor * self.own)
+
+    def dense(self) -> FloatArray:
+        """All in one factor (s + d m, r + 3 m) of the covariance: for few markers."""
+        m = len(self.marker)
+        markers = apart(self.marker, self.own, np.arange(m)[:, None], m)
+        shared = np.pad(self.shared, ((0, 0), (0, 3 * m)))
+        return np.concatenate([shared, markers.reshape(-1, shared.shape[1])])
+
+
+def apart(common: FloatArray, own: FloatArray, marker: IntArray, m: int) -> FloatArray:
+    """Changes (…, r) by errors that all feel and (…, 3) by those of a marker (…) of m, as (…, r + 3 m)."""
+    *shape, r = common.shape
+    result = np.zeros((*shape, r + 3 * m))
+    result[..., :r] = common
+    columns = np.broadcast_to(r + 3 * marker[..., None] + np.arange(3), own.shape)
+    np.put_along_axis(result, columns, own, axis=-1)
+    return result
+
+
 NO_SPREAD = Spread(np.zeros((0, 2, 3, 4)), np.zeros((0, 0, 4, 4)), np.zeros((0, 0, 4)), 0.0, 0.0)
 
 
@@ -165,9 +202,15 @@ class Calibration:
     a_inf: FloatArray = _array("coordinate", about="common plane at infinity")
     marker: IntArray = _array("marker", about="number of the marker")
     M: FloatArray = _array("marker coordinate", about="markers at the reference, a_inf @ M = 1")
-    covariance: FloatArray = _array(
-        "parameter parameter_",
-        about="of P.ravel(), H_hat_0.ravel(), M.ravel(), gauge fixed, and k1, k2 of both lenses if any",
+    # The covariance of all these, as ``Errors`` says; of a method without one they are not finite.
+    shared_error: FloatArray = _array(
+        "parameter error",
+        about="deviations of P.ravel(), H_hat_0.ravel() and k1, k2 of both lenses if any, by independent "
+        "errors of unit variance, up to frame and scales that no image shows",
+    )
+    marker_error: FloatArray = _array("marker coordinate error", about="deviations of M by the same errors")
+    own_error: FloatArray = _array(
+        "marker coordinate own", about="deviations of each marker by three more errors of its own"
     )
     excitation: FloatArray = _array("joint", "rad or m", "range of joint motion in the data")
     lowest: FloatArray = _array("joint", "rad or m", "lowest joint reading in the data")
@@ -234,6 +277,32 @@ class Calibration:
         """Where markers stand in ``marker`` and ``M``, by their numbers; ValueError for one that does not."""
         known = self.marker.tolist()
         return [known.index(number) for number in numbers]
+
+    @property
+    def errors(self) -> Errors:
+        """How far P, H_hat_0, lenses and M are off, in this order."""
+        return Errors(self.shared_error, self.marker_error, self.own_error)
+
+    @property
+    def has_covariance(self) -> bool:
+        """Whether the method says how far it is off."""
+        return bool(np.isfinite(self.shared_error).all())
+
+    def without_covariance(self) -> "Calibration":
+        """The same, which takes little memory, for those who do not ask how far it is off."""
+        none = {name: getattr(self, name)[..., :0] for name in ("shared_error", "marker_error", "own_error")}
+        return replace(self, **none)
+
+    def with_markers(self, indices: IntArray | list[int]) -> "Calibration":
+        """The same with some of the markers, by their indices."""
+        few = self.errors.of(indices)
+        return replace(
+            self,
+            marker=self.marker[indices],
+            M=self.M[indices],
+            marker_error=few.marker,
+            own_error=few.own,
+        )
 
     def model(self) -> Model:
         """The kernels' view of the calibration."""

@@ -24,7 +24,7 @@ from scipy.sparse import csr_array
 from projservo_cli.calibration.forward import CAMERA, LENS, Scene, image_points
 from projservo_cli.calibration.readings import RAYLEIGH, Readings
 from projservo_cli.geometry.lens import FIRST, bent
-from projservo_cli.records import BoolArray, FloatArray, IntArray
+from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
 
 def cross_matrix(w: FloatArray) -> FloatArray:
@@ -67,10 +67,11 @@ def moved_operators(scene: Scene) -> list[FloatArray]:
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """Images to explain, and where each parameter stands: both cameras, joints, markers, then both lenses.
+    """Images to explain, and where each parameter stands: both cameras, joints, both lenses, then markers.
 
     Residuals and derivatives are weighed, so that all have the noise of a pixel of weight one. The derivative
-    of the images is compact: (2, N, 2, c) for each reading by the c parameters it depends on.
+    of the images is compact: (2, N, 2, c) for each reading by the c parameters it depends on, the last three
+    those of its marker.
     Offsets of joint readings come after the ``size`` parameters, (K, n) in units of ``tau``, in which their
     squares weigh as those of pixels.
     """
@@ -78,8 +79,8 @@ class LeastSquares:
     readings: Readings  # what was seen
     q: FloatArray  # (K, n) joint values from the reference, rad or m
     q_reference: FloatArray  # (n,) the reference, rad or m
-    joint: IntArray  # (n + 1,) first parameter of each joint, then of the markers
-    lens: int  # first parameter of the lenses; ``size`` where none is sought
+    joint: IntArray  # (n + 1,) first parameter of each joint, then of the lenses where these are sought
+    shared: int  # number of parameters before those of the markers
     size: int  # number of parameters
     columns: IntArray  # (2, N, c) parameters that a reading depends on
     # (n,) noise of joint readings over that of pixels, rad/px or m/px; None where readings are exact
@@ -92,19 +93,19 @@ class LeastSquares:
         12 parameters a camera, 4 a revolute and 2 a prismatic joint, 3 a marker, 2 a lens.
         """
         joint = 2 * CAMERA + np.concatenate([[0], np.cumsum(np.where(readings.prismatic, 2, 4))])
-        first = int(joint[-1]) + 3 * readings.marker.size
         count = LENS if lens else 0
+        shared = int(joint[-1]) + 2 * count
         shape = (2, readings.marker_of.size)
         view = np.arange(2)[:, None, None]
         parts = (
             view * CAMERA + np.arange(CAMERA),
             np.arange(joint[0], joint[-1]),
-            joint[-1] + 3 * readings.marker_of[:, None] + np.arange(3),
-            first + view * count + np.arange(count),
+            joint[-1] + view * count + np.arange(count),
+            shared + 3 * readings.marker_of[:, None] + np.arange(3),
         )
         columns = np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=2)
         q = readings.q - q_reference
-        return cls(readings, q, q_reference, joint, first, first + 2 * count, columns)
+        return cls(readings, q, q_reference, joint, shared, shared + 3 * readings.marker.size, columns)
 
     def joints(self, scene: Scene) -> FloatArray:
         """Joint values (K, n) from the reference, rad or m; where they have noise with a scene's offsets."""
@@ -119,6 +120,17 @@ class LeastSquares:
     def with_noise(self, tau: FloatArray | None) -> "LeastSquares":
         """The same problem with other noise of joints (n,) over that of pixels, rad/px or m/px."""
         return dataclasses.replace(self, tau=tau)
+
+    def rows(self, at: IntArray) -> "LeastSquares":
+        """The same problem with some of the sightings (N,); parameters stay."""
+        return dataclasses.replace(self, readings=self.readings.rows(at), columns=self.columns[:, at])
+
+    def of_markers(self, keep: BoolArray) -> "LeastSquares":
+        """The same problem with some of the markers (m,) alone."""
+        smaller = LeastSquares.of(
+            self.readings.of_markers(keep), self.q_reference, self.shared > self.joint[-1]
+        )
+        return smaller.with_noise(self.tau)
 
     def pixels(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Predicted pixels (2, N, 2) of every sighting and their depths (2, N)."""
@@ -146,9 +158,9 @@ class LeastSquares:
         for i, B in enumerate(_generators(scene)):
             near, far = (D[k] @ np.einsum("bij,Nj->Nib", B, Y[k]) for k in (i, i + 1))
             blocks.append(near - far)
-        blocks.append(D[-1][..., :3])
         if by_lens is not None:
             blocks.append(by_lens)
+        blocks.append(D[-1][..., :3])
         return np.concatenate(blocks, axis=3) * readings.weight[..., None, None]
 
     def joint_derivative(self, scene: Scene) -> FloatArray:
@@ -175,11 +187,11 @@ class LeastSquares:
                 H_hat[i, :3, :3] = cross_matrix(w)
                 H_hat[i, :3, 3] = v - w * (w @ v)
         M = scene.M.copy()
-        M[:, :3] += x[self.joint[-1] : self.lens].reshape(-1, 3)
+        M[:, :3] += x[self.shared :].reshape(-1, 3)
         lens = scene.lens
         if lens is not None:
             lens = lens.copy()
-            lens[:, FIRST:] += x[self.lens :].reshape(2, LENS)
+            lens[:, FIRST:] += x[self.joint[-1] : self.shared].reshape(2, LENS)
         offsets = scene.offsets
         if self.tau is not None and further.size:
             offsets = (0.0 if offsets is None else offsets) + self.tau * further.reshape(self.q.shape)
@@ -202,7 +214,7 @@ class LeastSquares:
             found = np.linalg.lstsq(reach.reshape(-1, 16).T, wanted, rcond=None)[0]
             result[self.joint[i] : self.joint[i + 1], :-2] = found
         moved = (scene.M @ motions.swapaxes(1, 2))[..., :3]
-        result[self.joint[-1] : self.lens, :-2] = moved.reshape(len(motions), -1).T
+        result[self.shared :, :-2] = moved.reshape(len(motions), -1).T
         for v in (0, 1):
             result[v * CAMERA : (v + 1) * CAMERA, v - 2] = scene.P[v].ravel()
         return np.asarray(result / np.linalg.norm(result, axis=0))
@@ -243,6 +255,14 @@ class LeastSquares:
         result = np.zeros((*J.shape[:3], self.size))
         np.put_along_axis(result, self.columns[:, :, None], J * mask[..., None, None], axis=3)
         return result.reshape(-1, self.size)
+
+    def predicted(self, scene: Scene, errors: Errors) -> tuple[FloatArray, FloatArray]:
+        """Change of the images by ``errors``: (2, N, 2, r) all feel, (2, N, 2, 3) are a marker's own."""
+        J, marker_of = self.derivative(scene), self.readings.marker_of
+        common = J[..., -3:] @ errors.marker[marker_of]
+        for v in (0, 1):
+            common[v] += J[v, ..., :-3] @ errors.shared[self.columns[v, 0, :-3]]
+        return common, J[..., -3:] @ errors.own[marker_of]
 
     def whitened(self, scene: Scene, rows: FloatArray, mask: BoolArray) -> FloatArray:
         """S^-½ times rows (4 N, c) of coordinates in a mask (2, N), S = I + G τ² Gᵀ of each pose."""

@@ -16,7 +16,7 @@ from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
 from projservo_cli.calibration.fit import Solution, fit_from, median_px
 from projservo_cli.calibration.forward import LENS, Scene
-from projservo_cli.calibration.readings import RAYLEIGH, Readings
+from projservo_cli.calibration.readings import MOST_JUDGED, RAYLEIGH, Readings
 from projservo_cli.calibration.start import Search, carrying, starts, still
 from projservo_cli.geometry.lens import straight_views, within
 from projservo_cli.records import WHY_LOST, BoolArray, Calibration, FloatArray, IntArray, WorkFailed
@@ -289,7 +289,6 @@ def _describes(problem: LeastSquares, scene: Scene, epipolar: Epipolar, most_px:
 # probability, would not.
 _LEAST_SHARE, _TAIL = 0.02, 1e-3
 _LEAST_CHI2 = 1e-20
-_JUDGES = 100  # markers that are asked about a lens
 
 
 def share_explained(solution: Solution, frame: ImageFrame) -> float:
@@ -302,7 +301,7 @@ def share_explained(solution: Solution, frame: ImageFrame) -> float:
     """
     if solution.scene.lens is not None:
         return 0.0
-    solution = solution.of_some(_JUDGES)
+    solution = solution.of_some(MOST_JUDGED)
     readings = solution.problem.readings
     poses = np.unique(readings.pose_of[solution.used.any(axis=0)])
     K, d = poses.size, 2 * LENS
@@ -332,7 +331,8 @@ def _cleared_columns(solution: Solution, frame: ImageFrame) -> FloatArray:
     scene = dataclasses.replace(solution.scene, lens=_undistorted(frame))
     J = problem.whitened(scene, problem.dense(problem.derivative(scene), solution.used), solution.used)
     J /= np.maximum(np.linalg.norm(J, axis=0), 1e-300)
-    others, lenses = J[:, : problem.lens], J[:, problem.lens :]
+    first, last = problem.joint[-1], problem.shared
+    others, lenses = np.delete(J, np.s_[first:last], axis=1), J[:, first:last]
     left = lenses - others @ np.linalg.lstsq(others, lenses, rcond=None)[0]
     return np.asarray(left.T.reshape(-1, *solution.residual.shape))
 

@@ -27,7 +27,7 @@ from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate, judged
 from projservo_cli.calibration.readings import Readings, require_images, require_motion
 from projservo_cli.calibration.start import Nominal, Search, Tell
 from projservo_cli.geometry.lens import FIRST
-from projservo_cli.records import Calibration, FloatArray, InputError, Observation
+from projservo_cli.records import Calibration, Errors, InputError, Observation
 
 _METHODS = ("refined", "closed_form")
 # Fitted noise over the expected one from which on, though the fit passes, one joint may be to blame: it is
@@ -186,9 +186,9 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
             raise
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
-    spread = solution.spread_factor()
+    errors = solution.errors()
     suspicion = "lens" if share else "joint readings"
-    record = _record(Projective.of(solution), solution, expected, spread, found, suspicion)
+    record = _record(Projective.of(solution), solution, expected, errors, found, suspicion)
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
     if kept.all():
@@ -225,7 +225,8 @@ def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tupl
             return ()
         return (f"lens distortion would explain {100.0 * share:.0f} % of the squared residuals: try --lens",)
     k = calibration.lens[:, FIRST:].ravel()
-    statistic = k @ np.linalg.solve(calibration.covariance[-k.size :, -k.size :], k)
+    of_lenses = calibration.shared_error[-k.size :]
+    statistic = k @ np.linalg.solve(of_lenses @ of_lenses.T, k)
     if statistic < chdtri(k.size, _NO_LENS_TAIL):
         return ("the images show no lens distortion: leave out --lens",)
     if not centered:
@@ -251,25 +252,25 @@ def _record(
     result: Projective,
     solution: Solution,
     expected: Expected,
-    spread: FloatArray | None,
+    errors: Errors | None,
     found: Outliers,
     suspicion: str,
 ) -> Calibration:
     """Record of a fit in its projective frame; WorkFailed if a joint is not determined.
 
-    ``spread`` is its ``spread_factor``, None for a method without covariance; ``found`` explains readings
-    left out, and ``suspicion`` is what may be to blame for more than pixel noise.
+    ``errors`` are those of its parameters, None for a method without; ``found`` explains readings left out,
+    and ``suspicion`` is what may be to blame for more than pixel noise.
     """
-    method = "closed_form" if spread is None else "refined"
+    method = "closed_form" if errors is None else "refined"
     problem, readings, scene = solution.problem, solution.problem.readings, result.scene
-    if spread is None:
-        covariance = np.full((scene.P.size + scene.H_hat.size + scene.M.size,) * 2, np.nan)
+    if errors is None:
+        m, unknown = len(scene.M), np.full(scene.P.size + scene.H_hat.size, np.nan)
+        off = Errors(unknown[:, None], np.full((m, 4, 1), np.nan), np.full((m, 4, 3), np.nan))
     else:
-        factor = expected.noise_px(solution) * result.covariance_factor(solution, spread)
-        covariance = factor @ factor.T
+        off = result.errors(solution, errors).scaled(expected.noise_px(solution))
     outlier = listed(readings, readings.seen & ~solution.used & ~found.explained)
     counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.swapped))
-    verdict = judged(solution, spread, expected, counts, suspicion)
+    verdict = judged(solution, errors, expected, counts, suspicion)
     operator_defect, trace_defect, plane_defect = result.defects()
     used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
     # More than noise, as far as the readings tell.
@@ -293,7 +294,9 @@ def _record(
         a_inf=result.a_inf,
         marker=readings.marker,
         M=scene.M,
-        covariance=covariance,
+        shared_error=off.shared,
+        marker_error=off.marker,
+        own_error=off.own,
         excitation=verdict.span,
         lowest=readings.q[np.unique(readings.pose_of)].min(axis=0),
         weak=verdict.noise > WEAK_NOISE,

@@ -1,7 +1,7 @@
 """Fits: a robust search from each start, then least squares of the readings that count, and their noise."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 
@@ -12,10 +12,10 @@ from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
-from projservo_cli.calibration.readings import RAYLEIGH, per_rad
+from projservo_cli.calibration.readings import RAYLEIGH, evenly, per_rad
 from projservo_cli.calibration.start import Nominal, Search, carrying, starts
 from projservo_cli.calibration.tracks import Tracks
-from projservo_cli.records import BoolArray, FloatArray, WorkFailed
+from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 
 # Fitted noise over the noise expected: above the first, or so many standard errors above one where that
 # is less, more than pixel noise is left; above the last the model does not describe the data.
@@ -25,6 +25,8 @@ _CHI2_TAIL = 1e-4
 _STATED_ERROR = 0.1
 # A direction whose singular value is this share of the largest is open.
 OPEN_DIRECTION = 1e-10
+# Numbers of the derivative that are dealt with at once: 16 MB.
+_AT_ONCE = 2**21
 
 
 class Misfit(WorkFailed):
@@ -96,8 +98,7 @@ class Solution:
     def of_some(self, most: int) -> "Solution":
         """What it says of at most so many of the markers, evenly chosen."""
         m = self.problem.readings.marker.size
-        chosen = np.linspace(0, m - 1, most).astype(np.int64)
-        return self if m <= most else self._of_markers(np.isin(np.arange(m), chosen))
+        return self if m <= most else self._of_markers(np.isin(np.arange(m), evenly(m, most)))
 
     def kept(self) -> "Solution":
         """The solution of the readings that count alone."""
@@ -111,23 +112,80 @@ class Solution:
             used=self.used[:, rows],
         )
 
-    def spread_factor(self) -> FloatArray:
-        """Factor L of the inverse information, L Lᵀ = (JᵀS⁻¹J)⁺, on the directions that readings determine.
+    def errors(self) -> Errors:
+        """Errors of the parameters at a noise of one pixel: (JᵀS⁻¹J)⁺ where readings determine it.
 
-        Singular values of J itself keep the weakest direction, which the normal matrix would lose.
-        At a noise of one pixel, (size, size − g); a direction left open has a column of enormous length.
+        Factors of J itself keep the weakest direction, which the normal matrix would lose. The columns of a
+        marker are projected out of its own rows, what is left tells the other parameters (B. Triggs et al.,
+        "Bundle adjustment: a modern synthesis", 1999, section 6), which the markers follow. Offsets of joints
+        are such parameters too, unless there are more of them than coordinates of markers: then those are,
+        and offsets are left out by whitening. A direction left open has errors of enormous length.
         """
         problem, scene = self.problem, self.scene
-        J = problem.whitened(scene, problem.dense(problem.derivative(scene), self.used), self.used)
-        scale = np.linalg.norm(J, axis=0)
-        # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
-        scale = np.where(scale > 0.0, scale, scale.max())
-        G = np.linalg.qr(scale[:, None] * problem.gauge(scene))[0]
-        free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
-        _, s, Vt = np.linalg.svd(np.linalg.qr((J / scale) @ free, mode="r"))
-        # Robots of one or two joints leave more directions open than the gauge, none of which matters
-        # to an image: they must come out as zero after the product with its derivative.
-        return np.asarray((free @ (Vt.T / np.maximum(s, OPEN_DIRECTION * s[0]))) / scale[:, None])
+        s, m, offsets = problem.shared, len(scene.M), 0 if problem.tau is None else problem.q.size
+        gauge = problem.gauge(scene)
+        if 3 * m < offsets:
+            J = problem.whitened(scene, problem.dense(problem.derivative(scene), self.used), self.used)
+            factor = _inverse_root(J, np.linalg.norm(J, axis=0), gauge)
+            return Errors(factor[:s], factor[s:].reshape(m, 3, -1), np.zeros((m, 3, 3)))
+        R = np.eye(s + offsets)[s:]
+        squares = R.sum(axis=0)
+        follows, own = np.zeros((m, 3, s + offsets)), np.zeros((m, 3, 3))
+        for markers, A, B in self._tracks(s + offsets):
+            U, size, Vt = np.linalg.svd(B, full_matrices=False)
+            least = OPEN_DIRECTION * size[:, :1]
+            U *= (size > least)[:, None]
+            own[markers] = Vt.swapaxes(1, 2) / np.maximum(size, least)[:, None]
+            along = U.swapaxes(1, 2) @ A
+            follows[markers] = -own[markers] @ along
+            squares += (A**2).sum(axis=(0, 1))
+            left = (A - U @ along).reshape(-1, s + offsets)
+            R = np.asarray(np.linalg.qr(np.vstack([R, left]), mode="r"))
+        held = np.zeros((s + offsets, gauge.shape[1]))
+        held[:s] = gauge[:s]
+        factor = _inverse_root(R, np.sqrt(squares), held)
+        return Errors(factor[:s], follows @ factor, own)
+
+    def _tracks(self, count: int) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Some markers (k,), and of all their rows the derivatives (k, l, count) and (k, l, 3) by them.
+
+        The first by parameters that are shared, then by offsets of joints in units of their noise.
+        """
+        problem, readings = self.problem, self.problem.readings
+        edges = np.searchsorted(readings.marker_of, np.arange(readings.marker.size + 1))
+        lengths = np.diff(edges)
+        for length in np.unique(lengths[lengths > 0]):
+            alike = np.flatnonzero(lengths == length)
+            for markers in np.array_split(alike, 1 + 4 * length * count * alike.size // _AT_ONCE):
+                at = (edges[markers, None] + np.arange(length)).ravel()
+                part, used = problem.rows(at), self.used[:, at, None, None]
+                J = part.derivative(self.scene) * used
+                A = np.zeros((*J.shape[:3], count + 3))
+                np.put_along_axis(A, part.columns[:, :, None, :-3], J[..., :-3], axis=3)
+                if problem.tau is not None:
+                    n = len(problem.tau)
+                    columns = problem.shared + n * part.readings.pose_of[:, None, None] + np.arange(n)
+                    G = part.joint_derivative(self.scene) * problem.tau * used
+                    np.put_along_axis(A, columns[None], G, axis=3)
+                A[..., count:] = J[..., -3:]
+                A = (
+                    A.reshape(2, markers.size, length, 2, -1)
+                    .swapaxes(0, 1)
+                    .reshape(markers.size, 4 * length, -1)
+                )
+                yield markers, A[..., :count], A[..., count:]
+
+
+def _inverse_root(R: FloatArray, scale: FloatArray, gauge: FloatArray) -> FloatArray:
+    """L (c, c − g) with L Lᵀ = (RᵀR)⁺ beside a gauge (c, g), for R (l, c), its columns in units (c,)."""
+    # A parameter no residual depends on has no scale of its own: it is open whatever the unit.
+    scale = np.where(scale > 0.0, scale, scale.max())
+    G = np.linalg.qr(scale[:, None] * gauge)[0]
+    free = np.linalg.qr(G, mode="complete")[0][:, G.shape[1] :]
+    _, s, Vt = np.linalg.svd(np.linalg.qr((R / scale) @ free, mode="r"))
+    # Robots of one or two joints leave more directions open than the gauge, none of which matters
+    # to an image: they must come out as zero after the product with its derivative.
+    return np.asarray((free @ (Vt.T / np.maximum(s, OPEN_DIRECTION * s[0]))) / scale[:, None])
 
 
 @dataclass(frozen=True)
@@ -293,9 +351,7 @@ def _of_markers(problem: LeastSquares, scene: Scene, keep: BoolArray) -> tuple[L
     """The problem and the scene of some of the markers (m,)."""
     if keep.all():
         return problem, scene
-    some = problem.readings.of_markers(keep)
-    smaller = LeastSquares.of(some, problem.q_reference, scene.lens is not None).with_noise(problem.tau)
-    return smaller, dataclasses.replace(scene, M=scene.M[keep])
+    return problem.of_markers(keep), dataclasses.replace(scene, M=scene.M[keep])
 
 
 def _sides(depth: FloatArray, used: BoolArray) -> tuple[FloatArray, BoolArray]:

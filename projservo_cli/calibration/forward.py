@@ -67,7 +67,7 @@ def projection_derivative(
     return bent(lens[:, None], pixels), by_pixel @ G, by_lens
 
 
-class _Images(NamedTuple):
+class Images(NamedTuple):
     """Pixels of N sightings and their derivatives."""
 
     pixels: FloatArray  # (2, N, 2) px
@@ -108,7 +108,7 @@ class Scene:
         E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]
         return E, moved_points(E, self.M[marker_of][:, None])[:, :, 0]
 
-    def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> _Images:
+    def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> Images:
         """Sightings (N,) of markers at rows of q (K, n), with their derivatives.
 
         From images to the point behind each joint by [RH00] eq. (6).
@@ -120,25 +120,24 @@ class Scene:
         for i, by_joint in enumerate(E):
             D[i + 1] = D[i] @ by_joint
         by_camera = (G[..., None] * Y[0][:, None, None, :]).reshape(*pixels.shape, CAMERA)
-        return _Images(pixels, Y, by_camera, D, by_lens)
+        return Images(pixels, Y, by_camera, D, by_lens)
 
-    def everywhere(self, q: FloatArray) -> _Images:
+    def everywhere(self, q: FloatArray) -> Images:
         """Images of all markers at joints (K, n), pose by pose, with their derivatives."""
         pose_of, marker_of = np.divmod(np.arange(len(q) * len(self.M)), len(self.M))
         return self.images(q, pose_of, marker_of)
 
-    def derivative(self, q: FloatArray, images: _Images | None = None) -> FloatArray:
-        """Derivative of all markers' pixels by P, H_hat, M (ravelled): (K, 2, m, 2, 24 + 16 n + 4 m).
+    def derivative(self, q: FloatArray, images: Images | None = None) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of all markers' pixels by P, H_hat (ravelled), and by the marker's own coordinates.
 
-        With a lens, by k1 and k2 of both views in four more columns. An operator enters by
-        E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of
-        ``everywhere``, where they are known.
+        (K, 2, m, 2, 24 + 16 n), four columns more with a lens for k1 and k2 of both views, and
+        (K, 2, m, 2, 4). An operator enters by E = I + s Ĥ + c Ĥ², [RH00] eqs. (4), (5), so
+        dE = s dĤ + c (dĤ Ĥ + Ĥ dĤ). images : those of ``everywhere``, where they are known.
         """
         (K, n), m = q.shape, len(self.M)
-        pose_of, marker_of = np.divmod(np.arange(K * m), m)
+        pose_of = np.repeat(np.arange(K), m)
         images = self.everywhere(q) if images is None else images
-        joints, markers = 2 * CAMERA, 2 * CAMERA + 16 * n
-        lenses = markers + 4 * m
+        joints, lenses = 2 * CAMERA, 2 * CAMERA + 16 * n
         J = np.zeros((2, K * m, 2, lenses + (0 if images.by_lens is None else 2 * LENS)))
         for v in (0, 1):
             J[v, ..., v * CAMERA : (v + 1) * CAMERA] = images.by_camera[v]
@@ -151,6 +150,18 @@ class Scene:
             Y, HY = Y[:, None, None], (Y @ H.T)[:, None, None]
             block = D[..., None] * (s * Y + c * HY) + (c * (D @ H)[..., None]) * Y
             J[..., joints + 16 * i : joints + 16 * (i + 1)] = block.reshape(2, K * m, 2, 16)
-        columns = markers + 4 * marker_of[None, :, None, None] + np.arange(4)
-        np.put_along_axis(J, columns, images.by_point[n], axis=3)
-        return np.asarray(J.reshape(2, K, m, *J.shape[2:]).swapaxes(0, 1))
+        shared, own = (part.reshape(2, K, m, 2, -1).swapaxes(0, 1) for part in (J, images.by_point[n]))
+        return shared, own
+
+    def gauge(self) -> FloatArray:
+        """Orthonormal directions (24 + 16 n + 4 m, 18) of P, H_hat, M that change no image.
+
+        Those of the frame and of the scales of both cameras; four rows of zeros before M for lenses.
+        """
+        Z = np.eye(16).reshape(16, 1, 4, 4)
+        lenses = np.zeros((16, 0 if self.lens is None else 2 * LENS))
+        parts = -(self.P @ Z), Z @ self.H_hat - self.H_hat @ Z, lenses, self.M @ Z.swapaxes(2, 3)
+        frame = np.hstack([part.reshape(16, -1) for part in parts])
+        cameras = np.zeros((2, frame.shape[1]))
+        cameras[0, :CAMERA], cameras[1, CAMERA : 2 * CAMERA] = self.P.reshape(2, CAMERA)
+        return np.asarray(np.linalg.svd(np.vstack([frame, cameras]).T, full_matrices=False)[0])

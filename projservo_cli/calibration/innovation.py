@@ -7,8 +7,8 @@ from scipy.linalg import solve_triangular
 from scipy.special import chdtri
 
 from projservo_cli.calibration.forward import CAMERA
-from projservo_cli.calibration.prediction import covariance_root, scene_of
-from projservo_cli.calibration.readings import LEAST_SIGMA, per_rad
+from projservo_cli.calibration.prediction import all_changed, scene_of
+from projservo_cli.calibration.readings import LEAST_SIGMA, evenly, per_rad
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
 # Looks in a row that must agree on a gross disturbance: one may be blurred, or a marker taken for another.
@@ -31,7 +31,7 @@ _STRAIGHT = 1.0 / 8.0
 # Much of what a finder states of a corner is the same while the view of it is: it does not average away, and
 # of many corners some are off by so many deviations.
 _LASTING_CORNER = 2.0
-# Where a finder states deviations, a marker that seems to have moved by less, px, is an edge taken for another.
+# Where a finder states deviations, a marker that seems to have moved by less, px, is a wrong edge.
 _LEAST_MOVED_PX = 1.0
 # A corner that is so many times less certain than most is not tested: its error is the finder's, and lasts.
 _VAGUE = 10.0
@@ -52,6 +52,8 @@ _FLEXIBLE, _MOST_FLEXIBLE = np.radians(1.0), np.radians(3.0)
 _TOGETHER_S, _WAITING = 0.025, 25
 # Frames that are so near show joints of one reading.
 _AT_ONCE_S = 1e-4
+# Markers that are tested, at most.
+_MOST_TESTED = 40
 # Joints that differ by no more stand still, rad or m: as they were read, and since the first look.
 _STILL, _AT_REST = 1e-9, 1e-3
 
@@ -140,13 +142,22 @@ class Innovation:
     calibration : what predicts the pixels, with its covariance.
     sigma_px : pixel noise per coordinate.
     observations : most looks of one sequence, which sets the thresholds.
+    shown : indices of the markers that images may show, None all; of many, some stand for all.
     """
 
-    def __init__(self, calibration: Calibration, sigma_px: float, observations: int) -> None:
-        self.calibration = calibration
+    def __init__(
+        self,
+        calibration: Calibration,
+        sigma_px: float,
+        observations: int,
+        shown: IntArray | None = None,
+    ) -> None:
+        shown = np.arange(len(calibration.M)) if shown is None else shown
+        self._shown = shown[evenly(len(shown), _MOST_TESTED)]
+        self.calibration = calibration = calibration.with_markers(self._shown)
         m, n = len(calibration.M), len(calibration.H_hat_0)
         self._scene = scene_of(calibration)
-        self._factor = covariance_root(calibration.covariance)
+        self._errors, self._e = calibration.errors, calibration.shared_error.shape[1] + 3 * m
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(bent, LEAST_SIGMA)
         self._sigma = max(sigma_px, self._least)
@@ -173,7 +184,7 @@ class Innovation:
         tail = _FALSE_ALARM / observations
         self._chance = _FALSE_ALARM / np.log1p(observations / _SOON)
         self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (2 + m)))
-        c = self._factor.shape[1] + self._f + 1
+        c = self._e + self._f + 1
         self._sums = [_Sums(0, 0.0, np.zeros((c, c)), np.zeros((2, m)))]
         self._pending: list[tuple[BoolArray, _Sums]] = []
         self._readings: list[FloatArray] = []
@@ -216,6 +227,7 @@ class Innovation:
         stated : (2, m) standard deviations of the pixels, px, if they are told: by how much more than what
             it was told the calibration found is added.
         """
+        images, stated = images[:, self._shown], None if stated is None else stated[:, self._shown]
         noise = np.full(images.shape[:2], self._sigma)
         if stated is not None:
             noise = np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), noise)
@@ -283,7 +295,7 @@ class Innovation:
         r = images - scene.seen(away)[views, views]
         seen = np.isfinite(r[..., 0])
         at = scene.everywhere(away)
-        B = scene.derivative(away, at)[views, views] @ self._factor
+        B = all_changed(scene, self._errors, away, at)[views, views]
         D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
         Y = at.points.reshape(n + 1, 2, m, 4)
         by_camera = at.by_camera.reshape(2, 2, m, 2, CAMERA)[views, views]
@@ -330,12 +342,12 @@ class Innovation:
 
     def _error_root(self, sums: _Sums) -> FloatArray:
         """Root (e, e) of the information on the errors of the calibration."""
-        e = self._factor.shape[1]
+        e = self._e
         return np.asarray(np.linalg.cholesky(np.eye(e) + sums.normal[:e, :e]))
 
     def _beyond_chance(self, look: _Look) -> tuple[BoolArray, float]:
         """Whether χ² of what is seen of each view and marker is beyond chance, (2 + m,); rms of all, px."""
-        e, m = self._factor.shape[1], look.seen.shape[1]
+        e, m = self._e, look.seen.shape[1]
         both = np.concatenate([look.B.T, self._sums[-1].normal[:e, -1:]], axis=1)
         both = solve_triangular(self._error_root(self._sums[-1]), both, lower=True, check_finite=False)
         W = both[:, :-1]
@@ -371,7 +383,7 @@ class Innovation:
 
         Lasting errors of joints and instants are beside them always, with their priors.
         """
-        e, n = self._factor.shape[1], len(self._sigma_q)
+        e, n = self._e, len(self._sigma_q)
         across = (total.normal - since.normal)[:, e:]
         for part in (across.T, across[e:]):  # time is from the onset
             part[-1 - n : -1] += since.t * (since.t * part[:n] - 2.0 * part[n : 2 * n])

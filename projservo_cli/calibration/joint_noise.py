@@ -4,13 +4,15 @@ What is left of the images of pose k is r = J x + G δ + ε, with ε ~ N(0, σ²
 joints less their readings: of covariance S = σ² I + σ_q² G Gᵀ. Errors of pixels scatter from marker to
 marker, those of joints move all markers of a pose together, which is how they are told apart.
 
+It is taken over the markers of which most readings count, for many markers say no more about few joints.
+
 Source of the restricted likelihood: H. D. Patterson, R. Thompson, "Recovery of inter-block information when
 block sizes are unequal", Biometrika 58(3), 1971; of the test at the border of the parameters: S. G. Self,
 K.-Y. Liang, "Asymptotic properties of maximum likelihood estimators and likelihood ratio tests under
 nonstandard conditions", JASA 82, 1987.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -32,6 +34,8 @@ _OPEN = 1e-12  # information of a direction that images leave open, over that of
 _SIGNIFICANT, _INTERVAL = 5.412, 3.841
 # What fits without and with noise may differ by: so many times what they stay below in 999 of 1,000 cases.
 _CHANCE, _LENIENT = 0.999, 1.5
+# Markers over which the likelihood is taken, at most.
+_MOST_MARKERS = 50
 # Ticks are no finer than this, rad or m; readings lie on them to this share.
 _LEAST_TICK, _ON_TICK = 1e-5, 0.01
 
@@ -54,6 +58,12 @@ class JointNoise:
         Zero where chance may do as well. Where readings lie on ticks and the interval holds what these make,
         that is taken.
         """
+        readings = problem.readings
+        keep = np.zeros(len(scene.M), dtype=np.bool_)
+        keep[np.argsort(-readings.count_of(used), kind="stable")[:_MOST_MARKERS]] = True
+        if not keep.all():
+            used, scene = used[:, keep[readings.marker_of]], replace(scene, M=scene.M[keep])
+            problem = problem.of_markers(keep)
         likelihood = _Likelihood(problem, scene, used, sigma_px)
         # Ratios of both noises, rad/px, as logarithms: even steps from the least that matters to the most,
         # at which pixels may be left with far less noise.
@@ -99,7 +109,8 @@ class _Likelihood:
     def __init__(self, problem: LeastSquares, scene: Scene, used: BoolArray, sigma_px: float | None) -> None:
         self.given = sigma_px
         unit, J = per_rad(problem.readings.prismatic), problem.derivative(scene)
-        A = problem.normal(J, used.astype(np.float64))
+        D = problem.dense(J, used)
+        A = D.T @ D
         errors, residual = JointErrors(problem, scene, used, unit), problem.residual(scene)
         if problem.tau is not None:  # at the joints as read
             residual = residual - errors.change(problem.strain(scene) * problem.tau / unit)
@@ -113,9 +124,9 @@ class _Likelihood:
         free = free @ (basis[:, known] / np.sqrt(values[known]))
         self.dof = 2 * int(np.count_nonzero(used)) - free.shape[1]
         self.eigenvalue = errors.square.ravel()
-        self.B = errors.parts(problem.dense(J, used) @ free)
+        self.B = errors.parts(D @ free)
         self.h = errors.parts(residual.ravel())
-        self.g = free.T @ problem.gradient(J, residual)
+        self.g = free.T @ (D.T @ residual.ravel())
         self.square = float((residual**2).sum())
 
     def _normal(self, place: float) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.forward import Images, Scene
+from projservo_cli.calibration.readings import evenly
 from projservo_cli.records import (
     NO_SPREAD,
     BoolArray,
     Calibration,
+    Errors,
     FloatArray,
     InputError,
     Observation,
     Spread,
     WorkFailed,
+    apart,
 )
 
 
@@ -103,15 +106,35 @@ def prediction_variance(calibration: Calibration, q: FloatArray) -> FloatArray:
     Returns (K, 2, m, 2) variances of u and v, px². Raises InputError if the readings have another number of
     joints or are not finite.
     """
-    J = prediction_derivative(calibration, q)
-    variance = np.einsum("...a,...a->...", J @ calibration.covariance, J)
-    return np.asarray(np.maximum(variance, 0.0))
-
-
-def prediction_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
-    """Derivative (K, 2, m, 2, parameters) of predicted pixels by the parameters of the covariance."""
     scene, q = _scene(calibration, q)
-    return scene.derivative(q)
+    result = np.empty((len(q), 2, len(scene.M), 2))
+    for k in range(len(q)):  # a pose at a time, which bounds what is in memory
+        common, own = changed(scene, calibration.errors, q[k : k + 1])
+        result[k] = ((common**2).sum(axis=-1) + (own**2).sum(axis=-1))[0]
+    return result
+
+
+def changed(
+    scene: Scene, errors: Errors, q: FloatArray, images: Images | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Change of all pixels (K, 2, m, 2, r) and (K, 2, m, 2, 3) by ``errors``, joints from the reference."""
+    shared, by_marker = scene.derivative(q, images)
+    return shared @ errors.shared + by_marker @ errors.marker, by_marker @ errors.own
+
+
+def all_changed(scene: Scene, errors: Errors, q: FloatArray, images: Images | None = None) -> FloatArray:
+    """Change of all pixels by all ``errors``, (K, 2, m, 2, r + 3 m): for few markers."""
+    m = len(scene.M)
+    return apart(*changed(scene, errors, q, images), np.arange(m)[:, None], m)
+
+
+def error_factor(calibration: Calibration) -> FloatArray:
+    """Factor (24 + 16 n + 4 m, r + 3 m) of the covariance of P, H_hat_0, lenses, M: for few markers.
+
+    Gauge fixed: of all errors that change images alike the least. Four rows more before M with lenses.
+    """
+    factor, free = calibration.errors.dense(), scene_of(calibration).gauge()
+    return np.asarray(factor - free @ (free.T @ factor))
 
 
 def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
@@ -121,18 +144,13 @@ def joint_derivative(calibration: Calibration, q: FloatArray) -> FloatArray:
     return np.asarray(J.reshape(2, len(q), len(scene.M), *J.shape[2:]).swapaxes(0, 1))
 
 
-def covariance_root(covariance: FloatArray) -> FloatArray:
-    """Λ (d, r) with Λ Λᵀ the covariance (d, d); the gauge, and what no robot can do, have no spread."""
-    spread, basis = np.linalg.eigh(covariance)
-    known = spread > len(spread) * np.finfo(np.float64).eps * spread[-1]
-    return np.asarray(basis[:, known] * np.sqrt(spread[known]))
-
-
 # Poses drawn to choose from, and to judge by; draws before giving up, in batches.
 _CANDIDATES, _TARGETS = 300, 150
 _BATCH, _BATCHES = 1500, 20
 # Markers that both views must see at a pose for it to tell the joints.
 _LEAST_SEEN = 3
+# Markers that suggestions are judged by, at most.
+_MOST_SHOWN = 25
 # A prediction that errs by more than this share of the image does not say what will be seen.
 _VAGUE = 0.02
 
@@ -172,7 +190,7 @@ def suggest(
     Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS", 2007, chapter 10.
     With Λ Λᵀ the covariance, C the derivative of what a pose would show and T that of the targets,
     both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen where they are
-    predicted within the image.
+    predicted within the image; of many markers some stand for all.
 
     calibration : with its covariance.
     observation : what it was made from.
@@ -183,15 +201,15 @@ def suggest(
     Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose of a region
     shows the markers to both views.
     """
-    if not np.isfinite(calibration.covariance).all():
+    if not calibration.has_covariance:
         raise InputError(
             f"suggestions need a covariance, which the method {calibration.method} has not: "
             "use --set calibration.method=refined"
         )
-    factor = covariance_root(calibration.covariance)
+    few = calibration.with_markers(evenly(len(calibration.M), _MOST_SHOWN))
     sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
-    _, T = _shown(calibration, targets, _TARGETS, factor, rng)
-    q, C = _shown(calibration, candidates, _CANDIDATES, factor, rng)
+    _, T = _shown(few, targets, _TARGETS, rng)
+    q, C = _shown(few, candidates, _CANDIDATES, rng)
     coordinates = np.count_nonzero(T.any(axis=2))
     rows = T.reshape(-1, T.shape[2])
     gram = rows.T @ rows
@@ -215,7 +233,7 @@ def suggest(
 
 
 def _shown(
-    calibration: Calibration, region: Region, count: int, factor: FloatArray, rng: np.random.Generator
+    calibration: Calibration, region: Region, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Random poses (k, n) that show enough markers, and the derivative (k, 4 m, r) of what they show.
 
@@ -227,7 +245,7 @@ def _shown(
     for q, seen in _drawn(calibration, region, _BATCHES, rng):
         enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
         if enough.size:
-            J = scene.derivative(q[enough] - calibration.q_reference) @ factor
+            J = all_changed(scene, calibration.errors, q[enough] - calibration.q_reference)
             sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= _VAGUE * np.ptp(region.image, axis=1).max()
             seen = seen[enough] & sharp
             J[~seen] = 0.0
@@ -271,13 +289,14 @@ def spread_of(
     what they leave is taken to be the same everywhere. None without a covariance. It takes 20 ms, once
     for all tasks of a calibration.
     """
-    if not np.isfinite(calibration.covariance).all():
+    if not calibration.has_covariance:
         return NO_SPREAD
-    q = _showing(calibration, indices[:face], bounds, seed)
+    calibration = calibration.with_markers(list(indices))
+    q = _showing(calibration, face, bounds, seed)
     if len(q) == 0:
         return NO_SPREAD
-    factor = covariance_root(calibration.covariance)
-    J = prediction_derivative(calibration, q)[:, :, list(indices[:face])] @ factor
+    scene, factor = scene_of(calibration), error_factor(calibration)
+    J = all_changed(scene, calibration.errors, q - calibration.q_reference)[:, :, :face]
     variance = (J**2).sum(axis=-1)
     rows = J.reshape(-1, J.shape[-1]) / np.maximum(np.sqrt(variance).reshape(-1, 1), 1e-9)
     # LAPACK's singular value decomposition fails on some of these rows, finite as they are.
@@ -285,27 +304,25 @@ def spread_of(
     rest = float(np.sqrt(np.median(np.maximum(variance - ((J @ main) ** 2).sum(axis=-1), 0.0))))
     moved = (factor @ main).T
     n, b = calibration.H_hat_0.shape[0], calibration.M.shape[0]
-    P, H_hat, M = np.split(moved[:, : 24 + 16 * n + 4 * b], [24, 24 + 16 * n], axis=1)
+    P, H_hat, M = moved[:, :24], moved[:, 24 : 24 + 16 * n], moved[:, -4 * b :]
     return Spread(
         np.concatenate([calibration.P[None], calibration.P + P.reshape(-1, 2, 3, 4)]),
         np.concatenate([calibration.H_hat_0[None], calibration.H_hat_0 + H_hat.reshape(-1, n, 4, 4)]),
-        np.ascontiguousarray(
-            np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)])[:, list(indices)]
-        ),
+        np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)]),
         rest,
         float(np.sqrt(variance.max())),
     )
 
 
-def _showing(calibration: Calibration, indices: tuple[int, ...], bounds: _Bounds, seed: int) -> FloatArray:
-    """Joints (k, n) within the limits at which both images hold the markers."""
+def _showing(calibration: Calibration, face: int, bounds: _Bounds, seed: int) -> FloatArray:
+    """Joints (k, n) within the limits at which both images hold the first markers, those of the face."""
     lower, upper, image_size = bounds
     low = np.where(np.isfinite(lower), lower, calibration.q_reference - np.pi)
     high = np.where(np.isfinite(upper), upper, calibration.q_reference + np.pi)
     corners = np.array([[-0.5, -0.5], np.array(image_size) - 0.5])
     region, found = Region(low, high, np.stack([corners, corners])), np.zeros((0, len(low)))
     for q, seen in _drawn(calibration, region, _MOST_BATCHES, np.random.default_rng(seed)):
-        found = np.concatenate([found, q[seen[:, :, list(indices)].all(axis=(1, 2))]])
+        found = np.concatenate([found, q[seen[:, :, :face].all(axis=(1, 2))]])
         if len(found) >= _LOOKED_AT:
             break
     return found[:_LOOKED_AT]

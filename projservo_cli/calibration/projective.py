@@ -4,7 +4,7 @@ Of an adjusted scene with its covariance, or by the paper's closed forms: one 4�
 equations (4), (5).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -12,10 +12,10 @@ from scipy.linalg import block_diag
 from projservo_cli.calibration.adjustment import moved_operators
 from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
-from projservo_cli.calibration.forward import CAMERA, Scene
-from projservo_cli.calibration.readings import ON_A_LINE, Readings
+from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.readings import MOST_JUDGED, ON_A_LINE, Readings, evenly
 from projservo_cli.geometry.algebra import normalize_displacement
-from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
+from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 
 # Least distance of the markers from their best line, in units of its own noise.
 _OFF_LINE = 5.0
@@ -39,19 +39,21 @@ class Projective:
         moved = solution.scene.carried(problem.q, readings.pose_of, readings.marker_of)[1][0]
         return _isotropic(solution.scene, _A_INF, moved)
 
-    def covariance_factor(self, solution: Solution, spread: FloatArray) -> FloatArray:
-        """Factor (24 + 16 n + 4 m, r) of the covariance of P, H_hat, M, gauge fixed, by ``spread_factor``.
+    def errors(self, solution: Solution, errors: Errors) -> Errors:
+        """Those of P, H_hat, k1 and k2 of both views where lenses are sought, and M, by ``Solution.errors``.
 
-        At a noise of one pixel; with four rows more, for k1 and k2 of both views, where lenses are adjusted.
-
-        Raises WorkFailed where the markers cannot be told from a line.
+        At a noise of one pixel. Raises WorkFailed where the markers cannot be told from a line.
         """
-        factor = _output_derivative(solution, self) @ spread
-        free = _output_gauge(self.scene)
-        first = len(free)
-        factor[:first] -= free @ (free.T @ factor[:first])
-        _require_off_line(self.scene.M, free, solution.sigma_px * factor[:first])
-        return factor
+        back = np.linalg.inv(self.W)
+        cameras = [scale * np.kron(np.eye(3), back.T) for scale in self.camera_scale]
+        joints = [(self.W @ moved @ back).reshape(-1, 16).T for moved in moved_operators(solution.scene)]
+        lenses = np.eye(solution.problem.shared - solution.problem.joint[-1])
+        by_marker = self.W[:, :3]
+        shared = block_diag(*cameras, *joints, lenses) @ errors.shared
+        found = Errors(shared, by_marker @ errors.marker, by_marker @ errors.own)
+        few = evenly(len(self.scene.M), MOST_JUDGED)
+        _require_off_line(replace(self.scene, M=self.scene.M[few]), found.of(few).scaled(solution.sigma_px))
+        return found
 
     def defects(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Defects (n,) of [RH00] section 2: of Ĥ³ = −Ĥ or Ĥ² = 0, of no trace, of one plane at infinity."""
@@ -91,36 +93,17 @@ def _isotropic(scene: Scene, a_inf: FloatArray, moved: FloatArray) -> Projective
     return Projective(Scene(P, H_hat, scene.prismatic, M @ W.T, scene.lens), a_inf @ back, W, scale)
 
 
-def _output_derivative(solution: Solution, result: Projective) -> FloatArray:
-    """Derivative of P, H_hat_0, M and the lenses (ravelled) by the adjusted parameters, the frame held."""
-    problem, scene = solution.problem, solution.scene
-    back = np.linalg.inv(result.W)
-    cameras = [scale * np.kron(np.eye(3), back.T) for scale in result.camera_scale]
-    joints = [(result.W @ moved @ back).reshape(-1, 16).T for moved in moved_operators(scene)]
-    markers = [result.W[:, :3]] * len(scene.M)
-    return block_diag(*cameras, *joints, *markers, np.eye(problem.size - problem.lens))
-
-
-def _output_gauge(scene: Scene) -> FloatArray:
-    """Orthonormal directions (24 + 16 n + 4 m, 18) that change no image: of the frame and of both cameras."""
-    Z = np.eye(16).reshape(16, 1, 4, 4)
-    parts = (-(scene.P @ Z), Z @ scene.H_hat - scene.H_hat @ Z, scene.M @ Z.swapaxes(2, 3))
-    frame = np.hstack([part.reshape(16, -1) for part in parts])
-    cameras = np.zeros((2, frame.shape[1]))
-    cameras[:, : 2 * CAMERA] = block_diag(*scene.P.reshape(2, 1, CAMERA))
-    return np.asarray(np.linalg.svd(np.vstack([frame, cameras]).T, full_matrices=False)[0])
-
-
-def _require_off_line(M: FloatArray, gauge: FloatArray, factor: FloatArray) -> None:
-    """Refuse markers (m, 4) that a factor (24 + 16 n + 4 m, r) of the covariance cannot tell from a line.
+def _require_off_line(scene: Scene, errors: Errors) -> None:
+    """Refuse markers that cannot be told from a line by their errors.
 
     A line is the span of two points; the markers must be off it by several times the noise of that distance,
-    whatever frame and scale they are given: beside the ``gauge`` their scales are free.
+    whatever frame and scale they are given: beside the gauge their scales are free.
     """
+    M, factor = scene.M, errors.dense()
     first, m = len(factor) - M.size, len(M)
     scales = np.vstack([np.zeros((first, m)), block_diag(*M[:, :, None])])
     # One of the directions is a sum of others: all markers scaled at once.
-    U, s, _ = np.linalg.svd(np.hstack([gauge, scales]), full_matrices=False)
+    U, s, _ = np.linalg.svd(np.hstack([scene.gauge(), scales]), full_matrices=False)
     free = U[:, s > OPEN_DIRECTION * s[0]]
     markers = (factor - free @ (free.T @ factor))[first:]
     U, extent, Vt = np.linalg.svd(M, full_matrices=False)

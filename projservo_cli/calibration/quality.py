@@ -9,18 +9,30 @@ from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
+from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.joint_noise import quantile
 from projservo_cli.calibration.prediction import distance_statistics
 from projservo_cli.calibration.readings import (
+    MOST_JUDGED,
     MOST_REACHES,
     REACH_M,
     REACH_RAD,
     Readings,
     describe_joints,
+    evenly,
     require_motion,
     require_moved,
 )
-from projservo_cli.records import BoolArray, CrossValidation, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.records import (
+    BoolArray,
+    CrossValidation,
+    Errors,
+    FloatArray,
+    InputError,
+    IntArray,
+    WorkFailed,
+    apart,
+)
 
 # Noise of predictions at the reach, in units of the pixel noise, above which a joint is undetermined.
 _UNDETERMINED_NOISE = 1000.0
@@ -39,46 +51,57 @@ _FRAMES, _LEAST_REACHES, _BISECTIONS = 8, 0.01, 7
 class _Uncertainty:
     """A fit whose predictions err, judged in twice the image region in which markers were seen."""
 
-    solution: Solution
-    factor: FloatArray  # (size, r) ``spread_factor``, at a noise of one pixel
+    problem: LeastSquares
+    scene: Scene
+    errors: Errors  # at a noise of one pixel
+    region: FloatArray  # (2, 2, 2) lower and upper corners (view, coordinate), px
 
-    def shown(self, q: FloatArray) -> BoolArray:
-        """Which images (2, K, m) at poses (K, n) lie in the region that counts."""
-        readings = self.solution.problem.readings
-        pixels = self.solution.scene.seen(q - self.solution.problem.q_reference).swapaxes(0, 1)
+    @classmethod
+    def of(cls, solution: Solution, errors: Errors) -> "_Uncertainty":
+        """Of no more markers than are judged, the region that of all."""
+        readings = solution.problem.readings
         low, high = (
             np.stack([extreme(readings.pixels[v][readings.seen[v]], axis=0) for v in (0, 1)])
             for extreme in (np.min, np.max)
         )
         wide = 0.5 * (high - low)
-        low, high = (low - wide)[:, None, None], (high + wide)[:, None, None]
+        some, which = solution.of_some(MOST_JUDGED), evenly(len(solution.scene.M), MOST_JUDGED)
+        return cls(some.problem, some.scene, errors.of(which), np.stack([low - wide, high + wide]))
+
+    def shown(self, q: FloatArray) -> BoolArray:
+        """Which images (2, K, m) at poses (K, n) lie in the region that counts."""
+        pixels = self.scene.seen(q - self.problem.q_reference).swapaxes(0, 1)
+        low, high = self.region[:, :, None, None]
         return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
 
     def spread(self, q: FloatArray, *, nearer: bool = False) -> FloatArray:
-        """Derivative (rows, r) of coordinates shown at poses (K, n) by independent errors of size one.
+        """Change (rows, r) of coordinates shown at poses (K, n) by independent errors of size one.
 
         Where no image would count, poses may be taken nearer to the reference, half the way each time.
         """
-        problem, scene = self.solution.problem, self.solution.scene
+        q_reference = self.problem.q_reference
         shown = self.shown(q)
         for _ in range(_HALVINGS if nearer else 0):
             if shown.any():
                 break
-            q = 0.5 * (q + problem.q_reference)
+            q = 0.5 * (q + q_reference)
             shown = self.shown(q)
-        there = LeastSquares.of(problem.readings.everywhere(q), problem.q_reference, scene.lens is not None)
+        readings, lens = self.problem.readings.everywhere(q), self.scene.lens is not None
+        there = LeastSquares.of(readings, q_reference, lens)
+        common, own = there.predicted(self.scene, self.errors)
         shown = shown.swapaxes(1, 2).reshape(2, -1)  # sightings are in the order of markers
-        J = there.dense(there.derivative(scene), shown)
-        return np.asarray(J[np.repeat(shown.ravel(), 2)] @ self.factor)
+        marker = np.nonzero(shown)[1] // len(q)
+        T = apart(common[shown], own[shown], marker[:, None], readings.marker.size)
+        return T.reshape(-1, T.shape[-1])
 
     def at(self, i: int, offsets: FloatArray) -> FloatArray:
         """Poses (K, n) with joint i at offsets (K,) from the reference, rad or m."""
-        q_reference = self.solution.problem.q_reference
+        q_reference = self.problem.q_reference
         return np.asarray(q_reference + offsets[:, None] * np.eye(len(q_reference))[i])
 
     def reach(self, i: int) -> float:
         """Reach of joint i at which predictions are judged, rad or m."""
-        return REACH_M if self.solution.scene.prismatic[i] else REACH_RAD
+        return REACH_M if self.scene.prismatic[i] else REACH_RAD
 
 
 def _needed_spans(sure: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
@@ -117,7 +140,7 @@ def _predicted_error(sure: _Uncertainty) -> tuple[float, float]:
     are halved about the reference. No residual shows on which side of the expectation a calibration came
     to lie: to first order the error of a maximum of the likelihood does not depend on what it leaves.
     """
-    q = sure.solution.problem.readings.q
+    q = sure.problem.readings.q
     poses = np.random.default_rng(0).uniform(q.min(axis=0), q.max(axis=0), (_POSES, q.shape[1]))
     spread = sure.spread(poses, nearer=True)
     variances = np.linalg.eigvalsh(spread.T @ spread) / max(len(spread) // 2, 1)
@@ -140,12 +163,12 @@ class _Judgement:
 
 def judged(
     solution: Solution,
-    spread: FloatArray | None,
+    errors: Errors | None,
     expected: Expected,
     left_out: tuple[int, int, int],
     suspicion: str,
 ) -> _Judgement:
-    """Verdict on a fit with its ``spread_factor``, None for the closed form, which has none.
+    """Verdict on a fit with its ``errors``, None for the closed form, which tells none.
 
     From the numbers of outliers, of suspect joint readings and of exchanged markers left out, and a
     suspicion of what may be to blame for more than pixel noise.
@@ -154,12 +177,12 @@ def judged(
     """
     prismatic = solution.scene.prismatic
     # Residuals of a method without covariance are its own doing, not noise of the images.
-    sigma = expected.sigma_px if spread is None else expected.noise_px(solution)
+    sigma = expected.sigma_px if errors is None else expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
     noise, error = np.full(len(span), np.nan), None
     advice: list[str] = []
-    if spread is not None:
-        sure = _Uncertainty(solution, spread)
+    if errors is not None:
+        sure = _Uncertainty.of(solution, errors)
         sides = np.array([1.0, -1.0])
         spreads = [sure.spread(sure.at(i, sure.reach(i) * sides), nearer=True) for i in range(len(span))]
         noise = np.array([_rms(T) for T in spreads])
@@ -177,7 +200,7 @@ def judged(
     warned, share = expected.warns(solution), expected.ratio(solution)
     found = f"{solution.sigma_px:.3g} px a coordinate"
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
-    if spread is None and warned:
+    if errors is None and warned:
         # Kept for comparison: it returns what it finds, marked so.
         short = f"the closed_form method explains the images only to {found}"
         return _Judgement(span, noise, error, False, f"{short}, {share:.3g} times {wanted}: use refined", ())
@@ -351,12 +374,12 @@ def _predicted(
     found = fit_inliers(problem, scene, solution.sigma_px)
     if found is None:
         raise WorkFailed(_OPEN)
-    factor = found.spread_factor()
+    found, kept = found.determined()
+    known[known] = kept
     place = held_out[whole.pose_of] & known[whole.marker_of]
     test = LeastSquares.of(whole.of_poses(held_out).of_markers(known), q_reference, lens)
     left, weight = test.residual(found.scene), test.readings.weight[..., None]
-    spread = test.dense(test.derivative(found.scene), np.ones_like(test.readings.seen)) @ factor
-    variance = (spread**2).sum(axis=1).reshape(left.shape)
+    variance = sum((part**2).sum(axis=-1) for part in test.predicted(found.scene, found.errors()))
     # A direction the other poses leave open would stay where the whole fit put it.
     if np.sqrt(variance[test.readings.seen].mean()) > _UNDETERMINED_NOISE:
         raise WorkFailed(_OPEN)

@@ -87,7 +87,7 @@ class Readings:
         """(N,) whether both views saw the marker."""
         return np.asarray(np.logical_and(self.seen[0], self.seen[1]))
 
-    def rows(self, keep: BoolArray) -> "Readings":
+    def rows(self, keep: BoolArray | IntArray) -> "Readings":
         """Some of the sightings (N,); the lists of poses and markers stay."""
         return dataclasses.replace(
             self,
@@ -190,6 +190,15 @@ LEAST_MOTION = 5.0
 _STANDING = 0.1
 # Least range of a joint that is a motion at all, rad or m.
 _LEAST_SPAN = 1e-6
+
+
+# What only judges a fit looks at this many markers at most.
+MOST_JUDGED = 50
+
+
+def evenly(count: int, most: int) -> IntArray:
+    """Indices of all of so many, or of no more than the most, from the first to the last in even steps."""
+    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(np.int64)
 
 
 def per_rad(prismatic: BoolArray) -> FloatArray:

@@ -253,7 +253,8 @@ def connected(scenario: Scenario, law: str) -> DrivenRobot:
     innovation = None
     if not scenario.untested:
         noise = config.stop.innovation_factor * scenario.noise_px
-        innovation = Innovation(calibration, noise, scenario.limits.max_steps + 1 + WINDOW)
+        shown = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
+        innovation = Innovation(calibration, noise, scenario.limits.max_steps + 1 + WINDOW, shown)
     return DrivenRobot(robot, plant, _known_of(scenario, calibration, law), innovation)
 
 

@@ -85,7 +85,7 @@ class Scenario:
         if self.config.stop.innovation_factor == 0.0:
             return "stop.innovation_factor is 0"
         assert self.calibration is not None
-        if not np.isfinite(self.calibration.covariance).all():
+        if not self.calibration.has_covariance:
             return "the calibration has no covariance, which the method refined gives"
         return ""
 

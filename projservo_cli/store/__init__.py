@@ -44,7 +44,7 @@ from projservo_cli.records import (
 if typing.TYPE_CHECKING:
     import h5netcdf
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _SEAL = b"\nprojservo sha256 %s\n"
 _SEAL_SIZE = len(_SEAL % bytes(64))

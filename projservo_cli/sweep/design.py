@@ -298,7 +298,7 @@ class Design:
                 yield key, self.calibrated(*place)
 
     def with_covariance(self) -> set[str]:
-        """Keys of the calibrations of which a run needs the covariance, each 0.2 MB."""
+        """Keys of the calibrations of which a run needs the covariance, each 0.1 MB."""
         cells = [c for c in range(self.cells) if self.cell(c).trajectory.needs_covariance]
         return {self.calibration_key(*place) for place in product(cells, range(self._calibrations))}
 

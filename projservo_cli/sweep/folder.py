@@ -194,7 +194,7 @@ class Folder:
         whole = design.with_covariance()
         for key, _ in design.calibrations():
             made = load(path).calibration if (path := self.calibration(key)).exists() else None
-            found[key] = made if made is None or key in whole else replace(made, covariance=np.zeros((0, 0)))
+            found[key] = made if made is None or key in whole else made.without_covariance()
         return found
 
 

@@ -11,6 +11,7 @@ from projservo_cli.calibration import calibrate, predict, residual_statistics
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import Solution
 from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.prediction import all_changed
 from projservo_cli.calibration.projective import Projective
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics
@@ -51,8 +52,7 @@ def test_record_follows_the_conventions():
     # Signs: the plane at infinity is one on the markers, both cameras see positive depths.
     assert np.allclose(calibration.M @ calibration.a_inf, 1.0, atol=1e-12)
     assert np.all(np.einsum("vc,mc->vm", calibration.P[:, 2], calibration.M) > 0.0)
-    assert calibration.covariance.shape == (24 + 16 * n + 4 * m,) * 2
-    assert np.linalg.eigvalsh(calibration.covariance)[0] > -1e-12 * np.trace(calibration.covariance)
+    assert calibration.errors.dense().shape == (24 + 16 * n + 4 * m, 24 + 5 * 4 + 2 - 8 + 3 * m)
     assert calibration.dof == 2 * 2 * 49 * 10 - (24 + 5 * 4 + 2 + 3 * 10 - 8)
     assert calibration.merged_poses == 49
     assert calibration.merged_markers == 10
@@ -82,22 +82,41 @@ def test_frame_does_not_depend_on_the_frame_it_comes_from():
         np.testing.assert_allclose(getattr(other, name), expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_covariance_is_that_of_the_parameters():
-    """Variances of predictions from the record equal those of the adjustment, and its gauge is free."""
-    robot = random_robot("RPR", np.random.default_rng(2), markers=5)
+@pytest.mark.parametrize(("noise", "markers"), [(None, 5), (0.01, 5), (0.01, 30)])
+@pytest.mark.parametrize("lens", [False, True])
+def test_covariance_is_that_of_the_parameters(noise, markers, lens):
+    """Predictions err as by the dense information matrix, of every marker that is eliminated or kept."""
+    robot = random_robot("RPR", np.random.default_rng(2), markers=markers)
     q = trials(robot, frames=4)
     readings = readings_at(robot, q)
-    problem = LeastSquares.of(readings, robot.q_reference)
-    scene = Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers)
-    solution = Solution(problem, scene, problem.residual(scene), readings.seen, 1)
-    spread = solution.spread_factor()
-    direct = problem.dense(problem.derivative(scene), readings.seen) @ spread
+    tau = None if noise is None else noise * np.array([1.0, 0.3, 2.0])
+    problem = LeastSquares.of(readings, robot.q_reference, lens).with_noise(tau)
+    bent = np.array([[320.0, 240.0, 300.0, -0.1, 0.02]] * 2) if lens else None
+    scene = Scene(robot.cameras, robot.twists, readings.prismatic, robot.markers, bent)
+    used = readings.seen & (np.random.default_rng(3).random(readings.seen.shape) > 0.3)
+    solution = Solution(problem, scene, problem.residual(scene), used, 10**12)
+    ahead = problem.dense(problem.derivative(scene), readings.seen)
+    J = ahead * np.repeat(used.ravel(), 2)[:, None]
+    if tau is not None:  # offsets of all joints as parameters of their own, held by their noise
+        G = (problem.joint_derivative(scene) * tau)[..., None, :] * used[..., None, None, None]
+        at_pose = (readings.pose_of[:, None] == np.arange(len(q)))[None, :, None, :, None]
+        offsets = (G * at_pose).reshape(len(J), -1)
+        held = np.hstack([np.zeros((offsets.shape[1], problem.size)), np.eye(offsets.shape[1])])
+        J = np.vstack([np.hstack([J, offsets]), held])
+    scale = np.linalg.norm(J, axis=0)
+    root = np.linalg.pinv(J / scale, rcond=1e-11)[: problem.size] / scale[: problem.size, None]
+    expected = (ahead @ root) @ (ahead @ root).T
+    errors = solution.errors()
+    factor = ahead @ errors.dense()
+    np.testing.assert_allclose(factor @ factor.T, expected, atol=1e-9 * np.abs(expected).max())
+    parts = problem.predicted(scene, errors)
+    variance = sum((part**2).sum(axis=-1) for part in parts)
+    np.testing.assert_allclose(variance.ravel(), np.diag(expected), rtol=1e-9)
+    # The record tells them of another frame.
     result = Projective.of(solution)
-    chained = result.scene.derivative(problem.q) @ result.covariance_factor(solution, spread)
-    chained = chained[readings.pose_of, :, readings.marker_of].transpose(1, 0, 2, 3).reshape(direct.shape)
-    # Both are factors of one covariance, each with a gauge of its own.
-    covariance, other = direct @ direct.T, chained @ chained.T
-    assert np.abs(other - covariance).max() < 1e-9 * np.abs(covariance).max()
+    found = all_changed(result.scene, result.errors(solution, errors), problem.q)
+    found = found[readings.pose_of, :, readings.marker_of].swapaxes(0, 1).reshape(len(expected), -1)
+    np.testing.assert_allclose(found @ found.T, expected, atol=1e-9 * np.abs(expected).max())
 
 
 def test_residual_statistics_count_what_they_skip():

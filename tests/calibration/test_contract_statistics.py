@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import chi2, kstest
 
 from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.calibration.prediction import error_factor
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
 
@@ -38,8 +39,8 @@ def test_degrees_of_freedom(draws):
     for calibration in found:
         assert calibration.outlier.size == 0  # a normal draw of 85 pairs has 5σ once in a thousand sets
         assert calibration.dof == bound.coordinates - bound.rank
-        rank = np.linalg.matrix_rank(calibration.covariance, rtol=1e-11, hermitian=True)
-        assert rank == bound.rank
+        factor = error_factor(calibration)
+        assert np.linalg.matrix_rank(factor @ factor.T, rtol=1e-11, hermitian=True) == bound.rank
 
 
 def test_chi2_is_distributed_as_it_should(draws):

@@ -72,9 +72,12 @@ def filmed(trace, width, height):
 def known(config, true, model, q):
     """The record of a model known in the frame of ``projective_twin``, as if it had been fitted freely."""
     M = np.linalg.solve(studies.H_PE, true.M.T).T
-    J = Scene(model.P, model.H_hat_0, model.joint_types == PRISMATIC, M).derivative(q - model.q_reference)
+    scene = Scene(model.P, model.H_hat_0, model.joint_types == PRISMATIC, M)
+    J, own = scene.derivative(q - model.q_reference)
+    own = np.einsum("kvmia,mn->kvmina", own, np.eye(len(M))).reshape(*own.shape[:-1], -1)
+    J, first = np.concatenate([J, own], axis=-1), J.shape[-1]
     s, Vt = np.linalg.svd(J.reshape(-1, J.shape[-1]), full_matrices=False)[1:]
-    factor = (Vt / s[:, None])[s > 1e-8 * s[0]]
+    factor = (Vt / s[:, None])[s > 1e-8 * s[0]].T
     none = np.zeros((0, 3), dtype=np.int64)
     sigma = config.noise.calibration_px or 0.5
     return fake(
@@ -86,7 +89,9 @@ def known(config, true, model, q):
         **{name: getattr(model, name) for name in ("P", "H_hat_0", "q_reference", "a_inf")},
         marker=np.array(true.number),
         M=M,
-        covariance=sigma**2 * factor.T @ factor,
+        shared_error=sigma * factor[:first],
+        marker_error=sigma * factor[first:].reshape(len(M), 4, -1),
+        own_error=np.zeros((len(M), 4, 3)),
         excitation=np.ptp(q, axis=0),
         lowest=q.min(axis=0),
         weak=np.arange(len(q[0])) == 1,

@@ -6,6 +6,7 @@ from matplotlib.container import BarContainer
 from scipy.linalg import sqrtm
 
 from projservo_cli.calibration import predict, prediction_variance
+from projservo_cli.calibration.prediction import scene_of
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
@@ -114,11 +115,15 @@ def test_held_out_errors_take_the_place_of_those_in_the_fit():
 
 
 def test_information_is_the_inverse_of_the_covariance_without_its_null_space():
-    size = len(case()[2].calibration.covariance)
-    basis = np.linalg.qr(np.random.default_rng(1).normal(size=(size, size)))[0]
-    spread = np.zeros(size)
-    spread[:6] = 1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0
-    values = SPEC.data(shifted(covariance=basis * spread @ basis.T))["information"]
+    calibration = case()[2].calibration
+    m, s = len(calibration.M), len(calibration.shared_error)
+    gauge = scene_of(calibration).gauge()
+    directions = np.random.default_rng(1).normal(size=(len(gauge), 6))
+    basis = np.linalg.qr(np.hstack([gauge, directions]))[0][:, gauge.shape[1] :]
+    factor = basis * np.sqrt([1e-6, 1e-3, 0.5, 2.0, 2.0, 4.0])
+    factor += gauge[:, :6]  # which no image shows
+    off = {"shared_error": factor[:s], "marker_error": factor[s:].reshape(m, 4, 6)}
+    values = SPEC.data(shifted(**off, own_error=np.zeros((m, 4, 3))))["information"]
     # round-off of the largest eigenvalue over the smallest: 4 · 1e-16 · 200 / 1e-6
     np.testing.assert_allclose(values, [1e6, 1e3, 2.0, 0.5, 0.5, 0.25], rtol=1e-6)
 
@@ -173,8 +178,8 @@ def test_excitation_is_in_degrees_and_metres_on_own_axes_and_weak_joints_are_hat
 
 
 def test_a_method_without_covariance_says_so_in_both_panels():
-    size = len(case()[2].calibration.covariance)
-    axes = drawn(shifted(covariance=np.full((size, size), np.nan))).axes
+    unknown = np.full_like(case()[2].calibration.shared_error, np.nan)
+    axes = drawn(shifted(shared_error=unknown)).axes
     for panel in (axes[3], axes[5]):
         assert [text.get_text() for text in panel.texts] == ["the method has no covariance"]
 

@@ -220,9 +220,9 @@ def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
 
 def test_a_calibration_without_covariance_tests_nothing_and_says_so():
     config = load_config(UR5)
-    bare = fake(Calibration, covariance=np.full((3, 3), np.nan))
+    bare = fake(Calibration, shared_error=np.full((3, 3), np.nan))
     assert "has no covariance" in Scenario.untested.fget(SimpleNamespace(config=config, calibration=bare))
-    sound = fake(Calibration, covariance=np.eye(3))
+    sound = fake(Calibration, shared_error=np.eye(3))
     assert Scenario.untested.fget(SimpleNamespace(config=config, calibration=sound)) == ""
 
 

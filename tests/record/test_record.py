@@ -56,7 +56,7 @@ def test_recording_then_calibrating_is_calibrating(projservo):
     assert projservo("calibrate", "-c", UR5, *recorded, "-o", "two", "-q").code == 0
     one, two = load("one").calibration, load("two").calibration
     assert (one.source, two.source) == ("simulated", "recorded")
-    for name in ("P", "H_hat_0", "M", "a_inf", "q_reference", "covariance"):
+    for name in ("P", "H_hat_0", "M", "a_inf", "q_reference", "shared_error", "marker_error", "own_error"):
         np.testing.assert_array_equal(getattr(two, name), getattr(one, name), err_msg=name)
 
 

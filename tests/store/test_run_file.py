@@ -161,7 +161,7 @@ def test_a_change_anywhere_is_noticed_before_it_is_read(path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema_version": 2}, "upgrade, pip install --upgrade projservo, or make it again: projservo cal"),
+        ({"schema_version": 3}, "upgrade, pip install --upgrade projservo, or make it again: projservo cal"),
         ({"schema": "something else"}, "not a run file of projservo"),
     ],
 )

@@ -245,12 +245,12 @@ def test_guided_runs_are_the_same_in_processes_and_made_anew(tmp_path):
     (trace,) = load(tmp_path / "run").traces.values()
     for name in ("verdict", "steps", "success", "effort", "position_error_mm"):
         assert getattr(trace, name) == rows[name][number]
-    assert {made.covariance.size > 0 for made in Folder(tmp_path / "one").calibrations(found).values()} == {
+    assert {made.shared_error.size > 0 for made in Folder(tmp_path / "one").calibrations(found).values()} == {
         True
     }
     plain = design(runs=3, calibrations=2)
     kept = Folder(tmp_path / "one").calibrations(plain).values()
-    assert {made.covariance.size for made in kept} == {0}
+    assert {made.shared_error.size for made in kept} == {0}
 
 
 def test_a_run_made_anew_has_the_numbers_of_its_row(whole, tmp_path):

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration import predict, prediction_variance
-from projservo_cli.calibration.prediction import covariance_root, joint_derivative, prediction_derivative
-from projservo_cli.calibration.readings import per_rad
+from projservo_cli.calibration.prediction import changed, error_factor, joint_derivative, scene_of
+from projservo_cli.calibration.readings import MOST_JUDGED, evenly, per_rad
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
@@ -55,8 +55,8 @@ def _data(fit: Fit) -> Data:
         "excitation": calibration.excitation,
         "prismatic": calibration.prismatic,
         "weak": calibration.weak,
-        "information": _information(calibration.covariance),
-        "parameters": np.array(len(calibration.covariance)),
+        "information": _information(calibration),
+        "parameters": np.array(len(calibration.shared_error) + calibration.M[:MOST_JUDGED].size),
         "residual": residual[used].ravel(),
         "held_out": np.array(fit.held_out is not None),
         "weighed": np.array(bool(weighed)),
@@ -87,7 +87,8 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
 
     Those of a pose, weighed where their deviations are stated, have the covariance S = σ² (I + G Gᵀ), with G
     the derivative by the joints times their noise over σ. With G = U s Vᵀ, σ S^-½ takes the share
-    1 − (1 + s²)^-½ from what lies along U.
+    1 − (1 + s²)^-½ from what lies along U. It mixes the errors that markers have of their own: of the squares
+    of what comes to one of them from the others, only their sum A over all is needed.
     """
     calibration, q = fit.calibration, fit.observation.q
     weight = np.ones(used.shape)
@@ -96,16 +97,26 @@ def _as_tested(fit: Fit, residual: FloatArray, used: BoolArray) -> tuple[FloatAr
         weight[used] = np.sqrt(np.mean(stated[used] ** 2)) / stated[used]
     noise = (calibration.sigma_q or 0.0) * per_rad(calibration.prismatic) / calibration.sigma_px
     G = weight[..., None, None] * joint_derivative(calibration, q) * noise
-    root = np.full((*residual.shape, 1), np.nan)  # of a method without covariance
-    if np.isfinite(calibration.covariance).all():
-        root = prediction_derivative(calibration, q) @ covariance_root(calibration.covariance)
-    both = np.concatenate([residual[..., None], root], axis=-1) * weight[..., None, None]
+    tested, variance = residual * weight[..., None], np.empty_like(residual)
     for k, of_pose in enumerate(used):
+        parts = changed(scene_of(calibration), calibration.errors, q[k : k + 1] - calibration.q_reference)
+        common, own = (part[0] * weight[k, ..., None, None] for part in parts)
+        variance[k] = (common**2).sum(axis=-1) + (own**2).sum(axis=-1)
         U, s, _ = np.linalg.svd(G[k][of_pose].reshape(-1, len(q[k])), full_matrices=False)
-        rows = both[k][of_pose].reshape(len(U), -1)
-        rows -= U @ ((1.0 - 1.0 / np.sqrt(1.0 + s**2))[:, None] * (U.T @ rows))
-        both[k][of_pose] = rows.reshape(-1, 2, rows.shape[1])
-    return both[..., 0], (both[..., 1:] ** 2).sum(axis=-1)
+        rows = np.concatenate([tested[k][..., None], common], axis=-1)[of_pose].reshape(len(U), -1)
+        across = U * (1.0 - 1.0 / np.sqrt(1.0 + s**2))
+        rows -= across @ (U.T @ rows)
+        tested[k][of_pose] = rows[:, 0].reshape(-1, 2)
+        # Uᵀ own of each marker, of both views: (m, n, 3).
+        along = np.zeros((used.shape[2], len(s), 3))
+        marker = np.repeat(np.nonzero(of_pose)[1], 2)
+        own = own[of_pose].reshape(-1, 3)
+        np.add.at(along, marker, U[:, :, None] * own[:, None])
+        A = np.tensordot(along, along, axes=([0, 2], [0, 2]))
+        mixed = ((across @ A) * across).sum(axis=1)
+        kept = (own**2).sum(axis=1) - 2.0 * np.einsum("ai,aij,aj->a", across, along[marker], own)
+        variance[k][of_pose] = ((rows[:, 1:] ** 2).sum(axis=1) + kept + mixed).reshape(-1, 2)
+    return tested, variance
 
 
 def _readings(calibration: Calibration, observation: Observation) -> tuple[FloatArray, IntArray]:
@@ -150,15 +161,16 @@ def _by_pose(used: BoolArray, residual: FloatArray, variance: FloatArray) -> Dat
     return found | {"pose_coordinates": count}
 
 
-def _information(covariance: FloatArray) -> FloatArray:
+def _information(calibration: Calibration) -> FloatArray:
     """Eigenvalues of the information matrix, falling: the covariance's that are not zero, inverted.
 
     Zero are the gauge directions, and those across the constraint that all operators are conjugate
-    to rigid motions by one matrix. Empty for a method without a covariance (d, d) of P, H_hat_0 and M.
+    to rigid motions by one matrix. Of P, H_hat_0 and M, some of them for many; empty without a covariance.
     """
-    if not np.isfinite(covariance).all():
+    if not calibration.has_covariance:
         return np.zeros(0)
-    spread = np.linalg.eigvalsh(covariance)
+    few = calibration.with_markers(evenly(len(calibration.M), MOST_JUDGED))
+    spread = np.linalg.svd(error_factor(few), compute_uv=False)[::-1] ** 2
     floor = len(spread) * np.finfo(np.float64).eps * spread[-1]
     return np.asarray(1.0 / spread[spread > floor])
 
