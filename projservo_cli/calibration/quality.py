@@ -54,23 +54,25 @@ class _Uncertainty:
     problem: LeastSquares
     scene: Scene
     errors: Errors  # at a noise of one pixel
+    which: IntArray  # markers that are looked at; the generators of the screws are those of all
     region: FloatArray  # (2, 2, 2) lower and upper corners (view, coordinate), px
 
     @classmethod
     def of(cls, solution: Solution, errors: Errors) -> "_Uncertainty":
-        """Of no more markers than are judged, the region that of all."""
+        """By no more markers than are judged, in the region of all."""
         readings = solution.problem.readings
         low, high = (
             np.stack([extreme(readings.pixels[v][readings.seen[v]], axis=0) for v in (0, 1)])
             for extreme in (np.min, np.max)
         )
         wide = 0.5 * (high - low)
-        some, which = solution.of_some(MOST_JUDGED), evenly(len(solution.scene.M), MOST_JUDGED)
-        return cls(some.problem, some.scene, errors.of(which), np.stack([low - wide, high + wide]))
+        which = evenly(len(solution.scene.M), MOST_JUDGED)
+        return cls(solution.problem, solution.scene, errors, which, np.stack([low - wide, high + wide]))
 
     def shown(self, q: FloatArray) -> BoolArray:
         """Which images (2, K, m) at poses (K, n) lie in the region that counts."""
-        pixels = self.scene.seen(q - self.problem.q_reference).swapaxes(0, 1)
+        some = dataclasses.replace(self.scene, M=self.scene.M[self.which])
+        pixels = some.seen(q - self.problem.q_reference).swapaxes(0, 1)
         low, high = self.region[:, :, None, None]
         return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=-1))
 
@@ -86,12 +88,12 @@ class _Uncertainty:
                 break
             q = 0.5 * (q + q_reference)
             shown = self.shown(q)
-        readings, lens = self.problem.readings.everywhere(q), self.scene.lens is not None
+        readings, lens = self.problem.readings.everywhere(q, self.which), self.scene.lens is not None
         there = LeastSquares.of(readings, q_reference, lens)
         common, own = there.predicted(self.scene, self.errors)
         shown = shown.swapaxes(1, 2).reshape(2, -1)  # sightings are in the order of markers
         marker = np.nonzero(shown)[1] // len(q)
-        T = apart(common[shown], own[shown], marker[:, None], readings.marker.size)
+        T = apart(common[shown], own[shown], marker[:, None], self.which.size)
         return T.reshape(-1, T.shape[-1])
 
     def at(self, i: int, offsets: FloatArray) -> FloatArray:

@@ -75,9 +75,10 @@ class Readings:
             stated_px=stated_px,
         )
 
-    def everywhere(self, q: FloatArray) -> "Readings":
-        """All markers at other joint readings (K, n), rad or m, as if both views had seen them at zero."""
-        marker_of, pose_of = np.divmod(np.arange(self.marker.size * len(q)), len(q))
+    def everywhere(self, q: FloatArray, which: IntArray | None = None) -> "Readings":
+        """All markers, or some, at other joints (K, n), rad or m, as if both views had seen them at zero."""
+        which = np.arange(self.marker.size) if which is None else which
+        marker_of, pose_of = np.repeat(which, len(q)), np.tile(np.arange(len(q)), which.size)
         pixels, weight = np.zeros((2, marker_of.size, 2)), np.ones((2, marker_of.size))
         where = np.arange(len(q)), self.marker, pose_of, marker_of
         return Readings(q, self.prismatic, *where, pixels, weight > 0.0, weight, None)
