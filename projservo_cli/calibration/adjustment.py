@@ -6,8 +6,9 @@ construction. Both cameras are general 3×4 matrices. The frame is a means of wr
 has no claim to truth: how it sits in the world is left to the images as far as they determine it.
 
 Where joint readings err, the true joints of each pose are unknowns too, held to the readings by their noise.
-They are eliminated from each step pose by pose (Schur complement), exactly: W. A. Fuller, "Measurement error
-models", Wiley 1987, section 3.2; B. Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
+Markers are eliminated from each step one by one, or these offsets pose by pose where they are more (Schur
+complement), so that the cost is linear in the markers: W. A. Fuller, "Measurement error models", Wiley 1987,
+section 3.2; B. Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 
 Levenberg–Marquardt with geodesic acceleration and a gauge penalty: M. Transtrum, J. Sethna,
 "Improvements to the Levenberg–Marquardt algorithm", arXiv:1201.5885.
@@ -16,9 +17,10 @@ Levenberg–Marquardt with geodesic acceleration and a gauge penalty: M. Transtr
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, expm
+from scipy.linalg import expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
 from projservo_cli.calibration.forward import CAMERA, LENS, Scene, image_points
@@ -82,7 +84,7 @@ class LeastSquares:
     joint: IntArray  # (n + 1,) first parameter of each joint, then of the lenses where these are sought
     shared: int  # number of parameters before those of the markers
     size: int  # number of parameters
-    columns: IntArray  # (2, N, c) parameters that a reading depends on
+    columns: IntArray  # (2, c - 3) parameters that all readings of a view depend on
     # (n,) noise of joint readings over that of pixels, rad/px or m/px; None where readings are exact
     tau: FloatArray | None = None
 
@@ -95,15 +97,13 @@ class LeastSquares:
         joint = 2 * CAMERA + np.concatenate([[0], np.cumsum(np.where(readings.prismatic, 2, 4))])
         count = LENS if lens else 0
         shared = int(joint[-1]) + 2 * count
-        shape = (2, readings.marker_of.size)
-        view = np.arange(2)[:, None, None]
+        view = np.arange(2)[:, None]
         parts = (
             view * CAMERA + np.arange(CAMERA),
-            np.arange(joint[0], joint[-1]),
+            np.broadcast_to(np.arange(joint[0], joint[-1]), (2, joint[-1] - joint[0])),
             joint[-1] + view * count + np.arange(count),
-            shared + 3 * readings.marker_of[:, None] + np.arange(3),
         )
-        columns = np.concatenate([np.broadcast_to(p, (*shape, p.shape[-1])) for p in parts], axis=2)
+        columns = np.concatenate(parts, axis=1)
         q = readings.q - q_reference
         return cls(readings, q, q_reference, joint, shared, shared + 3 * readings.marker.size, columns)
 
@@ -123,7 +123,7 @@ class LeastSquares:
 
     def rows(self, at: IntArray) -> "LeastSquares":
         """The same problem with some of the sightings (N,); parameters stay."""
-        return dataclasses.replace(self, readings=self.readings.rows(at), columns=self.columns[:, at])
+        return dataclasses.replace(self, readings=self.readings.rows(at))
 
     def of_markers(self, keep: BoolArray) -> "LeastSquares":
         """The same problem with some of the markers (m,) alone."""
@@ -219,31 +219,6 @@ class LeastSquares:
             result[v * CAMERA : (v + 1) * CAMERA, v - 2] = scene.P[v].ravel()
         return np.asarray(result / np.linalg.norm(result, axis=0))
 
-    def _blocks(self) -> Iterator[tuple[int, slice, IntArray]]:
-        """View and rows of the readings of each marker, and their columns (c,), the same for all."""
-        edges = np.searchsorted(self.readings.marker_of, np.arange(self.readings.marker.size + 1))
-        for v, j in np.ndindex(2, len(edges) - 1):
-            yield v, slice(edges[j], edges[j + 1]), self.columns[v, edges[j]]
-
-    def normal(self, J: FloatArray, weight: FloatArray) -> FloatArray:
-        """Normal matrix Jᵀ W J (size, size) from the compact derivative."""
-        A = np.zeros((self.size, self.size))
-        for v, rows, columns in self._blocks():
-            block = J[v, rows].reshape(-1, J.shape[-1])
-            A[np.ix_(columns, columns)] += (block.T * np.repeat(weight[v, rows], 2)) @ block
-        return A
-
-    def gradient(self, J: FloatArray, weighted: FloatArray) -> FloatArray:
-        """Jᵀ times weighted residuals (2, N, 2): (size,)."""
-        g = np.zeros(self.size)
-        for v, rows, columns in self._blocks():
-            g[columns] += weighted[v, rows].ravel() @ J[v, rows].reshape(-1, J.shape[-1])
-        return g
-
-    def change(self, J: FloatArray, x: FloatArray) -> FloatArray:
-        """J times a step (size,): first-order change (2, N, 2) of the images."""
-        return np.asarray((J @ x[self.columns][..., None])[..., 0])
-
     def at_poses(self, values: FloatArray) -> FloatArray:
         """Sums (K, …) over the sightings of each pose of values (N, …)."""
         result: FloatArray = np.zeros((len(self.q), *values.shape[1:]))
@@ -253,7 +228,11 @@ class LeastSquares:
     def dense(self, J: FloatArray, mask: BoolArray) -> FloatArray:
         """The whole derivative (4 N, size), zero outside a mask (2, N), for what needs more than JᵀJ."""
         result = np.zeros((*J.shape[:3], self.size))
-        np.put_along_axis(result, self.columns[:, :, None], J * mask[..., None, None], axis=3)
+        J = J * mask[..., None, None]
+        for v in (0, 1):
+            result[v][..., self.columns[v]] = J[v, ..., :-3]
+        own = self.shared + 3 * self.readings.marker_of[None, :, None, None] + np.arange(3)
+        np.put_along_axis(result, own, J[..., -3:], axis=3)
         return result.reshape(-1, self.size)
 
     def predicted(self, scene: Scene, errors: Errors) -> tuple[FloatArray, FloatArray]:
@@ -261,7 +240,7 @@ class LeastSquares:
         J, marker_of = self.derivative(scene), self.readings.marker_of
         common = J[..., -3:] @ errors.marker[marker_of]
         for v in (0, 1):
-            common[v] += J[v, ..., :-3] @ errors.shared[self.columns[v, 0, :-3]]
+            common[v] += J[v, ..., :-3] @ errors.shared[self.columns[v]]
         return common, J[..., -3:] @ errors.own[marker_of]
 
     def whitened(self, scene: Scene, rows: FloatArray, mask: BoolArray) -> FloatArray:
@@ -330,73 +309,238 @@ class _Fit:
     cost: float  # weighted sum of squares, px²
 
 
+class _Family(NamedTuple):
+    """Parameters of which a sighting depends on one block alone: markers, or offsets of joints at a pose."""
+
+    of: IntArray  # (N,) block of a sighting
+    J: FloatArray  # (2, N, 2, d) derivatives by it, weighed
+    sums: csr_array  # (b, N) adds up the sightings of each block
+
+    @classmethod
+    def by(cls, of: IntArray, J: FloatArray, count: int) -> "_Family":
+        """Of derivatives by blocks, so many of them."""
+        N = len(of)
+        return cls(of, J, csr_array((np.ones(N), (of, np.arange(N))), shape=(count, N)))
+
+    def added(self, values: FloatArray) -> FloatArray:
+        """Sums (b, …) over the sightings of each block of values (N, …)."""
+        flat = self.sums @ values.reshape(len(values), -1)
+        return np.asarray(flat.reshape(self.sums.shape[0], *values.shape[1:]))
+
+    def across(self, others: FloatArray) -> FloatArray:
+        """Products (b, d, c) of its derivatives with others (2, N, 2, c) over all sightings of each block."""
+        return self.added(_products(self.J, others))
+
+    def gradient(self, change: FloatArray) -> FloatArray:
+        """Products (b, d) of its derivatives with a weighed change (2, N, 2) of the images."""
+        return self.across(change[..., None])[..., 0]
+
+
+def _products(J: FloatArray, others: FloatArray) -> FloatArray:
+    """Products (N, d, c) of derivatives (v, N, 2, d) with others (v, N, 2, c) of the same sightings."""
+    N = J.shape[1]
+    a, b = (part.swapaxes(0, 1).reshape(N, -1, part.shape[-1]) for part in (J, others))
+    return np.asarray(a.swapaxes(1, 2) @ b)
+
+
+class _Part(NamedTuple):
+    """Derivatives of some sightings, weighed by the roots of their weights."""
+
+    at: slice  # of the sightings
+    shared: FloatArray  # (2, N, 2, c - 3) by what all sightings of a view depend on
+    gone: _Family  # eliminated
+    kept: _Family | None  # the other family
+
+
+# Sightings of which the derivatives are kept at once: some 100 MB.
+_AT_ONCE = 2**16
+
+
 class _Expansion:
-    """First order of the images about a scene, with weights (2, N), by the parameters from a first one on."""
+    """First order of the images about a scene, with weights (2, N), by the parameters from a first one on.
+
+    In units in which the diagonal of the normal matrix is at most one. One of both families of blocks is
+    eliminated, so that what is solved has the size of the other one and of what all sightings share. The
+    gauge is tied by a penalty, as multipliers beside them.
+    """
 
     def __init__(
         self, problem: LeastSquares, scene: Scene, residual: FloatArray, weight: FloatArray, least: FloatArray
     ) -> None:
-        self.problem, self.scene, self.residual, self.weight = problem, scene, residual, weight
-        first = problem.size - len(least)
-        self.J = problem.derivative(scene)
-        A = problem.normal(self.J, weight)
-        self.errors, self.strain, self.raw = None, np.zeros(0), residual
-        if problem.tau is not None:
-            self.errors, self.strain = JointErrors(problem, scene, weight, problem.tau), problem.strain(scene)
-            self.raw = residual - self.errors.change(self.strain)  # at the joints as read
-            B = self.errors.parts(problem.dense(self.J, np.ones_like(problem.readings.seen)))
-            share = self.errors.square / (1.0 + self.errors.square)
-            self.by_errors = B.T * share.ravel()
-            A -= self.by_errors @ B
-        A = A[first:, first:]
-        # Units in which the diagonal is at most one, and the gauge tied.
-        self.scale = np.maximum(least, np.sqrt(np.maximum(np.diagonal(A), 1e-300)))
-        self.A = A / np.outer(self.scale, self.scale)
+        self.problem, self.scene, self.residual = problem, scene, residual
+        self.root, self.first = np.sqrt(weight), problem.size - len(least)
+        m, offsets = len(scene.M), 0 if problem.tau is None else problem.q.size
+        self.by_pose = 3 * m < offsets
+        self.strain = problem.strain(scene)
+        self.known: list[_Part] = []
+        s, size = problem.shared, 3 * m if self.by_pose else offsets
+        blocks, width = problem.q.shape if self.by_pose else (m, 3)
+        A, C = np.zeros((s + size, s + size)), np.zeros((blocks, width, s + size))
+        D = np.zeros((blocks, width, width))
+        for part in self._parts():
+            self._add(part, A, C, D)
+        if offsets:  # what readings say of them
+            own = D if self.by_pose else A[s:, s:]
+            own += np.eye(own.shape[-1])
+        self._scaled(A, C, D, least)
+
+    def _parts(self) -> Iterator[_Part]:
+        """Derivatives of all sightings, part by part; one that is all of them is kept."""
+        N = self.problem.readings.marker_of.size
+        if self.known:
+            yield from self.known
+            return
+        for first in range(0, N, _AT_ONCE):
+            at = slice(first, min(first + _AT_ONCE, N))
+            part = self._part(at)
+            if N <= _AT_ONCE:
+                self.known.append(part)
+            yield part
+
+    def _part(self, at: slice) -> _Part:
+        some = (
+            self.problem
+            if at.stop - at.start == self.residual.shape[1]
+            else self.problem.rows(np.arange(at.start, at.stop))
+        )
+        readings, root = some.readings, self.root[:, at, None, None]
+        J = some.derivative(self.scene) * root
+        families = [_Family.by(readings.marker_of, J[..., -3:], len(self.scene.M))]
+        if some.tau is not None:
+            G = some.joint_derivative(self.scene) * (some.tau * root)
+            families.insert(int(not self.by_pose), _Family.by(readings.pose_of, G, len(some.q)))
+        return _Part(at, J[..., :-3], families[0], families[1] if len(families) > 1 else None)
+
+    def _add(self, part: _Part, A: FloatArray, C: FloatArray, D: FloatArray) -> None:
+        """Add the products of the derivatives of some sightings to what is kept, crossed and eliminated."""
+        s, other = self.problem.shared, part.kept
+        D += part.gone.across(part.gone.J)
+        for v, columns in enumerate(self.problem.columns):
+            J = part.shared[v].reshape(-1, len(columns))
+            A[np.ix_(columns, columns)] += J.T @ J
+            one = part.shared[[v]]
+            C[:, :, columns] += part.gone._replace(J=part.gone.J[[v]]).across(one)
+            if other is not None:
+                crossed = other._replace(J=other.J[[v]]).across(one).reshape(-1, len(columns))
+                A[s:, columns] += crossed
+                A[columns[:, None], np.arange(s, len(A))] += crossed.T
+        if other is not None:
+            blocks, width = other.sums.shape[0], other.J.shape[-1]
+            at = s + width * np.arange(blocks)[:, None] + np.arange(width)
+            A[at[:, :, None], at[:, None]] += other.across(other.J)
+            rows = part.gone.of[:, None, None], np.arange(C.shape[1])[:, None], at[other.of][:, None]
+            C[rows] += _products(part.gone.J, other.J)
+
+    def _scaled(self, A: FloatArray, C: FloatArray, D: FloatArray, least: FloatArray) -> None:
+        """Take units of the parameters, no smaller than before, and tie the gauge."""
+        problem, s, first = self.problem, self.problem.shared, self.first
+        of_gone = np.diagonal(D, axis1=1, axis2=2).ravel()
+        markers = np.diagonal(A)[s:] if self.by_pose else of_gone
+        diagonal = np.concatenate([np.diagonal(A)[first:s], markers])
+        self.scale = np.maximum(least, np.sqrt(np.maximum(diagonal, 1e-300)))
+        shared, marker = self.scale[: s - first], self.scale[s - first :]
+        kept = np.concatenate([shared, marker if self.by_pose else np.ones(len(A) - s)])
+        gone = (np.ones(of_gone.size) if self.by_pose else marker).reshape(D.shape[:2])
+        self.units = kept, gone
+        self.A = A[first:, first:] / np.outer(kept, kept)
+        self.C = C[:, :, first:] / (gone[:, :, None] * kept)
+        self.D = D / (gone[:, :, None] * gone[:, None, :])
+        # Offsets are held by their own noise, all else is damped.
+        self.damped = np.arange(len(kept)) < (len(kept) if self.by_pose else s - first)
+        self.ties = 0
         if first == 0:
-            G = np.linalg.qr(self.scale[:, None] * problem.gauge(scene))[0]
-            self.A += G @ G.T
+            G = np.linalg.qr(self.scale[:, None] * problem.gauge(self.scene))[0]
+            self.ties = G.shape[1]
+            rest = np.zeros((len(kept) - s, self.ties))
+            held = G if self.by_pose else np.vstack([G[:s], rest])
+            at_gone = np.zeros((*gone.shape, self.ties)) if self.by_pose else G[s:].reshape(*gone.shape, -1)
+            self.A = np.block([[self.A, held], [held.T, -np.eye(self.ties)]])
+            self.C = np.concatenate([self.C, at_gone], axis=2)
 
     def step(self, damping: float) -> FloatArray | None:
         """Damped step (size or more,) with geodesic acceleration; None where second outweighs first order."""
-        try:
-            factor = cho_factor(self.A + damping * np.eye(len(self.A)))
-        except np.linalg.LinAlgError:
+        descent, count = self.solved(damping), len(self.scale)
+        if descent is None:
             return None
-        problem, errors, count = self.problem, self.errors, len(self.A)
-        held = np.zeros(problem.size - count)
-
-        def descent(change: FloatArray) -> FloatArray:
-            """Step in units of the scale, and errors of joints, that undo a change (2, N, 2) of images."""
-            g = problem.gradient(self.J, self.weight[..., None] * change)
-            if errors is not None:
-                g -= self.by_errors @ errors.parts(change.ravel())
-            step = -cho_solve(factor, g[len(held) :] / self.scale)
-            if errors is None:
-                return np.asarray(step)
-            left = change + problem.change(self.J, np.concatenate([held, step / self.scale]))
-            return np.concatenate([step, errors.undoing(left).ravel()])
-
-        def whole(step: FloatArray) -> FloatArray:
-            """Step of all parameters, (size,), and of offsets in units of tau."""
-            return np.concatenate([held, step[:count] / self.scale, step[count:]])
-
-        velocity = descent(self.raw)
-        velocity[count:] -= self.strain.ravel()
-        probe = problem.residual(problem.retract(self.scene, _PROBE * whole(velocity)))
-        bend = (2.0 / _PROBE) * ((probe - self.residual) / _PROBE - self.change(whole(velocity)))
+        velocity = descent(self.residual, self.strain)
+        if not np.isfinite(velocity).all():
+            return None
+        probe = self.problem.residual(self.problem.retract(self.scene, _PROBE * self._whole(velocity)))
+        bend = (2.0 / _PROBE) * ((probe - self.residual) / _PROBE - self.change(self._whole(velocity)))
         if not np.isfinite(bend).all():
             return None
-        acceleration = descent(bend)
-        if np.linalg.norm(acceleration[:count]) > _BEND * np.linalg.norm(velocity[:count]):
+        acceleration = descent(bend, np.zeros_like(self.strain))
+        if not np.linalg.norm(acceleration[:count]) <= _BEND * np.linalg.norm(velocity[:count]):
             return None
-        return whole(velocity + 0.5 * acceleration)
+        return self._whole(velocity + 0.5 * acceleration)
+
+    def solved(self, damping: float) -> Callable[[FloatArray, FloatArray], FloatArray] | None:
+        """What undoes a change (2, N, 2) of images and strains (K, n), in units; None where nothing does."""
+        A, D = self.A.copy(), self.D + (0.0 if self.by_pose else damping) * np.eye(self.D.shape[1])
+        A[np.arange(len(self.damped)), np.arange(len(self.damped))] += damping * self.damped
+        try:
+            root = np.linalg.cholesky(D)
+            crossed = np.linalg.solve(root, self.C)
+            flat = crossed.reshape(-1, len(A))
+            factor = lu_factor(A - flat.T @ flat, check_finite=False)
+        except np.linalg.LinAlgError:
+            return None
+
+        def descent(change: FloatArray, strain: FloatArray) -> FloatArray:
+            """Step of parameters in units, then of offsets in those of tau."""
+            kept, gone = self._gradient(change, strain)
+            left = np.linalg.solve(root, gone[..., None])
+            x = -lu_solve(factor, kept - flat.T @ left.ravel(), check_finite=False)
+            y = -np.linalg.solve(root.swapaxes(1, 2), left + (crossed @ x)[..., None])[..., 0]
+            return self._in_order(x, y)
+
+        return descent
+
+    def _gradient(self, change: FloatArray, strain: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradients, in units, of what is kept (k,) and eliminated (b, d), by a change and by strains."""
+        (kept, gone), problem, first = self.units, self.problem, self.first
+        by_kept, by_gone = np.zeros(first + len(self.A)), np.zeros(gone.shape)
+        others = by_kept[problem.shared : first + len(kept)]
+        for part in self._parts():
+            weighed = self.root[:, part.at, None] * change[:, part.at]
+            for v, columns in enumerate(problem.columns):
+                by_kept[columns] += weighed[v].ravel() @ part.shared[v].reshape(-1, len(columns))
+            by_gone += part.gone.gradient(weighed)
+            if part.kept is not None:
+                others += part.kept.gradient(weighed).ravel()
+        if self.by_pose:
+            by_gone += strain
+        elif strain.size:
+            others += strain.ravel()
+        by_kept = by_kept[first:]
+        by_kept[: len(kept)] /= kept
+        return by_kept, by_gone / gone
+
+    def _in_order(self, kept: FloatArray, gone: FloatArray) -> FloatArray:
+        """Shared parameters, markers, then offsets, of what is kept (k,) and eliminated (b, d)."""
+        s = self.problem.shared - self.first
+        others = kept[s : len(kept) - self.ties]
+        families = [others, gone.ravel()] if self.by_pose else [gone.ravel(), others]
+        return np.concatenate([kept[:s], *families])
+
+    def _whole(self, step: FloatArray) -> FloatArray:
+        """Step of all parameters, (size,), and of offsets in units of tau, from one in units."""
+        count = len(self.scale)
+        return np.concatenate([np.zeros(self.first), step[:count] / self.scale, step[count:]])
 
     def change(self, x: FloatArray) -> FloatArray:
-        """First-order change (2, N, 2) of the images by a step (size or more,)."""
-        change = self.problem.change(self.J, x[: self.problem.size])
-        if self.errors is None:
-            return change
-        return change + self.errors.change(x[self.problem.size :].reshape(self.problem.q.shape))
+        """First-order change (2, N, 2) of the weighed images by a step (size or more,)."""
+        problem, result = self.problem, np.zeros_like(self.residual)
+        shared, marker, offsets = np.split(x, [problem.shared, problem.size])
+        families = [marker.reshape(-1, 3), offsets.reshape(problem.q.shape) if offsets.size else None]
+        gone, kept = families[::-1] if self.by_pose else families
+        for part in self._parts():
+            for v, columns in enumerate(problem.columns):
+                result[v, part.at] = part.shared[v] @ shared[columns]
+            for family, values in ((part.gone, gone), (part.kept, kept)):
+                if family is not None and values is not None:
+                    result[:, part.at] += (family.J @ values[family.of][..., None])[..., 0]
+        return result / np.maximum(self.root, 1e-150)[..., None]
 
 
 def minimize(

@@ -161,12 +161,13 @@ class Solution:
                 part, used = problem.rows(at), self.used[:, at, None, None]
                 J = part.derivative(self.scene) * used
                 A = np.zeros((*J.shape[:3], count + 3))
-                np.put_along_axis(A, part.columns[:, :, None, :-3], J[..., :-3], axis=3)
+                for v, columns in enumerate(part.columns):
+                    A[v][..., columns] = J[v, ..., :-3]
                 if problem.tau is not None:
                     n = len(problem.tau)
-                    columns = problem.shared + n * part.readings.pose_of[:, None, None] + np.arange(n)
+                    at_pose = problem.shared + n * part.readings.pose_of[:, None, None] + np.arange(n)
                     G = part.joint_derivative(self.scene) * problem.tau * used
-                    np.put_along_axis(A, columns[None], G, axis=3)
+                    np.put_along_axis(A, at_pose[None], G, axis=3)
                 A[..., count:] = J[..., -3:]
                 A = (
                     A.reshape(2, markers.size, length, 2, -1)

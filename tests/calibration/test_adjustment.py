@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import LeastSquares, minimize
 from projservo_cli.calibration.forward import Scene, displacements
 from projservo_cli.calibration.readings import Readings
@@ -75,18 +76,41 @@ def test_gauge_directions_change_no_image():
         assert singular[-dimension] < 1e-13 < 1e-6 < singular[-dimension - 1]
 
 
-def test_blocks_of_the_normal_matrix_are_those_of_the_whole():
-    problem, scene = problem_of(random_robot("RPR", np.random.default_rng(6)), unseen=0.3)
-    J = problem.derivative(scene)
+@pytest.mark.parametrize(("joint_noise", "poses"), [(False, 9), (True, 4), (True, 30)])
+def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, monkeypatch):
+    """Markers eliminated, with offsets of joints or without; offsets eliminated; in one part and in many."""
+    problem, scene = problem_of(random_robot("RPR", np.random.default_rng(6)), unseen=0.3, count=poses)
     rng = np.random.default_rng(0)
-    weight = rng.uniform(0.0, 1.0, J.shape[:2])
-    residual = rng.standard_normal(J.shape[:3])
-    dense = full_jacobian(problem, J) * np.sqrt(np.repeat(weight.ravel(), 2))[:, None]
-    assert np.allclose(problem.normal(J, weight), dense.T @ dense, rtol=1e-12, atol=1e-9)
-    whole = full_jacobian(problem, J)
-    assert np.allclose(problem.gradient(J, residual), whole.T @ residual.ravel(), rtol=1e-12, atol=1e-9)
-    x = rng.standard_normal(problem.size)
-    assert np.allclose(problem.change(J, x).ravel(), whole @ x, rtol=1e-12, atol=1e-9)
+    if joint_noise:
+        problem = problem.with_noise(np.array([2e-3, 1e-3, 2e-3]))
+        scene = dataclasses.replace(scene, offsets=1e-3 * rng.standard_normal(problem.q.shape))
+    weight = rng.uniform(0.1, 1.0, problem.readings.seen.shape)
+    residual = problem.residual(scene) + rng.standard_normal((*weight.shape, 2))
+    strain, damping = problem.strain(scene), 1e-2
+    J = full_jacobian(problem, problem.derivative(scene))
+    if joint_noise:
+        K, n = problem.q.shape
+        G = np.zeros((*weight.shape, 2, K, n))
+        by_joint = problem.joint_derivative(scene) * problem.tau
+        G[:, np.arange(weight.shape[1]), :, problem.readings.pose_of] = by_joint.swapaxes(0, 1)
+        J = np.hstack([J, G.reshape(len(J), -1)])
+    root = np.sqrt(np.repeat(weight.ravel(), 2))[:, None]
+    A = (root * J).T @ (root * J)
+    g = J.T @ (root[:, 0] ** 2 * residual.ravel())
+    A[problem.size :, problem.size :] += np.eye(strain.size)
+    g[problem.size :] += strain.ravel()
+    scale = np.append(np.sqrt(np.diagonal(A)[: problem.size]), np.ones(strain.size))
+    tied = np.linalg.qr(scale[: problem.size, None] * problem.gauge(scene))[0]
+    A /= np.outer(scale, scale)
+    A[: problem.size, : problem.size] += tied @ tied.T + damping * np.eye(problem.size)
+    wanted = -np.linalg.solve(A, g / scale) / scale
+    for at_once in (adjustment._AT_ONCE, 7):
+        monkeypatch.setattr(adjustment, "_AT_ONCE", at_once)
+        here = adjustment._Expansion(problem, scene, residual, weight, np.zeros(problem.size))
+        assert here.by_pose == (joint_noise and poses == 30)
+        found = here._whole(here.solved(damping)(residual, strain))
+        assert np.abs((found - wanted) * scale).max() < 1e-9 * np.abs(wanted * scale).max()
+        assert np.allclose(here.change(wanted).ravel(), J @ wanted, rtol=1e-9, atol=1e-9)
 
 
 def test_twin_of_the_kernels():
