@@ -40,6 +40,8 @@ _DECISIVE_SHARE, _NO_LENS_TAIL = 0.5, 0.01
 # err by no more than this ratio of what is expected, in its residuals and when it predicts each of so many
 # parts of the poses.
 _KEPT, _DOUBTED_RATIO, _PARTS = 0.5, 1.3, 3
+# Share of the readings that is much to leave out unless exchanged markers or wrong joints explain it.
+_MUCH = 0.1
 # Share of readings that may lie outside the images: they are outliers.
 _STRAYS = 0.01
 # As many lines of advice as fit a screen, and as many examples as a line names.
@@ -179,8 +181,12 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
             raise Misfit(refusal)
         found = Outliers.of(solution)
         doubt = unexplained(solution, found, epipolar)
-        if doubt and (share >= _DECISIVE_SHARE or not _verified(whole, solution, expected)):
-            raise Misfit(f"the fit does not describe the data: {doubt}")
+        out = 1.0 - (solution.used | found.explained).sum() / whole.problem.readings.seen.sum()
+        if doubt or out > _MUCH:
+            why = _contradiction(whole, solution, expected)
+            if why or (doubt and share >= _DECISIVE_SHARE):
+                doubt = doubt or f"{100.0 * out:.0f} % of the readings do not fit it, and {why}"
+                raise Misfit(f"the fit does not describe the data: {doubt}")
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
             raise
@@ -204,18 +210,27 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     return dataclasses.replace(record, outlier=outlier, lost=lost, advice=(*advice, seldom))
 
 
-def _verified(whole: Solution, solution: Solution, expected: Expected) -> bool:
-    """Whether what is kept is most, leaves nothing but noise, and predicts what it has not seen."""
+def _contradiction(whole: Solution, solution: Solution, expected: Expected) -> str:
+    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing.
+
+    It must be most, span the motions, leave nothing but noise, and predict poses that it has not seen.
+    """
+    readings, ratio = solution.problem.readings, expected.ratio(solution)
     if solution.used.sum() < _KEPT * whole.problem.readings.seen.sum():
-        return False
-    readings = solution.problem.readings
+        return "that is most of them; leave out what is not on the robot, and check the joint readings"
     span = np.ptp(readings.q[np.unique(readings.pose_of[solution.used.any(axis=0)])], axis=0)
-    if expected.ratio(solution) > _DOUBTED_RATIO or (span < _KEPT * np.ptp(readings.q, axis=0)).any():
-        return False
+    if (short := span < _KEPT * np.ptp(readings.q, axis=0)).any():
+        i = int(np.argmax(short))
+        return f"what does moves joint {i + 1} little; check its readings and its type (R or P)"
+    if ratio > _DOUBTED_RATIO:
+        return (
+            f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types (R or P)"
+        )
     held_out = cross_validate(solution.kept(), expected.noise_px(solution), _PARTS, 0)
-    if held_out.failed or held_out.rms_px is None or held_out.predicted_rms_px is None:
-        return False
-    return held_out.rms_px <= _DOUBTED_RATIO * held_out.predicted_rms_px
+    rms, predicted = held_out.rms_px, held_out.predicted_rms_px
+    if held_out.failed or rms is None or predicted is None or rms > _DOUBTED_RATIO * predicted:
+        return "the rest does not predict poses that it has not seen; record more poses and more markers"
+    return ""
 
 
 def _lens_advice(calibration: Calibration, share: float, centered: bool) -> tuple[str, ...]:
