@@ -3,14 +3,12 @@
 The path of a calibration: what was seen (``readings``) → the rig (``epipolar``) → a start (``start``) →
 bundle adjustment (``adjustment``) of the ``forward`` model, robustly (``fit``) → what was left out
 (``diagnosis``) → its frame and covariance (``projective``) → the verdict (``quality``); ``estimate`` leads
-through it, and ``prediction`` is what the result is for, with how far it errs, and ``innovation`` for what
-contradicts it in the loop.
+through it, and ``prediction`` is what the result is for, with how far it errs.
 """
 
 from projservo_cli.calibration.diagnosis import findings
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
-from projservo_cli.calibration.innovation import WINDOW, Innovation
 from projservo_cli.calibration.prediction import (
     Region,
     Suggestion,
@@ -24,8 +22,6 @@ from projservo_cli.calibration.start import Nominal
 
 __all__ = [
     "WEAK_NOISE",
-    "WINDOW",
-    "Innovation",
     "Nominal",
     "Region",
     "Solution",

@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration import WINDOW, Innovation
 from projservo_cli.calibration.readings import LEAST_SIGMA
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
+from projservo_cli.robots.innovation import WINDOW, Innovation
 from projservo_cli.robots.instants import DelayPrior, Delays, History
 from projservo_cli.robots.simulated import Plant, observe
 

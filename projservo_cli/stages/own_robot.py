@@ -7,13 +7,14 @@ from functools import partial
 
 import numpy as np
 
-from projservo_cli.calibration import WINDOW, Innovation, predict
+from projservo_cli.calibration import predict
 from projservo_cli.config import Config
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.driven import DrivenRobot, Known, Steered
+from projservo_cli.robots.innovation import WINDOW, Innovation
 from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.calibration import WINDOW, Innovation, innovation, predict
 from projservo_cli.calibration import calibrate as calibrated
+from projservo_cli.calibration import predict
 from projservo_cli.calibration.forward import Scene, displacements, image_points, moved_points
 from projservo_cli.calibration.prediction import all_changed, scene_of
+from projservo_cli.robots import innovation
+from projservo_cli.robots.innovation import WINDOW, Innovation
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.world import truth_of
 from tests.calibration.simulated_robot import random_robot, trials
