@@ -79,8 +79,10 @@ def test_a_corner_without_room_for_edges_is_kept_with_a_deviation_of_its_own(rng
         if tag is not None:
             assert not tag.clean.any()
             off.append((tag.pixels - corners) / tag.sigma[:, None])
+    kept = np.isfinite(off)  # where an edge passes far from a corner, it is left out
     assert len(off) > 3
-    assert 0.4 < np.sqrt(np.mean(np.square(off))) < 1.6
+    assert kept.mean() > 0.7
+    assert 0.4 < np.sqrt(np.mean(np.square(off)[kept])) < 1.6
 
 
 @pytest.mark.parametrize(
