@@ -38,6 +38,7 @@ class Frames:
         except Exception as error:  # of another kind for each library of GL
             raise InputError(no_gl(error)) from error
         self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SHADOW] = self._options.light == "side"
+        self._renderer.scene.flags[mj.mjtRndFlag.mjRND_SKYBOX] = 0  # of a file: it takes longer than the rest
         self._model = copy.copy(scene.model)
         self._data = scene.begin(self._model, scene.model.qpos0[scene.places])
         self._shown = mj.MjvOption()

@@ -32,6 +32,7 @@ _ARMATURE, _ARMATURE_SHARE = 0.1, 0.05
 _SENSOR_M = 1e-5  # width of a pixel of a camera's sensor; only ratios to it matter
 _NO_SKEW = 1e-9  # of a camera's pixels, which rounding leaves
 _NEAR_M, _FAR_M = 0.01, 50.0  # what cameras see
+_WALL, _WALL_M = "far wall", 40.0  # what stands behind everything, and how far
 FINER = 2
 """Pixels of a drawing along each of a frame: of one alone, edges are drawn up to a tenth of a pixel off."""
 CAMERAS = ("left camera", "right camera")
@@ -239,16 +240,6 @@ def _put_light(spec: Any, light: str, P: FloatArray) -> None:
         specular=[0.0] * 3,
         castshadow=not soft,
     )
-    if not any(texture.type == mj.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
-        spec.add_texture(
-            name="far around",
-            type=mj.mjtTexture.mjTEXTURE_SKYBOX,
-            builtin=mj.mjtBuiltin.mjBUILTIN_GRADIENT,
-            rgb1=[0.55] * 3,
-            rgb2=[0.35] * 3,
-            width=64,
-            height=384,
-        )
 
 
 def drawn_at(P: FloatArray, lens: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -276,6 +267,7 @@ def _add_cameras(spec: Any, K: FloatArray, R: FloatArray, t: FloatArray, size: t
     """Add the cameras of a rig of (2, 3, 3), (2, 3, 3), (2, 3), m, whose images have a size, px."""
     mj = mujoco()
     width, height = size
+    spec.add_material(name=_WALL, rgba=[0.25, 0.25, 0.25, 1.0], emission=1.0, specular=0.0)
     for view in range(2):
         camera = spec.worldbody.add_camera(name=CAMERAS[view], pos=-R[view].T @ t[view])
         camera.alt.type = mj.mjtOrientation.mjORIENTATION_XYAXES
@@ -284,6 +276,10 @@ def _add_cameras(spec: Any, K: FloatArray, R: FloatArray, t: FloatArray, size: t
         camera.sensor_size = [width * _SENSOR_M, height * _SENSOR_M]
         camera.focal_pixel = [K[view, 0, 0], K[view, 1, 1]]
         camera.principal_pixel = [0.5 * (width - 1) - K[view, 0, 2], 0.5 * (height - 1) - K[view, 1, 2]]
+        # A grey wall far behind: drawn in a quarter of the time of a sky.
+        wall = spec.worldbody.add_geom(type=mj.mjtGeom.mjGEOM_BOX, material=_WALL, contype=0, conaffinity=0)
+        wall.pos, wall.size = camera.pos + _WALL_M * R[view][2], [_WALL_M, _WALL_M, _PLATE_M]
+        wall.alt.type, wall.alt.xyaxes = camera.alt.type, camera.alt.xyaxes
     spec.stat.extent = 1.0
     visual = spec.visual
     visual.map.znear, visual.map.zfar = _NEAR_M, _FAR_M
