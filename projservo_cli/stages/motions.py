@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.prediction import spread_of
 from projservo_cli.config.models import LIMITS_MISSING
 from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.algebra import as_array
@@ -16,6 +15,7 @@ from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.keep_out import keep_out_of
 from projservo_cli.guidance.lattice import duration, evenly, plan_path
 from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares
+from projservo_cli.guidance.spread import spread_of
 from projservo_cli.guidance.timing import Pace, joints_at, least_time
 from projservo_cli.guidance.validity import BORDER, CLEAR, Constraints, constraints_of
 from projservo_cli.guidance.way import Budget, Way, find_way, first_within, margins_at, within_region
