@@ -18,7 +18,7 @@ from projservo_cli.calibration.epipolar import (
     metric_guesses,
 )
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.readings import MAD, SAME_READING, Readings, per_marker
+from projservo_cli.calibration.readings import MAD, Readings, per_marker
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
     PRISMATIC,
@@ -223,15 +223,12 @@ def _rotation_axes(
 ) -> list[FloatArray]:
     """Sets of axes (n, 3) that explain the rotations at joint values (K, n), distinct minima, best first.
 
-    From many random sets and the axes that single-joint trials show directly. None where no axes explain the
-    rotations at all; axes of prismatic joints have no meaning.
+    From many random sets. None where no axes explain the rotations at all; axes of prismatic joints have no
+    meaning.
     """
     R, q = alignment.R[alignment.merged], q[alignment.merged]
     w = rng.standard_normal((_STARTS, q.shape[1], 3))
     w /= np.linalg.norm(w, axis=2, keepdims=True)
-    direct = _isolated_axes(R, q, prismatic)
-    if direct is not None:
-        w[0] = direct
     w, loss = _fit_axes(w, R, q, prismatic)
     order = np.argsort(loss)
     kept: list[FloatArray] = []
@@ -266,23 +263,6 @@ def _chain(w: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray:
     for i in range(n):
         result[..., i + 1, :, :, :] = result[..., i, :, :, :] @ turns[..., i, :, :, :]
     return result
-
-
-def _isolated_axes(R: FloatArray, q: FloatArray, prismatic: BoolArray) -> FloatArray | None:
-    """Axes (n, 3) from the poses that differ from the reference in one joint; None if a joint has none."""
-    moved = np.abs(q) > SAME_READING
-    home = np.flatnonzero(~moved.any(axis=1))
-    if home.size == 0:
-        return None
-    w = np.tile([0.0, 0.0, 1.0], (q.shape[1], 1))
-    for i in np.flatnonzero(~prismatic):
-        rows = np.flatnonzero(moved[:, i] & (moved.sum(axis=1) == 1))
-        if rows.size == 0:
-            return None
-        vectors = _rotation_vectors(R[rows] @ R[home[0]].T)
-        total = np.median(vectors * np.sign(q[rows, i])[:, None], axis=0)
-        w[i] = total / max(float(np.linalg.norm(total)), 1e-12)
-    return w
 
 
 def _fit_axes(
