@@ -24,7 +24,7 @@ from scipy.linalg import expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
 from projservo_cli.calibration.forward import CAMERA, LENS, Scene, image_points
-from projservo_cli.calibration.readings import RAYLEIGH, Readings
+from projservo_cli.calibration.readings import RAYLEIGH, Readings, per_block
 from projservo_cli.geometry.lens import FIRST, bent
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray
 
@@ -120,6 +120,11 @@ class LeastSquares:
     def with_noise(self, tau: FloatArray | None) -> "LeastSquares":
         """The same problem with other noise of joints (n,) over that of pixels, rad/px or m/px."""
         return dataclasses.replace(self, tau=tau)
+
+    @property
+    def by_pose(self) -> bool:
+        """Whether offsets of joints are eliminated pose by pose, being more than coordinates of markers."""
+        return self.tau is not None and self.size - self.shared < self.q.size
 
     def rows(self, at: IntArray) -> "LeastSquares":
         """The same problem with some of the sightings (N,); parameters stay."""
@@ -221,9 +226,7 @@ class LeastSquares:
 
     def at_poses(self, values: FloatArray) -> FloatArray:
         """Sums (K, …) over the sightings of each pose of values (N, …)."""
-        result: FloatArray = np.zeros((len(self.q), *values.shape[1:]))
-        np.add.at(result, self.readings.pose_of, values)
-        return result
+        return per_block(self.readings.pose_of, values, len(self.q))
 
     def dense(self, J: FloatArray, mask: BoolArray) -> FloatArray:
         """The whole derivative (4 N, size), zero outside a mask (2, N), for what needs more than JᵀJ."""
@@ -370,7 +373,7 @@ class _Expansion:
         self.problem, self.scene, self.residual = problem, scene, residual
         self.root, self.first = np.sqrt(weight), problem.size - len(least)
         m, offsets = len(scene.M), 0 if problem.tau is None else problem.q.size
-        self.by_pose = 3 * m < offsets
+        self.by_pose = problem.by_pose
         self.strain = problem.strain(scene)
         self.known: list[_Part] = []
         s, size = problem.shared, 3 * m if self.by_pose else offsets

@@ -110,9 +110,10 @@ def _is_elsewhere(pose: LeastSquares, scene: Scene, q: FloatArray, sigma: float)
     """Whether other joints explain the images of a pose: those of another one (K, n), or near these."""
     levels = []
     for values in q:
-        moved = dataclasses.replace(pose, q=pose.q * 0.0 + values, tau=None)
+        moved = dataclasses.replace(pose, q=np.broadcast_to(values, pose.q.shape), tau=None)
         levels.append(median_px(moved.residual(scene), moved.readings.seen))
-    best = dataclasses.replace(pose, q=pose.q * 0.0 + q[int(np.argmin(levels))], tau=None)
+    nearest = np.broadcast_to(q[int(np.argmin(levels))], pose.q.shape)
+    best = dataclasses.replace(pose, q=nearest, tau=None)
     joints = list(range(q.shape[1]))
     level = min(min(levels), _corrected_level(best, scene, joints, sigma))
     return level <= _CORRECTED * RAYLEIGH * sigma
@@ -241,7 +242,7 @@ def blamed_joint(search: Search, most_px: float) -> str:
         for done, (words, changed, handicap) in enumerate(changes):
             search.tell("calibration, joint at fault", done, len(changes))
             seen = changed.readings.seen
-            for start in islice(starts(dataclasses.replace(search, problem=changed), changed.readings), 1):
+            for start in islice(starts(dataclasses.replace(search, problem=changed)), 1):
                 scene = minimize(changed, start, seen, robust=True, cameras=False, most=_SCREW_STEPS).scene
                 # By logarithms neither a few gross errors nor many small ones outweigh the rest.
                 level = np.mean(np.log(np.linalg.norm(changed.residual(scene)[seen], axis=1) + 1e-9))

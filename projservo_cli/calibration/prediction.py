@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.calibration.forward import Images, Scene
-from projservo_cli.calibration.readings import evenly
+from projservo_cli.calibration.readings import even_choice
 from projservo_cli.records import (
     BoolArray,
     Calibration,
@@ -203,7 +203,7 @@ def suggest(
             f"suggestions need a covariance, which the method {calibration.method} has not: "
             "use --set calibration.method=refined"
         )
-    few = calibration.with_markers(evenly(len(calibration.M), _MOST_SHOWN))
+    few = calibration.with_markers(even_choice(len(calibration.M), _MOST_SHOWN))
     sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
     _, T = _shown(few, targets, _TARGETS, rng)
     q, C = _shown(few, candidates, _CANDIDATES, rng)

@@ -13,7 +13,7 @@ from projservo_cli.calibration.adjustment import moved_operators
 from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.readings import MOST_JUDGED, ON_A_LINE, Readings, evenly
+from projservo_cli.calibration.readings import MOST_JUDGED, ON_A_LINE, Readings, even_choice
 from projservo_cli.geometry.algebra import normalize_displacement
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
 
@@ -51,7 +51,7 @@ class Projective:
         by_marker = self.W[:, :3]
         shared = block_diag(*cameras, *joints, lenses) @ errors.shared
         found = Errors(shared, by_marker @ errors.marker, by_marker @ errors.own)
-        few = evenly(len(self.scene.M), MOST_JUDGED)
+        few = even_choice(len(self.scene.M), MOST_JUDGED)
         _require_off_line(replace(self.scene, M=self.scene.M[few]), found.of(few).scaled(solution.sigma_px))
         return found
 

@@ -19,7 +19,7 @@ from projservo_cli.calibration.readings import (
     REACH_RAD,
     Readings,
     describe_joints,
-    evenly,
+    even_choice,
     require_motion,
     require_moved,
 )
@@ -66,7 +66,7 @@ class _Uncertainty:
             for extreme in (np.min, np.max)
         )
         wide = 0.5 * (high - low)
-        which = evenly(len(solution.scene.M), MOST_JUDGED)
+        which = even_choice(len(solution.scene.M), MOST_JUDGED)
         return cls(solution.problem, solution.scene, errors, which, np.stack([low - wide, high + wide]))
 
     def shown(self, q: FloatArray) -> BoolArray:

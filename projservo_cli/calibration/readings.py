@@ -145,9 +145,9 @@ class Readings:
         return np.asarray(self.q[row].copy())
 
 
-def per_marker(marker_of: IntArray, values: FloatArray, count: int) -> FloatArray:
-    """Sums (m, …) over the sightings of each marker of values (N, …)."""
-    sums = [np.bincount(marker_of, column, count) for column in values.reshape(len(values), -1).T]
+def per_block(block_of: IntArray, values: FloatArray, count: int) -> FloatArray:
+    """Sums (b, …) over the sightings of each marker, or of each pose, of values (N, …)."""
+    sums = [np.bincount(block_of, column, count) for column in values.reshape(len(values), -1).T]
     return np.stack(sums, axis=1).astype(np.float64).reshape(count, *values.shape[1:])
 
 
@@ -197,7 +197,7 @@ _LEAST_SPAN = 1e-6
 MOST_JUDGED = 50
 
 
-def evenly(count: int, most: int) -> IntArray:
+def even_choice(count: int, most: int) -> IntArray:
     """Indices of all of so many, or of no more than the most, from the first to the last in even steps."""
     return np.arange(count) if count <= most else np.linspace(0, count - 1, most).round().astype(np.int64)
 

@@ -18,7 +18,7 @@ from projservo_cli.calibration.epipolar import (
     metric_guesses,
 )
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.readings import MAD, Readings, per_marker
+from projservo_cli.calibration.readings import MAD, Readings, per_block
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
     PRISMATIC,
@@ -380,7 +380,7 @@ def _robust_solve(
     weight = trusted[marker_of].astype(np.float64)
     for _ in range(10):
         sums = np.maximum(np.bincount(marker_of, weight, len(trusted)), 1e-12)[:, None, None]
-        means = per_marker(marker_of, weight[:, None, None] * whole, len(trusted)) / sums
+        means = per_block(marker_of, weight[:, None, None] * whole, len(trusted)) / sums
         left = whole - means[marker_of]
         A = np.tensordot(left * weight[:, None, None], left, axes=((0, 1), (0, 1)))
         x = np.linalg.solve(A[:-1, :-1] + np.diag(ridge), A[:-1, -1])
@@ -390,11 +390,9 @@ def _robust_solve(
     return np.asarray(x), np.asarray(means[..., -1] - means[..., :-1] @ x)
 
 
-def starts(search: Search, readings: Readings, factors: tuple[float, ...] = (1.0,)) -> Iterator[Scene]:
-    """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each.
-
-    The readings are those of the problem, perhaps at some of its poses.
-    """
+def starts(search: Search, factors: tuple[float, ...] = (1.0,)) -> Iterator[Scene]:
+    """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each."""
+    readings = search.problem.readings
     for factor in factors:
         for guess in metric_guesses(search.epipolar, readings, search.frame, factor):
             alignment = _merged(guess[1], readings, search.rng)

@@ -11,14 +11,14 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.forward import Scene, displacements, projection_derivative
-from projservo_cli.calibration.readings import per_marker
+from projservo_cli.calibration.readings import per_block
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 # Places tried for each marker: those that single sightings show. Steps to the best place near them.
 _PLACES, _STEPS = 6, 4
-# Chance with which noise alone drops a reading or a sighting; rounds of tests.
-# and where another sighting of the marker does not fit.
+# Chance with which noise alone drops a reading or a sighting, and so where another sighting of the marker
+# does not fit; rounds of tests.
 _TAIL, _TAIL_OF_DOUBT, _ROUNDS = 1e-3, 4e-3, 6
 # Of sightings of one marker that do not fit, those are dropped at once that are so near to the worst.
 _WORST = 0.25
@@ -97,7 +97,7 @@ class Tracks:
         for _ in range(_STEPS):
             residual, D = self._residual(M[marker], rows)
             square = (residual**2).sum(axis=2) / sigma**2
-            here = per_marker(marker, np.minimum(square, 16.0).sum(axis=0), len(M))
+            here = per_block(marker, np.minimum(square, 16.0).sum(axis=0), len(M))
             better = here < loss
             best, loss = np.where(better[:, None], M, best), np.where(better, here, loss)
             A, g = self._normal(marker, residual, D, square <= (limit / sigma) ** 2, len(M))
@@ -110,8 +110,8 @@ class Tracks:
     ) -> tuple[FloatArray, FloatArray]:
         """Normal equations (m, 3, 3), (m, 3) of the readings used, regular whatever is left open."""
         D = D * used[..., None, None]
-        A = per_marker(marker, (np.swapaxes(D, 2, 3) @ D).sum(axis=0), count)
-        g = per_marker(marker, (np.swapaxes(D, 2, 3) @ residual[..., None])[..., 0].sum(axis=0), count)
+        A = per_block(marker, (np.swapaxes(D, 2, 3) @ D).sum(axis=0), count)
+        g = per_block(marker, (np.swapaxes(D, 2, 3) @ residual[..., None])[..., 0].sum(axis=0), count)
         size = np.maximum(np.trace(A, axis1=1, axis2=2), 1e-300)
         return A + (_OPEN * size)[:, None, None] * np.eye(3), g
 

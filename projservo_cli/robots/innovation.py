@@ -8,7 +8,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.forward import CAMERA
 from projservo_cli.calibration.prediction import all_changed, scene_of
-from projservo_cli.calibration.readings import LEAST_SIGMA, evenly, per_rad
+from projservo_cli.calibration.readings import LEAST_SIGMA, even_choice, per_rad
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
 
 # Looks in a row that must agree on a gross disturbance: one may be blurred, or a marker taken for another.
@@ -153,7 +153,7 @@ class Innovation:
         shown: IntArray | None = None,
     ) -> None:
         shown = np.arange(len(calibration.M)) if shown is None else shown
-        self._shown = shown[evenly(len(shown), _MOST_TESTED)]
+        self._shown = shown[even_choice(len(shown), _MOST_TESTED)]
         self.calibration = calibration = calibration.with_markers(self._shown)
         m, n = len(calibration.M), len(calibration.H_hat_0)
         self._scene = scene_of(calibration)

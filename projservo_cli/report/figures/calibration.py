@@ -7,7 +7,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration import predict, prediction_variance
 from projservo_cli.calibration.prediction import changed, error_factor, joint_derivative, scene_of
-from projservo_cli.calibration.readings import MOST_JUDGED, evenly, per_rad
+from projservo_cli.calibration.readings import MOST_JUDGED, even_choice, per_rad
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import VIEWS, Data, Fit, registered
@@ -169,7 +169,7 @@ def _information(calibration: Calibration) -> FloatArray:
     """
     if not calibration.has_covariance:
         return np.zeros(0)
-    few = calibration.with_markers(evenly(len(calibration.M), MOST_JUDGED))
+    few = calibration.with_markers(even_choice(len(calibration.M), MOST_JUDGED))
     spread = np.linalg.svd(error_factor(few), compute_uv=False)[::-1] ** 2
     floor = len(spread) * np.finfo(np.float64).eps * spread[-1]
     return np.asarray(1.0 / spread[spread > floor])
