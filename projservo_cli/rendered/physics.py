@@ -55,7 +55,7 @@ class Physics:
     def __init__(self, scene: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
         arm, servo = scene.arm, scene.options.servo
         self._model, self._places, self._rates = copy.copy(scene.model), scene.places, scene.rates
-        self._data = scene.begin(self._model, q)
+        self._data, self._base = scene.begin(self._model, q), int(self._model.jnt_bodyid[scene.joints[0]])
         self._step_s, self._lag_s = min(_STEP_S, float(self._model.opt.timestep)), lag_s
         self._own = {
             i: actuator
@@ -92,6 +92,22 @@ class Physics:
     def motor(self) -> FloatArray:
         """Where the joints are (n,), rad or m."""
         return np.array(self._data.qpos[self._places])
+
+    @property
+    def touching(self) -> str:
+        """What of the arm touches what, by names of bodies; empty where nothing does."""
+        model, pairs = self._model, dict[str, None]()
+        for contact in self._data.contact:
+            bodies = [int(model.geom_bodyid[geom]) for geom in contact.geom]
+            if contact.dist < 0.0 and any(self._carries(body) for body in bodies):
+                pairs[" and ".join(model.body(body).name or f"body {body}" for body in bodies)] = None
+        return ", ".join(pairs)
+
+    def _carries(self, body: int) -> bool:
+        """Whether the first joint of the arm moves a body."""
+        while body > self._base:  # bodies come after what carries them
+            body = int(self._model.body_parentid[body])
+        return body == self._base
 
     def strike(self, by: FloatArray) -> None:
         """Move joints, and where they are sent, by (n,), rad or m, at once."""

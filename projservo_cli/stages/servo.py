@@ -41,6 +41,7 @@ from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.stages import own_robot
 from projservo_cli.stages.motions import Ways, search_of, why_closed
 from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.stages.simulation import FaultyRobot
 from projservo_cli.stages.world import arm_of
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
@@ -63,6 +64,7 @@ class _Outcome:
     unplanned: str = ""  # why it went without the plan that it was to follow
     anew: tuple[str, ...] = ()  # when and why a way was searched anew
     driven: DrivenRobot | None = None  # what was driven, where that is a robot of the contract
+    touching: str = ""  # what of an arm touched what at the end, where its simulation tells
 
     @cached_property
     def summary(self) -> Summary:
@@ -202,7 +204,8 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         *([] if turn is None else [f"{turn:.3g} deg of rotation"]),
         f"an image error of {error:.3g} px",
     ]
-    return {
+    touching = f"; the arm touches: {run.touching}" if run.touching and run.verdict != "converged" else ""
+    reasons = {
         "converged": f"image error {error:.3g} px is within {within:.3g} px",
         "plateau": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
         if run.why
@@ -220,7 +223,8 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         f"m), and the task would take it beyond; {' and '.join(left)} are left",
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
         **dict.fromkeys(("disturbed", "failed"), run.why),
-    }[run.verdict]
+    }
+    return reasons[run.verdict] + touching
 
 
 def run(config: Config, calibration: Calibration, plan: Plan, name: str) -> Trace:
@@ -356,6 +360,7 @@ class _Asked:
         )
         limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         driven = plant if isinstance(plant, DrivenRobot) else None
+        robot = None if driven is None else driven.robot.robot
         if driven is not None:  # it goes from sample to sample, whatever was asked for
             path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
             log = log._replace(path=path, parts=np.ones_like(log.parts))
@@ -369,6 +374,7 @@ class _Asked:
             plant.plant,
             anew=() if watch is None else tuple(watch.told),
             driven=driven,
+            touching=robot.touching if isinstance(robot, FaultyRobot) else "",
         )
 
     def _task(self, model: Model, plan: Plan) -> Task:

@@ -249,6 +249,12 @@ class FaultyRobot:
         """The last frames of both cameras as they were searched, where they are rendered."""
         return self.world.eyes.last if isinstance(self.world.eyes, Frames) else None
 
+    @property
+    def touching(self) -> str:
+        """What of the arm touches what, where its physics tell; else empty."""
+        servos = self.world.servos
+        return servos.touching if isinstance(servos, Physics) else ""
+
     def truth(self) -> FloatArray:
         """True joints (n,), rad or m."""
         return self._joints.links[-1].copy()

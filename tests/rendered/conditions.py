@@ -12,7 +12,7 @@ import numpy as np
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.records import FloatArray
-from projservo_cli.stages.simulation import shown_in_frames
+from projservo_cli.stages.simulation import robot_by_itself, shown_in_frames
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.design import STRATA, random_tasks
 from tests.conftest import SHARED
@@ -91,7 +91,10 @@ def taught_images(config, q: FloatArray, seed):
 
 
 def drawn():
-    """Tasks of all seeds, those of each sixth of half a turn in turn, whose ends show the middle tag well."""
+    """Tasks of all seeds, those of each sixth of half a turn in turn.
+
+    Their ends show the middle tag well, and the arm touches nothing there, itself included.
+    """
     config = base_of("ideal")
     truth = truth_of(config)
     for seed in SEEDS:
@@ -99,7 +102,8 @@ def drawn():
         while found is None:
             starts, goals = random_tasks(truth, np.array(FRONT), STRATA, rng)
             ends = starts[(seed - 1) % STRATA], goals[(seed - 1) % STRATA]
-            found = ends if all(_shows(config, truth, q) for q in ends) else None
+            free = not any(robot_by_itself(config, truth, q, 0.0, 0, 0).touching for q in ends)
+            found = ends if free and all(_shows(config, truth, q) for q in ends) else None
         yield {"seed": seed} | {
             f"{end}_q{i}": repr(float(x))
             for end, q in zip(("start", "goal"), found, strict=True)

@@ -114,6 +114,19 @@ def test_servos_of_ours_follow_lag_and_sag_as_they_are_told(tmp_path, servo):
 
 
 @pytest.mark.usefixtures("needs_mujoco")
+def test_what_an_arm_touches_is_told(tmp_path):
+    config = described(tmp_path, "position")
+    path = tmp_path / "arm.xml"
+    post = '<worldbody><body name="post" pos="0 0.5 0.4"><geom size="0.04"/></body>'
+    path.write_text(path.read_text(encoding="utf-8").replace("<worldbody>", post), encoding="utf-8")
+    physics = driven(config, np.array([0.4, 0.0]))
+    assert physics.touching == ""
+    physics.follow(np.array([1.7, 0.0]), 2.0)
+    assert physics.motor[0] < 1.5
+    assert physics.touching == "post and boom"
+
+
+@pytest.mark.usefixtures("needs_mujoco")
 def test_what_cannot_drive_a_joint_is_named(tmp_path):
     with pytest.raises(InputError, match=r"disturbance.sag_deg: servos of robot.mjcf sag as they are"):
         driven(described(tmp_path, "position"), Q, sag=0.01)
