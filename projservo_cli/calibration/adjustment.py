@@ -140,8 +140,8 @@ class LeastSquares:
     def pixels(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Predicted pixels (2, N, 2) of every sighting and their depths (2, N)."""
         readings = self.readings
-        points = scene.carried(self.joints(scene), readings.pose_of, readings.marker_of)[1][0]
-        m = image_points(scene.P, points)
+        motion = scene.motion(self.joints(scene))[readings.pose_of]
+        m = image_points(scene.P, (motion @ scene.M[readings.marker_of][..., None])[..., 0])
         pixels = m[..., :2] / m[..., 2:]
         return pixels if scene.lens is None else bent(scene.lens[:, None], pixels), m[..., 2]
 
@@ -317,13 +317,15 @@ class _Family(NamedTuple):
 
     of: IntArray  # (N,) block of a sighting
     J: FloatArray  # (2, N, 2, d) derivatives by it, weighed
+    blocks: slice  # from the first to the last of these, b in all
     sums: csr_array  # (b, N) adds up the sightings of each block
 
     @classmethod
-    def by(cls, of: IntArray, J: FloatArray, count: int) -> "_Family":
-        """Of derivatives by blocks, so many of them."""
-        N = len(of)
-        return cls(of, J, csr_array((np.ones(N), (of, np.arange(N))), shape=(count, N)))
+    def by(cls, of: IntArray, J: FloatArray) -> "_Family":
+        """Of derivatives by blocks."""
+        first, N = int(of.min()), len(of)
+        sums = csr_array((np.ones(N), (of - first, np.arange(N))))
+        return cls(of, J, slice(first, first + sums.shape[0]), sums)
 
     def added(self, values: FloatArray) -> FloatArray:
         """Sums (b, …) over the sightings of each block of values (N, …)."""
@@ -355,8 +357,8 @@ class _Part(NamedTuple):
     kept: _Family | None  # the other family
 
 
-# Sightings of which the derivatives are kept at once: some 100 MB.
-_AT_ONCE = 2**16
+# Sightings that are derived at once, in some 50 MB, and of which the derivatives are kept: some 80 MB.
+_AT_ONCE, _MOST_KEPT = 2**13, 2**16
 
 
 class _Expansion:
@@ -378,7 +380,9 @@ class _Expansion:
         self.known: list[_Part] = []
         s, size = problem.shared, 3 * m if self.by_pose else offsets
         blocks, width = problem.q.shape if self.by_pose else (m, 3)
-        A, C = np.zeros((s + size, s + size)), np.zeros((blocks, width, s + size))
+        gauge = problem.gauge(scene) if self.first == 0 else np.zeros((problem.size, 0))
+        self.ties = gauge.shape[1]
+        A, C = np.zeros((s + size, s + size)), np.zeros((blocks, width, s + size + self.ties))
         D = np.zeros((blocks, width, width))
         for part in self._parts():
             self._add(part, A, C, D)
@@ -386,9 +390,11 @@ class _Expansion:
             own = D if self.by_pose else A[s:, s:]
             own += np.eye(own.shape[-1])
         self._scaled(A, C, D, least)
+        if self.ties:
+            self._tied(gauge)
 
     def _parts(self) -> Iterator[_Part]:
-        """Derivatives of all sightings, part by part; one that is all of them is kept."""
+        """Derivatives of all sightings, part by part; kept where they are few."""
         N = self.problem.readings.marker_of.size
         if self.known:
             yield from self.known
@@ -396,7 +402,7 @@ class _Expansion:
         for first in range(0, N, _AT_ONCE):
             at = slice(first, min(first + _AT_ONCE, N))
             part = self._part(at)
-            if N <= _AT_ONCE:
+            if N <= _MOST_KEPT:
                 self.known.append(part)
             yield part
 
@@ -408,35 +414,37 @@ class _Expansion:
         )
         readings, root = some.readings, self.root[:, at, None, None]
         J = some.derivative(self.scene) * root
-        families = [_Family.by(readings.marker_of, J[..., -3:], len(self.scene.M))]
+        families = [_Family.by(readings.marker_of, J[..., -3:])]
         if some.tau is not None:
             G = some.joint_derivative(self.scene) * (some.tau * root)
-            families.insert(int(not self.by_pose), _Family.by(readings.pose_of, G, len(some.q)))
+            families.insert(int(not self.by_pose), _Family.by(readings.pose_of, G))
         return _Part(at, J[..., :-3], families[0], families[1] if len(families) > 1 else None)
 
     def _add(self, part: _Part, A: FloatArray, C: FloatArray, D: FloatArray) -> None:
         """Add the products of the derivatives of some sightings to what is kept, crossed and eliminated."""
         s, other = self.problem.shared, part.kept
-        D += part.gone.across(part.gone.J)
+        D[part.gone.blocks] += part.gone.across(part.gone.J)
+        if other is not None:
+            width = other.J.shape[-1]
+            at = s + width * np.arange(other.blocks.stop)[:, None] + np.arange(width)
+            own = at[other.blocks]
         for v, columns in enumerate(self.problem.columns):
             J = part.shared[v].reshape(-1, len(columns))
             A[np.ix_(columns, columns)] += J.T @ J
             one = part.shared[[v]]
-            C[:, :, columns] += part.gone._replace(J=part.gone.J[[v]]).across(one)
+            C[part.gone.blocks, :, columns] += part.gone._replace(J=part.gone.J[[v]]).across(one)
             if other is not None:
                 crossed = other._replace(J=other.J[[v]]).across(one).reshape(-1, len(columns))
-                A[s:, columns] += crossed
-                A[columns[:, None], np.arange(s, len(A))] += crossed.T
+                A[own.reshape(-1, 1), columns] += crossed
+                A[columns[:, None], own.ravel()] += crossed.T
         if other is not None:
-            blocks, width = other.sums.shape[0], other.J.shape[-1]
-            at = s + width * np.arange(blocks)[:, None] + np.arange(width)
-            A[at[:, :, None], at[:, None]] += other.across(other.J)
+            A[own[:, :, None], own[:, None]] += other.across(other.J)
             rows = part.gone.of[:, None, None], np.arange(C.shape[1])[:, None], at[other.of][:, None]
             C[rows] += _products(part.gone.J, other.J)
 
     def _scaled(self, A: FloatArray, C: FloatArray, D: FloatArray, least: FloatArray) -> None:
         """Take units of the parameters, no smaller than before, and tie the gauge."""
-        problem, s, first = self.problem, self.problem.shared, self.first
+        s, first = self.problem.shared, self.first
         of_gone = np.diagonal(D, axis1=1, axis2=2).ravel()
         markers = np.diagonal(A)[s:] if self.by_pose else of_gone
         diagonal = np.concatenate([np.diagonal(A)[first:s], markers])
@@ -446,19 +454,24 @@ class _Expansion:
         gone = (np.ones(of_gone.size) if self.by_pose else marker).reshape(D.shape[:2])
         self.units = kept, gone
         self.A = A[first:, first:] / np.outer(kept, kept)
-        self.C = C[:, :, first:] / (gone[:, :, None] * kept)
+        # In place: this is most of what is held where markers are many.
+        self.C = C[:, :, first:]
+        self.C[:, :, : len(kept)] /= kept
+        self.C /= gone[:, :, None]
         self.D = D / (gone[:, :, None] * gone[:, None, :])
         # Offsets are held by their own noise, all else is damped.
         self.damped = np.arange(len(kept)) < (len(kept) if self.by_pose else s - first)
-        self.ties = 0
-        if first == 0:
-            G = np.linalg.qr(self.scale[:, None] * problem.gauge(self.scene))[0]
-            self.ties = G.shape[1]
-            rest = np.zeros((len(kept) - s, self.ties))
-            held = G if self.by_pose else np.vstack([G[:s], rest])
-            at_gone = np.zeros((*gone.shape, self.ties)) if self.by_pose else G[s:].reshape(*gone.shape, -1)
-            self.A = np.block([[self.A, held], [held.T, -np.eye(self.ties)]])
-            self.C = np.concatenate([self.C, at_gone], axis=2)
+
+    def _tied(self, gauge: FloatArray) -> None:
+        """Tie the gauge (size, g) by multipliers."""
+        s, free = self.problem.shared, len(self.A)
+        G = np.linalg.qr(self.scale[:, None] * gauge)[0]
+        held = np.zeros((free, self.ties))
+        if self.by_pose:
+            held[:] = G
+        else:
+            held[:s], self.C[:, :, free:] = G[:s], G[s:].reshape(*self.units[1].shape, -1)
+        self.A = np.block([[self.A, held], [held.T, -np.eye(self.ties)]])
 
     def step(self, damping: float) -> FloatArray | None:
         """Damped step (size or more,) with geodesic acceleration; None where second outweighs first order."""
@@ -503,18 +516,19 @@ class _Expansion:
         """Gradients, in units, of what is kept (k,) and eliminated (b, d), by a change and by strains."""
         (kept, gone), problem, first = self.units, self.problem, self.first
         by_kept, by_gone = np.zeros(first + len(self.A)), np.zeros(gone.shape)
-        others = by_kept[problem.shared : first + len(kept)]
+        width = 3 if self.by_pose else len(problem.q_reference)
+        others = by_kept[problem.shared : first + len(kept)].reshape(-1, width)
         for part in self._parts():
             weighed = self.root[:, part.at, None] * change[:, part.at]
             for v, columns in enumerate(problem.columns):
                 by_kept[columns] += weighed[v].ravel() @ part.shared[v].reshape(-1, len(columns))
-            by_gone += part.gone.gradient(weighed)
+            by_gone[part.gone.blocks] += part.gone.gradient(weighed)
             if part.kept is not None:
-                others += part.kept.gradient(weighed).ravel()
+                others[part.kept.blocks] += part.kept.gradient(weighed)
         if self.by_pose:
             by_gone += strain
         elif strain.size:
-            others += strain.ravel()
+            others += strain
         by_kept = by_kept[first:]
         by_kept[: len(kept)] /= kept
         return by_kept, by_gone / gone
@@ -582,6 +596,7 @@ def minimize(
             moved = _cost(weight, here.change(x), np.zeros(0))
             settled = moved <= least_change * max(cost, _LEAST_RESIDUAL**2 * float(weight.sum()))
         if fresh:
+            del here  # before the next takes as much again
             scene, residual, weight = candidate, new_residual, _weights(new_residual, rows, robust)
             damping = max(0.1 * damping, _LEAST_DAMPING)
             if stalled(residual):

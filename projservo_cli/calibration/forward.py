@@ -5,6 +5,7 @@ adjustment, predictions and random tasks share.
 """
 
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -102,6 +103,10 @@ class Scene:
         m = image_points(self.P, moved_points(displacements(self.H_hat, self.prismatic, q), self.M)[0])
         pixels: FloatArray = m[..., :2] / np.where(m[..., 2:] > 0.0, m[..., 2:], np.nan)
         return pixels if self.lens is None else through(self.lens[:, None], pixels)
+
+    def motion(self, q: FloatArray) -> FloatArray:
+        """Displacements (K, 4, 4) by all joints together, [RH00] eq. (6)."""
+        return reduce(np.matmul, displacements(self.H_hat, self.prismatic, q))
 
     def carried(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> tuple[FloatArray, FloatArray]:
         """Displacements (n, N, 4, 4) at sightings (N,), and points behind each joint (n + 1, N, 4)."""

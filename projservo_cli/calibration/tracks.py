@@ -4,13 +4,11 @@ A marker has three unknowns and its sightings nothing else in common, so that al
 number of sightings, whatever share of them is wrong.
 """
 
-from functools import reduce
-
 import numpy as np
 from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.forward import Scene, displacements, projection_derivative
+from projservo_cli.calibration.forward import Scene, projection_derivative
 from projservo_cli.calibration.readings import per_block
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.records import BoolArray, FloatArray, IntArray
@@ -34,8 +32,7 @@ class Tracks:
 
     def __init__(self, problem: LeastSquares, scene: Scene) -> None:
         self.readings, self.scene = problem.readings, scene
-        E = displacements(scene.H_hat, scene.prismatic, problem.joints(scene))
-        self.motion = reduce(np.matmul, E)
+        self.motion = scene.motion(problem.joints(scene))
 
     def _grams(self, M: FloatArray, rows: IntArray, sigma: float) -> FloatArray:
         """Gram matrices (2, R, 4, 4) of derivatives and residuals, in σ, of sightings for places (R, 3)."""
