@@ -140,8 +140,8 @@ class LeastSquares:
     def pixels(self, scene: Scene) -> tuple[FloatArray, FloatArray]:
         """Predicted pixels (2, N, 2) of every sighting and their depths (2, N)."""
         readings = self.readings
-        motion = scene.motion(self.joints(scene))[readings.pose_of]
-        m = image_points(scene.P, (motion @ scene.M[readings.marker_of][..., None])[..., 0])
+        points = scene.moved(self.joints(scene), readings.pose_of, readings.marker_of)
+        m = image_points(scene.P, points)
         pixels = m[..., :2] / m[..., 2:]
         return pixels if scene.lens is None else bent(scene.lens[:, None], pixels), m[..., 2]
 
@@ -161,7 +161,8 @@ class LeastSquares:
         _, Y, by_camera, D, by_lens = scene.images(q, readings.pose_of, readings.marker_of)
         blocks = [by_camera]
         for i, B in enumerate(_generators(scene)):
-            near, far = (D[k] @ np.einsum("bij,Nj->Nib", B, Y[k]) for k in (i, i + 1))
+            turn = B.transpose(2, 1, 0).reshape(4, -1)
+            near, far = (D[k] @ (Y[k] @ turn).reshape(-1, 4, len(B)) for k in (i, i + 1))
             blocks.append(near - far)
         if by_lens is not None:
             blocks.append(by_lens)
@@ -508,7 +509,7 @@ class _Expansion:
             left = np.linalg.solve(root, gone[..., None])
             x = -lu_solve(factor, kept - flat.T @ left.ravel(), check_finite=False)
             y = -np.linalg.solve(root.swapaxes(1, 2), left + (crossed @ x)[..., None])[..., 0]
-            return self._in_order(x, y)
+            return self._in_order(x, np.asarray(y, float))
 
         return descent
 

@@ -108,6 +108,10 @@ class Scene:
         """Displacements (K, 4, 4) by all joints together, [RH00] eq. (6)."""
         return reduce(np.matmul, displacements(self.H_hat, self.prismatic, q))
 
+    def moved(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> FloatArray:
+        """Points (N, 4) of sightings, moved by all joints."""
+        return np.asarray((self.motion(q)[pose_of] @ self.M[marker_of][..., None])[..., 0])
+
     def carried(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> tuple[FloatArray, FloatArray]:
         """Displacements (n, N, 4, 4) at sightings (N,), and points behind each joint (n + 1, N, 4)."""
         E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]

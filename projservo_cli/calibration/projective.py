@@ -36,7 +36,7 @@ class Projective:
     def of(cls, solution: Solution) -> "Projective":
         """The adjusted scene in the isotropic projective frame of the points seen."""
         problem, readings = solution.problem, solution.problem.readings
-        moved = solution.scene.carried(problem.q, readings.pose_of, readings.marker_of)[1][0]
+        moved = solution.scene.moved(problem.q, readings.pose_of, readings.marker_of)
         return _isotropic(solution.scene, _A_INF, moved)
 
     def errors(self, solution: Solution, errors: Errors) -> Errors:
