@@ -76,10 +76,10 @@ class Outliers:
 def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) -> tuple[IntArray, BoolArray]:
     """Sightings (W, 3) that lie where another marker belongs in every view, and their readings (2, N).
 
-    The other is itself not seen there, or left out.
+    The other is itself not seen there, or left out; a view that fits its own marker speaks against it.
     """
     readings = problem.readings
-    joints, rows = problem.joints(settled(problem, scene)), np.flatnonzero(out.any(axis=0))
+    joints, rows = problem.joints(settled(problem, scene)), np.flatnonzero((out == readings.seen).all(axis=0))
     found = set()
     explained = np.zeros_like(out)
     for k in np.unique(readings.pose_of[rows]):

@@ -21,6 +21,8 @@ _TAIL, _TAIL_AT_END, _ROUNDS = 5e-4, 1e-2, 7
 # Of sightings of one marker that do not fit, those are dropped at once that are so near to the worst.
 _WORST = 0.25
 _FAR = 1e6  # px
+# Sightings that are dealt with at once, about so many.
+_AT_ONCE = 2**15
 # Errors beyond so many σ are gross; so many times what chance does is more than chance.
 _GROSS, _EXCESS, _THOUSANDTH = 5.0, 3.0, 1e-3
 # Least information of a coordinate of a marker, over the best known one.
@@ -89,8 +91,18 @@ class Tracks:
 
     def _improved(self, M: FloatArray, rows: IntArray, sigma: float) -> tuple[FloatArray, FloatArray]:
         """Places (m, 3) after steps to where more agrees, and the losses (m,), truncated at each reading."""
-        marker, loss = self.readings.marker_of[rows], np.full(len(M), np.inf)
-        best = M
+        marker, best, loss = self.readings.marker_of[rows], M.copy(), np.zeros(len(M))
+        firsts = np.unique(np.searchsorted(marker, marker[::_AT_ONCE]))
+        for part in np.split(np.arange(rows.size), firsts[1:]) if rows.size else []:
+            some = slice(marker[part[0]], marker[part[-1]] + 1)
+            best[some], loss[some] = self._stepped(M[some], rows[part], marker[part] - some.start, sigma)
+        return best, loss
+
+    def _stepped(
+        self, M: FloatArray, rows: IntArray, marker: IntArray, sigma: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """The same of some markers (m, 3), to which rows (R,) belong as ``marker`` (R,) tells."""
+        best, loss = M, np.full(len(M), np.inf)
         limit = 16.0
         for _ in range(_STEPS):
             grams = self._grams(M[marker], rows, sigma)

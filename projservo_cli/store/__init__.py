@@ -48,6 +48,7 @@ SCHEMA_VERSION = 2
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _SEAL = b"\nprojservo sha256 %s\n"
 _SEAL_SIZE = len(_SEAL % bytes(64))
+_AT_ONCE = 2**23  # bytes that are written or summed at once
 _FORMAT = ("v110", "v110")  # that of HDF5 from 2016, with checksums in its structures
 _ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, ArithmeticError)
 # Kind and size in bytes of the numbers of each type of array, as they are stored.
@@ -231,7 +232,12 @@ def labelled(file: h5py.File) -> "h5netcdf.File":
 
 def _digest(path: Path, size: int) -> str:
     """SHA-256 of the first ``size`` bytes of a file, in hexadecimal."""
-    return hashlib.sha256(np.memmap(path, mode="r", shape=size).data if size > 0 else b"").hexdigest()
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while size > 0 and (block := stream.read(min(size, _AT_ONCE))):
+            digest.update(block)
+            size -= len(block)
+    return digest.hexdigest()
 
 
 def _require_unchanged(path: Path, remedy: str) -> None:
@@ -309,11 +315,17 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             field.name,
             field.metadata["dims"],
             data=value.astype(np.int8) if boolean else value,
-            **({"chunks": value.shape, "fletcher32": True} if value.size else {}),
+            **({"chunks": _chunks(value), "fletcher32": True} if value.size else {}),
         )
         data.attrs.update({"units": field.metadata["units"], "long_name": field.metadata["about"]})
         if boolean:  # netCDF has none; this is how xarray marks them
             data.attrs["dtype"] = "bool"
+
+
+def _chunks(value: npt.NDArray[Any]) -> tuple[int, ...]:
+    """Shape of what is written of an array at once: all of it, or as many rows as are not too large."""
+    rows = len(value) * _AT_ONCE // value.nbytes
+    return (min(max(1, rows), len(value)), *value.shape[1:])
 
 
 def _require_sizes(name: str, dims: tuple[str, ...], shape: tuple[int, ...], sizes: dict[str, int]) -> None:
