@@ -126,7 +126,7 @@ class LeastSquares:
         """Whether offsets of joints are eliminated pose by pose, being more than coordinates of markers."""
         return self.tau is not None and self.size - self.shared < self.q.size
 
-    def rows(self, at: IntArray) -> "LeastSquares":
+    def rows(self, at: IntArray | slice) -> "LeastSquares":
         """The same problem with some of the sightings (N,); parameters stay."""
         return dataclasses.replace(self, readings=self.readings.rows(at))
 
@@ -390,9 +390,7 @@ class _Expansion:
         if offsets:  # what readings say of them
             own = D if self.by_pose else A[s:, s:]
             own += np.eye(own.shape[-1])
-        self._scaled(A, C, D, least)
-        if self.ties:
-            self._tied(gauge)
+        self._scaled(A, C, D, least, gauge)
 
     def _parts(self) -> Iterator[_Part]:
         """Derivatives of all sightings, part by part; kept where they are few."""
@@ -401,18 +399,13 @@ class _Expansion:
             yield from self.known
             return
         for first in range(0, N, _AT_ONCE):
-            at = slice(first, min(first + _AT_ONCE, N))
-            part = self._part(at)
+            part = self._part(slice(first, first + _AT_ONCE))
             if N <= _MOST_KEPT:
                 self.known.append(part)
             yield part
 
     def _part(self, at: slice) -> _Part:
-        some = (
-            self.problem
-            if at.stop - at.start == self.residual.shape[1]
-            else self.problem.rows(np.arange(at.start, at.stop))
-        )
+        some = self.problem.rows(at)
         readings, root = some.readings, self.root[:, at, None, None]
         J = some.derivative(self.scene) * root
         families = [_Family.by(readings.marker_of, J[..., -3:])]
@@ -443,8 +436,10 @@ class _Expansion:
             rows = part.gone.of[:, None, None], np.arange(C.shape[1])[:, None], at[other.of][:, None]
             C[rows] += _products(part.gone.J, other.J)
 
-    def _scaled(self, A: FloatArray, C: FloatArray, D: FloatArray, least: FloatArray) -> None:
-        """Take units of the parameters, no smaller than before, and tie the gauge."""
+    def _scaled(
+        self, A: FloatArray, C: FloatArray, D: FloatArray, least: FloatArray, gauge: FloatArray
+    ) -> None:
+        """Take units of the parameters, no smaller than before, and tie the gauge (size, g)."""
         s, first = self.problem.shared, self.first
         of_gone = np.diagonal(D, axis1=1, axis2=2).ravel()
         markers = np.diagonal(A)[s:] if self.by_pose else of_gone
@@ -462,17 +457,13 @@ class _Expansion:
         self.D = D / (gone[:, :, None] * gone[:, None, :])
         # Offsets are held by their own noise, all else is damped.
         self.damped = np.arange(len(kept)) < (len(kept) if self.by_pose else s - first)
-
-    def _tied(self, gauge: FloatArray) -> None:
-        """Tie the gauge (size, g) by multipliers."""
-        s, free = self.problem.shared, len(self.A)
-        G = np.linalg.qr(self.scale[:, None] * gauge)[0]
-        held = np.zeros((free, self.ties))
-        if self.by_pose:
-            held[:] = G
-        else:
-            held[:s], self.C[:, :, free:] = G[:s], G[s:].reshape(*self.units[1].shape, -1)
-        self.A = np.block([[self.A, held], [held.T, -np.eye(self.ties)]])
+        if self.ties:
+            G, held = np.linalg.qr(self.scale[:, None] * gauge)[0], np.zeros((len(kept), self.ties))
+            if self.by_pose:
+                held[:] = G
+            else:
+                held[:s], self.C[:, :, len(kept) :] = G[:s], G[s:].reshape(*gone.shape, -1)
+            self.A = np.block([[self.A, held], [held.T, -np.eye(self.ties)]])
 
     def step(self, damping: float) -> FloatArray | None:
         """Damped step (size or more,) with geodesic acceleration; None where second outweighs first order."""

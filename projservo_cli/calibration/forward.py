@@ -105,24 +105,20 @@ class Scene:
         return pixels if self.lens is None else through(self.lens[:, None], pixels)
 
     def motion(self, q: FloatArray) -> FloatArray:
-        """Displacements (K, 4, 4) by all joints together, [RH00] eq. (6)."""
+        """Displacements (K, 4, 4) by all joints together at joints (K, n), [RH00] eq. (6)."""
         return reduce(np.matmul, displacements(self.H_hat, self.prismatic, q))
 
     def moved(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> FloatArray:
         """Points (N, 4) of sightings, moved by all joints."""
         return np.asarray((self.motion(q)[pose_of] @ self.M[marker_of][..., None])[..., 0])
 
-    def carried(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Displacements (n, N, 4, 4) at sightings (N,), and points behind each joint (n + 1, N, 4)."""
-        E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]
-        return E, moved_points(E, self.M[marker_of][:, None])[:, :, 0]
-
     def images(self, q: FloatArray, pose_of: IntArray, marker_of: IntArray) -> Images:
         """Sightings (N,) of markers at rows of q (K, n), with their derivatives.
 
         From images to the point behind each joint by [RH00] eq. (6).
         """
-        E, Y = self.carried(q, pose_of, marker_of)
+        E = displacements(self.H_hat, self.prismatic, q)[:, pose_of]
+        Y = moved_points(E, self.M[marker_of][:, None])[:, :, 0]
         pixels, G, by_lens = projection_derivative(self.P, self.lens, Y[0])
         D = np.empty((len(Y), *pixels.shape, 4))
         D[0] = G @ self.P[:, None]

@@ -88,7 +88,7 @@ class Readings:
         """(N,) whether both views saw the marker."""
         return np.asarray(np.logical_and(self.seen[0], self.seen[1]))
 
-    def rows(self, keep: BoolArray | IntArray) -> "Readings":
+    def rows(self, keep: BoolArray | IntArray | slice) -> "Readings":
         """Some of the sightings (N,); the lists of poses and markers stay."""
         return dataclasses.replace(
             self,

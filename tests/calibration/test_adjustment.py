@@ -1,6 +1,7 @@
 """The vectorised forward model, its derivatives, and the search: against differences, scipy, the kernels."""
 
 import dataclasses
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -104,13 +105,29 @@ def test_steps_of_blocks_are_those_of_the_dense_equations(joint_noise, poses, mo
     A /= np.outer(scale, scale)
     A[: problem.size, : problem.size] += tied @ tied.T + damping * np.eye(problem.size)
     wanted = -np.linalg.solve(A, g / scale) / scale
-    for at_once in (adjustment._AT_ONCE, 7):
+    for at_once, kept in ((adjustment._AT_ONCE, adjustment._MOST_KEPT), (7, 0)):
         monkeypatch.setattr(adjustment, "_AT_ONCE", at_once)
+        monkeypatch.setattr(adjustment, "_MOST_KEPT", kept)
         here = adjustment._Expansion(problem, scene, residual, weight, np.zeros(problem.size))
         assert here.by_pose == (joint_noise and poses == 30)
         found = here._whole(here.solved(damping)(residual, strain))
         assert np.abs((found - wanted) * scale).max() < 1e-9 * np.abs(wanted * scale).max()
         assert np.allclose(here.change(wanted).ravel(), J @ wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_memory_of_a_search_grows_by_little_a_sighting(monkeypatch):
+    """Ten sightings a marker: derivatives alone, of all at once, would take 1,250 bytes each."""
+    monkeypatch.setattr(adjustment, "_AT_ONCE", 256)
+    monkeypatch.setattr(adjustment, "_MOST_KEPT", 0)
+    most = []
+    for markers in (200, 800):
+        robot = random_robot("RRRRRR", np.random.default_rng(3), markers=markers)
+        problem, scene = problem_of(robot, count=10)
+        tracemalloc.start()
+        minimize(problem, scene, problem.readings.seen, robust=True, most=2)
+        most.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert most[1] - most[0] < 900 * 10 * 600  # bytes
 
 
 def test_twin_of_the_kernels():
