@@ -6,7 +6,6 @@ bundle adjustment (``adjustment``) of the ``forward`` model, robustly (``fit``) 
 through it, and ``prediction`` is what the result is for, with how far it errs.
 """
 
-from projservo_cli.calibration.diagnosis import findings
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
 from projservo_cli.calibration.prediction import (
@@ -29,7 +28,6 @@ __all__ = [
     "calibrate",
     "chi2_band",
     "cross_validate",
-    "findings",
     "predict",
     "prediction_variance",
     "residual_statistics",

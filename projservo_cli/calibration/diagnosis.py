@@ -5,7 +5,6 @@ import itertools
 from dataclasses import dataclass
 from functools import reduce
 from itertools import islice
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -19,7 +18,7 @@ from projservo_cli.calibration.forward import LENS, Scene
 from projservo_cli.calibration.readings import MOST_JUDGED, RAYLEIGH, Readings
 from projservo_cli.calibration.start import Search, carrying, starts, still
 from projservo_cli.geometry.lens import straight_views, within
-from projservo_cli.records import WHY_LOST, BoolArray, Calibration, FloatArray, IntArray, WorkFailed
+from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # A pose is explained by a corrected joint reading when its median residual falls below so many σ.
 _CORRECTED = 3.0
@@ -29,7 +28,6 @@ _SHOWN, _SEEN = 50, 3
 _CONSISTENT = 3.0
 # Shares of sightings both views agree on, and of poses, that may be left out of a fit.
 _MOST_UNEXPLAINED, _MOST_SUSPECT = 0.02, 0.4
-_VIEWS = ("left", "right", "both")
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,38 +187,6 @@ def listed(readings: Readings, out: BoolArray) -> IntArray:
     return found[np.lexsort(found.T[::-1])].astype(np.int64)
 
 
-def findings(calibration: Calibration) -> dict[str, Any]:
-    """Single observations that do not fit, and how many do, as plain lists for people and JSON.
-
-    calibration : the record.
-    Returns ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``, and
-    ``left_out`` by kind: counts of ``sightings`` and of those ``swapped``, numbers of the ``tracks``
-    (markers) left out whole by why, and of the ``poses`` left out whole.
-    """
-    outliers, suspects, swaps = (
-        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.swapped)
-    )
-    lost, poses = (
-        [] if rows is None else rows.tolist() for rows in (calibration.lost, calibration.lost_poses)
-    )
-    tracks = {why: [j for j, w in lost if w == code] for code, why in enumerate(WHY_LOST)}
-    whole = {j for numbers in tracks.values() for j in numbers}
-    left_out = {
-        "sightings": sum(marker not in whole for _, marker, _ in outliers),
-        "swapped": len(swaps),
-        "tracks": tracks,
-        "poses": sorted({p for p, _ in suspects} | set(poses)),
-    }
-    return {
-        "outliers": [{"pose": p, "marker": m, "view": _VIEWS[v]} for p, m, v in outliers],
-        "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
-        "swapped": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
-        "merged_poses": calibration.merged_poses,
-        "merged_markers": calibration.merged_markers,
-        "left_out": left_out,
-    }
-
-
 # Hypotheses that are followed to the end, and steps of the screws by which they are compared before.
 _FOLLOWED, _SCREW_STEPS = 2, 8
 # A joint that stands still is a prismatic one of no speed: it is preferred unless the residuals with the
@@ -251,7 +217,10 @@ def blamed_joint(search: Search, most_px: float) -> str:
         return ""
     candidates.sort(key=lambda candidate: candidate[0])
     for _, words, changed, scene in candidates[:_FOLLOWED]:
-        if _describes(changed, scene, search.epipolar, most_px):
+        found = fit_from(changed, scene, search.epipolar)
+        if found is None or found.sigma_px > most_px:
+            continue
+        if not unexplained(found, Outliers.nothing(changed.readings), search.epipolar):
             return words
     return ""
 
@@ -276,14 +245,6 @@ def _hypotheses(readings: Readings, q_reference: FloatArray) -> list[tuple[str, 
         )
         found.append((words, LeastSquares.of(fewer, np.delete(q_reference, i)), 0.0))
     return found
-
-
-def _describes(problem: LeastSquares, scene: Scene, epipolar: Epipolar, most_px: float) -> bool:
-    """Whether a scene leads to a fit that leaves little noise and little out."""
-    found = fit_from(problem, scene, epipolar)
-    if found is None or found.sigma_px > most_px:
-        return False
-    return not unexplained(found, Outliers.nothing(problem.readings), epipolar)
 
 
 # A lens is suspected where it explains this share of the squared residuals and chance, with its tail

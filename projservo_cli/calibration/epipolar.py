@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.calibration.readings import LEAST_SIGMA, MAD, Readings
+from projservo_cli.calibration.readings import LEAST_SIGMA, MAD, Readings, medians
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 
 # Correspondences and readings farther than this many standard deviations do not count.
@@ -340,11 +340,8 @@ def log_distances(
     """|log distance − its median over the poses| of pairs of points (N, 3), and which are seen twice."""
     first, second, pair = pairs
     log = np.log(np.maximum(np.linalg.norm(points[first] - points[second], axis=1), 1e-12))
-    order = np.lexsort((log, pair))
-    count = np.bincount(pair)
-    start = np.cumsum(count) - count
-    middle = 0.5 * (log[order[start + (count - 1) // 2]] + log[order[start + count // 2]])
-    return np.abs(log - middle[pair]), count[pair] > 1
+    middle = medians(log[:, None], pair)[:, 0]
+    return np.abs(log - middle[pair]), np.bincount(pair)[pair] > 1
 
 
 def _distance_spread(points: FloatArray, pairs: tuple[IntArray, IntArray, IntArray]) -> float:

@@ -395,7 +395,7 @@ def _variances(values: FloatArray, group: IntArray) -> FloatArray:
     return square
 
 
-def _medians(values: FloatArray, group: IntArray) -> FloatArray:
+def medians(values: FloatArray, group: IntArray) -> FloatArray:
     """Medians (G, d) of the values (L, d) of each group, 0 to G - 1, none of them empty."""
     count = np.bincount(group)
     first = np.cumsum(count) - count
@@ -406,7 +406,7 @@ def _medians(values: FloatArray, group: IntArray) -> FloatArray:
 def _farthest(readings: Readings) -> float:
     """How far sightings are from the median place of their marker in their view, but for the farthest, px."""
     pixels, track = _tracks(readings)
-    distance = np.linalg.norm(pixels - _medians(pixels, track)[track], axis=1)
+    distance = np.linalg.norm(pixels - medians(pixels, track)[track], axis=1)
     return float(np.quantile(distance, 1.0 - _MOST_WRONG)) if distance.size else np.inf
 
 

@@ -20,6 +20,7 @@ from projservo_cli.records import (
     IMAGE_TRACK,
     REPLAN,
     TRACK,
+    WHY_LOST,
     Calibration,
     CrossValidation,
     FloatArray,
@@ -266,8 +267,6 @@ def _scalars(record: Any) -> dict[str, Any]:
 
 
 def _calibration(run: Run, config: Config) -> dict[str, Any]:
-    from projservo_cli.calibration import findings  # heavy; only this object needs it
-
     calibration = run.calibration
     given = config.robot.joints if config.robot is not None else ()
     joints = [
@@ -304,3 +303,35 @@ def _plan(run: Run) -> dict[str, Any]:
         | {"tau_0": plan.tau_0, "smallest_margin": plan.margin.min(axis=0)}
         | {"margins": {name: {"least": least, "mu": mu} for name, least, mu in nearest}}
     )
+
+
+def findings(calibration: Calibration) -> dict[str, Any]:
+    """Single observations that do not fit, and how many do, as plain lists for people and JSON.
+
+    calibration : the record.
+    Returns ``outliers``, ``suspect_joint_readings``, ``swapped``, ``merged_poses``, ``merged_markers``, and
+    ``left_out`` by kind: counts of ``sightings`` and of those ``swapped``, numbers of the ``tracks``
+    (markers) left out whole by why, and of the ``poses`` left out whole.
+    """
+    outliers, suspects, swaps = (
+        rows.tolist() for rows in (calibration.outlier, calibration.suspect, calibration.swapped)
+    )
+    lost, poses = (
+        [] if rows is None else rows.tolist() for rows in (calibration.lost, calibration.lost_poses)
+    )
+    tracks = {why: [j for j, w in lost if w == code] for code, why in enumerate(WHY_LOST)}
+    whole = {j for numbers in tracks.values() for j in numbers}
+    left_out = {
+        "sightings": sum(marker not in whole for _, marker, _ in outliers),
+        "swapped": len(swaps),
+        "tracks": tracks,
+        "poses": sorted({p for p, _ in suspects} | set(poses)),
+    }
+    return {
+        "outliers": [{"pose": p, "marker": m, "view": (*VIEWS, "both")[v]} for p, m, v in outliers],
+        "suspect_joint_readings": [{"pose": p, "joint": j} for p, j in suspects],
+        "swapped": [{"pose": p, "markers": [a, b]} for p, a, b in swaps],
+        "merged_poses": calibration.merged_poses,
+        "merged_markers": calibration.merged_markers,
+        "left_out": left_out,
+    }

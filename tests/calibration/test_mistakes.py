@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, findings
+from projservo_cli.calibration import calibrate
+from projservo_cli.report.material import findings
 from tests.calibration.bound import errors_of_the_best
 from tests.calibration.mistakes import KINDS, MISTAKES, table
 from tests.calibration.mistakes_study import median_error, shares_left_out

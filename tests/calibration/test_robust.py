@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import calibrate, findings, predict
+from projservo_cli.calibration import calibrate, predict
+from projservo_cli.report.material import findings
 from tests.calibration.damage import exchanged, listed, misread, shifted
 from tests.calibration.simulated_robot import around, random_robot, trials
 
