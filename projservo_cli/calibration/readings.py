@@ -162,20 +162,14 @@ def _require_shapes(observation: Observation) -> None:
         if (count > 1).any():
             raise InputError(f"{name} number {values[count > 1][0]} stands twice: number each {name} once")
     K, m = len(observation.q), len(observation.marker)
-    if len(observation.pose) != K:
-        raise InputError(f"{len(observation.pose)} pose numbers for {K} rows of joint readings")
-    if observation.images.shape != (K, 2, m, 2):
-        raise InputError(
-            f"images of shape {observation.images.shape}: expected {(K, 2, m, 2)} for {K} poses, two views, "
-            f"{m} markers and two coordinates"
-        )
-    for name, shape in (("moving", (K,)), ("t_q", (K,)), ("t_view", (K, 2))):
+    shapes = {"pose": (K,), "images": (K, 2, m, 2), "sigma": (K, 2, m), "moving": (K,), "t_q": (K,)}
+    for name, shape in (shapes | {"t_view": (K, 2)}).items():
         given = getattr(observation, name)
         if given is not None and given.shape != shape:
-            raise InputError(f"{name} of shape {given.shape}: expected {shape} for {K} poses")
+            raise InputError(
+                f"{name} of shape {given.shape}: expected {shape} for {K} poses, two views, {m} markers"
+            )
     if observation.sigma is not None:
-        if observation.sigma.shape != (K, 2, m):
-            raise InputError(f"sigma of shape {observation.sigma.shape}: expected {(K, 2, m)}")
         stated = observation.sigma[np.isfinite(observation.images).all(axis=3)]
         if not ((stated > 0.0) & (stated < np.inf)).all():
             raise InputError("sigma must be a positive number wherever a marker was seen, px")

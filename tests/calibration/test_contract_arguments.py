@@ -25,7 +25,7 @@ def shaped(**given):
 
 K, M = len(OBSERVATION.pose), len(OBSERVATION.marker)
 CASES = {
-    "readings of fewer poses": (shaped(q=OBSERVATION.q[:-1]), "RPR", {}, f"{K} pose numbers for"),
+    "readings of fewer poses": (shaped(q=OBSERVATION.q[:-1]), "RPR", {}, "pose of shape"),
     "readings in a row": (shaped(q=OBSERVATION.q[:, 0]), "R", {}, "expected (poses, joints)"),
     "images of fewer poses": (shaped(images=OBSERVATION.images[:-1]), "RPR", {}, f"for {K} poses"),
     "fewer marker numbers": (shaped(marker=OBSERVATION.marker[:-1]), "RPR", {}, f"{M - 1} markers"),
