@@ -31,7 +31,8 @@ _STRAIGHT = 1.0 / 8.0
 # Much of what a finder states of a corner is the same while the view of it is: it does not average away, and
 # of many corners some are off by so many deviations.
 _LASTING_CORNER = 2.0
-# Where a finder states deviations, a marker that seems to have moved by less, px, is a wrong edge.
+# Where a finder states deviations, a marker that seems to have moved by less, px, is a wrong edge, and so is
+# perhaps one that a single camera shows: something may hide it there.
 _LEAST_MOVED_PX = 1.0
 # A corner that is so many times less certain than most is not tested: its error is the finder's, and lasts.
 _VAGUE = 10.0
@@ -189,7 +190,7 @@ class Innovation:
         self._pending: list[tuple[BoolArray, _Sums]] = []
         self._readings: list[FloatArray] = []
         self._last: _Frame | None = None
-        self._doubtful, self._least_moved = 0, 0.0
+        self._doubtful, self._by_edges = 0, False
         self._amounts: list[tuple[int, float]] = []
         self._waiting: tuple[list[_Frame], list[_Frame]] = ([], [])
         self._reached = np.full(2, -np.inf)
@@ -234,7 +235,7 @@ class Innovation:
             seen = np.isfinite(images[..., 0])
             vague = noise > _VAGUE * np.median(noise[seen]) if seen.any() else ~seen
             images = np.where(vague[..., None], np.nan, images)
-            self._floor, self._least_moved = max(self._floor, _LASTING_CORNER), _LEAST_MOVED_PX
+            self._floor, self._by_edges = max(self._floor, _LASTING_CORNER), True
         self._first = q[0] if self._first is None else self._first
         if self._at_rest:
             self._at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
@@ -463,7 +464,7 @@ class Innovation:
         self._doubtful += 1
         best, *others = sorted(blamed, key=lambda blame: -blame.score)
         who = self._causes[best.causes[0]][:2]
-        if who[0] == "marker" and self._changed(best, look) < self._least_moved:
+        if who[0] == "marker" and self._by_edges and self._is_wrong_edge(best, look):
             self._doubtful = 0
             self._pending.clear()
             return ""
@@ -482,6 +483,12 @@ class Innovation:
         return f"{fit}: {self._said(best, look)}" + (
             "" if clear or not others else f"; or {self._said(others[0], look)}"
         )
+
+    def _is_wrong_edge(self, blame: _Blame, look: _Look) -> bool:
+        """Whether what moved may be the edges that a finder took for those of a marker."""
+        which = [self._causes[i].which for i in blame.causes]
+        alone = not look.seen[:, which].all(axis=0).any()
+        return alone or self._changed(blame, look) < _LEAST_MOVED_PX
 
     def _is_steady(self, blame: _Blame) -> bool:
         """Whether what a joint slipped by stays: a reading that stands still is off by ever more."""

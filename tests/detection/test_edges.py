@@ -48,6 +48,17 @@ def test_a_side_that_is_covered_costs_its_two_corners_unless_it_is_a_little(grey
     np.testing.assert_allclose(found[2:], CORNERS[2:], atol=0.03)
 
 
+def test_what_reaches_over_an_edge_little_by_little_does_not_move_its_corners():
+    v, u = np.mgrid[0:100, 0:120]
+    for depth in np.arange(0.0, 12.0, 0.5):
+        image = dark_square(CORNERS)
+        disc = np.hypot(u - 74.0, v - 14.0 - depth) < 16.0  # its lowest point goes down over the upper side
+        image = gaussian_filter(np.where(disc, 190.0, image), 0.5)
+        found = found_in(image, CORNERS)
+        assert np.isnan(found[1, 0]) or found[1] == pytest.approx(CORNERS[1], abs=0.3)  # px; 3.4 without rounds of ever smaller residuals
+        assert found[2:] == pytest.approx(CORNERS[2:], abs=0.05)
+
+
 UNCLEAN = {
     "bright on dark": (lambda image: 240.0 - image, CORNERS),
     "no contrast": (lambda image: np.full_like(image, 90.0), CORNERS),

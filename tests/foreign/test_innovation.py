@@ -153,6 +153,8 @@ def test_a_marker_is_tested_by_the_deviation_it_states(arm):
     assert first_alarm(arm, q, s)[0] < 10
     s[20:, 0, 4] += 3.0  # less than what the others are off
     assert 20 <= first_alarm(arm, q, s, stated=stated)[0] < 40
+    s[20:, 1, 4] = np.nan  # something may hide what a single camera shows
+    assert first_alarm(arm, q, s, stated=stated) == (None, "")
 
 
 def test_instants_that_are_uncertain_are_not_taken_for_a_disturbance(arm):
