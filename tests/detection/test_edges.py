@@ -55,7 +55,8 @@ def test_what_reaches_over_an_edge_little_by_little_does_not_move_its_corners():
         disc = np.hypot(u - 74.0, v - 14.0 - depth) < 16.0  # its lowest point goes down over the upper side
         image = gaussian_filter(np.where(disc, 190.0, image), 0.5)
         found = found_in(image, CORNERS)
-        assert np.isnan(found[1, 0]) or found[1] == pytest.approx(CORNERS[1], abs=0.3)  # px; 3.4 without rounds of ever smaller residuals
+        # px; 3.4 where profiles are left out by one limit alone
+        assert np.isnan(found[1, 0]) or found[1] == pytest.approx(CORNERS[1], abs=0.3)
         assert found[2:] == pytest.approx(CORNERS[2:], abs=0.05)
 
 
