@@ -9,12 +9,9 @@ through it, and ``prediction`` is what the result is for, with how far it errs.
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
 from projservo_cli.calibration.prediction import (
-    Region,
-    Suggestion,
     predict,
     prediction_variance,
     residual_statistics,
-    suggest,
 )
 from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate
 from projservo_cli.calibration.start import Nominal
@@ -22,14 +19,11 @@ from projservo_cli.calibration.start import Nominal
 __all__ = [
     "WEAK_NOISE",
     "Nominal",
-    "Region",
     "Solution",
-    "Suggestion",
     "calibrate",
     "chi2_band",
     "cross_validate",
     "predict",
     "prediction_variance",
     "residual_statistics",
-    "suggest",
 ]

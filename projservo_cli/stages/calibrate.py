@@ -8,15 +8,13 @@ import numpy as np
 
 from projservo_cli.calibration import (
     Nominal,
-    Region,
     Solution,
-    Suggestion,
     calibrate,
     cross_validate,
-    suggest,
 )
 from projservo_cli.config import Config
 from projservo_cli.files import write_whole
+from projservo_cli.guidance.spread import Region, Suggestion, suggest
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed, seed_of_trials

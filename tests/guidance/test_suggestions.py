@@ -6,7 +6,8 @@ import itertools
 import numpy as np
 import pytest
 
-from projservo_cli.calibration import Region, calibrate, predict, prediction_variance, suggest
+from projservo_cli.calibration import calibrate, predict, prediction_variance
+from projservo_cli.guidance.spread import Region, suggest
 from projservo_cli.records import InputError, Observation, WorkFailed
 from tests.calibration.simulated_robot import IMAGE_SIZE, around, random_robot, trials
 
