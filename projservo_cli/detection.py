@@ -100,8 +100,8 @@ _BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
 # What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
 _FLOOR, _LEAK = 0.002, (0.5, 0.6)
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
-# the blur that is reckoned with where no edge tells it, in cells.
-_UNREFINED, _BY_CELL, _BLURRED = 1.35, -0.75, 0.4
+# the blur that is reckoned with where no edge tells it, in cells; from what cell on, px, it grows no more.
+_UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.35, -0.75, 0.4, 1.6
 
 
 class _Sides(NamedTuple):
@@ -361,7 +361,7 @@ def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
 
     A formula that was fitted to drawn and to rendered tags of all sizes, tilts and blurs.
     """
-    cell = np.maximum(cell, 1.0).reshape(-1, 4)
+    cell = np.maximum(cell, _LEAST_UNREFINED).reshape(-1, 4)
     cell = np.minimum(cell, np.roll(cell, 1, axis=1))
     known = blur[np.isfinite(blur)]
     typical = float(np.median(known)) if known.size else _BLURRED * cell
