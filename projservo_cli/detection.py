@@ -101,7 +101,7 @@ _BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
 _FLOOR, _LEAK = 0.002, (0.5, 0.6)
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
 # the blur that is reckoned with where no edge tells it, in cells; from what cell on, px, it grows no more.
-_UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.35, -0.75, 0.4, 1.6
+_UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.35, -0.75, 0.4, 1.25
 
 
 class _Sides(NamedTuple):
