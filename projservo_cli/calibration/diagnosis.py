@@ -208,7 +208,7 @@ def blamed_joint(search: Search, most_px: float) -> str:
         for done, (words, changed, handicap) in enumerate(changes):
             search.tell("calibration, joint at fault", done, len(changes))
             seen = changed.readings.seen
-            for start in islice(starts(dataclasses.replace(search, problem=changed)), 1):
+            for start in islice(starts(dataclasses.replace(search, problem=changed), changed.readings), 1):
                 scene = minimize(changed, start, seen, robust=True, cameras=False, most=_SCREW_STEPS).scene
                 # By logarithms neither a few gross errors nor many small ones outweigh the rest.
                 level = np.mean(np.log(np.linalg.norm(changed.residual(scene)[seen], axis=1) + 1e-9))

@@ -290,13 +290,14 @@ def _crawling(seen: BoolArray, far: float) -> Callable[[FloatArray], bool]:
 
 def fit_from(problem: LeastSquares, scene: Scene, epipolar: Epipolar) -> Solution | None:
     """The fit that a scene leads to: a robust search, then ``fit_inliers``."""
-    searched, level = _robust_search(problem, scene, epipolar)
+    searched, level = _robust_search(problem, scene, problem.readings.seen, epipolar)
     return fit_inliers(problem, searched, level / RAYLEIGH, epipolar.noise_px, hopeless=_HOPELESS)
 
 
-def _robust_search(problem: LeastSquares, scene: Scene, epipolar: Epipolar) -> tuple[Scene, float]:
-    """Screws alone, then everything, under a Cauchy loss: scene, median px."""
-    rows = problem.readings.seen
+def _robust_search(
+    problem: LeastSquares, scene: Scene, rows: BoolArray, epipolar: Epipolar
+) -> tuple[Scene, float]:
+    """Screws alone, then everything, under a Cauchy loss over some readings (2, N): scene, median px."""
     scene = minimize(problem, scene, rows, robust=True, cameras=False, most=20).scene
     stalled = _crawling(rows, REFUSE_RATIO * epipolar.noise_px)
     fit = minimize(problem, scene, rows, robust=True, most=100, stalled=stalled)
@@ -441,8 +442,10 @@ def with_joint_noise(exact: Solution, expected: Expected, given: float | None) -
 
 
 # Passes over the starts until one is good enough: factors of the focal length that fits best, for a
-# wrong one often leads where the best does not.
+# wrong one often leads where the best does not. After a pass, poses whose residual is so many times
+# the median are left out of the next.
 _FOCAL_FACTORS = ((1.0,), (1.0, 0.6), (1.6, 0.4, 2.5))
+_SPOILT = 8.0
 # Most searches a pass: data that fit no robot are refused within seconds.
 _SEARCHES = 5
 
@@ -492,16 +495,18 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
     """
     whole, epipolar = search.problem, search.epipolar
     best: Solution | None = None
+    trusted = np.ones(len(whole.q), dtype=bool)
     levels: list[float] = []
     for number, factors in enumerate(_FOCAL_FACTORS):
         # Of many markers other ones each time.
         few = carrying(whole.readings, epipolar.noise_px, search.rng)
         problem = whole if few.all() else whole.of_markers(few)
-        search = dataclasses.replace(search, problem=problem)
-        scenes = islice(starts(search, factors), _SEARCHES)
+        search, readings = dataclasses.replace(search, problem=problem), problem.readings
+        rows = readings.seen & trusted[readings.pose_of]
+        scenes = islice(starts(search, readings.of_poses(trusted), factors), _SEARCHES)
         for done, start in enumerate(scenes, number * _SEARCHES):
             search.tell("calibration, starts", done, len(_FOCAL_FACTORS) * _SEARCHES)
-            scene, level = _robust_search(problem, start, epipolar)
+            scene, level = _robust_search(problem, start, rows, epipolar)
             # Different starts that end at one place need not be followed to the end twice.
             if any(abs(level - other) < _SAME_LEVEL * other for other in levels):
                 # Twice the same place and no gross misfit: more starts would not better it.
@@ -525,11 +530,28 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
                     best = explained
             if factors != _FOCAL_FACTORS[0] and expected.refusal(best) is None:
                 return best
-        if best is not None and expected.refusal(best) is None:
-            return best
+        if best is not None:
+            if expected.refusal(best) is None:
+                return best
+            # Wrong joint readings spoil the start: once the rest is roughly explained they stand out.
+            before, trusted = trusted, _explained(best)
+            if not np.array_equal(before, trusted):
+                levels = []
     if best is None:
         raise Misfit(
             "the data contradict the joint readings from the start: check that they belong to their poses, "
             "their units (rad, m) and types (R or P), and that rows of one pose belong together"
         )
     return best
+
+
+def _explained(solution: Solution) -> BoolArray:
+    """Poses (K,) whose median residual is within some times that of all."""
+    readings = solution.problem.readings
+    distance = np.linalg.norm(solution.residual, axis=2)
+    limit = _SPOILT * solution.typical_px
+    result = np.ones(len(readings.q), dtype=bool)
+    for k in np.unique(readings.pose_of):
+        here = readings.pose_of == k
+        result[k] = np.median(distance[:, here][readings.seen[:, here]]) <= limit
+    return result

@@ -390,9 +390,11 @@ def _robust_solve(
     return np.asarray(x), np.asarray(means[..., -1] - means[..., :-1] @ x)
 
 
-def starts(search: Search, factors: tuple[float, ...] = (1.0,)) -> Iterator[Scene]:
-    """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each."""
-    readings = search.problem.readings
+def starts(search: Search, readings: Readings, factors: tuple[float, ...] = (1.0,)) -> Iterator[Scene]:
+    """Scenes to start from, most promising first: factors of the best focal lengths, and axes for each.
+
+    The readings are those of the problem, perhaps at some of its poses.
+    """
     for factor in factors:
         for guess in metric_guesses(search.epipolar, readings, search.frame, factor):
             alignment = _merged(guess[1], readings, search.rng)

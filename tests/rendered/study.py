@@ -223,10 +223,12 @@ def main():
         if n:
             print(f"corners of {low} to {high} px: {n:.0f}, off over stated {math.sqrt(square / n):.2f}")
     jobs = [(name, seed, *both) for name, both in made.items() for seed in list(SEEDS)[: given.tasks]]
-    rows = [row for mine in in_two_processes(driven, jobs, "tasks") for row in mine]
+    rows = []
+    for mine in in_two_processes(driven, jobs, "tasks"):
+        rows += mine
+        write_rows(given.output, rows)  # what is cut off leaves what was driven
     for condition in made:
         tell(condition, [row for row in rows if row["condition"] == condition])
-    write_rows(given.output, rows)
 
 
 if __name__ == "__main__":
