@@ -286,11 +286,8 @@ def _uncovered(
     strips: _Strips, noise: FloatArray, x: FloatArray, A: FloatArray
 ) -> tuple[_Strips, FloatArray, FloatArray, BoolArray]:
     """Strips without the profiles that something covers, fitted again; whether (S,) these were few."""
-    whole = strips.weight.any(axis=2)
+    whole, rms = strips.weight.any(axis=2), _rms_of_profiles(x, strips)
     for share in _SPOILT:
-        residual, _ = _edge_model(x, strips)
-        count = strips.weight.sum(axis=2)
-        rms = np.sqrt((residual**2).sum(axis=2) / np.maximum(count, 1.0))
         spoilt = rms > np.maximum(share * x[:, 1], 3.0 * noise)[:, None]
         touched = spoilt.any(axis=1)
         if not touched.any():
@@ -299,8 +296,15 @@ def _uncovered(
         some = _Strips(*(part[touched] for part in strips))
         x, A = x.copy(), A.copy()
         x[touched], A[touched] = _fitted(x[touched], some, noise[touched], _STEPS[1])
+        rms[touched] = _rms_of_profiles(x[touched], some)
     left = strips.weight.any(axis=2).sum(axis=1)
     return strips, x, A, left >= (1.0 - _SPOILT_SHARE) * np.maximum(whole.sum(axis=1), 1)
+
+
+def _rms_of_profiles(x: FloatArray, strips: _Strips) -> FloatArray:
+    """Root mean square (S, C) of what a model (S, 6) leaves of each profile of a side."""
+    residual, _ = _edge_model(x, strips)
+    return np.asarray(np.sqrt((residual**2).sum(axis=2) / np.maximum(strips.weight.sum(axis=2), 1.0)))
 
 
 def _noise(strips: _Strips) -> FloatArray:

@@ -26,8 +26,8 @@ _CORRECTED = 3.0
 _SHOWN, _SEEN = 50, 3
 # Sightings both views agree on, in units of the epipolar noise, are no errors of detection.
 _CONSISTENT = 3.0
-# Shares of sightings both views agree on, and of poses, that may be left out of a fit.
-_MOST_UNEXPLAINED, _MOST_SUSPECT = 0.02, 0.4
+# Share of sightings both views agree on that may be left out of a fit.
+_MOST_UNEXPLAINED = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,7 @@ class Outliers:
         readings, sigma = problem.readings, solution.sigma_px
         out = readings.seen & ~used
         swapped, explained = _swaps(problem, scene, out, OUTLIER * sigma)
-        suspects: list[tuple[int, int]] = []
-        poses = []
+        suspects, poses = list[tuple[int, int]](), list[int]()
         for k in np.flatnonzero(readings.count_at(used) == 0):
             here = readings.pose_of == k
             pose = dataclasses.replace(readings, seen=readings.seen & ~explained).rows(here)
@@ -93,11 +92,10 @@ def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) ->
                 trees[v].query_ball_point(readings.pixels[v, row], limit / readings.weight[v, row])
                 for v in np.flatnonzero(readings.seen[:, row])
             ]
-            fits = set(others[np.array(reduce(np.intersect1d, near), dtype=np.int64)].tolist()) - {
-                int(readings.marker_of[row])
-            }
-            if len(fits) == 1:
-                found.add((int(k), int(readings.marker_of[row]), fits.pop()))
+            marker = int(readings.marker_of[row])
+            fits = np.setdiff1d(others[np.array(reduce(np.intersect1d, near), dtype=np.int64)], marker)
+            if fits.size == 1:
+                found.add((int(k), marker, int(fits[0])))
                 explained[:, row] = out[:, row]
     # An exchange shows in both markers and is one finding.
     listed = sorted((k, a, b) for k, a, b in found if a < b or (k, b, a) not in found)
@@ -106,14 +104,10 @@ def _swaps(problem: LeastSquares, scene: Scene, out: BoolArray, limit: float) ->
 
 def _is_elsewhere(pose: LeastSquares, scene: Scene, q: FloatArray, sigma: float) -> bool:
     """Whether other joints explain the images of a pose: those of another one (K, n), or near these."""
-    levels = []
-    for values in q:
-        moved = dataclasses.replace(pose, q=np.broadcast_to(values, pose.q.shape), tau=None)
-        levels.append(median_px(moved.residual(scene), moved.readings.seen))
-    nearest = np.broadcast_to(q[int(np.argmin(levels))], pose.q.shape)
-    best = dataclasses.replace(pose, q=nearest, tau=None)
-    joints = list(range(q.shape[1]))
-    level = min(min(levels), _corrected_level(best, scene, joints, sigma))
+    poses = [dataclasses.replace(pose, q=np.broadcast_to(at, pose.q.shape), tau=None) for at in q]
+    levels = [median_px(one.residual(scene), one.readings.seen) for one in poses]
+    nearest = poses[int(np.argmin(levels))]
+    level = min(min(levels), _corrected_level(nearest, scene, list(range(q.shape[1])), sigma))
     return level <= _CORRECTED * RAYLEIGH * sigma
 
 
@@ -151,30 +145,23 @@ def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma:
         return images if pose.tau is None else np.concatenate([images, x[len(joints) :] / pose.tau[others]])
 
     found = least_squares(residual, np.zeros(len(moved)), loss="soft_l1", f_scale=sigma)
-    images = found.fun[: 2 * int(seen.sum())]
-    return float(np.median(np.linalg.norm(images.reshape(-1, 2), axis=1)))
+    return float(np.median(np.linalg.norm(found.fun[: 2 * int(seen.sum())].reshape(-1, 2), axis=1)))
 
 
 def unexplained(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
-    """What speaks against a fit: sightings left out that both views agree on, poses; in words, else empty."""
+    """What speaks against a fit: sightings left out that both views agree on, in words, else empty."""
     readings, used = _straight(solution.problem.readings, solution.scene.lens), solution.used
     # Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
     both = readings.both
     out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
     agree = epipolar.within(readings.rows(both), _CONSISTENT)
     count, sightings = int((out & agree).sum()), int(both.sum())
-    if count > max(3.0, _MOST_UNEXPLAINED * sightings):
-        return (
-            f"in {count} of {sightings} sightings both cameras agree with each other but not with the robot; "
-            "check the joint readings and types (R or P)"
-        )
-    suspects, poses = len(np.union1d(found.suspect[:, 0], found.poses)), len(readings.q)
-    if suspects > _MOST_SUSPECT * poses:
-        return (
-            f"{suspects} of {poses} poses contradict their joint readings; check the joint readings, their "
-            "units and types (R or P)"
-        )
-    return ""
+    if count <= max(3.0, _MOST_UNEXPLAINED * sightings):
+        return ""
+    return (
+        f"in {count} of {sightings} sightings both cameras agree with each other but not with the robot; "
+        "check the joint readings and types (R or P)"
+    )
 
 
 def listed(readings: Readings, out: BoolArray) -> IntArray:

@@ -53,7 +53,7 @@ class Epipolar:
         if count > _CORRESPONDENCES:
             some = rng.choice(count, _CORRESPONDENCES, replace=False)
             left, right, weight, count = left[some], right[some], weight[:, some], _CORRESPONDENCES
-        a, b = _homogeneous(left) @ T.T, _homogeneous(right) @ T_.T
+        a, b = homogeneous(left) @ T.T, homogeneous(right) @ T_.T
         picks = np.stack([rng.choice(count, 8, replace=False, shuffle=False) for _ in range(_SAMPLES)])
         candidates = _eight_point(a[picks], b[picks])
         judges = np.arange(count) if count <= _JUDGES else rng.choice(count, _JUDGES, replace=False)
@@ -65,7 +65,7 @@ class Epipolar:
         F = _refine(F, a, b, weight)
         product = T_.T @ F @ T
         in_pixels: FloatArray = product / float(np.linalg.norm(product))
-        residual, _ = _sampson(in_pixels, _homogeneous(left), _homogeneous(right), weight)
+        residual, _ = _sampson(in_pixels, homogeneous(left), homogeneous(right), weight)
         inlier = np.abs(residual) <= OUTLIER * _deviation(residual, 1e-9)
         if inlier.sum() <= _PARAMETERS:
             raise WorkFailed("the sightings of the two cameras share no epipolar geometry: check the rows")
@@ -91,7 +91,7 @@ class Epipolar:
 
     def within(self, readings: Readings, deviations: float) -> BoolArray:
         """Which of readings (N,) that both views saw obey the geometry to so many standard deviations."""
-        left, right = _homogeneous(readings.pixels)
+        left, right = homogeneous(readings.pixels)
         return np.abs(_sampson(self.F, left, right, readings.weight)[0]) <= deviations * self.sigma_px
 
 
@@ -100,7 +100,7 @@ def _deviation(r: FloatArray, least: float) -> float:
     return max(float(np.median(np.abs(r))) / MAD, least)
 
 
-def _homogeneous(pixels: FloatArray) -> FloatArray:
+def homogeneous(pixels: FloatArray) -> FloatArray:
     """Append a one to each row."""
     return np.concatenate([pixels, np.ones((*pixels.shape[:-1], 1))], axis=-1)
 
@@ -181,7 +181,7 @@ def reconstruct(F: FloatArray, left: FloatArray, right: FloatArray) -> tuple[Flo
     back = np.linalg.inv(T)
     P = _canonical_pair(back[1].T @ F @ back[0])
     # The right camera is known up to P' + e' vᵀ: a frame in which its left block is not singular.
-    points = _triangulate(P, _homogeneous(left) @ T[0].T, _homogeneous(right) @ T[1].T)
+    points = triangulated(P[:, None], np.stack([homogeneous(left) @ T[0].T, homogeneous(right) @ T[1].T]))
     W = _isotropic_frame(points)
     points = points @ W.T
     P = back @ P @ np.linalg.inv(W)
@@ -197,10 +197,10 @@ def _canonical_pair(F: FloatArray) -> FloatArray:
     return np.stack([np.eye(3, 4), np.hstack([np.cross(e[:, None], F, axis=0), e[:, None]])])
 
 
-def _triangulate(P: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Points (N, 4) of unit norm from linear equations in homogeneous pixels (N, 3): [HZ04] 12.2."""
-    rows = [m[:, :2, None] * camera[2] - camera[:2] for camera, m in zip(P, (left, right), strict=True)]
-    return np.linalg.svd(np.concatenate(rows, axis=1))[2][:, 3]
+def triangulated(P: FloatArray, m: FloatArray) -> FloatArray:
+    """Points (N, 4) of unit norm from homogeneous pixels (2, N, 3) of cameras (2, N, 3, 4): [HZ04] 12.2."""
+    rows = m[..., :2, None] * P[:, :, 2:] - P[:, :, :2]
+    return np.linalg.svd(rows.swapaxes(0, 1).reshape(-1, 4, 4))[2][:, 3]
 
 
 def _isotropic_frame(points: FloatArray) -> FloatArray:
@@ -297,7 +297,7 @@ def _guess_at(
     U, _, Vt = np.linalg.svd(K[1].T @ F @ K[0])
     U, Vt = U * np.sign(np.linalg.det(U)), Vt * np.sign(np.linalg.det(Vt))
     W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    x, y = (np.linalg.solve(K[v], _homogeneous(readings.pixels[v][readings.both]).T).T for v in (0, 1))
+    x, y = (np.linalg.solve(K[v], homogeneous(readings.pixels[v][readings.both]).T).T for v in (0, 1))
     # Turn and baseline, and depths along the rays of both cameras.
     solutions = [
         (R, t, *_ray_depths(R, t, x, y)) for R in (U @ W @ Vt, U @ W.T @ Vt) for t in (U[:, 2], -U[:, 2])

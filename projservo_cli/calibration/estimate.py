@@ -36,12 +36,12 @@ _DOUBTFUL_RATIO, _DOUBTFUL_SHARE = 2.0, 0.5
 # Share of the residuals that makes a lens the likely reason of a refusal, and the probability with which
 # noise alone exceeds coefficients that show no lens.
 _DECISIVE_SHARE, _NO_LENS_TAIL = 0.5, 0.01
-# A fit that leaves out what both views agree on must keep this share of the readings and of all motions, and
-# err by no more than this ratio of what is expected, in its residuals and when it predicts each of so many
-# parts of the poses.
+# A fit must keep this share of the motion of each joint, and where it leaves out much, of the readings. Then
+# it may err by no more than this ratio of what is expected, in its residuals and when it predicts each of so
+# many parts of the poses.
 _KEPT, _DOUBTED_RATIO, _PARTS = 0.5, 1.3, 3
-# Share of the readings that is much to leave out unless exchanged markers or wrong joints explain it.
-_MUCH = 0.1
+# Shares of the readings that are much to leave out: those that neither exchanges nor joints explain, all.
+_MUCH, _MOST = 0.1, 0.4
 # Share of readings that may lie outside the images: they are outliers.
 _STRAYS = 0.01
 # As many lines of advice as fit a screen, and as many examples as a line names.
@@ -176,16 +176,17 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     share = share_explained(whole, frame)
     solution, kept = whole.determined()
     try:
-        refusal = expected.refusal(solution)
+        refusal = expected.refusal(solution) or _unmoved(solution)
         if refusal is not None:
             raise Misfit(refusal)
         found = Outliers.of(solution)
         doubt = unexplained(solution, found, epipolar)
-        out = 1.0 - (solution.used | found.explained).sum() / whole.problem.readings.seen.sum()
-        if doubt or out > _MUCH:
+        kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
+        out, gone = 1.0 - kept_by / whole.problem.readings.seen.sum()
+        if doubt or out > _MUCH or gone > _MOST:
             why = _contradiction(whole, solution, expected)
             if why or (doubt and share >= _DECISIVE_SHARE):
-                doubt = doubt or f"{100.0 * out:.0f} % of the readings do not fit it, and {why}"
+                doubt = doubt or f"{100.0 * gone:.0f} % of the readings do not fit it, and {why}"
                 raise Misfit(f"the fit does not describe the data: {doubt}")
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
@@ -210,18 +211,23 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
     return dataclasses.replace(record, outlier=outlier, lost=lost, advice=(*advice, seldom))
 
 
-def _contradiction(whole: Solution, solution: Solution, expected: Expected) -> str:
-    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing.
+def _unmoved(solution: Solution) -> str | None:
+    """A joint that moves in what is left out, as of a wrong type or wrong readings, in words, or None."""
+    readings = solution.problem.readings
+    kept = np.unique(readings.pose_of[solution.used.any(axis=0)])
+    square = (readings.q - readings.q.mean(axis=0)) ** 2
+    short = square[kept].sum(axis=0) < _KEPT * square.sum(axis=0)
+    if not short.any():
+        return None
+    i = int(np.argmax(short))
+    return f"the fit leaves out most motion of joint {i + 1}; check its readings and its type (R or P)"
 
-    It must be most, span the motions, leave nothing but noise, and predict poses that it has not seen.
-    """
-    readings, ratio = solution.problem.readings, expected.ratio(solution)
+
+def _contradiction(whole: Solution, solution: Solution, expected: Expected) -> str:
+    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing."""
+    ratio = expected.ratio(solution)
     if solution.used.sum() < _KEPT * whole.problem.readings.seen.sum():
         return "that is most of them; leave out what is not on the robot, and check the joint readings"
-    span = np.ptp(readings.q[np.unique(readings.pose_of[solution.used.any(axis=0)])], axis=0)
-    if (short := span < _KEPT * np.ptp(readings.q, axis=0)).any():
-        i = int(np.argmax(short))
-        return f"what does moves joint {i + 1} little; check its readings and its type (R or P)"
     if ratio > _DOUBTED_RATIO:
         return (
             f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types (R or P)"

@@ -12,7 +12,7 @@ from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
 from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
-from projservo_cli.calibration.readings import RAYLEIGH, even_choice, per_rad
+from projservo_cli.calibration.readings import RAYLEIGH, even_choice, medians, per_rad
 from projservo_cli.calibration.start import Nominal, Search, carrying, starts
 from projservo_cli.calibration.tracks import Tracks
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed
@@ -548,10 +548,8 @@ def _solve_from_images(search: Search, expected: Expected) -> Solution:
 def _explained(solution: Solution) -> BoolArray:
     """Poses (K,) whose median residual is within some times that of all."""
     readings = solution.problem.readings
-    distance = np.linalg.norm(solution.residual, axis=2)
-    limit = _SPOILT * solution.typical_px
+    poses, group = np.unique(readings.pose_of[np.nonzero(readings.seen)[1]], return_inverse=True)
+    distance = np.linalg.norm(solution.residual[readings.seen], axis=1)
     result = np.ones(len(readings.q), dtype=bool)
-    for k in np.unique(readings.pose_of):
-        here = readings.pose_of == k
-        result[k] = np.median(distance[:, here][readings.seen[:, here]]) <= limit
+    result[poses] = medians(distance[:, None], group)[:, 0] <= _SPOILT * solution.typical_px
     return result

@@ -49,7 +49,6 @@ _COUNTS = ("merged_poses", "merged_markers")
 _NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
 
 DIRECT = ("direct_three", "direct_two")
-CLASSICAL = ("stacked", "blockwise", "euclidean_points")
 TITLES = {
     "direct_three": "directTHREE",
     "direct_two": "directTWO",

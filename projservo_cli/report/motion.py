@@ -14,6 +14,7 @@ from projservo_cli.files import replacing, write_whole
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (
     BODY_LAWS,
+    POINT_LAWS,
     BoolArray,
     ByteArray,
     FloatArray,
@@ -27,7 +28,7 @@ from projservo_cli.report.figures.frames import frames_of, with_halo
 from projservo_cli.report.figures.guided import tree_edges, with_gaps
 from projservo_cli.report.figures.images import near_pixels
 from projservo_cli.report.figures.scene import pyramids, skeleton
-from projservo_cli.report.material import CLASSICAL, PAGE_FILE, VIEWS, title
+from projservo_cli.report.material import PAGE_FILE, VIEWS, title
 from projservo_cli.report.page import template
 from projservo_cli.robots.simulated import Arm, Plant
 from projservo_cli.task.face import center_of
@@ -311,7 +312,7 @@ def write_animation(
     from PIL import Image
 
     direct = [name for name in traces if name in BODY_LAWS]
-    beside = [*direct[:1], *(name for name in traces if name in CLASSICAL)]
+    beside = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
     columns = {name: traces[name] for name in (beside if len(beside) > 1 else [*traces])[:_MOST_COLUMNS]}
     if size is None:
         size = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0

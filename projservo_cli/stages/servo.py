@@ -64,7 +64,6 @@ class _Outcome:
     unplanned: str = ""  # why it went without the plan that it was to follow
     anew: tuple[str, ...] = ()  # when and why a way was searched anew
     driven: DrivenRobot | None = None  # what was driven, where that is a robot of the contract
-    touching: str = ""  # what of an arm touched what at the end, where its simulation tells
 
     @cached_property
     def summary(self) -> Summary:
@@ -73,6 +72,12 @@ class _Outcome:
         ended = Ended(VERDICTS.index(self.verdict), self.steps, self.limited)
         found = summarize(self.plant, self.log, ended, period, ends)
         return found if self.scenario.truth is not None else found._replace(success=math.nan)
+
+    @property
+    def touching(self) -> str:
+        """What of an arm touched what at the end, where its simulation tells; else empty."""
+        robot = None if self.driven is None else self.driven.robot.robot
+        return robot.touching if isinstance(robot, FaultyRobot) else ""
 
     def deviation_mm(self) -> float:
         """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
@@ -204,7 +209,6 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         *([] if turn is None else [f"{turn:.3g} deg of rotation"]),
         f"an image error of {error:.3g} px",
     ]
-    touching = f"; the arm touches: {run.touching}" if run.touching and run.verdict != "converged" else ""
     reasons = {
         "converged": f"image error {error:.3g} px is within {within:.3g} px",
         "plateau": f"the robot stands still at an image error of {error:.3g} px: {run.why}"
@@ -224,7 +228,8 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
         **dict.fromkeys(("disturbed", "failed"), run.why),
     }
-    return reasons[run.verdict] + touching
+    touching = "" if run.verdict == "converged" else run.touching
+    return reasons[run.verdict] + (f"; the arm touches: {touching}" if touching else "")
 
 
 def run(config: Config, calibration: Calibration, plan: Plan, name: str) -> Trace:
@@ -360,7 +365,6 @@ class _Asked:
         )
         limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         driven = plant if isinstance(plant, DrivenRobot) else None
-        robot = None if driven is None else driven.robot.robot
         if driven is not None:  # it goes from sample to sample, whatever was asked for
             path = np.stack([log.q, np.roll(log.q, -1, axis=0)], axis=1)
             log = log._replace(path=path, parts=np.ones_like(log.parts))
@@ -374,7 +378,6 @@ class _Asked:
             plant.plant,
             anew=() if watch is None else tuple(watch.told),
             driven=driven,
-            touching=robot.touching if isinstance(robot, FaultyRobot) else "",
         )
 
     def _task(self, model: Model, plan: Plan) -> Task:

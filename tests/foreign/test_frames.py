@@ -13,7 +13,7 @@ from projservo_cli.store import load
 from tests.fake_records import fake
 from tests.foreign.robots import Sound
 from tests.foreign.test_foreign_robot import Scripted, opened
-from tests.foreign.test_servo import NEAR, OPTIONS, calibrated, no_disk, servo  # noqa: F401
+from tests.foreign.test_servo import NEAR, OPTIONS
 
 
 @pytest.mark.parametrize("looks", [1, 2, 59, 60, 61, 118, 1000])
@@ -63,7 +63,7 @@ class Seeing(Sound):
         return q, s
 
 
-def test_the_frames_of_a_run_show_what_was_found_in_them(servo):  # noqa: F811
+def test_the_frames_of_a_run_show_what_was_found_in_them(servo):
     seeing = f"plant={{use: '{__name__}:Seeing', {OPTIONS}}}}}"
     assert servo("--set", seeing, *NEAR, "-q").code == 0
     trace = load("run").traces["direct_three"]

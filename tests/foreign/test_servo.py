@@ -1,7 +1,6 @@
 """Servo and record with robots and laws of others, on the command line."""
 
 import io
-import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from projservo_cli import files
 from projservo_cli.config import load_config
 from projservo_cli.records import Calibration
 from projservo_cli.stages.scenario import Scenario, scenario_of
@@ -33,35 +31,6 @@ SOUND = ["--set", f"plant={{use: '{HERE}:Sound', {OPTIONS}}}}}"]
 def faulty(fault, after=0, **more):
     settings = "".join(f", {name}: {value}" for name, value in more.items())
     return ["--set", f"plant={{use: '{HERE}:Faulty', {OPTIONS}, fault: {fault}, after: {after}}}{settings}}}"]
-
-
-@pytest.fixture(autouse=True)
-def no_disk(monkeypatch):
-    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
-
-
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory):
-    """A run with a calibration and nothing else."""
-    from projservo_cli import cli
-
-    folder = tmp_path_factory.mktemp("calibrated")
-    assert cli.run(["calibrate", "-c", str(UR5), "-o", str(folder), "-q"]) == 0
-    return folder
-
-
-@pytest.fixture
-def servo(projservo, calibrated, monkeypatch, tmp_path):
-    """Servo with the calibration, the configuration given anew."""
-    monkeypatch.chdir(tmp_path)
-    CALLS.clear()
-    shutil.copytree(calibrated, "run")
-
-    def call(*arguments, law="direct_three"):
-        laws = ["--law", law] if law else []
-        return projservo("servo", "-c", UR5, "-o", "run", *laws, *arguments)
-
-    return call
 
 
 def commands():

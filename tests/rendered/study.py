@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from projservo_cli.records import WorkFailed
+from projservo_cli.records import POINT_LAWS, WorkFailed
 from projservo_cli.stages import calibrate, plan, record, servo
 from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself, shown_in_frames
 from projservo_cli.stages.world import truth_of
@@ -33,7 +33,6 @@ from tests.realistic.conditions import NEAR_DEG, NEAR_MM
 from tests.rendered import hand_eye
 from tests.rendered.conditions import CONDITIONS, LATEST, SEEDS, TAUGHT, base_of, task_config, tasks_of
 
-CLASSICAL = ("stacked", "blockwise", "euclidean_points")
 CLASSICAL_TASKS = 10
 DECADES = np.array([0.0, 0.01, 0.1, 1.0, np.inf])  # of stated deviations, px
 LOOKS = 3  # after which hand–eye calibration corrects the tool
@@ -85,7 +84,7 @@ def driven(job):
     told = {"condition": condition, "seed": seed}
     laws = ["exact_track"]
     if condition == "ideal" and seed <= CLASSICAL_TASKS:
-        laws += list(CLASSICAL)
+        laws += list(POINT_LAWS)
     rows = [told | {"by": law} | run_of(config, calibration, law, seed) for law in laws]
     for by, row in by_hand_eye(config, known, seed):
         rows.append(told | {"by": by} | row)
@@ -94,7 +93,7 @@ def driven(job):
 
 def run_of(config, calibration, law, seed):
     """One run, with its true errors at the end."""
-    if law in CLASSICAL:
+    if law in POINT_LAWS:
         control = config.control.model_copy(update={"mode": ("replan",)})
         stop = config.stop.model_copy(update={"max_steps": LATEST})
         config = config.model_copy(update={"control": control, "stop": stop})

@@ -4,10 +4,9 @@ import numpy as np
 
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.loop.step import plateau_stretch
-from projservo_cli.records import FloatArray
+from projservo_cli.records import POINT_LAWS, FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.material import (
-    CLASSICAL,
     DIRECT,
     TITLES,
     VIEWS,
@@ -42,7 +41,7 @@ def _data_classical(material: Material) -> Data:
     """Image paths of the classical laws that were run, with their hidden and standing stretches."""
     result: Data = {"image_size": material.plant.image_size}
     order = material.plant.order
-    for law in CLASSICAL:
+    for law in POINT_LAWS:
         if law in material.traces:
             trace = material.traces[law]
             stretch = plateau_stretch(trace.stop_error, material.plateau_steps)
@@ -61,7 +60,7 @@ def _data_classical(material: Material) -> Data:
     "Image trajectories of the classical laws",
     "Fig. 4, section 6",
     _data_classical,
-    laws=CLASSICAL,
+    laws=POINT_LAWS,
     any_law=True,
     alt="A row for each classical law, a panel for each camera: the paths of the markers from start "
     "to goal, with the stretches in which the face is hidden and in which the image error "
@@ -69,7 +68,7 @@ def _data_classical(material: Material) -> Data:
 )
 def _draw_classical(data: Data, figure: "style.Figure") -> None:
     """One row a law, one column a camera."""
-    laws, size = [law for law in CLASSICAL if f"s_{law}" in data], data["image_size"]
+    laws, size = [law for law in POINT_LAWS if f"s_{law}" in data], data["image_size"]
     shown = [np.concatenate([data[f"s_{law}"], data[f"s_star_{law}"][None]]) for law in laws]
     heights = [_PANEL_WIDTH * style.aspect(near_pixels(s, size)) for s in shown]
     figure.set_figheight(sum(heights) + 0.62 * len(laws) + 0.45)
