@@ -37,9 +37,9 @@ _DOUBTFUL_RATIO, _DOUBTFUL_SHARE = 2.0, 0.5
 # noise alone exceeds coefficients that show no lens.
 _DECISIVE_SHARE, _NO_LENS_TAIL = 0.5, 0.01
 # A fit must keep this share of the motion of each joint, and where it leaves out much, of the readings. Then
-# it may err by no more than this ratio of what is expected, in its residuals and when it predicts each of so
-# many parts of the poses.
-_KEPT, _DOUBTED_RATIO, _PARTS = 0.5, 1.3, 3
+# it may err by no more than these ratios of what is expected: in its residuals, in which what is wrong and
+# stays hides, and when it predicts each of so many parts of the poses.
+_KEPT, _DOUBTED_RATIO, _DOUBTED_ERROR, _PARTS = 0.5, 1.15, 1.3, 3
 # Shares of the readings that are much to leave out: those that neither exchanges nor joints explain, all.
 _MUCH, _MOST = 0.1, 0.4
 # Share of readings that may lie outside the images: they are outliers.
@@ -234,7 +234,7 @@ def _contradiction(whole: Solution, solution: Solution, expected: Expected) -> s
         )
     held_out = cross_validate(solution.kept(), expected.noise_px(solution), _PARTS, 0)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
-    if held_out.failed or rms is None or predicted is None or rms > _DOUBTED_RATIO * predicted:
+    if held_out.failed or rms is None or predicted is None or rms > _DOUBTED_ERROR * predicted:
         return "the rest does not predict poses that it has not seen; record more poses and more markers"
     return ""
 
