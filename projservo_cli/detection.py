@@ -101,7 +101,7 @@ _BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
 _FLOOR, _LEAK = 0.002, (0.5, 0.6)
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
 # the blur that is reckoned with where no edge tells it, in cells; from what cell on, px, it grows no more.
-_UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.35, -0.75, 0.4, 1.25
+_UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.2, -0.75, 0.4, 1.25
 
 
 class _Sides(NamedTuple):
@@ -356,7 +356,9 @@ def refine_corners(image: FloatArray, guess: FloatArray, cells: int) -> Corners:
     away[spoilt | np.roll(spoilt, 1, axis=1)] = np.inf
     clean = np.isfinite(crossing).all(axis=2) & (away <= far)
     pixels = np.where(clean[..., None], crossing, np.where((away > far)[..., None], np.nan, guess))
-    deviation = np.where(clean, sigma, np.where(away > far, np.nan, _unrefined(sides.cell, blur)))
+    # A crossing so near the corner that OpenCV finds is no worse than that.
+    unrefined = _unrefined(sides.cell, blur)
+    deviation = np.where(away > far, np.nan, np.where(clean, np.fmin(sigma, unrefined), unrefined))
     return Corners(pixels, deviation, clean)
 
 
@@ -369,7 +371,7 @@ def _unrefined(cell: FloatArray, blur: FloatArray) -> FloatArray:
     cell = np.minimum(cell, np.roll(cell, 1, axis=1))
     known = blur[np.isfinite(blur)]
     typical = float(np.median(known)) if known.size else _BLURRED * cell
-    return np.asarray(_UNREFINED * np.where(np.isfinite(blur), blur, typical) * cell**_BY_CELL)
+    return np.asarray(_UNREFINED * np.sqrt(np.where(np.isfinite(blur), blur, typical)) * cell**_BY_CELL)
 
 
 class TagFinder:

@@ -74,8 +74,9 @@ class Standing:
         ends = verdict not in (RUNNING, WAITING, CONVERGED)
         if ends or k == self._limits.max_steps or math.isnan(error):
             return verdict
-        verdict = self._arrived(verdict, error, tolerance(self._limits, log.fit[k, 2]))
-        return verdict if verdict == CONVERGED else self._stuck(k, verdict)
+        within = tolerance(self._limits, log.fit[k, 2])
+        verdict = self._arrived(verdict, error, within)
+        return verdict if verdict == CONVERGED else self._stuck(k, verdict, error <= _GROWN * within)
 
     def _arrived(self, verdict: int, error: float, within: float) -> int:
         """``CONVERGED`` where the robot stands at the goal; until then the law goes on, then waits."""
@@ -92,8 +93,11 @@ class Standing:
         self._looks -= 1
         return verdict if verdict == CONVERGED or not self._looks else WAITING
 
-    def _stuck(self, k: int, verdict: int) -> int:
-        """``PLATEAU`` or ``NOT_FOLLOWING`` where the robot makes no progress; else the verdict as it is."""
+    def _stuck(self, k: int, verdict: int, near: bool) -> int:
+        """``PLATEAU`` or ``NOT_FOLLOWING`` where the robot makes no progress; else the verdict as it is.
+
+        ``near``: whether it is so near the goal that what the law asks for may be lost in its joints.
+        """
         idle, window = k - self._since, self._window
         if idle < window:
             return verdict
@@ -106,7 +110,13 @@ class Standing:
             self._say_who_stays(stays)
             return NOT_FOLLOWING
         if stands and (sent <= _LEAST).all():
-            self.why, self.minimum = "the law asks for no motion there, a local minimum", True
+            self.minimum = True
+            self.why = (
+                f"set-points moved by no more than {sent.max():.2g} (rad or m): play in the joints, coarse "
+                "set-points or coarse readings hide what is left"
+                if near
+                else "the law asks for no motion there, a local minimum"
+            )
             return PLATEAU
         if (moved <= np.maximum(sag, self._still)).all() and idle >= _PATIENCE * window:
             self._say_what_holds(moved_since, sent_since)
