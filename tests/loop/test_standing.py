@@ -48,7 +48,18 @@ def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=
 def test_a_law_that_asks_for_nothing_is_at_a_local_minimum():
     ruled, standing, k = judged(lambda k: 30.0 + 20.0 * 0.9**k, lambda k: (0.5, 0.1), lambda k: (0.5, 0.1))
     assert (ruled, standing.minimum) == (PLATEAU, True)
+    assert "a local minimum" in standing.why
     assert k < 100
+
+
+def test_beside_the_goal_the_joints_hide_what_is_left():
+    """An image error of up to three tolerances, that of joints within their ticks."""
+    ruled, standing, _ = judged(
+        lambda k: 1.5 + (k % 7) / 7, lambda k: (TICK * (k % 2), 0.0), lambda k: (1e-4 * (k % 3), 0.0)
+    )
+    assert ruled == PLATEAU
+    assert "set-points moved by no more than 0.0002" in standing.why
+    assert "coarse readings hide what is left" in standing.why
 
 
 def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
