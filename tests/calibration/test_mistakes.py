@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate
 from projservo_cli.report.material import findings
@@ -46,6 +47,39 @@ def test_one_joint_is_enough_for_a_turntable():
     wrong, right = shares_left_out(mistaken, found)
     assert wrong > 0.8
     assert right < 0.02
+    step = expm(found.H_hat_0[0] * np.radians(10.0))
+    assert np.angle(np.linalg.eigvals(step)).max() == pytest.approx(np.radians(10.0), rel=1e-9)
+    off, deviation = axis_missed(mistaken.robot, found)
+    assert np.abs(off / deviation).max() < 3.0
+    assert deviation.max() < 2.0  # of 0.5 px a reading
+
+
+def axis_missed(robot, calibration):
+    """How far points of the true axis are from that of the calibration in both images, and deviations (4,), px."""
+    twist, n = robot.twists[0], calibration.P.size
+    w = np.array([twist[2, 1], twist[0, 2], twist[1, 0]])
+    place = -np.linalg.pinv(twist[:3, :3]) @ twist[:3, 3]
+    ends = robot.cameras @ np.append([place - 0.1 * w, place + 0.1 * w], np.ones((2, 1)), axis=1).T
+    ends /= ends[:, 2:]
+
+    def missed(change):
+        P, H_hat = (
+            calibration.P + change[:n].reshape(2, 3, 4),
+            calibration.H_hat_0[0] + change[n:].reshape(4, 4),
+        )
+        axis = P @ np.linalg.svd(H_hat)[2][2:].T
+        lines = np.cross(axis[..., 0], axis[..., 1])
+        # The sign of a null space is as it happens; both lines are steep.
+        return (lines[:, None] @ ends)[:, 0].ravel() / np.repeat(
+            np.sign(lines[:, 0]) * np.hypot(*lines.T[:2]), 2
+        )
+
+    # What one joint leaves open is enormous and moves no image: steps of unit length.
+    roots = calibration.shared_error[: n + 16].T
+    size = np.linalg.norm(roots, axis=1)
+    steps = 1e-3 * roots / size[:, None]
+    slopes = [(missed(step) - missed(-step)) / 2e-3 for step in steps]
+    return missed(np.zeros(n + 16)), np.linalg.norm(slopes * size[:, None], axis=0)
 
 
 def test_poses_of_other_readings_are_told():
