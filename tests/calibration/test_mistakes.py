@@ -55,7 +55,7 @@ def test_one_joint_is_enough_for_a_turntable():
 
 
 def axis_missed(robot, calibration):
-    """How far points of the true axis are from that of the calibration in both images, and deviations (4,), px."""
+    """How far points of the true axis are from that of a calibration in images, and deviations (4,), px."""
     twist, n = robot.twists[0], calibration.P.size
     w = np.array([twist[2, 1], twist[0, 2], twist[1, 0]])
     place = -np.linalg.pinv(twist[:3, :3]) @ twist[:3, 3]
