@@ -47,7 +47,7 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
     "tests": ([*PYTEST, "--cov-append", "--cov-report=term", "--cov-fail-under=90"], {}),
     "speed": ([PYTHON, "-m", "pytest", "-q", "tests/benchmarks"], {}),
 }
-# An hour: only where it is asked for by name.
+# Forty minutes: only where it is asked for by name.
 STUDIES: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
     "rendered": ([PYTHON, "-m", "tests.rendered.study"], {}),
 }
