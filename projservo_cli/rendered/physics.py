@@ -76,6 +76,7 @@ class Physics:
         self._damping = _LOOP_S * self._stiffness if servo == "velocity" else critical
         self._ours = np.array([i for i in range(len(q)) if i not in self._own], dtype=np.int64)
         self._model.dof_damping[self._rates[self._ours]] += self._damping[self._ours]
+        self._motors = np.array([i for i, own in self._own.items() if not own.stiffness], dtype=np.int64)
         self._begin(q)
 
     def _begin(self, q: FloatArray) -> None:
@@ -141,13 +142,18 @@ class Physics:
     def _drive(self, speed: FloatArray, h: float) -> None:
         """Set what servos do in the next step of h, s, where they are sent moving at a speed (n,), per s."""
         q, data = self.motor, self._data
-        torque = self._stiffness * (self._sent - q) + self._damping * speed
-        torque += np.where(self._compensated, self._gravity(), 0.0)
+        gravity, torque = self._gravity(), self._stiffness * (self._sent - q) + self._damping * speed
+        torque += np.where(self._compensated, gravity, 0.0)
         data.qfrc_applied[self._rates[self._ours]] = torque[self._ours]
+        # What motors turn changes with the posture, and one turns what others hold: by the inertia of now.
+        gained, turned = np.zeros(self._model.nv), np.zeros(self._model.nv)
+        off = _RATE**2 * (self._sent - q) + 2.0 * _RATE * (speed - data.qvel[self._rates])
+        gained[self._rates[self._motors]] = off[self._motors]
+        mujoco().mj_mulM(self._model, data, turned, gained)
         for i, actuator in self._own.items():
             if not actuator.stiffness:
-                torque_now = torque[i] - self._damping[i] * data.qvel[self._rates[i]]
-                data.ctrl[actuator.number] = torque_now / (actuator.gear * actuator.gain)
+                asked = turned[self._rates[i]] + gravity[i]
+                data.ctrl[actuator.number] = asked / (actuator.gear * actuator.gain)
                 continue
             wanted = actuator.input_for(q[i], self._sent[i], speed[i])
             if actuator.integrates:

@@ -114,6 +114,24 @@ def test_servos_of_ours_follow_lag_and_sag_as_they_are_told(tmp_path, servo):
 
 
 @pytest.mark.usefixtures("needs_mujoco")
+def test_motors_hold_a_joint_that_has_to_turn_little(tmp_path):
+    """Upright, the arm weighs on its first joint a hundredth of what it does when it is stretched out."""
+    config = described(tmp_path, "motor")
+    path = tmp_path / "arm.xml"
+    path.write_text(path.read_text(encoding="utf-8").replace('"tilt" axis', '"tilt" range="-1.6 1.6" axis'))
+    physics = driven(config, np.array([0.4, -0.3]))
+    upright = np.array([0.9, -1.5])
+    physics.follow(upright, 0.5)
+    physics.follow(upright, 1.0)
+    sent = []
+    for _ in range(5):
+        physics.follow(upright, 0.002)
+        sent.append(physics._data.ctrl.copy())
+    assert physics.motor == pytest.approx(upright, abs=1e-6)
+    assert np.ptp(sent, axis=0) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.usefixtures("needs_mujoco")
 def test_what_an_arm_touches_is_told(tmp_path):
     config = described(tmp_path, "position")
     path = tmp_path / "arm.xml"
