@@ -55,6 +55,7 @@ class Physics:
     def __init__(self, scene: RenderedModel, q: FloatArray, lag_s: float, sag: float) -> None:
         arm, servo = scene.arm, scene.options.servo
         self._model, self._places, self._rates = copy.copy(scene.model), scene.places, scene.rates
+        self._joints = scene.joints
         self._data, self._base = scene.begin(self._model, q), int(self._model.jnt_bodyid[scene.joints[0]])
         self._step_s, self._lag_s = min(_STEP_S, float(self._model.opt.timestep)), lag_s
         self._own = {
@@ -95,7 +96,30 @@ class Physics:
         return np.array(self._data.qpos[self._places])
 
     @property
-    def touching(self) -> str:
+    def hindrance(self) -> str:
+        """What keeps the arm from where it is sent: what it touches, servos too weak; else empty."""
+        weak = " and ".join(str(i + 1) for i in self._own if self._at_end(i))
+        told = (
+            ("the arm touches: ", self._touching()),
+            ("at the end of what their servos can do: joint ", weak),
+        )
+        return "; ".join(said + named for said, named in told if named)
+
+    def _at_end(self, joint: int) -> bool:
+        """Whether the actuator of a joint can do no more than it does."""
+        model, data, k = self._model, self._data, self._own[joint].number
+        limits = (
+            (model.actuator_ctrllimited[k], data.ctrl[k], model.actuator_ctrlrange[k]),
+            (model.actuator_forcelimited[k], data.actuator_force[k], model.actuator_forcerange[k]),
+            (
+                model.jnt_actfrclimited[self._joints[joint]],
+                data.qfrc_actuator[self._rates[joint]],
+                model.jnt_actfrcrange[self._joints[joint]],
+            ),
+        )
+        return any(limited and not low < value < high for limited, value, (low, high) in limits)
+
+    def _touching(self) -> str:
         """What of the arm touches what, by names of bodies; empty where nothing does."""
         model, pairs = self._model, dict[str, None]()
         for contact in self._data.contact:
@@ -145,20 +169,25 @@ class Physics:
         gravity, torque = self._gravity(), self._stiffness * (self._sent - q) + self._damping * speed
         torque += np.where(self._compensated, gravity, 0.0)
         data.qfrc_applied[self._rates[self._ours]] = torque[self._ours]
-        # What motors turn changes with the posture, and one turns what others hold: by the inertia of now.
-        gained, turned = np.zeros(self._model.nv), np.zeros(self._model.nv)
+        # What a motor turns changes with the posture: each gives what moves its joint where the others are free.
+        inertia = self._free_inertia() if self._motors.size else np.zeros(0)
         off = _RATE**2 * (self._sent - q) + 2.0 * _RATE * (speed - data.qvel[self._rates])
-        gained[self._rates[self._motors]] = off[self._motors]
-        mujoco().mj_mulM(self._model, data, turned, gained)
+        torque[self._motors] = inertia * off[self._motors] + gravity[self._motors]
         for i, actuator in self._own.items():
             if not actuator.stiffness:
-                asked = turned[self._rates[i]] + gravity[i]
-                data.ctrl[actuator.number] = asked / (actuator.gear * actuator.gain)
+                data.ctrl[actuator.number] = torque[i] / (actuator.gear * actuator.gain)
                 continue
             wanted = actuator.input_for(q[i], self._sent[i], speed[i])
             if actuator.integrates:
                 wanted = (wanted - data.act[actuator.state]) / h
             data.ctrl[actuator.number] = wanted
+
+    def _free_inertia(self) -> FloatArray:
+        """What each motor has to turn, kg m² or kg, where all other joints are free."""
+        units = np.eye(self._model.nv)[self._rates[self._motors]]
+        solved = np.empty_like(units)
+        mujoco().mj_solveM(self._model, self._data, solved, units)
+        return np.asarray(1.0 / (solved * units).sum(axis=1))
 
     def _gravity(self) -> FloatArray:
         """What gravity and motion ask of each joint (n,), N m or N, less what the file compensates."""

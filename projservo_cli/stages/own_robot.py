@@ -18,7 +18,7 @@ from projservo_cli.robots.innovation import WINDOW, Innovation
 from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
-from projservo_cli.stages.simulation import FaultyRobot, Points, robot_of
+from projservo_cli.stages.simulation import FaultyRobot, Points, hindrance_of, robot_of
 from projservo_cli.stages.world import Joints
 
 # What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
@@ -78,7 +78,12 @@ def way_to(robot: Steered, q: FloatArray, settle_s: float, what: str) -> Iterato
     if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
         remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
-            remedy = f"it went away from there, from {begun[i]:.6g}: look at its sign and unit"
+            remedy = (
+                f"it went away from there, from {begun[i]:.6g}: look at its sign and unit, and whether it "
+                "can hold what it carries"
+            )
+        if hindrance := hindrance_of(robot.robot.robot):
+            remedy = f"{hindrance}: take joints that it can reach and hold"
         raise WorkFailed(
             f"{what}: joint {i + 1} was sent to {q[i]:.6g} and stands at {robot.reading.q[i]:.6g}, "
             f"{gap[i]:.3g} short (rad or m): {remedy}; then run the command again"

@@ -41,7 +41,7 @@ from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.stages import own_robot
 from projservo_cli.stages.motions import Ways, search_of, why_closed
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.simulation import FaultyRobot
+from projservo_cli.stages.simulation import hindrance_of
 from projservo_cli.stages.world import arm_of
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.target import followed
@@ -72,12 +72,6 @@ class _Outcome:
         ended = Ended(VERDICTS.index(self.verdict), self.steps, self.limited)
         found = summarize(self.plant, self.log, ended, period, ends)
         return found if self.scenario.truth is not None else found._replace(success=math.nan)
-
-    @property
-    def touching(self) -> str:
-        """What of an arm touched what at the end, where its simulation tells; else empty."""
-        robot = None if self.driven is None else self.driven.robot.robot
-        return robot.touching if isinstance(robot, FaultyRobot) else ""
 
     def deviation_mm(self) -> float:
         """Largest distance of the true centre from its line, between the samples too, mm; NaN if unknown."""
@@ -228,8 +222,10 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
         "singular": f"the joint motion was not unique at step {steps}: the robot is near a singularity",
         **dict.fromkeys(("disturbed", "failed"), run.why),
     }
-    touching = "" if run.verdict == "converged" else run.touching
-    return reasons[run.verdict] + (f"; the arm touches: {touching}" if touching else "")
+    hindrance = ""
+    if run.driven is not None and run.verdict != "converged":
+        hindrance = hindrance_of(run.driven.robot.robot)
+    return "; ".join(filter(None, (reasons[run.verdict], hindrance)))
 
 
 def run(config: Config, calibration: Calibration, plan: Plan, name: str) -> Trace:

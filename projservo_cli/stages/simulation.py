@@ -249,12 +249,6 @@ class FaultyRobot:
         """The last frames of both cameras as they were searched, where they are rendered."""
         return self.world.eyes.last if isinstance(self.world.eyes, Frames) else None
 
-    @property
-    def touching(self) -> str:
-        """What of the arm touches what, where its physics tell; else empty."""
-        servos = self.world.servos
-        return servos.touching if isinstance(servos, Physics) else ""
-
     def truth(self) -> FloatArray:
         """True joints (n,), rad or m."""
         return self._joints.links[-1].copy()
@@ -467,3 +461,9 @@ class _Camera:
         if world.eyes.borders:
             pixels = truth.within(pixels)
         return _Frame(middle, middle + self._clock, pixels, sigma)
+
+
+def hindrance_of(robot: object) -> str:
+    """What keeps an arm from where it is sent, where its simulation tells; else empty."""
+    servos = robot.world.servos if isinstance(robot, FaultyRobot) else None
+    return servos.hindrance if isinstance(servos, Physics) else ""

@@ -12,7 +12,7 @@ import numpy as np
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.records import FloatArray
-from projservo_cli.stages.simulation import robot_by_itself, shown_in_frames
+from projservo_cli.stages.simulation import hindrance_of, robot_by_itself, shown_in_frames
 from projservo_cli.stages.world import truth_of
 from projservo_cli.sweep.design import STRATA, random_tasks
 from tests.conftest import SHARED
@@ -102,7 +102,8 @@ def drawn():
         while found is None:
             starts, goals = random_tasks(truth, np.array(FRONT), STRATA, rng)
             ends = starts[(seed - 1) % STRATA], goals[(seed - 1) % STRATA]
-            free = not any(robot_by_itself(config, truth, q, 0.0, 0, 0).touching for q in ends)
+            robots = [robot_by_itself(config, truth, q, 0.0, 0, 0) for q in ends]
+            free = not any("touches" in hindrance_of(robot) for robot in robots)
             found = ends if free and all(_shows(config, truth, q) for q in ends) else None
         yield {"seed": seed} | {
             f"{end}_q{i}": repr(float(x))

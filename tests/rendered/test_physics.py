@@ -138,10 +138,29 @@ def test_what_an_arm_touches_is_told(tmp_path):
     post = '<worldbody><body name="post" pos="0 0.5 0.4"><geom size="0.04"/></body>'
     path.write_text(path.read_text(encoding="utf-8").replace("<worldbody>", post), encoding="utf-8")
     physics = driven(config, np.array([0.4, 0.0]))
-    assert physics.touching == ""
+    assert physics.hindrance == ""
     physics.follow(np.array([1.7, 0.0]), 2.0)
     assert physics.motor[0] < 1.5
-    assert physics.touching == "post and boom"
+    assert physics.hindrance == "the arm touches: post and boom"
+
+
+@pytest.mark.usefixtures("needs_mujoco")
+@pytest.mark.parametrize(
+    "limit", ['gear="-20" ctrlrange="-0.4 0.4"', 'forcerange="-8 8"', 'actuatorfrcrange="-8 8"']
+)
+def test_a_servo_too_weak_for_what_it_holds_is_told(tmp_path, limit):
+    config = described(tmp_path, "motor")
+    path, text = tmp_path / "arm.xml", (tmp_path / "arm.xml").read_text(encoding="utf-8")
+    if "actuatorfrcrange" in limit:
+        text = text.replace('axis="0 1 0"', 'axis="0 1 0" actuatorfrcrange="-8 8"')
+    else:
+        text = text.replace('gear="-20"', limit)
+    path.write_text(text, encoding="utf-8")
+    physics = driven(config, np.array([0.4, math.pi / 2.0]))  # it hangs
+    physics.follow(physics.setpoint, 0.1)
+    assert physics.hindrance == ""
+    physics.follow(np.array([0.4, 0.0]), 2.0)
+    assert physics.hindrance == "at the end of what their servos can do: joint 2"
 
 
 @pytest.mark.usefixtures("needs_mujoco")
