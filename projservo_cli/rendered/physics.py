@@ -169,7 +169,7 @@ class Physics:
         gravity, torque = self._gravity(), self._stiffness * (self._sent - q) + self._damping * speed
         torque += np.where(self._compensated, gravity, 0.0)
         data.qfrc_applied[self._rates[self._ours]] = torque[self._ours]
-        # What a motor turns changes with the posture: each gives what moves its joint where the others are free.
+        # Each motor gives what its joint takes in this posture, where the other joints are free.
         inertia = self._free_inertia() if self._motors.size else np.zeros(0)
         off = _RATE**2 * (self._sent - q) + 2.0 * _RATE * (speed - data.qvel[self._rates])
         torque[self._motors] = inertia * off[self._motors] + gravity[self._motors]
