@@ -105,6 +105,14 @@ class _LoopPlant(Protocol):
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
     weight: FloatArray | None  # (2, markers) of the pixels last observed in a fit; None for one
 
+    @property
+    def holds(self) -> bool:
+        """Whether images disagree with the calibration so that nothing should move."""
+
+    @property
+    def pending(self) -> bool:
+        """Whether images disagreed and nothing has cleared that yet."""
+
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
 
@@ -116,6 +124,9 @@ class _LoopPlant(Protocol):
 
     def command(self, step: FloatArray, period: float) -> None:
         """Move by the joint step (n,), rad or m, within one period, s."""
+
+    def give_up(self) -> None:
+        """Say what is wrong as far as it is known, where there is no time for more looks."""
 
     def stop(self) -> None:
         """Come to rest."""
@@ -192,10 +203,13 @@ def run_in_python(
         while verdict < 0:
             try:
                 verdict, q_dot = _instant(law, plant, s_star, limits, log, k)
-                if standing is not None:
-                    verdict = standing(log, k, verdict)
-                if watch is not None:
-                    verdict = watch(log, k, verdict, q_dot)
+                if not plant.holds:
+                    if standing is not None:
+                        verdict = standing(log, k, verdict)
+                    if watch is not None:
+                        verdict = watch(log, k, verdict, q_dot)
+                if plant.pending and verdict not in (RUNNING, DISTURBED) and k < limits.max_steps:
+                    verdict = WAITING  # nothing has ended while it is not known what images mean
                 if verdict == RUNNING:
                     told = float(_told(law, "share")[0]), int(_told(law, "blocked")[0])
                     verdict = bounded(log, k, Command(q_dot, *told, period, scale), plant.plant, limits)
@@ -227,6 +241,11 @@ def _instant(
     left = note(log, k, s_star, plant.plant, limits)
     status, q_dot = OK, np.zeros_like(log.read[k])
     if plant.disturbance:
+        return DISTURBED, q_dot
+    if plant.holds:
+        if k < limits.max_steps:
+            return WAITING, q_dot
+        plant.give_up()
         return DISTURBED, q_dot
     if plant.in_front:
         if plant.weight is not None and isinstance(law, BuiltInLaw):

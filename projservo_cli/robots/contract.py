@@ -125,6 +125,7 @@ class ForeignRobot:
         self._sent: FloatArray | None = None  # the last set-point (n,)
         self._due = -math.inf  # when it is to be there, s
         self._orders: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = queue.SimpleQueue()
+        self._runs_alone: bool | None = None  # whether its clock goes on by itself, once that was tried
         # begun, opened: whether opening it began, and ended; answers: whether its thread does
         self._begun = self._opened = self._stopped = False
         self._answers = True
@@ -199,6 +200,14 @@ class ForeignRobot:
                     "on by itself, or command() move it to when it is due"
                 )
         return before > due + slack
+
+    def waits(self, seconds: float) -> bool:
+        """Wait so long, s; False where the clock of the robot stands still meanwhile, a simulator's."""
+        if self._runs_alone is not False:
+            before = self.now()
+            time.sleep(seconds)
+            self._runs_alone = self.now() > before
+        return self._runs_alone
 
     def stop(self) -> None:
         """Bring the robot to rest, once: in its thread, and from another where that does not answer.

@@ -15,14 +15,19 @@ import numpy as np
 from projservo_cli.calibration.readings import LEAST_SIGMA
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
+from projservo_cli.monitoring.monitor import ImageMonitor
+from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
-from projservo_cli.robots.innovation import WINDOW, Innovation
 from projservo_cli.robots.instants import DelayPrior, Delays, History
 from projservo_cli.robots.simulated import Plant, observe
 
 # Share of the sag allowed for that a servo may still be behind where sag is told from lag.
 _STILL = 0.2
+# Weight in the fit of a law that a sighting keeps which is off by itself.
+_REJECTED = 1e-3
+# Looks before the first motion, until enough agree or a fault is named.
+_MOST_LOOKS = 40
 
 
 class SetPoint:
@@ -194,7 +199,7 @@ class DrivenRobot:
     plant : face; image size and joint limits: of the calibration, or the true ones of a robot that tells its
         true joints.
     known : of robot and images.
-    innovation : test of the raw images against the calibration; None tests nothing.
+    monitor : of the raw images against the calibration; None tests nothing.
     ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
     of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
     the images no longer agree with the calibration, or what failed; else empty. ``weight``: (2, k) of the
@@ -206,11 +211,9 @@ class DrivenRobot:
     in_front = True
     takes_parts = True
 
-    def __init__(
-        self, robot: ForeignRobot, plant: Plant, known: Known, innovation: Innovation | None
-    ) -> None:
+    def __init__(self, robot: ForeignRobot, plant: Plant, known: Known, monitor: ImageMonitor | None) -> None:
         self.robot, self.steered, self.plant = robot, Steered(robot), plant
-        self.known, self.innovation = known, innovation
+        self.known, self.monitor = known, monitor
         self.markers = len(known.shown)
         self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.shown])
         self._instants = Delays(known.predicted, known.delays, known.sigma_px, known.timeout_s)
@@ -254,12 +257,13 @@ class DrivenRobot:
             self.weight = weights(reading.sigma_px[:, shown], reading.s[:, shown])
         frames = self._instants.look(reading.t_view, images, history)
         q_then = history.at(frames.t)
-        if self.innovation is not None:
+        if self.monitor is not None:
             q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
-            wrong = self.innovation.disturbed(
+            fault = self.monitor.look(
                 frames.t, q_then, q_dot, frames.sigma, images, frames.fresh, stated=stated
             )
-            self.disturbance = wrong or self.disturbance
+            self.disturbance = fault or self.disturbance
+            self._leave_out(self.monitor.rejected[:, self._place], stated is None)
         q = self.steered.set_point.at_rest
         there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]
         for view in range(2):
@@ -268,13 +272,68 @@ class DrivenRobot:
         self.delays.append(self._instants.mean)
         return np.ascontiguousarray(reading.s[:, shown]) + self._carried
 
+    def _leave_out(self, rejected: BoolArray, alike: bool) -> None:
+        """Leave sightings (2, k) that are off by themselves out of the fit of the law.
+
+        alike : all others weigh the same.
+        """
+        if self.weight is not None and alike:
+            self.weight = np.ones(rejected.shape)
+        if rejected.any():
+            weight = np.ones(rejected.shape) if self.weight is None else self.weight
+            self.weight = np.where(rejected, _REJECTED * weight, weight)
+
+    @property
+    def holds(self) -> bool:
+        """Whether images disagree with the calibration so that nothing should move."""
+        return self.monitor is not None and self.monitor.holds
+
+    @property
+    def pending(self) -> bool:
+        """Whether images disagreed and nothing has cleared that yet."""
+        return self.monitor is not None and self.monitor.pending
+
+    def give_up(self) -> None:
+        """Say what is wrong as far as it is known, where there is no time for more looks."""
+        if self.monitor is not None:
+            self.disturbance = self.disturbance or self.monitor.give_up()
+
     def fits(self) -> str:
-        """What is wrong with the images where the robot stands; empty where nothing is."""
-        looks = 0
-        while not self.disturbance and (looks < WINDOW or (self.innovation and self.innovation.doubtful)):
+        """Return what is wrong with the images where the robot stands; empty where enough of them agree.
+
+        Nothing is moved meanwhile.
+        """
+        for look in range(1, _MOST_LOOKS):
+            tested = 0 if self.monitor is None else self.monitor.looks
             self.joints()
             self.observe()
-            looks += 1
+            if self.disturbance or self._agreed(look):
+                return self.disturbance
+            if self.monitor is None or self.monitor.looks > tested:
+                continue  # the next look shows another image
+            if not self.robot.waits(self.robot.bounds.period):  # time passes in commands alone
+                if look >= WINDOW and not self.pending:
+                    return ""
+                if look >= WINDOW:
+                    self.steered.hold()
+        if self.pending:
+            self.give_up()
+        return self.disturbance
+
+    def _agreed(self, looks: int) -> bool:
+        """Whether enough of so many looks agree."""
+        agreeing = looks if self.monitor is None else self.monitor.agreeing
+        return agreeing >= WINDOW and not self.pending
+
+    def agrees(self) -> str:
+        """Test the images of the last look, held as long as they disagree; return what is wrong with them."""
+        self.observe()
+        for _ in range(_MOST_LOOKS):
+            if self.disturbance or not self.holds:
+                return self.disturbance
+            self.steered.hold()
+            self.observe()
+        self.give_up()
         return self.disturbance
 
     @property
@@ -286,9 +345,9 @@ class DrivenRobot:
     def settled(self, within_px: float) -> bool:
         """Whether the arm stands as far as images to so many px rms, or its readings, can tell.
 
-        Not while it is about to be said what is wrong with the images.
+        Not before images of where it stands agree with the calibration.
         """
-        if self.innovation is not None and self.innovation.doubtful:
+        if self.monitor is not None and (self.pending or self.monitor.agreeing < WINDOW):
             return False
         q, face = self.steered.set_point.at_rest, self._place[: len(self.plant.M)]
         if self.known.sigma_q.any():

@@ -136,10 +136,11 @@ class AnalyticPlant:
     marker was in front of both cameras when last observed. ``markers``: how many are observed, those of the
     face first. ``hidden``: (2,) 1 where the face was self-occluded when last observed. ``disturbance``: why
     the law that drove it failed; else empty. ``takes_parts``: it goes straight to the end of each step; the
-    samples are the same. ``weight``: all pixels weigh alike.
+    samples are the same. ``weight``: all pixels weigh alike. ``holds, pending``: nothing tests its images.
     """
 
     takes_parts = False
+    holds = pending = False
     weight: FloatArray | None = None
 
     def __init__(self, plant: Plant, q_start: FloatArray, noise: FloatArray) -> None:
@@ -175,6 +176,9 @@ class AnalyticPlant:
         del period
         self.q = self.q + step
         self.H = as_array(forward(self.plant.model, self.q))
+
+    def give_up(self) -> None:
+        """Nothing is held."""
 
     def stop(self) -> None:
         """Nothing moves between commands."""

@@ -10,11 +10,12 @@ import numpy as np
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config
 from projservo_cli.geometry.algebra import mat
+from projservo_cli.monitoring.monitor import ImageMonitor
+from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.driven import DrivenRobot, Known, Steered
-from projservo_cli.robots.innovation import WINDOW, Innovation
 from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
@@ -256,12 +257,13 @@ def connected(scenario: Scenario, law: str) -> DrivenRobot:
         robot = foreign_robot(config, joints, len(scenario.observed))
     else:
         plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
-    innovation = None
+    monitor = None
     if not scenario.untested:
         noise = config.stop.innovation_factor * scenario.noise_px
         shown = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
-        innovation = Innovation(calibration, noise, scenario.limits.max_steps + 1 + WINDOW, shown)
-    return DrivenRobot(robot, plant, _known_of(scenario, calibration, law), innovation)
+        looks = scenario.limits.max_steps + 1 + WINDOW
+        monitor = ImageMonitor(calibration, noise, looks, shown, plant.image_size)
+    return DrivenRobot(robot, plant, _known_of(scenario, calibration, law), monitor)
 
 
 def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:

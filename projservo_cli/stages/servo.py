@@ -336,7 +336,8 @@ class _Asked:
                     raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
                 start, settle_s = scenario.ends.q_start, scenario.config.plant.settle_s
                 for _ in own_robot.way_to(driven.steered, start, settle_s, "servo"):
-                    pass
+                    if wrong := driven.agrees():
+                        raise WorkFailed(f"stopped on the way to the start, since {wrong}")
             driven.begin()
             return self._in_python(controller, driven, Standing(driven, scenario.limits))
 

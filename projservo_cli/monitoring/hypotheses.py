@@ -1,0 +1,394 @@
+"""Causes that may explain why images disagree, each by the images that it predicts."""
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, expm
+
+from projservo_cli.calibration.forward import CAMERA, Scene
+from projservo_cli.monitoring.looks import Look
+from projservo_cli.monitoring.statistics import Errors, Residual, Sums
+from projservo_cli.records import BoolArray, FloatArray, IntArray
+
+CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
+# Images are expected to be changed by so much by any cause, px rms: the prior of its parameters.
+_EXPECTED_PX = 30.0
+# A point that a cause puts behind a camera is off by so much, px.
+_HIDDEN_PX = 1e3
+# Steps of Gauss and Newton, halvings of each, and the change of parameters that derivatives are taken by.
+_STEPS, _HALVINGS, _EPSILON = 8, 6, 1e-6
+# Causes that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
+_FITTED, _FALLS = 8, 0.05
+# Starts of a joint that was homed anew, factors of images of another size.
+_TURNS = 12
+_FACTORS = (0.25, 1.0 / 3.0, 0.5, 2.0 / 3.0, 0.75, 0.8, 1.25, 4.0 / 3.0, 1.5, 2.0, 3.0, 4.0)
+# By so much a link may flex under its load, rad, which looks like a joint that slipped.
+_MOST_FLEXIBLE = np.radians(3.0)
+# Readings that differ by no more stand still, rad or m.
+_STILL = 1e-9
+# Most looks that are explained together.
+_MOST_LOOKS = 12
+
+
+class Changed(NamedTuple):
+    """Scene and joints as a cause leaves them."""
+
+    P: FloatArray  # (2, 3, 4)
+    lens: FloatArray | None  # (2, 5)
+    M: FloatArray  # (m, 4)
+    away: FloatArray  # (K, 2, n) joints from the reference, rad or m
+    scale: FloatArray  # (2,) of images
+    shift: FloatArray  # (2, 2) px, after that
+
+
+class Cause(NamedTuple):
+    """A cause, by its kind and the joint, view or marker that it is of; −1 for all of them."""
+
+    kind: str
+    which: int
+    starts: FloatArray  # (s, p) parameters that a fit starts from
+    change: Callable[[Changed, FloatArray], Changed]
+    markers: tuple[int, ...] = ()  # that it touches alone
+
+
+class Explanation(NamedTuple):
+    """A cause as fitted."""
+
+    cause: Cause
+    theta: FloatArray  # (p,)
+    gain: float  # by which χ² falls
+    cost: float  # of its parameters, by their prior
+    left: float  # χ² that stays
+    changed_px: float  # by how much it changes images of the markers that it touches, rms
+
+    @property
+    def score(self) -> float:
+        """Twice the logarithm of its odds against no cause."""
+        return self.gain - self.cost
+
+
+class Evidence:
+    """Looks that disagree, whitened beside errors of the calibration, of joints and of instants.
+
+    errors : what images may be off; looks, residuals, weights : of each look, and how many it is worth.
+    agreed : sums of the looks before.
+    """
+
+    def __init__(
+        self, errors: Errors, looks: list[Look], residuals: list[Residual], weights: FloatArray, agreed: Sums
+    ) -> None:
+        few = np.unique(np.linspace(0, len(looks) - 1, min(len(looks), _MOST_LOOKS)).round().astype(int))
+        self.looks = [looks[i] for i in few]
+        residuals, factor = (
+            [residuals[i] for i in few],
+            np.sqrt(weights[few] * (weights.sum() / weights[few].sum())),
+        )
+        self._errors = errors
+        self.scene: Scene = errors.scene
+        self.away = np.array([look.q for look in self.looks]) - errors.calibration.q_reference
+        self._images = np.array([look.images for look in self.looks])
+        self.seen = np.array([residual.seen for residual in residuals])
+        self._images[~self.seen] = 0.0
+        bias = (errors.bias_px / np.array([residual.noise for residual in residuals])) ** 2
+        self.bias = float(2.0 * (bias * self.seen).sum())
+        n = len(errors.sigma_q)
+        roots = np.linalg.cholesky(np.array([residual.R for residual in residuals]))
+        self._inverses = factor[:, None, None] * np.linalg.inv(roots)
+        onset = float(self.looks[0].t.mean())
+        seconds = float(self.looks[-1].t.mean()) - onset
+        beside = np.array([np.hstack([r.B, r.F[:, : 2 * n + 2]]) for r in residuals])
+        drift = slice(errors.e + n, errors.e + 2 * n)  # of joints, with time from the onset
+        beside[..., drift] -= onset * beside[..., errors.e : errors.e + n]
+        self._beside = self._whitened(beside)
+        late = np.maximum(np.max([look.late for look in self.looks], axis=0), 1e-6)
+        prior = np.zeros((errors.e + 2 * n + 2,) * 2)
+        prior[: errors.e, : errors.e] = np.eye(errors.e) + agreed.normal[: errors.e, : errors.e]
+        prior[errors.e :, errors.e :] = errors.lasting(seconds, late)
+        self._known = np.append(agreed.normal[: errors.e, -1], np.zeros(2 * n + 2))
+        self._factor = cho_factor(prior + self._beside.T @ self._beside)
+        self._offset = float(self._known @ cho_solve(cho_factor(prior), self._known))
+        self.rows = float(2.0 * (self.seen * factor[:, None, None] ** 2).sum())
+        self.nothing = Changed(
+            self.scene.P, self.scene.lens, self.scene.M, self.away, np.ones(2), np.zeros((2, 2))
+        )
+        self.at_first = self._off(self.nothing)
+        self.before = self._square(self._whitened(self.at_first))
+
+    def _whitened(self, rows: FloatArray) -> FloatArray:
+        """Rows (K, 4 m, …) over the root of their covariance, (K 4 m, …)."""
+        found = self._inverses @ rows.reshape(*rows.shape[:2], -1)
+        return np.asarray(found.reshape(-1, *rows.shape[2:]))
+
+    def _off(self, changed: Changed) -> FloatArray:
+        """What images (K, 4 m) are off the prediction of a cause, px; zero where unseen."""
+        K, _, n = changed.away.shape
+        scene = Scene(changed.P, self.scene.H_hat, self.scene.prismatic, changed.M, changed.lens)
+        s = scene.seen(changed.away.reshape(2 * K, n)).reshape(K, 2, 2, -1, 2)[:, [0, 1], [0, 1]]
+        s = changed.scale[:, None, None] * (s + 0.5) - 0.5 + changed.shift[:, None]
+        off = np.where(np.isfinite(s), self._images - s, _HIDDEN_PX)
+        off[~self.seen] = 0.0
+        return np.asarray(off.reshape(K, -1))
+
+    def _square(self, r: FloatArray) -> float:
+        """χ² of whitened residuals, beside errors and their priors."""
+        b = self._beside.T @ r + self._known
+        return float(r @ r + self._offset - b @ cho_solve(self._factor, b))
+
+    def explanations(self, causes: Iterable[Cause]) -> list[Explanation]:
+        """Fits of the causes that a first step of each makes the likeliest."""
+        tried = [self._tried(cause) for cause in causes]
+        tried.sort(key=lambda one: -one[0])
+        return [self._fitted(cause, start) for _, cause, start in tried[:_FITTED]]
+
+    def _changed_by(self, cause: Cause, theta: FloatArray) -> FloatArray:
+        return self._off(cause.change(self.nothing, theta))
+
+    def _tried(self, cause: Cause) -> tuple[float, Cause, FloatArray]:
+        """Score of a cause after one step from the best of its starts, and that start."""
+        rows = [self._changed_by(cause, start) for start in cause.starts]
+        squares = [self._square(self._whitened(row)) for row in rows]
+        best = int(np.argmin(squares))
+        start, cost, falls = cause.starts[best], 0.0, 0.0
+        if start.size:
+            _, cost, falls = self._step(cause, start, rows[best])
+        return self.before - squares[best] + falls - cost, cause, start
+
+    def _step(self, cause: Cause, theta: FloatArray, here: FloatArray) -> tuple[FloatArray, float, float]:
+        """Step of Gauss and Newton, what the parameters cost by their prior, and how far χ² falls at most."""
+        F = np.stack(
+            [(self._changed_by(cause, theta + h) - here) / _EPSILON for h in _EPSILON * np.eye(theta.size)],
+            axis=-1,
+        )
+        r = self._whitened(here)
+        size = np.sqrt(np.square(F).sum(axis=(0, 1)) / self._count(cause))  # px rms a unit
+        unit = _EXPECTED_PX / np.maximum(size, 1e-12)
+        F = self._whitened(F * unit)
+        across = self._beside.T @ F
+        solved = cho_solve(self._factor, across)
+        normal = F.T @ F - across.T @ solved + np.eye(theta.size)
+        right = F.T @ r - solved.T @ (self._beside.T @ r + self._known)
+        step = np.linalg.solve(normal, right)
+        return -unit * step, float(np.linalg.slogdet(normal)[1]), float(right @ step)
+
+    def _count(self, cause: Cause) -> float:
+        """Coordinates seen that a cause touches."""
+        touched = self.seen[..., list(cause.markers)] if cause.markers else self.seen
+        return max(2.0 * float(touched.sum()), 1.0)
+
+    def _fitted(self, cause: Cause, theta: FloatArray) -> Explanation:
+        """Fit of a cause, with the prior of its parameters."""
+        here = self._changed_by(cause, theta)
+        square, cost = self._square(self._whitened(here)), 0.0
+        for _ in range(_STEPS if theta.size else 0):
+            step, cost, _ = self._step(cause, theta, here)
+            for halved in step * 0.5 ** np.arange(_HALVINGS)[:, None]:
+                there = self._changed_by(cause, theta + halved)
+                less = self._square(self._whitened(there))
+                if less < square:
+                    break
+            else:
+                break
+            fell, theta, here, square = square - less, theta + halved, there, less
+            if fell < _FALLS:
+                break
+        change = np.square(here - self.at_first).reshape(-1, 2).sum(axis=1)
+        changed_px = float(np.sqrt(change[change > 0.0].mean())) if change.any() else 0.0
+        return Explanation(cause, theta, self.before - square, cost, square, changed_px)
+
+
+_NONE = np.zeros((1, 0))
+
+
+def causes_of(evidence: Evidence, numbers: IntArray, centre: FloatArray | None) -> Iterator[Cause]:
+    """All causes that are looked for, the simplest of a kind first.
+
+    numbers : (m,) of the markers; centre : (2,) of the images, px; None where their size is not known.
+    """
+    yield Cause(
+        "exchanged",
+        -1,
+        _NONE,
+        lambda s, _: s._replace(P=s.P[::-1], lens=None if s.lens is None else s.lens[::-1]),
+    )
+    yield from _joint_causes(evidence)
+    yield from _image_causes(centre)
+    yield from _camera_causes(evidence)
+    yield from _body_causes(evidence, numbers)
+
+
+def _joint_causes(evidence: Evidence) -> Iterator[Cause]:
+    q_reference = evidence._errors.calibration.q_reference
+    n, K = len(q_reference), len(evidence.looks)
+    velocity = np.array([look.q_dot for look in evidence.looks])
+    for i in range(n):
+
+        def mirrored(s: Changed, _: FloatArray, i: int = i) -> Changed:
+            away = s.away.copy()
+            away[..., i] = -(away[..., i] + 2.0 * q_reference[i])
+            return s._replace(away=away)
+
+        def slipped(s: Changed, theta: FloatArray, i: int = i) -> Changed:
+            return s._replace(away=s.away + theta[0] * np.eye(n)[i])
+
+        starts = np.zeros((1, 1))
+        if not evidence.scene.prismatic[i]:
+            starts = np.linspace(-np.pi, np.pi, _TURNS, endpoint=False)[:, None] + np.pi / _TURNS
+            starts = np.concatenate([np.zeros((1, 1)), starts])
+        yield Cause("mirrored", i, _NONE, mirrored)
+        yield Cause("slipped", i, starts, slipped)
+    read = np.array([look.q for look in evidence.looks])
+    still: BoolArray = np.ptp(read, axis=(0, 1)) <= _STILL
+    for j in np.flatnonzero(still) if K > 1 and not still.all() else ():
+
+        def frozen(s: Changed, theta: FloatArray, i: int = int(j)) -> Changed:
+            away = s.away.copy()
+            away[..., i] += theta[:, None]
+            return s._replace(away=away)
+
+        yield Cause("frozen", int(j), np.zeros((1, K)), frozen)
+    if K > 2 and still.all():
+        yield Cause(
+            "frozen",
+            -1,
+            np.zeros((1, n * K)),
+            lambda s, theta: s._replace(away=s.away + theta.reshape(K, 1, n)),
+        )
+    yield Cause("flexible", -1, np.zeros((1, n)), lambda s, theta: s._replace(away=s.away + theta))
+    for v in (0, 1, -1):
+
+        def late(s: Changed, theta: FloatArray, v: int = v) -> Changed:
+            both = theta if v < 0 else np.eye(2)[v] * theta
+            return s._replace(away=s.away - both[:, None] * velocity)
+
+        if velocity.any():
+            yield Cause("late", v, np.zeros((1, 2 if v < 0 else 1)), late)
+
+
+def _image_causes(centre: FloatArray | None) -> Iterator[Cause]:
+    for v in (0, 1, -1):
+        views = np.ones(2) if v < 0 else np.eye(2)[v]
+
+        def shifted(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
+            return s._replace(shift=s.shift + views[:, None] * theta)
+
+        def sized(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
+            factor = 1.0 + views * (theta[0] - 1.0)
+            return s._replace(scale=factor * s.scale, shift=factor[:, None] * s.shift)
+
+        yield Cause("shifted", v, np.zeros((1, 2)), shifted)
+        yield Cause("sized", v, np.array(_FACTORS)[:, None], sized)
+        if centre is not None and v >= 0:
+
+            def focused(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
+                factor = 1.0 + views * theta[0]
+                return s._replace(scale=factor, shift=(1.0 - factor)[:, None] * (centre + 0.5))
+
+            yield Cause("focused", v, np.zeros((1, 1)), focused)
+        elif v >= 0:
+
+            def zoomed(s: Changed, theta: FloatArray, views: FloatArray = views) -> Changed:
+                return s._replace(scale=1.0 + views * theta[0], shift=views[:, None] * theta[1:])
+
+            yield Cause("focused", v, np.zeros((1, 3)), zoomed)
+
+
+def _camera_causes(evidence: Evidence) -> Iterator[Cause]:
+    twists, bases, d = evidence._errors.twists, evidence._errors.cameras, len(evidence._errors.twists)
+
+    def turned(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
+        P = s.P.copy()
+        for part, v in zip(theta.reshape(-1, d), views, strict=False):
+            P[v] = P[v] @ expm(np.tensordot(part, twists, 1))
+        return s._replace(P=P)
+
+    for v in (0, 1):
+
+        def rigid(s: Changed, theta: FloatArray, v: int = v) -> Changed:
+            return turned(s, theta, (v,))
+
+        def free(s: Changed, theta: FloatArray, v: int = v) -> Changed:
+            P = s.P.copy()
+            P[v] += np.linalg.norm(P[v]) * (bases[v] @ theta).reshape(3, 4)
+            return s._replace(P=P)
+
+        yield Cause("camera", v, np.zeros((1, d)), rigid)
+        yield Cause("camera", v, np.zeros((1, CAMERA - 1)), free)
+    yield Cause("cameras", -1, np.zeros((1, 2 * d)), lambda s, theta: turned(s, theta, (0, 1)))
+    yield Cause(
+        "cameras",
+        -1,
+        np.zeros((1, 4)),
+        lambda s, theta: s._replace(shift=s.shift + theta.reshape(2, 2)),
+    )
+
+    def rig(s: Changed, theta: FloatArray) -> Changed:
+        return s._replace(P=s.P @ expm(np.tensordot(theta, twists, 1)))
+
+    yield Cause("rig", -1, np.zeros((1, d)), rig)
+
+
+def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
+    """Causes on the tool: its markers, tags, and all of them."""
+    twists, m = evidence._errors.twists, len(numbers)
+    shown: BoolArray = np.any(evidence.seen, axis=(0, 1))
+    d = len(twists)
+
+    def displaced(s: Changed, theta: FloatArray, which: IntArray) -> Changed:
+        M = s.M.copy()
+        M[which] = M[which] @ expm(np.tensordot(theta, twists, 1)).T
+        return s._replace(M=M)
+
+    yield Cause("tool", -1, np.zeros((1, d)), lambda s, theta: displaced(s, theta, np.arange(m)))
+    tags = [np.flatnonzero(numbers // CORNERS == t) for t in np.unique(numbers // CORNERS)]
+    tags = [which for which in tags if len(which) == CORNERS]
+    if tags:
+
+        def larger(s: Changed, theta: FloatArray) -> Changed:
+            M = s.M.copy()
+            for which in tags:
+                centre = M[which].mean(axis=0)
+                M[which] = centre + (1.0 + theta[0]) * (M[which] - centre)
+            return s._replace(M=M)
+
+        yield Cause("larger", -1, np.zeros((1, 1)), larger)
+    for which in tags:
+
+        def loose(s: Changed, theta: FloatArray, which: IntArray = which) -> Changed:
+            return displaced(s, theta, which)
+
+        if shown[which].any() and len(tags) > 1:
+            yield Cause("tag", int(which[0]), np.zeros((1, d)), loose, tuple(which.tolist()))
+    for j in np.flatnonzero(shown):
+
+        def moved(s: Changed, theta: FloatArray, j: int = int(j)) -> Changed:
+            M = s.M.copy()
+            M[j] += evidence._errors.directions.T @ theta * np.linalg.norm(M[j])
+            return s._replace(M=M)
+
+        yield Cause("marker", int(j), np.zeros((1, 3)), moved, (int(j),))
+
+
+# What a cause contains: with more parameters it explains as much.
+_CONTAINS = {
+    "camera": ("shifted", "focused", "sized", "camera"),
+    "cameras": ("shifted", "focused", "sized", "camera", "rig"),
+    "focused": ("shifted",),
+    "flexible": ("slipped",),
+    "frozen": ("slipped", "mirrored"),
+    "slipped": ("mirrored",),
+    "tag": ("marker",),
+    "tool": ("larger",),
+}
+
+
+def contains(one: Cause, other: Cause) -> bool:
+    """Whether a cause explains what another one does, with more parameters."""
+    alike = one.which in (-1, other.which) or set(other.markers) <= set(one.markers) != set()
+    more = one.starts.shape[1] > other.starts.shape[1]
+    return alike and more and other.kind in _CONTAINS.get(one.kind, ())
+
+
+def is_possible(found: Explanation) -> bool:
+    """Whether a cause can be of that size: links flex by a little only."""
+    return found.cause.kind != "flexible" or bool(np.abs(found.theta).max() <= _MOST_FLEXIBLE)

@@ -1,0 +1,324 @@
+"""Monitor of a run: tests each look, holds the arm while looks disagree, and names the fault."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.readings import even_choice
+from projservo_cli.monitoring.hypotheses import (
+    Evidence,
+    Explanation,
+    causes_of,
+    contains,
+    is_possible,
+)
+from projservo_cli.monitoring.looks import Frame, Look, Pairing
+from projservo_cli.monitoring.messages import group_of, moved_sentence, sentence
+from projservo_cli.monitoring.statistics import (
+    LEAST_ERROR,
+    WINDOW,
+    Detector,
+    Errors,
+    Residual,
+    Sums,
+    columns_of_marker,
+)
+from projservo_cli.records import VIEWS, BoolArray, Calibration, FloatArray, IntArray
+
+# Markers that are tested, at most.
+_MOST_TESTED = 40
+# A corner that is so many times less certain than most is not tested: its error is the finder's, and lasts.
+_VAGUE = 10.0
+# A cause is looked for after so many looks that disagree, since blur passes; after the last it is told.
+_NAMED_AT = (5, 7, 10, 15)
+# Advantage over the next cause, twice the logarithm of odds, at which one is named alone.
+_CLEAR = 2.0 * np.log(100.0)
+# Share of what images are off that a cause may leave.
+_LEFT = 0.25
+# A corner that is off by less, px, in one view of the tool is an edge that the finder took for another.
+_LEAST_MOVED_PX = 1.0
+# Looks that are remembered one by one.
+_REMEMBERED = 60
+# Joints that differ by no more since the first look have not moved, rad or m.
+_AT_REST = 1e-3
+
+
+class _Kept(NamedTuple):
+    """A look as it was tested."""
+
+    look: Look
+    residual: Residual
+    aside: BoolArray  # (2, m) sightings that were off by themselves
+    view: int  # number of the view that it is of
+
+
+class ImageMonitor:
+    """Monitor of the images of a run against a calibration.
+
+    Detection and isolation are two things. Each look is tested: whether it disagrees needs no cause. While
+    looks disagree they are ``pending``; after ``WINDOW`` of them the arm ``holds``; ``WINDOW`` looks in a row
+    that agree clear them. Meanwhile causes are fitted to them by the images that they predict, and one that
+    explains them, clearly better than others, is named. After fifteen looks the fault is told without.
+
+    Sources: R. Isermann, "Fault-Diagnosis Systems", Springer 2006, chapters 2 and 16; D. J. C. MacKay,
+    "Bayesian interpolation", Neural Computation 4 (1992) 415–447, for the odds of causes.
+
+    calibration : what predicts the pixels, with its covariance.
+    sigma_px : pixel noise per coordinate.
+    observations : most looks of one sequence, which sets the thresholds.
+    shown : indices of the markers that images may show, None all; of many, some stand for all.
+    image_size : (2,) px; None or infinite where it is not known.
+    ``fault``: what is wrong, in words; empty while nothing is, or while it is not clear what.
+    ``looks``: how many were tested. ``agreeing``: looks of one view in a row that agree. ``rejected``: (2, m)
+    sightings of the last look that are off by themselves, of all markers of the calibration.
+    """
+
+    def __init__(
+        self,
+        calibration: Calibration,
+        sigma_px: float,
+        observations: int,
+        shown: IntArray | None = None,
+        image_size: FloatArray | None = None,
+    ) -> None:
+        self._all = len(calibration.M)
+        shown = np.arange(self._all) if shown is None else shown
+        self._shown = shown[even_choice(len(shown), _MOST_TESTED)]
+        self.calibration = calibration.with_markers(self._shown)
+        known = image_size is not None and bool(np.isfinite(image_size).all())
+        self._centre = 0.5 * (np.asarray(image_size) - 1.0) if known else None
+        self._errors = Errors(self.calibration, sigma_px)
+        self._detector = Detector(self._errors, observations)
+        self._pairing = Pairing()
+        self._first: FloatArray | None = None  # (n,) joints of the first look, rad or m
+        self._kept: list[_Kept] = []
+        self.looks = self._view = 0
+        self._off = self._onset = self._agreed = (
+            0  # looks off, the number of the first, and looks in a row that agree
+        )
+        self._before = self._detector.memory.total  # sums up to the onset
+        self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # looks in a row
+        self._forgiven: list[int] = []
+        self.fault, self.agreeing = "", 0
+        self.rejected = np.zeros((2, self._all), dtype=np.bool_)
+
+    @property
+    def pending(self) -> bool:
+        """Whether looks disagreed that nothing has cleared or explained."""
+        return self._off > 0
+
+    @property
+    def holds(self) -> bool:
+        """Whether so many looks disagreed that nothing should move."""
+        return self._off >= WINDOW
+
+    def look(
+        self,
+        t: FloatArray,
+        q: FloatArray,
+        q_dot: FloatArray,
+        late: FloatArray,
+        images: FloatArray,
+        fresh: BoolArray,
+        *,
+        stated: FloatArray | None = None,
+    ) -> str:
+        """Take in the newest frames of both views, and return the fault, if there is one.
+
+        t : (2,) instants of both frames, s.
+        q : (2, n) joint readings then, rad or m; q_dot : (2, n) their velocities, rad/s or m/s.
+        late : (2,) standard deviation of these instants, of the delay and its jitter together, s.
+        images : (2, m, 2) raw pixels of the markers of the calibration, NaN where unseen.
+        fresh : (2,) whether the frame of a view is new; one that comes twice is no second measurement.
+        stated : (2, m) standard deviations of the pixels, px, if the finder states them.
+        """
+        images, stated = images[:, self._shown], None if stated is None else stated[:, self._shown]
+        seen = np.isfinite(images[..., 0])
+        noise = self._errors.noise(seen, stated)
+        if stated is not None and seen.any():
+            images = np.where((noise > _VAGUE * np.median(noise[seen]))[..., None], np.nan, images)
+        self._first = q[0].copy() if self._first is None else self._first
+        at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
+        for v in np.flatnonzero(fresh):
+            uncertain = max(float(late[v]), LEAST_ERROR)
+            self._pairing.add(int(v), Frame(float(t[v]), q[v], q_dot[v], uncertain, images[v], noise[v]))
+        self._pairing.reach(t)
+        while not self.fault and (look := self._pairing.next(at_rest)) is not None:
+            self._take(look)
+        return self.fault
+
+    def give_up(self) -> str:
+        """Return the fault that is pending, by what is known of it."""
+        if self.pending and not self.fault:
+            self.fault = self._told(self._explanations(self._since_onset(), self._before))
+        return self.fault
+
+    def _take(self, look: Look) -> None:
+        """Test a look, and judge what is known by now."""
+        self.looks += 1
+        memory, residual = self._detector.memory, self._errors.residual(look)
+        if not residual.seen.any():
+            return
+        lasts = memory.lasts(residual)
+        self._view += not lasts
+        tested = self._detector.tested(residual)
+        self._asides = np.where(tested.aside, self._asides + 1, self._asides * ~residual.seen)
+        self.rejected[:, self._shown] = tested.aside
+        self.rejected[:, self._shown[self._forgiven]] = True
+        self._kept = [*self._kept[-_REMEMBERED:], _Kept(look, residual, tested.aside, self._view)]
+        since = None
+        clean = residual.without(tested.aside)
+        memory.learn(clean, tested.disagrees)
+        if not tested.disagrees:
+            if not self.holds:
+                memory.keep(clean, float(look.t.mean()))
+            free = [columns_of_marker(self._errors, j) for j in self._forgiven]
+            since = self._detector.significant(self.looks, look.late, free, self.pending)
+        if not tested.disagrees and since is None:
+            self.agreeing = 1 + self.agreeing * lasts
+            self._agreed += 1
+            self._clear()
+        else:
+            self._disagree(since)
+        if not self.fault:
+            self._judge_markers()
+
+    def _disagree(self, since: Sums | None) -> None:
+        """Count a look that disagrees, and name the fault where that can be done."""
+        if not self._off:
+            self._onset, self._before = self.looks - 1, since or self._detector.memory.total
+            if since is not None:
+                self._onset = self.looks - len(self._kept)
+        self._off += 1
+        self.agreeing = self._agreed = 0
+        if self._off not in _NAMED_AT:
+            return
+        found = self._explanations(self._since_onset(), self._before)
+        best, patient = found[0], self._off < _NAMED_AT[-1]
+        if self._is_edge(best, len({one.view for one in self._since_onset()})):
+            self._forgive([int(j) for j in best.cause.markers])
+        elif not patient or (self._explains(best) and len(_rivals(found)) == 1):
+            self.fault = self._told(found)
+
+    def _clear(self) -> None:
+        """Clear what is pending where looks agree again; a fault that shows in motion alone is named."""
+        if not self.pending or self._agreed < WINDOW:
+            return
+        if self.holds:
+            kept = self._since_onset()
+            if any(look.q_dot.any() for look, *_ in kept):
+                best = self._explanations(kept, self._before)[0]
+                if best.cause.kind in ("late", "frozen") and self._explains(best):
+                    self.fault = self._told([best])
+        self._off = 0
+
+    def _since_onset(self) -> list[_Kept]:
+        """Looks since the onset of what is pending, those before it left out."""
+        return self._kept[-max(1, self.looks - self._onset) :]
+
+    def _explanations(
+        self, kept: list[_Kept], before: Sums, markers: list[int] | None = None
+    ) -> list[Explanation]:
+        """Causes fitted to looks, the likeliest first; only displacements of markers, if they are given.
+
+        before : sums of the looks before them.
+        """
+        evidence = self._evidence_now = self._evidence(kept, before)
+        causes = causes_of(evidence, self.calibration.marker, self._centre)
+        if markers is not None:
+            causes = (cause for cause in causes if cause.kind == "marker" and cause.which in markers)
+        found = [one for one in evidence.explanations(causes) if is_possible(one)]
+        # Where even the best leaves more than chance does, the unit is what that leaves.
+        least = min(found, key=lambda one: one.left)
+        unit = max(1.0, least.left / max(1.0, evidence.rows - least.theta.size))
+        return sorted(
+            (one._replace(gain=one.gain / unit, left=one.left / unit) for one in found),
+            key=lambda one: -one.score,
+        )
+
+    def _evidence(self, kept: list[_Kept], before: Sums) -> Evidence:
+        """Looks to be explained, those of one view worth what they are."""
+        memory = self._detector.memory
+        views = np.array([one.view for one in kept])
+        count = np.array([(views == view).sum() for view in views], dtype=np.float64)
+        weights = np.array([memory.worth(c) / c for c in count])
+        looks, residuals = [one.look for one in kept], [one.residual for one in kept]
+        return Evidence(self._errors, looks, residuals, weights, before)
+
+    def _explains(self, found: Explanation) -> bool:
+        """Whether a cause explains most of what images are off."""
+        evidence = self._evidence_now
+        allowed = evidence.rows + (np.sqrt(evidence.rows) * 3.0) + evidence.bias
+        return bool(found.left <= allowed + _LEFT * max(0.0, found.gain))
+
+    def _is_edge(self, found: Explanation, views: int) -> bool:
+        """Whether what seems to have moved is perhaps an edge that a finder took for that of a marker.
+
+        views : of the tool that showed it.
+        """
+        if not found.cause.markers:
+            return False
+        seen = self._evidence_now.seen[:, :, list(found.cause.markers)]
+        alone = seen.all(axis=1).sum() <= 0.5 * seen.any(axis=1).sum()
+        return bool(alone) or (found.changed_px < _LEAST_MOVED_PX and views < WINDOW)
+
+    def _judge_markers(self) -> None:
+        """Name markers that both views show off by themselves for long."""
+        both, either = self._asides.min(axis=0), self._asides.max(axis=0)
+        # What hides an edge shows in one view, and passes.
+        if self.pending or not ((both == _NAMED_AT[0]).any() or (either == _NAMED_AT[-1]).any()):
+            return
+        before, moved = self._detector.memory.total, []
+        for j in np.flatnonzero(either).tolist():
+            kept = [
+                one._replace(residual=one.residual.without(_all_but(one.residual.seen, j)))
+                for one in self._kept[-max(_NAMED_AT[0], int(either[j])) :]
+            ]
+            best = self._explanations(kept, before, [j])[0]
+            views = len({one.view for one in kept})
+            lasts = (both[j] or views >= WINDOW) and not self._is_edge(best, views)
+            if lasts and best.score > _CLEAR and self._explains(best):
+                moved.append(best)
+        if moved:
+            self.fault = self._told(moved, together=True)
+
+    def _forgive(self, markers: list[int]) -> None:
+        """Leave markers out from here on, and take up the run again."""
+        self._forgiven += [j for j in markers if j not in self._forgiven]
+        self._off = 0
+
+    def _told(self, found: list[Explanation], together: bool = False) -> str:
+        """Sentence on the fault by the likeliest of causes, or by all of them together."""
+        residual = self._kept[-1].residual
+        rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
+        off = f"images are {rms:.3g} px rms per coordinate off what the calibration predicts"
+        if not self._explains(found[0]):
+            return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
+        if together:
+            return f"{off}: {moved_sentence(found, self.calibration)}"
+        names = [sentence(one, self.calibration) for one in _rivals(found)[:2]]
+        return f"{off}: {'; or '.join(names)}"
+
+    def _where(self, residual: Residual) -> str:
+        """Where images are off most: a view, and a tag or marker."""
+        square = np.square(residual.r.reshape(2, -1, 2)).sum(axis=-1)
+        view, j = np.unravel_index(int(np.argmax(square)), square.shape)
+        number = int(self.calibration.marker[j])
+        return f"in the {VIEWS[view]} image, at marker {number}"
+
+
+def _rivals(found: list[Explanation]) -> list[Explanation]:
+    """The likeliest cause and those of other names that are nearly as likely."""
+    rivals: list[Explanation] = []
+    for one in found:
+        near = found[0].score - one.score < _CLEAR and not contains(one.cause, found[0].cause)
+        if near and group_of(one) not in [group_of(other) for other in rivals]:
+            rivals.append(one)
+    return rivals
+
+
+def _all_but(seen: BoolArray, marker: int) -> BoolArray:
+    """Sightings (2, m) of all markers but one."""
+    aside = np.ones_like(seen)
+    aside[:, marker] = False
+    return aside

@@ -1,0 +1,430 @@
+"""How images may differ from their prediction while nothing is wrong, and tests of that."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.special import chdtri
+
+from projservo_cli.calibration.forward import CAMERA
+from projservo_cli.calibration.prediction import all_changed, scene_of
+from projservo_cli.calibration.readings import LEAST_SIGMA, per_rad
+from projservo_cli.monitoring.looks import Look
+from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
+
+# Looks in a row that must agree: one may be blurred, or a marker taken for another.
+WINDOW = 3
+# Chance that a run of sound looks is called faulty, if all windows were independent. They overlap: it comes
+# to a twentieth of that. More of it is spent on the first looks.
+_FALSE_ALARM, _SOON = 1e-2, 10.0
+# Windows in which an onset is looked for, one longer than the other by this factor.
+_LONGER = 1.5
+# Error of the first order of a prediction, at most, as a share of the calibration's own noise.
+_BEYOND_FIRST_ORDER = 0.02
+# Lasting errors of a joint, by backlash and counts, differ between two times by √2 of their deviation.
+_LASTING = np.sqrt(2.0)
+# Joints (rad or m) and instants (s) are known no better than this, whatever is stated.
+LEAST_ERROR = 1e-6
+# A direction counts where it keeps this share of its size beside the others; what is added for solving.
+_RANK, RIDGE = 1e-6, 1e-9
+# Frames that are so near show joints of one reading, s.
+_AT_ONCE_S = 1e-4
+# A view lasts while markers move by no more than this, px rms; its looks are forgotten at this rate.
+_SAME_VIEW_PX, _FORGET = 20.0, 1.0 - 1.0 / 30.0
+# Share of the markers of a view that may be off one by one before the view itself is.
+_MOST_ASIDE = 1.0 / 3.0
+
+
+class Residual(NamedTuple):
+    """Residuals of one look: rows by view, marker and coordinate, zero where unseen."""
+
+    seen: BoolArray  # (2, m)
+    noise: FloatArray  # (2, m) px
+    predicted: FloatArray  # (2, m, 2) px
+    r: FloatArray  # (4 m,) seen less predicted, px
+    B: FloatArray  # (4 m, e) derivatives by the errors of the calibration, in units of their deviations
+    F: FloatArray  # (4 m, f) derivatives by what may be wrong
+    R: FloatArray  # (4 m, 4 m) covariance of one look but for the errors of the calibration, px²
+
+    def without(self, aside: BoolArray) -> "Residual":
+        """The same without some sightings (2, m)."""
+        rows = np.repeat(~aside.ravel(), 2)
+        r, B, F = (part * (rows if part.ndim == 1 else rows[:, None]) for part in (self.r, self.B, self.F))
+        return self._replace(seen=self.seen & ~aside, r=r, B=B, F=F)
+
+
+class Sums(NamedTuple):
+    """Normal equations of looks, those of one view together as so many as they are worth."""
+
+    looks: int  # views that they come from
+    t: float  # when the last was taken, s from the first look
+    normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
+    seen: float  # coordinates seen
+    bias: FloatArray  # (2, m) squared errors of the model that they may have, over the noise
+
+    def plus(self, other: "Sums", factor: float = 1.0) -> "Sums":
+        """Sums and so many times others, which are later."""
+        return Sums(
+            self.looks + other.looks,
+            other.t,
+            self.normal + factor * other.normal,
+            self.seen + factor * other.seen,
+            self.bias + factor * other.bias,
+        )
+
+    def times(self, factor: float) -> "Sums":
+        """The same with another weight."""
+        return self._replace(normal=factor * self.normal, seen=factor * self.seen, bias=factor * self.bias)
+
+
+class Errors:
+    """What a calibration allows images to be off, and directions in which faults would change them.
+
+    At given joint readings the calibration predicts the pixels of every marker. What is seen differs by
+
+        r = J δ + J_q δq + J_q q̇ δd + c + ε
+
+    to first order: δ ~ N(0, Σ), errors of the calibration, the same all along; δq of the joint readings, the
+    same in both views of one instant; δd of the instant of each frame; c, errors of corners that last while
+    the view does, and ε, what is new in each frame, of the variance σ² together.
+    """
+
+    def __init__(self, calibration: Calibration, sigma_px: float) -> None:
+        m, n = len(calibration.M), len(calibration.H_hat_0)
+        self.calibration, self.scene = calibration, scene_of(calibration)
+        self.errors, self.e = calibration.errors, calibration.shared_error.shape[1] + 3 * m
+        bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
+        self._least = max(bent, LEAST_SIGMA)
+        self._sigma = max(sigma_px, self._least)
+        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA)
+        self.bias_px = max(calibration.model_px, bent)
+        sigma_q = calibration.sigma_q or 0.0
+        if calibration.sigma_q_interval is not None:
+            sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
+        self.sigma_q = np.maximum(sigma_q * per_rad(calibration.prismatic), LEAST_ERROR)
+        # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
+        self.directions = np.linalg.svd(calibration.a_inf[None])[2][1:]
+        self.twists = _rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
+        self.cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
+        self.parts, self.touches, self.f = _directions_of(n, m, len(self.twists))
+
+    def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
+        """Standard deviation (2, m) of pixels, px: those stated, as the calibration found them, if any."""
+        common = np.full(seen.shape, self._sigma)
+        if stated is None:
+            return common
+        return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
+
+    def residual(self, look: Look) -> Residual:
+        """Residuals of a look and their derivatives, each view at its own joints."""
+        scene, away, views = self.scene, look.q - self.calibration.q_reference, np.arange(2)
+        m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
+        predicted = scene.seen(away)[views, views]
+        r = look.images - predicted
+        seen = np.isfinite(r[..., 0])
+        at = scene.everywhere(away)
+        B = all_changed(scene, self.errors, away, at)[views, views]
+        D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
+        Y = at.points.reshape(n + 1, 2, m, 4)
+        by_camera = at.by_camera.reshape(2, 2, m, 2, CAMERA)[views, views]
+        F = self._fault_derivative(D, Y, by_camera, look)
+        for part in (r, B, F):
+            part[~seen] = 0.0
+        F = F.reshape(rows, -1)
+        sigma_q = np.hypot(self.sigma_q, look.curved)
+        new = F[:, [*range(n), 2 * n, 2 * n + 1]] * np.append(sigma_q, look.late)
+        late = new[:, n:]
+        if abs(look.t[0] - look.t[1]) > _AT_ONCE_S:  # joints were read anew for the other view
+            left = np.arange(rows)[:, None] < rows // 2
+            new = np.concatenate([new * left, new * ~left], axis=1)
+        # An instant so uncertain that the arm moves on a curve: half the square of the angle.
+        bend = 0.5 * np.abs(look.q_dot).sum(axis=1).max() * (late @ look.late)
+        R = new @ new.T + np.diag(np.repeat(look.noise.ravel(), 2) ** 2 + bend**2)
+        return Residual(seen, look.noise, predicted, r.ravel(), B.reshape(rows, -1), F, R)
+
+    def _fault_derivative(
+        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, look: Look
+    ) -> FloatArray:
+        """Derivatives (2, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
+
+        D : (n + 1, 2, m, 2, 4) by the points Y (n + 1, 2, m, 4) behind each joint; by_camera : (2, m, 2, 12).
+        """
+        n, _, m = Y[1:, ..., 0].shape
+        F, d = np.zeros((2, m, 2, self.f)), len(self.twists)
+        velocity = Y[:n] @ self.scene.H_hat[:, None].swapaxes(2, 3)
+        J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
+        F[..., :n], F[..., n : 2 * n] = J_q, J_q * look.t[:, None, None, None]
+        by_marker, first = D[n] @ self.directions.T, 2 * n + 2
+        for v in (0, 1):
+            F[v, ..., 2 * n + v] = -J_q[v] @ look.q_dot[v]
+            F[v, ..., first : first + CAMERA - 1] = by_camera[v] @ self.cameras[v]
+            first += CAMERA - 1
+        for j in range(m):
+            F[:, j, :, first : first + 3] = by_marker[:, j]
+            first += 3
+        F[..., first : first + d] = D[n] @ np.moveaxis(self.scene.M @ self.twists.swapaxes(1, 2), 0, -1)
+        F[..., first + d :] = D[0] @ np.moveaxis(Y[0] @ self.twists[:, None].swapaxes(2, 3), 0, -1)
+        return F
+
+    def sums(self, residual: Residual, t: float) -> Sums:
+        """What one look adds to the normal equations."""
+        rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
+        rows = solve_triangular(np.linalg.cholesky(residual.R), rows, lower=True, check_finite=False)
+        bias = 2.0 * residual.seen * (self.bias_px / residual.noise) ** 2
+        return Sums(1, t, rows.T @ rows, 2.0 * float(residual.seen.sum()), bias)
+
+    def nothing(self) -> Sums:
+        """Sums of no look."""
+        c = self.e + self.f + 1
+        return Sums(0, 0.0, np.zeros((c, c)), 0.0, np.zeros((2, len(self.calibration.M))))
+
+    def root(self, sums: Sums) -> FloatArray:
+        """Root (e, e) of the information on the errors of the calibration."""
+        return np.asarray(np.linalg.cholesky(np.eye(self.e) + sums.normal[: self.e, : self.e]))
+
+    def lasting(self, seconds: float, late: FloatArray) -> FloatArray:
+        """Information (2 n + 2, 2 n + 2) on errors of joints, their drift with time, and of instants.
+
+        Over that time joints are off by a straight line, its middle and its slope by what lasts.
+        """
+        n = len(self.sigma_q)
+        weight = np.diag((_LASTING * np.concatenate([self.sigma_q, self.sigma_q, late])) ** -2.0)
+        line = np.eye(2 * n + 2)
+        line[:n, n : 2 * n] = 0.5 * seconds * np.eye(n)
+        line[n : 2 * n, n : 2 * n] = max(seconds, LEAST_ERROR) / np.sqrt(12.0) * np.eye(n)
+        return np.asarray(line.T @ weight @ line)
+
+
+class Memory:
+    """Looks that agreed, view by view: looks of one view share the errors of their corners."""
+
+    def __init__(self, errors: Errors) -> None:
+        self._errors = errors
+        self._closed = [errors.nothing()]
+        self._view = errors.nothing()  # looks of the view that lasts, fading
+        self._count = 0.0
+        self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
+        self._before: tuple[Residual, bool] | None = None  # the last look, and whether it disagreed
+        self._squares = self._freedom = 0.0  # of differences from look to look, over σ²
+
+    @property
+    def fresh(self) -> float:
+        """Share of the variance of a corner that is new in each frame, as differences in a view tell.
+
+        No more than is sure; a finder that makes the same error in each frame has none.
+        """
+        if not self._freedom:
+            return 0.0
+        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom)
+        return float(np.clip(self._squares / self._freedom, 0.0, 1.0) * max(0.0, sure))
+
+    def worth(self, looks: float) -> float:
+        """How many single looks so many looks of one view are worth."""
+        return looks / (self.fresh + looks * (1.0 - self.fresh)) if looks else 0.0
+
+    @property
+    def total(self) -> Sums:
+        """Sums of all looks."""
+        if not self._count:
+            return self._closed[-1]
+        return self._closed[-1].plus(self._view.times(self.worth(self._count) / self._count))
+
+    def onsets(self) -> list[Sums]:
+        """Sums before each time that something may have begun, the earliest first."""
+        seen = self.total.seen
+        return [sums for sums in self._closed if sums.seen < seen]
+
+    def lasts(self, residual: Residual) -> bool:
+        """Whether a look is of the view before."""
+        return self._first is not None and _alike(self._first, residual.predicted)
+
+    def keep(self, residual: Residual, t: float) -> None:
+        """Add a look; of earlier views those are kept that tell an onset to a quarter of its age."""
+        lasts = self.lasts(residual)
+        if not lasts:
+            if self._count:
+                self._closed.append(self.total)
+                age = [max(1, (self._closed[-1].looks - sums.looks) // 4) for sums in self._closed]
+                self._closed = [
+                    sums
+                    for sums, a in zip(self._closed, age, strict=True)
+                    if sums.looks % (1 << (a.bit_length() - 1)) == 0
+                ]
+            self._view, self._count, self._first = self._errors.nothing(), 0.0, residual.predicted
+        new = self._errors.sums(residual, t)
+        self._view = self._view.times(_FORGET).plus(new)._replace(looks=1)
+        self._count = _FORGET * self._count + 1.0
+
+    def learn(self, now: Residual, disagrees: bool) -> None:
+        """Learn what is new in each frame from two in a row, beside errors of joints and instants.
+
+        disagrees : whether this look does; one that does and one that does not tell nothing.
+        """
+        last, self._before = self._before, (now, disagrees)
+        if last is None or last[1] != disagrees or not _alike(last[0].predicted, now.predicted):
+            return
+        before, n = last[0], len(self._errors.sigma_q)
+        rows = np.repeat((before.seen & now.seen).ravel(), 2)
+        weight = 1.0 / np.repeat(now.noise.ravel(), 2)[rows]
+        off = (now.r - before.r)[rows] * weight
+        basis = np.linalg.qr(now.F[rows][:, [*range(n), 2 * n, 2 * n + 1]] * weight[:, None])[0]
+        freedom = len(off) - basis.shape[1]
+        if freedom > 0:
+            # Fading, so that what a finder does in one light does not count for ever.
+            self._squares = 0.99 * self._squares + 0.5 * float(off @ off - np.square(off @ basis).sum())
+            self._freedom = 0.99 * self._freedom + freedom
+
+
+def _alike(before: FloatArray, now: FloatArray) -> bool:
+    """Whether predicted pixels (2, m, 2) are of one view."""
+    moved = np.square(now - before).sum(axis=-1)
+    return bool(np.nanmean(np.append(moved, 0.0)) <= _SAME_VIEW_PX**2)
+
+
+class Parts(NamedTuple):
+    """Tests of one look."""
+
+    disagrees: bool  # whether the whole of it does
+    aside: BoolArray  # (2, m) sightings that are off by themselves
+
+
+class Detector:
+    """Tests of looks against a calibration.
+
+    Each look is tested by itself, each view and each marker; the looks of each window since an onset by the
+    likelihood ratio of each direction that a fault may take, beside the errors of the calibration and the
+    lasting ones with their priors.
+
+    Source: A. S. Willsky, H. L. Jones, "A Generalized Likelihood Ratio Approach to the Detection and
+    Estimation of Jumps in Linear Systems", IEEE Trans. Automatic Control 21 (1976) 108–112.
+
+    errors : what images may be off; observations : most looks of one sequence, which sets the thresholds.
+    """
+
+    def __init__(self, errors: Errors, observations: int) -> None:
+        self._errors, self.memory = errors, Memory(errors)
+        m = len(errors.calibration.M)
+        tail = _FALSE_ALARM / observations
+        self._chance = _FALSE_ALARM / np.log1p(observations / _SOON)
+        self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (2 + m)))
+        self._sizes = np.array([len(columns) for columns in errors.parts])
+        self._by_size = [
+            (which, np.array([errors.parts[i] for i in which]))
+            for which in (np.flatnonzero(self._sizes == size) for size in np.unique(self._sizes))
+        ]
+
+    def tested(self, residual: Residual) -> Parts:
+        """Test χ² of each view and each marker in one look, sightings that are off by themselves aside."""
+        errors, (_, m) = self._errors, residual.seen.shape
+        total = self.memory.total
+        both = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
+        both = solve_triangular(errors.root(total), both, lower=True, check_finite=False)
+        W = both[:, :-1]
+        S, r = W.T @ W + residual.R, residual.r - W.T @ both[:, -1]
+        rows = np.arange(4 * m).reshape(2, m, 2)
+        sightings = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
+        markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
+        aside = (sightings | (markers & ~sightings.any(axis=0))) & residual.seen
+        many = aside.sum(axis=1) > _MOST_ASIDE * residual.seen.sum(axis=1)
+        if many.any():
+            aside[:] = False
+        left = residual.without(aside)
+        off = self._beyond(S, r, rows.reshape(2, 2 * m), left)
+        return Parts(bool(off.any() or many.any()), aside)
+
+    def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
+        """Which parts (h,) of residuals, by their rows (h, p), are beyond chance and errors of the model."""
+        seen = np.repeat(residual.seen.ravel(), 2)[parts]
+        bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
+        most = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
+        gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
+        return np.asarray(gain > most**2)
+
+    def significant(self, looks: int, late: FloatArray, free: list[IntArray], thorough: bool) -> Sums | None:
+        """Sums before an onset since when something is beyond chance, if so.
+
+        looks : number of this one; late : (2,) deviation of instants, s; free : columns of markers that are
+        known to be off; thorough : test windows of all lengths, not of another one at each look.
+        """
+        total, onsets = self.memory.total, self.memory.onsets()
+        if not onsets or not total.looks:
+            return None
+        lengths = _LONGER ** np.arange(1 + int(np.log(total.looks) / np.log(_LONGER)))
+        tail = self._chance / (looks + _SOON) / len(self._sizes)
+        by_chance = np.sqrt(chdtri(self._sizes, tail))
+        for length in lengths if thorough else lengths[[looks % len(lengths)]]:
+            since = min(onsets, key=lambda sums: abs(total.looks - length - sums.looks))
+            gain, bias = self._gain(since, total, late, free)
+            if bool((np.sqrt(gain) > by_chance + np.sqrt(bias)).any()):
+                return since
+        return None
+
+    def _gain(
+        self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """What each direction gains since an onset (h,), and what errors of the model may."""
+        e, n = self._errors.e, len(self._errors.sigma_q)
+        across = (total.normal - since.normal)[:, e:]
+        for part in (across.T, across[e:]):  # time is from the onset
+            part[n : 2 * n] -= since.t * part[:n]
+        least = RIDGE * across[e:].diagonal()
+        across[:e, -1] = total.normal[:e, -1]
+        W = solve_triangular(self._errors.root(total), across[:e], lower=True, check_finite=False)
+        normal = across[e:] - W.T @ W
+        beside = np.concatenate([np.arange(2 * n + 2), *free]).astype(np.int64)
+        weight = np.diag(np.maximum(least[beside], RIDGE))
+        weight[: 2 * n + 2, : 2 * n + 2] = self._errors.lasting(total.t - since.t, late)
+        solved = np.linalg.solve(normal[np.ix_(beside, beside)] + weight, normal[beside])
+        normal -= normal[:, beside] @ solved
+        gain = np.zeros(len(self._sizes))
+        for which, columns in self._by_size:
+            gain[which] = gains(normal, normal[:, -1], columns, least)[0]
+        return gain, self._errors.touches @ (total.bias - since.bias).ravel()
+
+
+def gains(
+    normal: FloatArray, right: FloatArray, parts: IntArray, least: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """bᵀ A⁻¹ b (h,) and A⁻¹ b (h, p) for parts (h, p) of A x = b, its diagonal not below a least."""
+    size = np.sqrt(np.maximum(np.maximum(normal.diagonal(), least), 1e-300))[parts]
+    blocks = normal[parts[:, :, None], parts[:, None, :]] / (size[:, :, None] * size[:, None, :])
+    b = right[parts] / size
+    x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
+    return np.maximum((b * x).sum(axis=1), 0.0), x / size
+
+
+def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
+    """Basis (d, 4, 4) of rigid motions: translations, and what the joints generate together."""
+    brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
+    known = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
+    sizes, rows = np.linalg.svd(known.reshape(-1, 16))[1:]
+    return np.asarray(rows[:6][sizes[:6] > _RANK * sizes[0]].reshape(-1, 4, 4))
+
+
+def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, int]:
+    """Columns of each direction of a fault, sightings (h, 2 m) that each touches, and how many columns.
+
+    The columns are: joints, joints that go on, instants, cameras, markers, rigid motions of the tool and of
+    the rig.
+    """
+    everything = np.ones((2, m))
+    views = [everything * (np.arange(2)[:, None] == v) for v in (0, 1)]
+    at_camera, free = 2 * n + 2, CAMERA - 1
+    at_marker = at_camera + 2 * free
+    at_tool = at_marker + 3 * m
+    found = [*((np.array([i]), everything) for i in range(2 * n))]
+    found += [(n + np.arange(n), everything), (np.arange(n), everything)]
+    for v in (0, 1):
+        found += [(np.array([2 * n + v]), views[v]), (at_camera + v * free + np.arange(free), views[v])]
+    found += [(2 * n + np.arange(2), everything)]
+    for j in range(m):
+        found += [(at_marker + 3 * j + np.arange(3), everything * (np.arange(m) == j))]
+    found += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
+    columns, touches = zip(*found, strict=True)
+    return list(columns), np.array([part.ravel() for part in touches]), at_tool + 2 * d
+
+
+def columns_of_marker(errors: Errors, marker: int) -> IntArray:
+    """Columns of the displacement of a marker among the directions of faults."""
+    n = len(errors.sigma_q)
+    return np.asarray(2 * n + 2 + 2 * (CAMERA - 1) + 3 * marker + np.arange(3))
