@@ -16,6 +16,7 @@ import re
 import tempfile
 import time
 from collections import Counter
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
@@ -137,12 +138,16 @@ def config_of(rig, task, table, options):
 
 @lru_cache(maxsize=64)
 def calibrated(rig):
-    """The calibration of a rig."""
+    """The calibration of a rig, or why there is none."""
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "trials.csv"
         config = config_of(rig, None, table, rig.options())
         record.record(config, record.new_recording(config, table))
-        return calibrate.run(config)[1]
+        try:
+            found = calibrate.run(config)[1]
+        except WorkFailed as error:
+            return str(error)
+    return found if found.usable else found.reason
 
 
 def shows(arm, q_deg):
@@ -244,14 +249,14 @@ def judged(expected, named, joints):
     return "right" if named == {expected} else "pair" if named <= partners else "two"
 
 
-def run_of(rig, task, fault=None, frames=False, seed=1):
-    """One run as it ended: a row."""
+def run_of(rig, task, fault=None, made=None, frames=False, seed=1):
+    """One run as it ended, by a plan that was made or is made now: a row."""
     options = rig.options(at_deg=task[0], fault=fault, frames=frames, seed=seed)
     config, begun = config_of(rig, task, "none.csv", options), time.monotonic()
     row, calibration = {"stage": "plan"}, calibrated(rig)
     LAST.clear()
     try:
-        made = plan.run(config, calibration)
+        made = made or plan.run(config, calibration)
         row["stage"] = "servo"
         trace = servo.run(config, calibration, made, "exact_track")
         row |= {"verdict": trace.verdict, "steps": trace.steps, "reason": trace.reason}
@@ -266,26 +271,31 @@ def run_of(rig, task, fault=None, frames=False, seed=1):
 
 
 def driven(job):
-    """Rows of the runs of one rig in a cell."""
-    cell, rig, drawn = job
-    rows = []
-    for number, level in drawn:
+    """Rows of runs of one rig."""
+    rig, drawn = job
+    arm, calibration, rows = ARMS[rig.arm], calibrated(rig), []
+    for cell, number, level in drawn:
+        row = {"cell": cell, "number": number, **rig._asdict(), "fault": level[0]}
+        if isinstance(calibration, str):
+            rows.append(row | {"verdict": "no calibration", "reason": calibration})
+            continue
         rng = np.random.default_rng([SEED, sum(map(ord, cell)), number])
-        joints, by_images = len(ARMS[rig.arm].home), bool(rng.integers(2)) or level[0] == "taught"
+        by_images = bool(rng.integers(2)) or level[0] == "taught"
         for start, goal in tasks(rig, rng):
             shown = taught(rig, goal) if by_images else goal
-            try:
-                if plan.run(
-                    config_of(rig, (start, shown), "none.csv", rig.options()), calibrated(rig)
-                ).feasible:
+            with suppress(WorkFailed):
+                made = plan.run(config_of(rig, (start, shown), "none.csv", rig.options()), calibration)
+                if made.feasible:
                     break
-            except WorkFailed:
-                pass
-        there = [tool_pose(ARMS[rig.arm], np.radians(q)) for q in (start, goal)]
-        fault, expected = fault_of(level, there[level[0] == "taught"], joints, rng)
-        row = {"cell": cell, "number": number, **rig._asdict(), "goal": "images" if by_images else "joints"}
-        row |= {"level": " ".join(map(str, level)), "fault": level[0], "expected": expected}
-        more = {"seed": int(rng.integers(2**31)), "frames": level[0] == "size" and bool(level[3])}
+        there = [tool_pose(arm, np.radians(q)) for q in (start, goal)]
+        fault, expected = fault_of(level, there[level[0] == "taught"], len(arm.home), rng)
+        row |= {"goal": "images" if by_images else "joints", "expected": expected}
+        row |= {"level": " ".join(map(str, level))}
+        more = {
+            "made": made,
+            "seed": int(rng.integers(2**31)),
+            "frames": level[0] == "size" and bool(level[3]),
+        }
         if cell in ("during", "sound") and fault is not None:
             quiet = run_of(rig, (start, shown), None, **more)
             row |= {"quiet_mm": off_mm(there[1]), "quiet": quiet["verdict"], "quiet_steps": quiet["steps"]}
@@ -295,13 +305,13 @@ def driven(job):
             since = LAST[0].time - 0.12 if last else began
             fault["at"] = float(rng.uniform(since, LAST[0].time))
         if level[0] == "taught":
-            found = run_of(rig, (start, taught(rig, goal, fault)), None, **more)
+            found = run_of(rig, (start, taught(rig, goal, fault)), None, **(more | {"made": None}))
         else:
             found = run_of(rig, (start, shown), fault, **more)
         row |= {"at": (fault or {}).get("at", 0.0), "task": [start, goal], "by": json.dumps(fault)} | found
         row["error_mm"] = off_mm(there[1]) if LAST else float("nan")
         named = named_in(found["reason"]) if found["verdict"] != "converged" else set()
-        row |= {"named": ", ".join(sorted(named)), "judged": judged(expected, named, joints)}
+        row |= {"named": ", ".join(sorted(named)), "judged": judged(expected, named, len(arm.home))}
         rows.append(row)
     return rows
 
@@ -311,20 +321,21 @@ def off_mm(there):
     return 1e3 * float(np.linalg.norm(LAST[0].pose()[:3, 3] - there[:3, 3]))
 
 
-def jobs_of(cell, runs, kinds, each=10):
-    """Jobs of a cell: rigs, each with numbers and levels of its runs."""
-    parts = {"before": [(CAMERA, kinds)], "during": [(CAMERA, kinds)]}
-    parts["faults"] = [(levels, kinds) for levels in FAULTS.values()]
-    parts["sound"] = [(SOUND, [kind]) for kind in kinds]
-    drawn: dict[Rig, list] = {}
-    for part, (levels, some) in enumerate(parts[cell]):
-        rng = np.random.default_rng([SEED, part])
-        known = rigs(some)[: max(len(some), runs // each)]
+def jobs_of(cells, runs, kinds, each=10, most=40):
+    """Jobs: a rig, and cell, number and level of up to so many runs of it."""
+    parts = [("before", CAMERA, kinds), ("during", CAMERA, kinds)]
+    parts += [("faults", levels, kinds) for levels in FAULTS.values()]
+    parts += [("sound", SOUND, [kind]) for kind in KINDS]
+    drawn: dict[Rig, list] = {rig: [] for rig in rigs(kinds)}
+    for part, (cell, levels, some) in enumerate(parts):
+        if cell not in cells or not set(some) <= set(kinds):
+            continue
+        rng, known = np.random.default_rng([SEED, part]), rigs(some)[: max(len(some), runs // each)]
         turns = [[rng.permutation(len(x)) for _ in range(-(-runs // len(x)))] for x in (levels, known)]
         for k, (level, rig) in enumerate(zip(*map(np.concatenate, turns), strict=False)):
             if k < runs:
-                drawn.setdefault(known[rig], []).append((10_000 * part + k, levels[level]))
-    return [(cell, rig, rows[i : i + each]) for rig, rows in drawn.items() for i in range(0, len(rows), each)]
+                drawn[known[rig]].append((cell, 10_000 * part + k, levels[level]))
+    return [(rig, rows[i : i + most]) for rig, rows in drawn.items() for i in range(0, len(rows), most)]
 
 
 COLUMNS = (
@@ -336,6 +347,9 @@ COLUMNS = (
 
 def tell(rows, before):
     """Lines on each cell, against its bars."""
+    for (kind, why), count in Counter((r["corners"], r["reason"]) for r in rows if "level" not in r).items():
+        print(f"no calibration, {kind}, {count} runs: {why}"[:260])
+    rows = [row for row in rows if "level" in row]
     for px in ("3.0", "8.0", "15.0"):
         some = [row for row in rows if row["cell"] == "before" and row["level"].endswith(px)]
         if some:
@@ -404,9 +418,7 @@ def main():
     if given.against is not None:
         with open(given.against, encoding="utf-8", newline="") as file:
             before = {key_of(row): float(row["error_mm"]) for row in csv.DictReader(file)}
-    jobs = [job for cell in given.cells for job in jobs_of(cell, given.runs, given.corners)]
-    jobs.sort(key=lambda job: rigs(given.corners).index(job[1]))
-    every = []
+    jobs, every = jobs_of(given.cells, given.runs, given.corners), []
     with open(given.output, "w", encoding="utf-8", newline="") as file:
         table = csv.DictWriter(file, COLUMNS)
         table.writeheader()
