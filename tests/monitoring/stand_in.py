@@ -33,7 +33,7 @@ IMAGE, FOCAL, TAG_M = (800, 600), 760.0, 0.035
 # Places of both cameras and what they look at, m; rolled about their axes, rad.
 CAMERAS = (((0.80, -0.17, 0.31), (0.29, -0.01, 0.21), 0.05), ((0.78, 0.19, 0.25), (0.30, 0.02, 0.20), -0.03))
 FPS, OFFSETS = 30.0, (0.0, 0.013)  # Hz; when the first frame of each camera is exposed, s
-COUNTS, LAG_S, SAG_DEG, STEP_S = 4096, 0.06, 0.4, 0.005
+COUNTS, LAG_S, SAG_DEG, STEP_S = 4096, 0.06, 0.4, 0.01
 MOST_TILT, BORDER_PX, LEAST_FOUND = math.radians(66.0), 4.0, 0.5
 PULLED_PX, REACH_PX = 5.0, 25.0  # beside a hand: how far corners are pulled at most, and how near to it
 # Which pixels, and by how much deviations are off that the finder states; None states none.

@@ -50,7 +50,7 @@ CAUSES = {
     "backlash": r"\b(?:play|backlash) in",
 }
 # A verdict without a cause says where images disagree most, which blames nobody.
-_BLAMELESS = r"disagree with the calibration by[^;]*? most\b"
+_WHERE = r"disagree with the calibration by[^;]*? most\b"
 # What images cannot tell apart, or hardly: both, or all, may be said. {} is one joint, {last} the last.
 PAIRS = (
     {"both cameras", "base", "joint 1 homed"},  # about an upright first axis, or moved together
@@ -67,6 +67,9 @@ PAIRS = (
 )
 SEED, HOLD_DEG = 2029, 0.2  # of a set-point that holds the arm where it stands
 SPREAD_DEG, ROLL_DEG, INSIDE_PX, FEWEST_TAGS = 18.0, 50.0, 30.0, 3  # of tasks around the home posture
+# What a run takes before it moves and after its plan has ended, s, about; verdicts that blame nobody.
+BEFORE_S, AFTER_S = 0.6, 1.0
+BLAMELESS = ("converged", "plateau", "no progress", "max steps")
 AXES, SIGNS, VIEWS = (0, 1, 2), (-1, 1), ((0,), (1,), (0, 1))
 CAMERA = [
     level
@@ -103,11 +106,9 @@ class Rig(NamedTuple):
 def rigs(kinds):
     """All rigs in an order by seed; of any run of them as long as there are kinds, one is of each."""
     rng = np.random.default_rng(SEED)
-    rest = list(itertools.product(ARMS, (0.0, 0.3), (0.0, 0.08)))
-    drawn = [
-        [Rig(arm, kind, *more) for arm, *more in rng.permuted(np.array(rest, object), axis=0)]
-        for kind in KINDS
-    ]
+    rest = list(itertools.product((0.0, 0.3), (0.0, 0.08), ARMS))
+    drawn = [[(kind, *rest[i]) for i in rng.permutation(len(rest))] for kind in KINDS]
+    drawn = [[Rig(arm, kind, *more) for kind, *more, arm in row] for row in drawn]
     return [rig for row in zip(*drawn, strict=True) for rig in row if rig.corners in kinds]
 
 
@@ -119,7 +120,12 @@ def config_of(rig, task, table, options):
     goal = goal if isinstance(goal, dict) else {"joints": {"joints": list(goal), "unit": "deg"}}
     told = {
         "name": "stand-in",
-        "plant": {"use": "tests.monitoring.stand_in:StandIn", "options": options, "timeout_s": 20},
+        "plant": {
+            "use": "tests.monitoring.stand_in:StandIn",
+            "options": options,
+            "timeout_s": 20,
+            "settle_s": 0.3,
+        },
         "data": {"table": str(table), "joints": "R" * len(arm.axes)},
         "markers": {"numbers": list(range(20)), "face": [0, 1, 2, 3]},
         "robot": {"limits": {"joints": [list(pair) for pair in arm.limits], "unit": "deg"}},
@@ -228,7 +234,7 @@ def fault_of(level, T, joints, rng):
 
 def named_in(text):
     """Causes that a text names."""
-    text, found = re.sub(_BLAMELESS, "", text), set()
+    text, found = re.sub(_WHERE, "", text), set()
     for cause, words in CAUSES.items():
         for match in re.finditer(words, text):
             found.add(cause.format(*(group for group in match.groups() if group)))
@@ -296,21 +302,21 @@ def driven(job):
             "seed": int(rng.integers(2**31)),
             "frames": level[0] == "size" and bool(level[3]),
         }
-        if cell in ("during", "sound") and fault is not None:
+        if cell == "sound" and fault is not None:
+            fault["at"] = float(rng.uniform(0.0, BEFORE_S + made.duration + AFTER_S))
+        if cell == "during":
             quiet = run_of(rig, (start, shown), None, **more)
             row |= {"quiet_mm": off_mm(there[1]), "quiet": quiet["verdict"], "quiet_steps": quiet["steps"]}
-            began = LAST[0].time - 0.04 * quiet["steps"]
             # Of every fourth run in one of the last three periods.
-            last = number % 4 == 0 and cell == "during"
-            since = LAST[0].time - 0.12 if last else began
-            fault["at"] = float(rng.uniform(since, LAST[0].time))
+            periods = 3 if number % 4 == 0 else quiet["steps"]
+            fault["at"] = LAST[0].time - 0.04 * float(rng.uniform(0.0, periods))
         if level[0] == "taught":
             found = run_of(rig, (start, taught(rig, goal, fault)), None, **(more | {"made": None}))
         else:
             found = run_of(rig, (start, shown), fault, **more)
         row |= {"at": (fault or {}).get("at", 0.0), "task": [start, goal], "by": json.dumps(fault)} | found
         row["error_mm"] = off_mm(there[1]) if LAST else float("nan")
-        named = named_in(found["reason"]) if found["verdict"] != "converged" else set()
+        named = named_in(found["reason"]) if found["verdict"] not in BLAMELESS else set()
         row |= {"named": ", ".join(sorted(named)), "judged": judged(expected, named, len(arm.home))}
         rows.append(row)
     return rows
