@@ -47,8 +47,8 @@ def sentence(found: Explanation, calibration: Calibration) -> str:
         )
     if kind == "focused":
         return (
-            f"the focal length of {side} changed by {100.0 * theta[0]:+.2g} %: its focus or zoom was "
-            "changed; restore and lock it, or recalibrate"
+            f"the focal length of {side} changed by {100.0 * theta[0]:+.2g} %, or it was moved along its "
+            "optical axis; restore and lock focus and zoom, put it back, or recalibrate"
         )
     if kind in ("camera", "shifted") and i >= 0:
         return f"{side} was moved, by {px}; put it back, or recalibrate"

@@ -23,6 +23,9 @@ _LONGER = 1.5
 _BEYOND_FIRST_ORDER = 0.02
 # Lasting errors of a joint, by backlash and counts, differ between two times by √2 of their deviation.
 _LASTING = np.sqrt(2.0)
+# The part of a corner's error that is not new in each frame may last beyond a view: of many corners some are
+# off by so many deviations all along.
+_LASTING_CORNER = 2.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is stated.
 LEAST_ERROR = 1e-6
 # A direction counts where it keeps this share of its size beside the others; what is added for solving.
@@ -59,7 +62,7 @@ class Sums(NamedTuple):
     looks: int  # views that they come from
     t: float  # when the last was taken, s from the first look
     normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
-    seen: float  # coordinates seen
+    seen: FloatArray  # (2, m) coordinates seen of each marker
     bias: FloatArray  # (2, m) squared errors of the model that they may have, over the noise
 
     def plus(self, other: "Sums", factor: float = 1.0) -> "Sums":
@@ -171,12 +174,13 @@ class Errors:
         rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
         rows = solve_triangular(np.linalg.cholesky(residual.R), rows, lower=True, check_finite=False)
         bias = 2.0 * residual.seen * (self.bias_px / residual.noise) ** 2
-        return Sums(1, t, rows.T @ rows, 2.0 * float(residual.seen.sum()), bias)
+        return Sums(1, t, rows.T @ rows, 2.0 * residual.seen, bias)
 
     def nothing(self) -> Sums:
         """Sums of no look."""
         c = self.e + self.f + 1
-        return Sums(0, 0.0, np.zeros((c, c)), 0.0, np.zeros((2, len(self.calibration.M))))
+        none = np.zeros((2, len(self.calibration.M)))
+        return Sums(0, 0.0, np.zeros((c, c)), none, none)
 
     def root(self, sums: Sums) -> FloatArray:
         """Root (e, e) of the information on the errors of the calibration."""
@@ -231,8 +235,8 @@ class Memory:
 
     def onsets(self) -> list[Sums]:
         """Sums before each time that something may have begun, the earliest first."""
-        seen = self.total.seen
-        return [sums for sums in self._closed if sums.seen < seen]
+        seen = self.total.seen.sum()
+        return [sums for sums in self._closed if sums.seen.sum() < seen]
 
     def lasts(self, residual: Residual) -> bool:
         """Whether a look is of the view before."""
@@ -379,7 +383,9 @@ class Detector:
         gain = np.zeros(len(self._sizes))
         for which, columns in self._by_size:
             gain[which] = gains(normal, normal[:, -1], columns, least)[0]
-        return gain, self._errors.touches @ (total.bias - since.bias).ravel()
+        lasting = _LASTING_CORNER**2 * (1.0 - self.memory.fresh)
+        bias = total.bias - since.bias + lasting * (total.seen - since.seen)
+        return gain, self._errors.touches @ bias.ravel()
 
 
 def gains(

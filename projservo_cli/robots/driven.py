@@ -312,7 +312,7 @@ class DrivenRobot:
             if self.monitor is None or self.monitor.looks > tested:
                 continue  # the next look shows another image
             if not self.robot.waits(self.robot.bounds.period):  # time passes in commands alone
-                if look >= WINDOW and not self.pending:
+                if look >= WINDOW and self.monitor.agreeing and not self.pending:
                     return ""
                 if look >= WINDOW:
                     self.steered.hold()
