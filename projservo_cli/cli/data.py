@@ -77,10 +77,16 @@ def _teach(
     calibration = option.calibration_of(run, settings)
     asks = not settings.plant.simulated and sys.stdin.isatty()
     with option.writing(output):
-        taught = stage.teach(settings, frames, put, console.wait if asks else None)
-        if not start:
-            stage.require_face(settings, taught)
-        check = None if calibration is None or start else stage.checked(settings, calibration, taught)
+        try:
+            taught = stage.teach(settings, frames, put, console.wait if asks else None)
+            if not start:
+                stage.require_face(settings, taught)
+            check = None if calibration is None or start else stage.checked(settings, calibration, taught)
+        except WorkFailed as error:
+            reason = " ".join(str(error).split()).removeprefix("teach: ")
+            value = {"file": output.resolve(), "failed": "teach", "reason": reason}
+            console.tell(value, ["teach: failed, nothing was written"])
+            raise WorkFailed(f"teach: {reason}") from error
         write_whole(output, taught.as_text())
     _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")
     if check is not None and not check.reached:

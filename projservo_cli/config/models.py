@@ -34,7 +34,7 @@ from projservo_cli.config.robot import (
     Whole,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
-from projservo_cli.records import LAWS, REPLAN, InputError
+from projservo_cli.records import LAWS, POINT_LAWS, REPLAN, InputError
 from projservo_cli.robots import plugins
 
 
@@ -305,8 +305,10 @@ class _Control(Section):
     searches_anew: Whole = Field(
         3, description="how often a way is searched anew where one comes to nothing, profiles joint and auto"
     )
-    must_converge: tuple[Law, ...] = Field(
-        ("direct_three", "direct_two"), description="laws whose failure is that of the call, exit code 1"
+    must_converge: tuple[Law, ...] | None = Field(
+        None,
+        description="laws whose failure is that of the call, exit code 1; null for direct_three, direct_two, "
+        "exact and laws of yours",
     )
     period_s: Positive = Field(0.04, description="control period")
     gain_t: Positive = Field(2.5, description="gain of the translation, 1/s")
@@ -331,6 +333,10 @@ class _Control(Section):
         description="what direct laws measure with: the face's points or all visible markers; "
         "null for body where the calibration is usable",
     )
+
+    def requires(self, law: str) -> bool:
+        """Tell whether a law that does not converge fails the call: by default all but classical ones."""
+        return law not in POINT_LAWS if self.must_converge is None else law in self.must_converge
 
     def contradictions(self) -> Iterator[Finding]:
         """Gains that overshoot."""
