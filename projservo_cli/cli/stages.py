@@ -70,7 +70,7 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
             recording = new_recording(config, path, motions=poses, force=options["force"])
             reason = _drive(console, config, recording, confirm=options["confirm"])
     value = _told_recording(recording, reason)
-    console.tell(value, [*words_of("record", value), f"table: {path}"])
+    console.tell(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
     if reason:
         click.echo(visible(f"projservo: record: {reason}"), err=True)
     return FAILED if reason else 0

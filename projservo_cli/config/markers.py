@@ -1,6 +1,7 @@
 """Points fixed to the tool, and tags whose corners they are."""
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
@@ -19,6 +20,15 @@ GROUND = 4.0 / 3.0
 
 DICTIONARY = "4X4_50"
 """Of tags, where none is given."""
+
+
+def cells_of(dictionary: str) -> int:
+    """Cells along a side of a tag, border included, by the name of its dictionary."""
+    found = re.search(r"(\d+)([XH])\d", dictionary.upper())
+    if found is None:  # ARUCO_ORIGINAL
+        return 7
+    return 2 + (int(found[1]) if found[2] == "X" else math.isqrt(int(found[1])))
+
 
 _SIZE_M = 0.06  # of tags, where none is given
 _TILT = math.radians(35.0)  # of the four tags around the middle one of a roof

@@ -560,6 +560,12 @@ def _rendered(plant: _PlantSettings, noise: _Noise, markers: Markers | None) -> 
         yield ("markers",), "plant mujoco shows tags: set markers.tags, such as roof"
 
 
+def _dictionary(plant: _PlantSettings, markers: Markers | None) -> Iterator[Finding]:
+    """A dictionary of tags that is said twice."""
+    if markers is not None and markers.dictionary is not None and "dictionary" in plant.options:
+        yield ("markers", "dictionary"), "plant.options gives the class its dictionary as well; keep one"
+
+
 def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
     if robot is None or not robot.joints:
         return
@@ -614,7 +620,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone, _rendered),
-        *(_disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
+        *(_dictionary, _disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
         *(_speed_in_joint_space, _limits_in_joint_space),
     )
 }

@@ -50,19 +50,33 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
             raise InputError(
                 f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot: Robot = plugins.make("plant", target, (), plant.options)
+    options, dictionary = dict(plant.options), config.markers.dictionary if config.markers else None
+    if dictionary is not None:
+        if not plugins.takes("plant", target, "dictionary"):
+            raise InputError(
+                f"markers.dictionary: is without effect: plant.use {target} takes no argument dictionary; "
+                "leave it out, or let the class take it"
+            )
+        options["dictionary"] = dictionary
+    robot: Robot = plugins.make("plant", target, (), options)
     bounds = bounds_of(config, joints)
     return ForeignRobot(robot, f"plant {target}", markers, bounds, plant.timeout_s, plant.open_s)
 
 
-def way_to(robot: Steered, q: FloatArray, settle_s: float, what: str) -> Iterator[Reading]:
+def way_to(
+    robot: Steered, q: FloatArray, settle_s: float, what: str, fit: Callable[[Reading], None] | None = None
+) -> Iterator[Reading]:
     """Move to joints (n,) along a straight line at the speed limit and come to rest there.
 
     what : the command it is for, in messages.
+    fit : is shown the first reading, before anything moves; it raises where nothing should.
     Yields what is read after each command. The robot has then stood still for so many s, and so have the
     images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
     """
-    bounds, begun, still = robot.robot.bounds, robot.look().q, _Standstill(settle_s)
+    bounds, still = robot.robot.bounds, _Standstill(settle_s)
+    begun = robot.look().q
+    if fit is not None:
+        fit(robot.reading)
     while (gap := q - robot.target).any():
         robot.command(gap / np.max(np.abs(gap) / (bounds.speed * bounds.period), initial=1.0), bounds.period)
         stands = still.joints(robot.look())
