@@ -111,7 +111,9 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
     words = [f"teach: {len(taught.marker)} markers from {left} images left and {right} right{certain}"]
     if taught.moved is not None:
         i = int(np.abs(taught.moved).argmax())
-        words.append(f"  since it is held, joint {i + 1} moved by {taught.moved[i]:.3g} (rad or m)")
+        words.append(
+            f"  since it is held, joint {i + 1} moved by {taught.bounds.told(i, taught.moved[i], 3)}"
+        )
     if unseen := ", ".join(f"{number} ({side})" for number, side in taught.unseen):
         words.append(wrapped(f"unseen: {unseen}", "  "))
     if check is not None:

@@ -32,6 +32,7 @@ from projservo_cli.config.robot import (
     Section,
     Vector3,
     Whole,
+    are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
 from projservo_cli.records import LAWS, POINT_LAWS, REPLAN, InputError
@@ -499,6 +500,11 @@ def _joint_vectors(
     pairs = robot.limits.joints if robot is not None and robot.limits is not None else None
     if types and pairs is not None and len(pairs) != len(types):
         yield ("robot", "limits", "joints"), f"{len(pairs)} pairs for {len(types)} joints ({types})"
+    elif pairs is not None and robot is not None and robot.limits is not None and robot.limits.unit == "rad":
+        for i, ((low, high), letter) in enumerate(zip(pairs, types or "R" * len(pairs), strict=True)):
+            if letter == "R" and are_degrees(low, high):
+                what = f"{low:g} to {high:g} rad is more than two turns to a side: degrees? set unit: deg"
+                yield ("robot", "limits", "joints", i), what
     if task is not None:
         vectors["task", "start"] = task.start
         vectors["task", "start_offset"] = task.start_offset

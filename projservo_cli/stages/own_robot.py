@@ -38,7 +38,9 @@ def bounds_of(config: Config, joints: Joints) -> Bounds:
     lead = speed * (plant.lag_s + period) + sag
     if plant.lead_deg is not None:
         lead = joints.length_of(plant.lead_deg)
-    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag)
+    turns = "rad" if config.reference is None else config.reference.unit
+    units = tuple("m" if kind == "P" else turns for kind in joints.types)
+    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag, units)
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
@@ -93,15 +95,15 @@ def way_to(
         remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
             remedy = (
-                f"it went away from there, from {begun[i]:.6g}: look at its sign and unit, and whether it "
-                "can hold what it carries"
+                f"it went away from there, from {bounds.told(i, begun[i])}: look at its sign and unit, and "
+                "whether it can hold what it carries"
             )
         if hindrance := hindrance_of(robot.robot.robot):
             remedy = f"{hindrance}: take joints that it can reach and hold"
         raise WorkFailed(
-            f"{what}: joint {i + 1} was sent to {q[i]:.6g} and stands at {robot.reading.q[i]:.6g}, "
-            f"{gap[i]:.3g} short (rad or m): {remedy}; then run the command again"
-            + (" to continue" if what == "record" else "")
+            f"{what}: joint {i + 1} was sent to {bounds.told(i, q[i])} and stands at "
+            f"{bounds.told(i, robot.reading.q[i])}, {bounds.told(i, gap[i], 3)} short: {remedy}; then run "
+            "the command again" + (" to continue" if what == "record" else "")
         )
 
 
@@ -164,7 +166,7 @@ def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray,
     freedom = 2 * np.maximum(count - 1, 0).sum()
     scatter = min(1.0, float(np.nansum(off / sigma**2)) / freedom) if freedom else 1.0
     typical = count / total[:, 0]  # variance of a frame
-    variance = typical * (1.0 - scatter) + scatter / total[:, 0]
+    variance = np.where(count > 0, typical * (1.0 - scatter) + scatter / total[:, 0], np.nan)
     return mean, np.sqrt(variance), np.nansum(off, axis=(0, 2)), count
 
 

@@ -216,7 +216,7 @@ class Arm:
 
 def driven(config, robot):
     bounds = bounds_of(config, joints_of(config))
-    return ForeignRobot(robot, "plant Arm", len(config.markers.known), bounds, 1.0, 1.0)
+    return ForeignRobot(robot, "plant Arm", len(config.markers.known), bounds, 30.0, 1.0)
 
 
 TEN = ["calibration.frames_per_joint=2"]
@@ -303,8 +303,8 @@ class Shaking(Arm):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (Stuck, r"joint 1 was sent to 4.18.* and stands at 3.7, 0.48\d short"),
-        (Backwards, r"joint 2 was sent to -1.678.*went away from there, from -1.378.*: look at its sign"),
+        (Stuck, r"joint 1 was sent to 4.18.* rad and stands at 3.7 rad, 0.48\d rad short"),
+        (Backwards, r"joint 2 was sent to -1.678.*went away from there, from -1.378.* rad: look at its sign"),
         (Shaking, r"joint 6 does not come to rest within 20 s"),
     ],
 )
@@ -536,3 +536,11 @@ def test_a_dictionary_reaches_the_class_or_is_refused():
         made("Unnamed", other)
     with pytest.raises(InputError, match=r"markers\.dictionary: plant\.options gives .* as well; keep one"):
         made("Named", other, "plant.options={dictionary: A}")
+
+
+def test_joints_are_told_in_the_unit_of_the_configuration():
+    for path, told in ((CONFIGS / "hobby.yaml", "90 deg"), (UR5, "1.57 rad")):
+        config = load_config(path)
+        assert bounds_of(config, joints_of(config)).told(1, np.pi / 2, 3) == told
+    config = load_config(STANFORD)
+    assert bounds_of(config, joints_of(config)).told(2, 0.5) == "0.5 m"
