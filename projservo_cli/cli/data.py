@@ -66,7 +66,7 @@ def _teach(
 
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
-    settings = option.configured(config, options, run)
+    settings = option.configured(config, options, run, teaching=True)
     put = None
     if at is not None:
         try:
