@@ -513,7 +513,7 @@ def _reported(chain: _Chain, run: Any) -> Any:
     """What a report is about: of the results before it those that the named runs of laws rest on."""
     from projservo_cli.store import SERVO
 
-    made = ["plan", *(SERVO + law for law in chain.laws)] if chain.config.has_task else []
+    made = ["plan", *(SERVO + law for law in chain.laws)] if chain.laws else []
     return replace(run, results={name: run.results[name] for name in ["calibrate", *made]})
 
 
