@@ -83,7 +83,10 @@ def _by_number(source: str, poses: list[int], where: str) -> list[Path]:
     return chosen
 
 
-_LEAST_SIDE, _LEAST_CELL = 6.0, 2.3  # px: a side that is shorter, or a border that is thinner, is none to fit
+LEAST_CELL = 2.3
+"""Width of a cell, px, below which edges of a tag cannot be fitted: its border is one cell wide."""
+
+_LEAST_SIDE = 6.0  # px: a side that is shorter is none to fit
 _LEAST_REACH, _MOST_REACH = 1.5, 6.0  # px on either side of an edge: less is no profile
 _LEAST_BLUR, _MOST_BLUR = 0.2, 10.0  # px: a sharper edge cannot be told
 # Rms residual of a profile that something covers, in contrasts, the worst first; clean ones have some 0.02.
@@ -247,7 +250,7 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     """
     line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, _EDGE))
     found = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
-    fits = np.flatnonzero((all_sides.length > _LEAST_SIDE) & (all_sides.cell > _LEAST_CELL))
+    fits = np.flatnonzero((all_sides.length > _LEAST_SIDE) & (all_sides.cell > LEAST_CELL))
     if fits.size == 0:
         return found
     sides, blur = _Sides(*(part[fits] for part in all_sides)), before[fits, 4]

@@ -544,6 +544,15 @@ class Trace:
     pose: FloatArray = _array("instant row coordinate", "m", "true pose of the tool")
     goal_pose: FloatArray = _array("row coordinate", "m", "true goal pose, NaN if unknown")
     center: FloatArray = _array("instant axis", "m", "true centre of the face")
+    image_error_px: float | None = _scalar(
+        "px", "image_error at the end; none where the face was not seen whole", default=None
+    )
+    estimated_position_error_mm: float | None = _scalar(
+        "mm",
+        "the same across the lines of sight, by the size of the face in the images; none where no size is "
+        "known, or images disagree with the calibration",
+        default=None,
+    )
     success: bool | None = _scalar(
         about="whether it converged and at every instant, in truth, no joint was past a limit, no camera "
         "behind the face and every marker of the face in both images; none where the truth is not known",

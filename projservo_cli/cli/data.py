@@ -66,7 +66,7 @@ def _teach(
 
     output = output or Path("start.yaml" if start else "goal.yaml")
     option.require_new(output, force=force)
-    settings = option.configured(config, options, run)
+    settings = option.configured(config, options, run, teaching=True)
     put = None
     if at is not None:
         try:
@@ -77,10 +77,16 @@ def _teach(
     calibration = option.calibration_of(run, settings)
     asks = not settings.plant.simulated and sys.stdin.isatty()
     with option.writing(output):
-        taught = stage.teach(settings, frames, put, console.wait if asks else None)
-        if not start:
-            stage.require_face(settings, taught)
-        check = None if calibration is None or start else stage.checked(settings, calibration, taught)
+        try:
+            taught = stage.teach(settings, frames, put, console.wait if asks else None)
+            if not start:
+                stage.require_face(settings, taught)
+            check = None if calibration is None or start else stage.checked(settings, calibration, taught)
+        except WorkFailed as error:
+            reason = " ".join(str(error).split()).removeprefix("teach: ")
+            value = {"file": output.resolve(), "failed": "teach", "reason": reason}
+            console.tell(value, ["teach: failed, nothing was written"])
+            raise WorkFailed(f"teach: {reason}") from error
         write_whole(output, taught.as_text())
     _tell_taught(console, output, taught, check, key="task.start" if start else "task.goal")
     if check is not None and not check.reached:
@@ -105,7 +111,9 @@ def _tell_taught(console: Console, path: Path, taught: Any, check: Any, *, key: 
     words = [f"teach: {len(taught.marker)} markers from {left} images left and {right} right{certain}"]
     if taught.moved is not None:
         i = int(np.abs(taught.moved).argmax())
-        words.append(f"  since it is held, joint {i + 1} moved by {taught.moved[i]:.3g} (rad or m)")
+        words.append(
+            f"  since it is held, joint {i + 1} moved by {taught.bounds.told(i, taught.moved[i], 3)}"
+        )
     if unseen := ", ".join(f"{number} ({side})" for number, side in taught.unseen):
         words.append(wrapped(f"unseen: {unseen}", "  "))
     if check is not None:

@@ -140,16 +140,19 @@ def one_run(command: str, run: Path | None, output: Path | None) -> Path | None:
     return run or output
 
 
-def configured(config: str | None, options: Mapping[str, Any], run: Path | None = None) -> "Config":
+def configured(
+    config: str | None, options: Mapping[str, Any], run: Path | None = None, *, teaching: bool = False
+) -> "Config":
     """The configuration in a file, else in a run, else that which is shipped, with what options say.
 
+    teaching : goal and start may name files that are still to be taught.
     Raises UsageError where a robot is named by the run alone, which starts no code.
     """
     from projservo_cli.config import load_config
 
     stored = None if config or run is None else _stored(run)
     if stored is None or not stored.configuration:
-        return load_config(config or _shipped(), _overrides(options))
+        return load_config(config or _shipped(), _overrides(options), teaching=teaching)
     found = load_config(stored.path, _overrides(options), text=stored.configuration)
     if not found.plant.simulated:
         raise click.UsageError(

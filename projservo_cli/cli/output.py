@@ -313,16 +313,22 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
 def _of_laws(value: dict[str, Any]) -> Iterator[str]:
     from projservo_cli.records import name_of
 
-    yield "servo: true errors at the end, self-occluded steps left/right"
-    yield f"  {'law':<20}{'verdict':<13}{'steps':>6}{'mm':>9}{'deg':>9}{'occluded':>11}{'drift mm':>10}"
+    known = any(trace["position_error_mm"] is not None for trace in value["laws"])
+    keys = ("position_error_mm", "rotation_error_deg", "center_deviation_mm")
+    heads = "mm", "deg", "drift mm"
+    if not known:
+        keys, heads = ("image_error_px", "estimated_position_error_mm", ""), ("px", "about mm", "")
+    errors = "true errors" if known else "image errors"
+    yield f"servo: {errors} at the end, self-occluded steps left/right"
+    first, second, last = heads
+    yield f"  {'law':<20}{'verdict':<13}{'steps':>6}{first:>9}{second:>9}{'occluded':>11}{last:>10}".rstrip()
     for trace in value["laws"]:
+        first, second, last = (_number(trace[key]) if key else "" for key in keys)
         yield (
             f"  {name_of(trace['law'], trace['mode']):<20}{trace['verdict']:<13}{trace['steps']:>6}"
-            f"{_number(trace['position_error_mm']):>9}"
-            f"{_number(trace['rotation_error_deg']):>9}"
-            f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}"
-            f"{_number(trace['center_deviation_mm']):>10}"
-        )
+            f"{first:>9}{second:>9}"
+            f"{trace['self_occluded_steps_left']:>6}/{trace['self_occluded_steps_right']:<4}{last:>10}"
+        ).rstrip()
     for name, said in _NOTES.items():
         for reason in dict.fromkeys(trace[name] for trace in value["laws"] if trace[name]):
             yield wrapped(f"{said}: {reason}", "  ")

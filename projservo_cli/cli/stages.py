@@ -11,7 +11,7 @@ import click
 
 from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
-from projservo_cli.cli.output import Console, words_of, wrapped
+from projservo_cli.cli.output import Console, visible, words_of, wrapped
 
 _FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
@@ -64,13 +64,22 @@ def _record(stages: Sequence[str], /, console: Console, **options: Any) -> int:
 
     config, path = option.configured(options["config"], options), options["output"]
     poses = _motions(config, options)
-    recording = new_recording(config, path, motions=poses, force=options["force"])
+    recording, reason = new_recording(config, path, motions=poses, force=options["force"]), ""
     if not options["dry_run"]:
         with option.writing(path):
             recording = new_recording(config, path, motions=poses, force=options["force"])
-            _drive(console, config, recording, confirm=options["confirm"])
-    console.tell(recording.told, [*words_of("record", recording.told), f"table: {path}"])
-    return 0
+            reason = _drive(console, config, recording, confirm=options["confirm"])
+    value = _told_recording(recording, reason)
+    console.tell(value, [*words_of("record", value), *([f"table: {path}"] if path.exists() else [])])
+    if reason:
+        click.echo(visible(f"projservo: record: {reason}"), err=True)
+    return FAILED if reason else 0
+
+
+def _told_recording(recording: Any, reason: str) -> dict[str, Any]:
+    """The JSON object of a recording, and why it stopped short where it did."""
+    told: dict[str, Any] = recording.told
+    return told | ({"reason": reason, "failed": "record"} if reason else {})
 
 
 def _motions(config: Any, options: Mapping[str, Any]) -> Any:
@@ -83,8 +92,9 @@ def _motions(config: Any, options: Mapping[str, Any]) -> Any:
     return read_joint_list(options["motions"], types, options["joint_unit"])
 
 
-def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> None:
-    """Record what is pending, and say how far it is where that is interrupted."""
+def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> str:
+    """Record what is pending, and say how far it is where that is interrupted; why it failed, if it did."""
+    from projservo_cli.records import WorkFailed
     from projservo_cli.stages.record import record
 
     if recording.pending and confirm:
@@ -94,9 +104,12 @@ def _drive(console: Console, config: Any, recording: Any, *, confirm: bool) -> N
         console.say(f"{recording.path}: continued after {recording.found} of {total} poses")
     try:
         record(config, recording, progress=console.progress)
+    except WorkFailed as error:
+        return " ".join(str(error).split()).removeprefix("record: ")
     except KeyboardInterrupt:
         console.say(f"{recording.path}: {len(recording.done)} of {total} poses; run again to continue")
         raise
+    return ""
 
 
 @main.stage(
@@ -165,8 +178,9 @@ def _plan(stages: Sequence[str], console: Console, **options: Any) -> int:
 def _servo(stages: Sequence[str], console: Console, **options: Any) -> int:
     """Run the control laws in closed loop.
 
-    Runs each law of control.laws (or of --law) to its verdict. Calibrates and plans first where needed. Exit
-    code 1 when a law of control.must_converge does not converge.
+    Runs each law of control.laws (or of --law) to its verdict, and says why one did not converge. Calibrates
+    and plans first where needed. Exit code 1 when a law of control.must_converge does not converge: by
+    default direct_three, direct_two, exact and laws of yours.
 
     With --set plant=module:Class (or plant in the configuration) a robot of yours takes the place of the
     simulated one. It is driven to the start of the task and from there by each law, and stopped on every way
@@ -254,15 +268,11 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
 def _recorded(chain: _Chain) -> _Chain:
     """Record what is to be recorded; what is to be done with the table."""
-    from projservo_cli.records import WorkFailed
-
     recording, why = chain.recording, chain.recording.why
     if why:
         chain.console.say(f"record: making ({why})")
-    try:
-        _drive(chain.console, chain.config, recording, confirm=chain.options["confirm"])
-    except WorkFailed as error:
-        chain.failed, chain.reason = "record", " ".join(str(error).split()).removeprefix("record: ")
+    if reason := _drive(chain.console, chain.config, recording, confirm=chain.options["confirm"]):
+        chain.failed, chain.reason = "record", reason
         return chain
     unasked = {**chain.options, "confirm": chain.options["confirm"] and not why}
     return _asked(chain.console, chain.names, unasked, replace(recording, why=""))
@@ -388,8 +398,8 @@ def _work(chain: _Chain) -> int:
     values = {}
     for name in chain.names:
         if name == "record":
-            failed = {"reason": chain.reason, "failed": name} if chain.lacks(name) else {}
-            values[name] = {"run": chain.run.path.resolve()} | chain.recording.told | failed
+            reason = chain.reason if chain.lacks(name) else ""
+            values[name] = {"run": chain.run.path.resolve()} | _told_recording(chain.recording, reason)
         elif chain.lacks(name):
             values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
         else:
@@ -400,8 +410,9 @@ def _work(chain: _Chain) -> int:
     words += [f"run: {chain.run.path}"] if chain.run.results else []
     chain.console.tell(values if len(values) > 1 else values[chain.names[0]], words)
     findings = list(_findings(chain))
-    for text, _ in findings:
-        click.echo(f"projservo: {text}", err=True)
+    for text, fatal in findings:
+        if fatal or not chain.console.quiet:
+            click.echo(visible(f"projservo: {text}"), err=True)
     return FAILED if any(fatal for _, fatal in findings) else 0
 
 
@@ -502,7 +513,7 @@ def _reported(chain: _Chain, run: Any) -> Any:
     """What a report is about: of the results before it those that the named runs of laws rest on."""
     from projservo_cli.store import SERVO
 
-    made = ["plan", *(SERVO + law for law in chain.laws)] if chain.config.has_task else []
+    made = ["plan", *(SERVO + law for law in chain.laws)] if chain.laws else []
     return replace(run, results={name: run.results[name] for name in ["calibrate", *made]})
 
 
@@ -556,9 +567,8 @@ def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
 
 def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
     """What is not as it was asked for, and whether that ends the call with exit code 1."""
-    from projservo_cli.records import POINT_LAWS, name_of
-
     if chain.failed:
+        yield from _of_runs(chain)
         yield f"{chain.failed}: {chain.reason}", True
         return
     results = chain.run.results
@@ -567,19 +577,32 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
         yield f"calibrate: the calibration is not usable: {reason}", "calibrate" in chain.names
     if (beside := chain.beside.get("calibrate", {})).get("suggestions") == []:
         yield f"calibrate: {beside['suggestions_reason']}", True
-    must = chain.config.control.must_converge
-    for trace in (chain.run.traces[law] for law in chain.laws_done):
-        disturbed = trace.verdict == "disturbed"
-        if disturbed or (trace.law in must and trace.verdict != "converged"):
-            reason = f": {trace.reason}" if trace.reason else ""
-            but = " must converge, but" if trace.law in must else ""
-            said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason}"
-            # Classical laws lead where nothing can be expected of them, images included.
-            yield said, trace.law in must or trace.law not in POINT_LAWS
+    yield from _of_runs(chain)
     # Other profiles are those of the paper, of which the margins are only measured.
     searched = "plan" in results and chain.run.plan.profile in ("constrained", "joint")
     if searched and not chain.run.plan.feasible:
         yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
+
+
+def _of_runs(chain: _Chain) -> Iterator[tuple[str, bool]]:
+    """A line on each run that did not converge or missed periods, and whether the call fails by it."""
+    from projservo_cli.records import POINT_LAWS, name_of
+
+    for trace in (chain.run.traces[law] for law in chain.laws_done):
+        must, converged = chain.config.control.requires(trace.law), trace.verdict == "converged"
+        if trace.verdict == "failed" or (converged and not trace.overruns):
+            continue  # what failed is the last thing that is said
+        but = " must converge, but" if must and not converged else ""
+        reason = " ".join(trace.reason.split())
+        said = f"{name_of(trace.law, trace.mode)}{but} ended in {trace.verdict}{reason and f': {reason}'}"
+        if trace.overruns:
+            said += (
+                f"; it missed {trace.overruns} periods of {trace.period:g} s: raise control.period_s, or "
+                "find fewer markers"
+            )
+        # Classical laws lead where nothing can be expected of them, images included.
+        disturbed = trace.verdict == "disturbed" and trace.law not in POINT_LAWS
+        yield said, not converged and (must or disturbed)
 
 
 def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> int:

@@ -255,13 +255,18 @@ class Override:
 
 
 def load_config(
-    path: pathlib.Path | str | None, overrides: Sequence[str | Override] = (), *, text: str | None = None
+    path: pathlib.Path | str | None,
+    overrides: Sequence[str | Override] = (),
+    *,
+    text: str | None = None,
+    teaching: bool = False,
 ) -> Config:
     """Read and check a configuration; paths in it become absolute.
 
     path : the YAML file; None for a blank recorded configuration, which overrides fill.
     overrides : ``a.b=v`` as for ``--set``, applied in order.
     text : its content, where it is already at hand; ``path`` then only names it in messages.
+    teaching : a goal or a start whose file does not exist yet is still to be taught, and left out.
     Raises InputError, one line ``file:line:column: path: what`` for each thing that is wrong.
     """
     changes = [change if isinstance(change, Override) else Override.parse(change) for change in overrides]
@@ -281,7 +286,7 @@ def load_config(
         _spell_out(document.values)
     _fill_in(document.values, path)
     _fill_in_arm(document)
-    _fill_in_taught(document, pathlib.Path(path).parent if path is not None else pathlib.Path())
+    _fill_in_taught(document, pathlib.Path(path).parent if path is not None else pathlib.Path(), teaching)
     _check_options(document)
     return _validated(Config, document)
 
@@ -403,13 +408,22 @@ def _fill_in_arm(document: _Document) -> None:
             raise InputError(f"{document.place(('robot', kind))}: robot.{kind}: {error}") from error
 
 
-def _fill_in_taught(document: _Document, base: pathlib.Path) -> None:
-    """Put what was taught in place of the names of files that hold it, relative to the configuration."""
+def _fill_in_taught(document: _Document, base: pathlib.Path, teaching: bool) -> None:
+    """Put what was taught in place of the names of files that hold it, relative to the configuration.
+
+    While it is being taught, a goal whose file is missing is the start, and without a start there is no task.
+    """
     task = document.values.get("task")
-    for key in ("goal", "start") if isinstance(task, dict) else ():
+    for key in ("start", "goal") if isinstance(task, dict) else ():
         if not isinstance(task.get(key), str):
             continue
         where, path = f"{document.place(('task', key))}: task.{key}", (base / task[key]).resolve()
+        if teaching and not path.exists():
+            if key == "start":
+                del document.values["task"]
+                return
+            task["goal"] = {"joints": task.get("start")}
+            continue
         try:
             taught = _Document(text_of(path, "a file that projservo teach wrote", _MAX_BYTES), str(path))
         except InputError as error:

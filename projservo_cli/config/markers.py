@@ -1,6 +1,7 @@
 """Points fixed to the tool, and tags whose corners they are."""
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, Literal
 
@@ -17,6 +18,19 @@ CORNERS = 4
 GROUND = 4.0 / 3.0
 """How much wider a tag of six cells is with a bright margin of one cell than without."""
 
+DICTIONARY = "4X4_50"
+"""Of tags, where none is given."""
+
+
+def cells_of(dictionary: str) -> int:
+    """Cells along a side of a tag, border included, by the name of its dictionary."""
+    found = re.search(r"(\d+)([XH])\d", dictionary.upper())
+    if found is None:  # ARUCO_ORIGINAL
+        return 7
+    return 2 + (int(found[1]) if found[2] == "X" else math.isqrt(int(found[1])))
+
+
+_SIZE_M = 0.06  # of tags, where none is given
 _TILT = math.radians(35.0)  # of the four tags around the middle one of a roof
 _CORNERS = ((-0.5, 0.5), (0.5, 0.5), (0.5, -0.5), (-0.5, -0.5))  # as they are detected, in sides of the tag
 
@@ -95,9 +109,15 @@ class Markers(Section):
     ) = Field(
         None, description="tags whose corners are the markers, instead of positions_m: a tool or a list"
     )
-    tag_size_m: Positive = Field(0.06, description="side of the black square of each tag of a roof or plate")
-    dictionary: Annotated[str, StringConstraints(min_length=1)] = Field(
-        "4X4_50", description="of the tags, as OpenCV names it"
+    tag_size_m: Positive | None = Field(
+        None,
+        description="side of the black square of each tag of a roof or plate, null for 0.06; of each tag "
+        "whose corners numbers are",
+    )
+    dictionary: Annotated[str, StringConstraints(min_length=1)] | None = Field(
+        None,
+        description="of the tags, as OpenCV names it, null for 4X4_50; a class of yours is given it where it "
+        "takes it",
     )
     face: tuple[Whole, ...] | None = Field(
         None,
@@ -109,7 +129,9 @@ class Markers(Section):
     @property
     def all_tags(self) -> tuple[Tag, ...]:
         """Each tag; none where markers are no corners of tags."""
-        return _TOOLS[self.tags](self.tag_size_m) if isinstance(self.tags, str) else self.tags or ()
+        return (
+            _TOOLS[self.tags](self.tag_size_m or _SIZE_M) if isinstance(self.tags, str) else self.tags or ()
+        )
 
     @property
     def points(self) -> FloatArray | None:
@@ -144,6 +166,18 @@ class Markers(Section):
         assert known is not None
         first = int(np.argmax((normals @ normals.sum(axis=0)).round(6)))
         return known[first : first + CORNERS]
+
+    def lengths(self, numbers: Sequence[int]) -> FloatArray:
+        """Distances (k, k) between markers of some numbers, m; NaN where nothing tells them."""
+        X, tag = np.full((len(numbers), 3), np.nan), np.zeros(len(numbers))
+        if self.points is not None:
+            known = self.known or ()
+            X = self.points[[known.index(number) for number in numbers]]
+        elif self.tag_size_m is not None:
+            X[:, 2], X[:, :2] = 0.0, [np.multiply(self.tag_size_m, _CORNERS[k % CORNERS]) for k in numbers]
+            tag = np.array(numbers) // CORNERS
+        found = np.linalg.norm(X[:, None] - X, axis=2)
+        return np.asarray(np.where(tag[:, None] == tag, found, np.nan))
 
     def contradictions(self) -> Iterator[Finding]:
         """Markers said twice; numbers that are missing, strange or given twice."""

@@ -32,9 +32,10 @@ from projservo_cli.config.robot import (
     Section,
     Vector3,
     Whole,
+    are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
-from projservo_cli.records import LAWS, REPLAN, InputError
+from projservo_cli.records import LAWS, POINT_LAWS, REPLAN, InputError
 from projservo_cli.robots import plugins
 
 
@@ -305,8 +306,10 @@ class _Control(Section):
     searches_anew: Whole = Field(
         3, description="how often a way is searched anew where one comes to nothing, profiles joint and auto"
     )
-    must_converge: tuple[Law, ...] = Field(
-        ("direct_three", "direct_two"), description="laws whose failure is that of the call, exit code 1"
+    must_converge: tuple[Law, ...] | None = Field(
+        None,
+        description="laws whose failure is that of the call, exit code 1; null for direct_three, direct_two, "
+        "exact and laws of yours",
     )
     period_s: Positive = Field(0.04, description="control period")
     gain_t: Positive = Field(2.5, description="gain of the translation, 1/s")
@@ -331,6 +334,10 @@ class _Control(Section):
         description="what direct laws measure with: the face's points or all visible markers; "
         "null for body where the calibration is usable",
     )
+
+    def requires(self, law: str) -> bool:
+        """Tell whether a law that does not converge fails the call: by default all but classical ones."""
+        return law not in POINT_LAWS if self.must_converge is None else law in self.must_converge
 
     def contradictions(self) -> Iterator[Finding]:
         """Gains that overshoot."""
@@ -493,6 +500,11 @@ def _joint_vectors(
     pairs = robot.limits.joints if robot is not None and robot.limits is not None else None
     if types and pairs is not None and len(pairs) != len(types):
         yield ("robot", "limits", "joints"), f"{len(pairs)} pairs for {len(types)} joints ({types})"
+    elif pairs is not None and robot is not None and robot.limits is not None and robot.limits.unit == "rad":
+        for i, ((low, high), letter) in enumerate(zip(pairs, types or "R" * len(pairs), strict=True)):
+            if letter == "R" and are_degrees(low, high):
+                what = f"{low:g} to {high:g} rad is more than two turns to a side: degrees? set unit: deg"
+                yield ("robot", "limits", "joints", i), what
     if task is not None:
         vectors["task", "start"] = task.start
         vectors["task", "start_offset"] = task.start_offset
@@ -554,6 +566,12 @@ def _rendered(plant: _PlantSettings, noise: _Noise, markers: Markers | None) -> 
         yield ("markers",), "plant mujoco shows tags: set markers.tags, such as roof"
 
 
+def _dictionary(plant: _PlantSettings, markers: Markers | None) -> Iterator[Finding]:
+    """A dictionary of tags that is said twice."""
+    if markers is not None and markers.dictionary is not None and "dictionary" in plant.options:
+        yield ("markers", "dictionary"), "plant.options gives the class its dictionary as well; keep one"
+
+
 def _disturbed_joints(disturbance: Disturbance, robot: RobotSettings | None) -> Iterator[Finding]:
     if robot is None or not robot.joints:
         return
@@ -608,7 +626,7 @@ _RULES: dict[Callable[..., Iterator[Finding]], set[str]] = {  # with the section
     rule: {*inspect.signature(rule).parameters}
     for rule in (
         *(_same_joints, _joint_vectors, _goal_images, _simulated_alone, _rendered),
-        *(_disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
+        *(_dictionary, _disturbed_joints, _disturbed_markers, _plan_to_follow, _keeping_out),
         *(_speed_in_joint_space, _limits_in_joint_space),
     )
 }

@@ -114,6 +114,15 @@ class JointVector(Section):
             yield (*path, "joints"), what
 
 
+# Limits in rad of two turns to a side or less; those of continuous joints in files are beyond any in degrees.
+_MOST_RAD, _MOST_DEG = 4.0 * math.pi, 1000.0
+
+
+def are_degrees(low: float, high: float) -> bool:
+    """Tell whether limits of a revolute joint that are to be rad look like degrees."""
+    return _MOST_RAD < max(abs(low), abs(high)) <= _MOST_DEG
+
+
 class _Joint(Section):
     """What joints have in common: a type, perhaps a name, perhaps limits."""
 
@@ -142,6 +151,11 @@ class _Joint(Section):
             low, high = getattr(self, name)
             if not low < high:
                 yield (name,), f"the lower limit {low:g} must be below the upper limit {high:g}"
+            elif name == "limits_rad" and are_degrees(low, high):
+                yield (
+                    (name,),
+                    f"{low:g} to {high:g} rad is more than two turns to a side: degrees? set limits_deg",
+                )
 
 
 class _DHJoint(_Joint):

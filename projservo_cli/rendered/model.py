@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 
-from projservo_cli.config.markers import Markers, Tag
+from projservo_cli.config.markers import DICTIONARY, Markers, Tag
 from projservo_cli.config.models import RenderedOptions
 from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.detection import TagFinder
@@ -100,7 +100,7 @@ def rendered_model(
 
     Raises InputError if MuJoCo or OpenCV is missing, or the scene cannot be made.
     """
-    mj, finder = mujoco(), TagFinder(markers.dictionary)
+    mj, finder = mujoco(), TagFinder(markers.dictionary or DICTIONARY)
     spec, where = mj.MjSpec() if robot.mjcf is None else spec_of(robot.mjcf), robot.mjcf or "the arm"
     if robot.mjcf is None:
         _add_arm(spec, arm)

@@ -92,6 +92,14 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
+class Driven(Fit):
+    """The runs of a robot of which no model is known, nor of its cameras."""
+
+    plan: Plan  # the plan
+    traces: Mapping[str, Trace]  # runs of the laws by name
+
+
+@dataclass(frozen=True, eq=False)
 class Material(Fit):
     """All that the figures of a run may show."""
 
@@ -168,6 +176,11 @@ class _FigureSpec:
         """Why the figure cannot be drawn; empty where it can."""
         if not self.task:
             return ""
+        if self.frames and isinstance(material, Driven | Material):
+            filmed = any(trace.frame_instant is not None for trace in material.traces.values())
+            return "" if filmed else "the robot shows no frames"
+        if isinstance(material, Driven):
+            return "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
         if not isinstance(material, Material):
             return "the run holds a calibration and no task: set robot, rig, markers and task"
         missing = self._without_run(material)
@@ -179,8 +192,6 @@ class _FigureSpec:
             return "a way through joint space has no shares of translation and rotations: see figure 16"
         if self.modes and not material.compared():
             return "no run follows the plan: set control.mode, such as [replan, track], and run servo report"
-        if self.frames and all(trace.frame_instant is None for trace in material.traces.values()):
-            return "the robot shows no frames"
         if self.goal and not material.goal_known():
             return "the pose of the goal is unknown, only its images are"
         return ""

@@ -295,7 +295,7 @@ def _visibility(plan: Plan) -> dict[str, Any]:
 
 def _law(trace: dict[str, Any], config: Config) -> dict[str, Any]:
     told = {"title": title(name_of(trace["law"], trace["mode"])), "words": _law_words(trace)}
-    must = trace["law"] in config.control.must_converge
+    must = config.control.requires(trace["law"])
     return trace | told | {"converged": trace["verdict"] == "converged", "must": must}
 
 

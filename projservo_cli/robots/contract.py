@@ -43,7 +43,10 @@ class Reading(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What no command may exceed, and how servos follow; (n,) each, rad or m, per s where it is a speed."""
+    """What no command may exceed, and how servos follow; (n,) each, rad or m, per s where it is a speed.
+
+    ``units`` are those in which messages tell joints: deg, rad or m; empty where nobody says.
+    """
 
     lower: FloatArray
     upper: FloatArray  # lower, upper: joint limits; infinite for none
@@ -52,6 +55,12 @@ class Bounds(NamedTuple):
     period: float  # of the loop, s
     lag_s: float  # time constant with which joints follow, s
     sag: FloatArray  # (n,) how far joints stay short under gravity
+    units: tuple[str, ...] = ()
+
+    def told(self, i: int, value: float, digits: int = 6) -> str:
+        """Write a value of joint i, rad or m, in its unit."""
+        unit = self.units[i] if self.units else "rad or m"
+        return f"{math.degrees(value) if unit == 'deg' else value:.{digits}g} {unit}"
 
     def within_limits(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Least and most (n,) that a set-point may be at a reading (n,): one beyond a limit may return."""
@@ -176,8 +185,21 @@ class ForeignRobot:
         return all(callable(getattr(self.robot, name, None)) for name in ("release", "hold"))
 
     def by_hand(self, what: str) -> None:
-        """``release`` the arm, so that somebody can move it, or ``hold`` it again where it is."""
+        """``release`` the arm, so that somebody can move it, or ``hold`` it again where it is.
+
+        Before and after ``hold`` the arm is sent where it is read to stand: one whose servos are only
+        switched on again would leap to its last set-point, from before it was released.
+        """
+        q = self.read().q if what == "hold" else None
+        self._stay(q)
         self._ask(what, getattr(self.robot, what))
+        self._stay(q)
+
+    def _stay(self, q: FloatArray | None) -> None:
+        """Send joints (n,) where the robot was read to stand as its set-point, if there are any."""
+        if q is not None:
+            self._sent = None  # it was moved by hand since: no step leads there
+            self.command(q, np.zeros_like(q), self.now() + self.bounds.period)
 
     def command(self, target: FloatArray, speed: FloatArray, due: float) -> None:
         """Send the set-point (n,), rad or m, with its speed (n,), per s, and when it is due, s."""

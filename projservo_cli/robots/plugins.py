@@ -76,6 +76,14 @@ def make(kind: str, target: str, arguments: Sequence[Any], options: Mapping[str,
     return result
 
 
+def takes(kind: str, target: str, name: str) -> bool:
+    """Tell whether a class says that it takes an argument of a name; one that takes any does not say so."""
+    try:
+        return name in inspect.signature(find(kind, target)).parameters
+    except ValueError:  # of a class in C
+        return False
+
+
 def _found(where: str, module: str, name: str) -> Any:
     if os.getcwd() not in sys.path:  # last, so that a file there never stands in for an installed module
         sys.path.append(os.getcwd())

@@ -39,7 +39,9 @@ def bounds_of(config: Config, joints: Joints) -> Bounds:
     lead = speed * (plant.lag_s + period) + sag
     if plant.lead_deg is not None:
         lead = joints.length_of(plant.lead_deg)
-    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag)
+    turns = "rad" if config.reference is None else config.reference.unit
+    units = tuple("m" if kind == "P" else turns for kind in joints.types)
+    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag, units)
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
@@ -51,19 +53,33 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
             raise InputError(
                 f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    robot: Robot = plugins.make("plant", target, (), plant.options)
+    options, dictionary = dict(plant.options), config.markers.dictionary if config.markers else None
+    if dictionary is not None:
+        if not plugins.takes("plant", target, "dictionary"):
+            raise InputError(
+                f"markers.dictionary: is without effect: plant.use {target} takes no argument dictionary; "
+                "leave it out, or let the class take it"
+            )
+        options["dictionary"] = dictionary
+    robot: Robot = plugins.make("plant", target, (), options)
     bounds = bounds_of(config, joints)
     return ForeignRobot(robot, f"plant {target}", markers, bounds, plant.timeout_s, plant.open_s)
 
 
-def way_to(robot: Steered, q: FloatArray, settle_s: float, what: str) -> Iterator[Reading]:
+def way_to(
+    robot: Steered, q: FloatArray, settle_s: float, what: str, fit: Callable[[Reading], None] | None = None
+) -> Iterator[Reading]:
     """Move to joints (n,) along a straight line at the speed limit and come to rest there.
 
     what : the command it is for, in messages.
+    fit : is shown the first reading, before anything moves; it raises where nothing should.
     Yields what is read after each command. The robot has then stood still for so many s, and so have the
     images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
     """
-    bounds, begun, still = robot.robot.bounds, robot.look().q, _Standstill(settle_s)
+    bounds, still = robot.robot.bounds, _Standstill(settle_s)
+    begun = robot.look().q
+    if fit is not None:
+        fit(robot.reading)
     while (gap := q - robot.target).any():
         robot.command(gap / np.max(np.abs(gap) / (bounds.speed * bounds.period), initial=1.0), bounds.period)
         stands = still.joints(robot.look())
@@ -80,15 +96,15 @@ def way_to(robot: Steered, q: FloatArray, settle_s: float, what: str) -> Iterato
         remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
         if gap[i] > abs(q[i] - begun[i]) + sag[i]:
             remedy = (
-                f"it went away from there, from {begun[i]:.6g}: look at its sign and unit, and whether it "
-                "can hold what it carries"
+                f"it went away from there, from {bounds.told(i, begun[i])}: look at its sign and unit, and "
+                "whether it can hold what it carries"
             )
         if hindrance := hindrance_of(robot.robot.robot):
             remedy = f"{hindrance}: take joints that it can reach and hold"
         raise WorkFailed(
-            f"{what}: joint {i + 1} was sent to {q[i]:.6g} and stands at {robot.reading.q[i]:.6g}, "
-            f"{gap[i]:.3g} short (rad or m): {remedy}; then run the command again"
-            + (" to continue" if what == "record" else "")
+            f"{what}: joint {i + 1} was sent to {bounds.told(i, q[i])} and stands at "
+            f"{bounds.told(i, robot.reading.q[i])}, {bounds.told(i, gap[i], 3)} short: {remedy}; then run "
+            "the command again" + (" to continue" if what == "record" else "")
         )
 
 
@@ -151,7 +167,7 @@ def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray,
     freedom = 2 * np.maximum(count - 1, 0).sum()
     scatter = min(1.0, float(np.nansum(off / sigma**2)) / freedom) if freedom else 1.0
     typical = count / total[:, 0]  # variance of a frame
-    variance = typical * (1.0 - scatter) + scatter / total[:, 0]
+    variance = np.where(count > 0, typical * (1.0 - scatter) + scatter / total[:, 0], np.nan)
     return mean, np.sqrt(variance), np.nansum(off, axis=(0, 2)), count
 
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,10 @@ import numpy as np
 
 from projservo_cli.calibration.readings import per_rad
 from projservo_cli.config import Config, digest
+from projservo_cli.config.markers import CORNERS, DICTIONARY, cells_of
 from projservo_cli.config.models import FAULTS
-from projservo_cli.records import FloatArray, InputError, IntArray, Observation
+from projservo_cli.detection import LEAST_CELL
+from projservo_cli.records import VIEWS, FloatArray, InputError, IntArray, Observation, WorkFailed
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.driven import Steered
 from projservo_cli.stages import Progress, silent
@@ -45,6 +48,7 @@ _MOST_MOVING = 200  # frames on the way in a table
 # a tick of a coarse encoder, 4,096 a turn. Draws of one pose, of which each reaches less far, and the shares
 # of markers that must be within both images, and look towards both cameras.
 _RANDOM_POSES, _TICKS = 12, 4096
+_LEAST_SHARED = 3  # markers that both cameras see: a turn about a line through two shows in no image
 _DRAWS, _SHRINKING, _LEAST_SEEN, _LEAST_FACING = 100, 0.98, 0.75, 0.5
 
 
@@ -275,8 +279,8 @@ def record(
     """
     if not recording.pending:
         return
-    robot = robot or _robot_of(config, recording)
-    poses = _simulated(config, recording) if robot is None else _recorded(robot, config, recording)
+    robot, sight = robot or _robot_of(config, recording), _Sight(config, recording)
+    poses = _simulated(config, recording) if robot is None else _recorded(robot, config, recording, sight)
     kept, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
@@ -333,9 +337,126 @@ def _simulated(config: Config, recording: _Recording) -> Iterator[int]:
         yield pose
 
 
-def _recorded(robot: ForeignRobot, config: Config, recording: _Recording) -> Iterator[int]:
-    """Drive to one pending pose after the other and look; the number of each that was recorded."""
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """Checks that a recording shows what a calibration needs, before the first motion and after each joint.
+
+    Messages name the place, the number and the limit: a recording of nothing takes as long as any other.
+    """
+
+    config: Config
+    recording: _Recording
+
+    def before(self, robot: ForeignRobot, reading: Reading) -> None:
+        """Refuse to move where the first look, and those of a while after it, show too little."""
+        period, waited = robot.bounds.period, 0.0
+        while wrong := self._wrong(reading.s[None], "where the robot stands"):
+            if waited >= self.config.plant.settle_s:  # a camera may need some time for its first image
+                raise WorkFailed(f"record: {wrong}; nothing was moved")
+            time.sleep(period)
+            waited, reading = waited + period, robot.read()
+
+    def after(self, pose: int) -> None:
+        """Refuse to go on where the reference and the trial motions of a joint that ends show too little."""
+        count = self.config.calibration.frames_per_joint
+        i, last = divmod(pose, count) if count else (0, 1)
+        group = [0, *range((i - 1) * count + 1, pose + 1)]
+        if (
+            last
+            or not 1 <= i <= self.recording.targets.shape[1]
+            or not {*group} <= self.recording.done.keys()
+        ):
+            return
+        s = np.array([self.recording.done[k].s for k in group])
+        if wrong := self._wrong(s, f"in the {len(s)} poses of joint {i}") or self._faceless():
+            remedy = "choose another calibration.reference or a smaller calibration.amplitude_deg"
+            raise WorkFailed(f"record: {wrong}, or {remedy}; then begin anew with --force")
+
+    def _faceless(self) -> str:
+        """Tell which marker of the face no pose shows to both cameras so far; empty where there is none."""
+        markers, done = self.config.markers, self.recording.done
+        assert markers is not None
+        shared = np.any([np.isfinite(one.s[..., 0]).all(axis=0) for one in done.values()], axis=0)
+        lost = [k for k in self.recording.marker[~shared].tolist() if k in (markers.front or ())]
+        if not lost:
+            return ""
+        return (
+            f"both cameras see marker {lost[0]} of the face, markers.face {[*(markers.front or ())]}, at "
+            f"none of {len(done)} poses: turn the face towards them"
+        )
+
+    def _wrong(self, s: FloatArray, where: str) -> str:
+        """Tell why looks (k, 2, m, 2) are of no use; empty where they are."""
+        markers, seen = self.config.markers, np.isfinite(s[..., 0])
+        assert markers is not None
+        blind, total = ~seen.any(axis=(0, 2)), seen.shape[2]
+        given = self.config.plant.options.get("dictionary", markers.dictionary)
+        if blind.all():
+            of = f", which is {given} here" if given else ""
+            return (
+                f"neither camera sees one of the {total} markers {where}: look whether they stand before "
+                f"both cameras, at light and focus, and whether the dictionary of the tags is right{of}"
+            )
+        cells = cells_of(str(given or DICTIONARY))
+        for view, side in zip(VIEWS, self._widths(s), strict=True):
+            if side < LEAST_CELL * cells:
+                return (
+                    f"tags are {side:.3g} px wide in the {view} image {where}, {side / cells:.2g} px a cell "
+                    f"({LEAST_CELL:g} at least): take larger tags, nearer cameras, or more pixels"
+                )
+        if blind.any():
+            view, other = (VIEWS[i] for i in np.argsort(~blind))
+            most = int(seen.sum(axis=2).max())
+            return (
+                f"the {view} camera sees none of the {total} markers {where}, the {other} one {most}: turn "
+                "it towards them, and look at its light and focus"
+            )
+        often = -(-len(s) // 2)
+        shared = int((seen.all(axis=1).sum(axis=0) >= often).sum())
+        if shared < _LEAST_SHARED:
+            half = "" if len(s) == 1 else ", half of them or more"
+            return (
+                f"both cameras see only {shared} of the {total} markers {where}{half} ({_LEAST_SHARED} at "
+                "least): turn the tool towards both cameras, and look what covers it"
+            )
+        return ""
+
+    def _widths(self, s: FloatArray) -> list[float]:
+        """Widest side of a tag in each view, px; infinite where markers are not known to be tags.
+
+        They are where the configuration says so, or where all markers are fours that look like tags: convex
+        and of one sense, wherever they are seen.
+        """
+        markers, number = self.config.markers, self.recording.marker
+        assert markers is not None
+        order = np.argsort(number)
+        corners = number[order].reshape(-1, CORNERS) if len(number) % CORNERS == 0 else np.ones((1, CORNERS))
+        if (corners != corners[:, :1] + range(CORNERS)).any() or (corners[:, 0] % CORNERS).any():
+            return [math.inf, math.inf]
+        tags = s[:, :, order.reshape(-1, CORNERS)]  # (k, 2, tags, 4, 2)
+        side = np.roll(tags, -1, axis=3) - tags
+        after = np.roll(side, -1, axis=3)
+        turn = side[..., 0] * after[..., 1] - side[..., 1] * after[..., 0]
+        turn = turn[np.isfinite(turn).all(axis=-1)]
+        told = (markers.tags, markers.tag_size_m, markers.dictionary) != (None, None, None)
+        if not told and (len(corners) < 2 or not ((turn > 0.0).all() or (turn < 0.0).all())):
+            return [math.inf, math.inf]
+        length = np.linalg.norm(side, axis=-1)
+        return [np.nanmax(one) if np.isfinite(one).any() else math.inf for one in np.moveaxis(length, 1, 0)]
+
+
+def _recorded(
+    robot: ForeignRobot, config: Config, recording: _Recording, sight: _Sight | None = None
+) -> Iterator[int]:
+    """Drive to one pending pose after the other and look; the number of each that was recorded.
+
+    sight : checks what is seen, as far as that is asked for.
+    """
     steered, settle_s = Steered(robot), config.plant.settle_s
+    fit = None if sight is None else partial(sight.before, robot)
+    if sight is not None:
+        for pose in recording.done:  # those of a call before
+            sight.after(pose)
 
     def look() -> Reading:
         """A look after a period."""
@@ -343,11 +464,14 @@ def _recorded(robot: ForeignRobot, config: Config, recording: _Recording) -> Ite
         return steered.hold()
 
     for pose in recording.pending:
-        seen = list(way_to(steered, recording.targets[pose], settle_s, "record"))
+        seen = list(way_to(steered, recording.targets[pose], settle_s, "record", fit))
+        fit = None
         recording.commands += len(seen)
         recording.done[pose], squares, count = averaged(steered.reading, look, config.plant.frames)
         recording.scatter += squares.sum(), 2.0 * np.maximum(count - 1, 0).sum()
         recording.ways[pose + 1] = _moving(seen, settle_s)
+        if sight is not None:
+            sight.after(pose)
         yield pose
 
 

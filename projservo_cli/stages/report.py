@@ -17,7 +17,15 @@ from projservo_cli.report import style
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.drift import drift_rows, study_numbers
-from projservo_cli.report.material import ANIMATION_FILE, CLAIMS_FILE, VIEW_FILE, Fit, Material, Studies
+from projservo_cli.report.material import (
+    ANIMATION_FILE,
+    CLAIMS_FILE,
+    VIEW_FILE,
+    Driven,
+    Fit,
+    Material,
+    Studies,
+)
 from projservo_cli.report.motion import motion_of, plotly, write_animation, write_view
 from projservo_cli.report.page import write_page
 from projservo_cli.stages import Progress, silent
@@ -47,7 +55,8 @@ _NUMBERS = "csv"  # what is drawn, beside each figure
 def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
     """Make the extra runs, draw the figures, measure the claims and write the page that tells all.
 
-    run : with calibration, plan and traces; where there is no task, with the calibration.
+    run : with calibration, plan and traces; where there is no task, with the calibration. Of a robot without
+        a model the page tells plan and runs, and figures those that need none.
     directory : folder of the run; receives ``figures/``, ``claims.json`` and ``report.html``.
     """
     config = load_config(run.path, text=run.configuration)
@@ -63,6 +72,10 @@ def run(run: "Run", directory: Path, *, progress: Progress = silent) -> Report:
             distance = composition_error(metric_plan(bench))
             share = np.array(LAMBDAS)
         claims = [claim._asdict() for claim in claims_of(material, share, distance)]
+    elif run.traces:
+        material = Driven(
+            run.calibration, run.observation.at_rest, run.plan, run.traces, held_out=run.cross_validation
+        )
     figures = draw_all(material, directory, config.report.formats, left_out, progress)
     report = Report(
         figures=tuple(figures),

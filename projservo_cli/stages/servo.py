@@ -143,6 +143,7 @@ class _Outcome:
             goal_pose=goal_pose,
             center=center if simulated else np.full_like(center, np.nan),
             unplanned=self.unplanned,
+            estimated_position_error_mm=_estimated_mm(self, views),
             untested="" if driven is None else scenario.untested,
             overruns=None if driven is None else driven.steered.overruns,
             delay=None if driven is None else _whole(driven.delays, rows),
@@ -171,6 +172,36 @@ def _told_poses(scenario: Scenario, truths: FloatArray) -> tuple[FloatArray, Flo
     if truths.ndim == 3:
         return truths, goal
     return np.array([goal * np.nan if arm is None else arm.pose(q) for q in truths]), goal
+
+
+# A body that is seen as it was calibrated fits its images to so many times their noise, px.
+_AGREES, _LEAST_NOISE_PX = 4.0, 0.01
+
+
+def _estimated_mm(run: _Outcome, views: FloatArray) -> float | None:
+    """Estimate how far the face ended from the goal across the lines of sight, mm, by its size in the images.
+
+    None where nothing tells the size, or images disagree with the calibration: they are no measure then.
+    """
+    scenario, markers = run.scenario, run.scenario.config.markers
+    assert markers is not None
+    s_star = scenario.ends.by_points().s_star
+    m = s_star.shape[1]
+    s, noise = run.log.s[run.steps, :, :m], [_LEAST_NOISE_PX, scenario.noise_px]
+    if scenario.calibration is not None:
+        noise.append(scenario.calibration.sigma_px)
+    left = _rms(run.log.fit[run.steps, 1:2], 2.0 * views[-1:] - COORDINATES)[0]
+    untested = run.driven is not None and scenario.untested
+    if run.verdict in ("disturbed", "failed") or untested or left > _AGREES * max(noise):
+        return None
+    # The pair of corners that is foreshortened least tells how much of the face a pixel is.
+    span = np.linalg.norm(s[:, :, None] - s[:, None], axis=3)
+    known = np.isfinite(lengths := markers.lengths(scenario.numbers[:m])) & (lengths > 0.0)
+    if not known.any() or not np.isfinite(s).all():
+        return None
+    m_per_px = 1.0 / np.max(span[:, known] / lengths[known], axis=1)
+    off = np.sqrt(np.mean(np.sum((s - s_star) ** 2, axis=2), axis=1))
+    return float(MM * math.sqrt(np.mean((m_per_px * off) ** 2)))
 
 
 def _told_anew(anew: tuple[str, ...]) -> list[str]:

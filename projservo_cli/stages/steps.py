@@ -14,7 +14,7 @@ from typing import Any
 from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.config.models import FAULTS
-from projservo_cli.records import InputError, names_of
+from projservo_cli.records import InputError, law_and_mode, names_of
 from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.store import SERVO, Result, Run
 
@@ -84,13 +84,22 @@ def steps_for(
     recording : why the table has to be recorded first; keys of what rests on it are not known until then.
     """
     stages = STAGES[: max(map(STAGES.index, named)) + 1]
-    if not config.has_task and set(named) <= {"calibrate", "report"}:
-        stages = tuple(stage for stage in stages if stage in ("calibrate", "report"))
-    steps: list[Step] = []
     inputs = {} if recording else _file_hashes(config, run)
-    for step in _needed(config, inputs, laws or config.control.laws, stages):
-        remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
-        steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
+
+    def planned(stages: Sequence[str], laws: Sequence[str]) -> list[Step]:
+        steps: list[Step] = []
+        for step in _needed(config, inputs, laws, stages):
+            remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
+            steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
+        return steps
+
+    steps = planned(stages, laws or config.control.laws)
+    if not config.has_task and set(named) <= {"calibrate", "report"}:
+        # Of a robot without a model a report tells the runs that are up to date, and asks for no others.
+        lacking = {law_and_mode(step.law)[0] for step in steps if step.law and step.why}
+        made = {law_and_mode(step.law)[0]: None for step in steps if step.law}.keys() - lacking
+        kept = [law for law in laws or config.control.laws if law in made]
+        steps = planned(stages if kept else [s for s in stages if s in ("calibrate", "report")], kept)
     stored = run.calibration.source if "calibrate" in run.results else ""
     if steps[0].why and not force and stored == "recorded" and not config.recorded:
         raise InputError(

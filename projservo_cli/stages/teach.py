@@ -12,7 +12,7 @@ from projservo_cli.calibration import predict
 from projservo_cli.config import Config, plain_yaml
 from projservo_cli.config.task import TaskSettings
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
-from projservo_cli.robots.contract import Reading, at_rest_after
+from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.own_robot import at_rest, averaged, foreign_robot, simulated_robot
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
@@ -21,6 +21,7 @@ from projservo_cli.stages.world import joints_of, limit_passed, truth_of
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
+_SLACK = 1e-3  # rad or m; by how much more than it sags a reading may change
 # From how far, rad or m, a simulated robot comes to where it is put, and how long it then rests, s.
 _BESIDE, _AT_REST_S = 0.02, 3
 
@@ -35,6 +36,7 @@ class _Taught:
     sigma: FloatArray  # (2, m) standard deviation of a coordinate of that mean, px; NaN where nobody knows
     frames: IntArray  # (2,) how many there were of each view
     moved: FloatArray | None  # (n,) by how much joints moved when they were held again; None if never
+    bounds: Bounds  # of the robot, which tell the units of its joints
 
     @property
     def unseen(self) -> list[tuple[int, str]]:
@@ -114,16 +116,33 @@ def teach(
         first, reading = robot.read(), look()
         if reading.t_q > first.t_q:  # else it is a simulator, whose time passes in its commands alone
             reading = [reading, *at_rest(reading, look, config.plant.settle_s, "teach")][-1]
+        stood = reading.q if moved is None else moved
         mean, squares, count = averaged(reading, look, frames)
+        since = "while images were taken" if moved is None else "since the arm was held again"
+        _require_still(robot.bounds, stood, robot.read().q, since)
     sigma = np.where(count > 1, np.sqrt(squares / np.maximum(2 * count * (count - 1), 1)), np.nan)
+    sigma = sigma if mean.sigma_px is None else mean.sigma_px
     return _Taught(
         np.array(numbers, dtype=np.int64),
         mean.q,
         mean.s,
-        sigma if mean.sigma_px is None else mean.sigma_px,
+        np.where(np.isfinite(mean.s[..., 0]), sigma, np.nan),
         count.max(axis=1),
         None if moved is None else mean.q - moved,
+        robot.bounds,
     )
+
+
+def _require_still(bounds: Bounds, before: FloatArray, after: FloatArray, since: str) -> None:
+    """Refuse what was seen where a joint has moved by more than it may sag; a WorkFailed names it."""
+    off, most = np.abs(after - before), bounds.sag + _SLACK
+    i = int(np.argmax(off / most))
+    if off[i] > most[i]:
+        raise WorkFailed(
+            f"teach: joint {i + 1} moved by {bounds.told(i, off[i], 3)} {since} "
+            f"({bounds.told(i, most[i], 3)} at most): take the hands away when asked to, and look "
+            "whether the arm holds what it carries; nothing was written"
+        )
 
 
 def _put_to(config: Config, q: FloatArray) -> FaultyRobot:

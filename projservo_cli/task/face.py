@@ -33,8 +33,8 @@ FOUND = 0
     NOT_MEASURED,
 ) = range(1, 11)
 _OTHER_SIDE = (
-    "the {} camera sees opposite sides of the face at the start and at the goal: choose a goal from which "
-    "both cameras see the side they see at the start"
+    "the {} camera sees opposite sides of the face at the start and at the goal: choose a start "
+    "and a goal at which both cameras see its front"
 )
 _UNSEEN = (
     "the images at the {} show too few markers, {{}} in both views together, to tell where the body is: show "

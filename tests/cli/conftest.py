@@ -36,6 +36,12 @@ control: {laws: [direct_three, stacked]}
 TABLE = "pose,marker,q1,q2,u_left,v_left,u_right,v_right\n0,0,0.1,0.2,1,2,3,4\n1,0,0.1,0.3,1,2,3,4\n"
 
 
+class Law:
+    """A law of somebody, which pretended stages never ask."""
+
+    def __call__(self, s: Any, q: Any) -> None: ...
+
+
 @dataclass
 class Stages:
     """What the pretended stages were called for, and how they are to end."""

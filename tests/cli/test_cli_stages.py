@@ -2,6 +2,7 @@
 
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 from tqdm import tqdm
@@ -244,6 +245,73 @@ def test_a_law_that_must_converge_decides_the_exit_code(projservo, stages):
     assert projservo("servo", "-o", "out", "--law", "stacked", "--force").code == 0
     assert projservo("servo", "-o", "out").code == 0
     assert projservo("servo", "-o", "out", "--set", "control.must_converge=[direct_three]").code == 1
+
+
+OWN = "tests.cli.conftest:Law"
+
+
+@pytest.mark.parametrize(
+    ("law", "settings", "code"),
+    [
+        ("exact", (), 1),
+        ("exact", ("control.mode=track",), 1),
+        (OWN, (), 1),
+        ("direct_two", (), 1),
+        ("stacked", (), 0),
+        ("exact", ("control.must_converge=[direct_three]",), 0),
+        (OWN, ("control.must_converge=[]",), 0),
+        ("stacked", ("control.must_converge=[stacked]",), 1),
+    ],
+)
+def test_a_named_law_must_converge_unless_it_is_classical_or_the_configuration_says_so(
+    projservo, stages, law, settings, code
+):
+    stages.verdicts = dict.fromkeys((law, f"{law}_track"), "plateau")
+    sets = [word for one in settings for word in ("--set", one)]
+    by_flag = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", law, *sets)
+    named = projservo("servo", "-c", "tiny.yaml", "-o", "two", "--set", f"control.laws=['{law}']", *sets)
+    for answer in (by_flag, named):
+        assert (answer.code, answer.err.count("ended in plateau: text ä\n")) == (code, 1)
+        assert (" must converge, but ended" in answer.err) == bool(code)
+
+
+def test_each_run_that_did_not_converge_or_missed_periods_has_a_line_with_its_reason(
+    projservo, stages, monkeypatch
+):
+    stages.verdicts = {"stacked": "diverged"}
+    drive, missed = stages.servo, {"direct_three": 7}
+    monkeypatch.setattr(
+        stages, "servo", lambda *given: replace(drive(*given), overruns=missed.get(given[-1], 0))
+    )
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out")
+    assert answer.code == 0
+    first, second = answer.err.splitlines()[-2:]
+    assert first.startswith(
+        "projservo: direct_three ended in converged: text ä; it missed 7 periods of 1.5 s:"
+    )
+    assert second == "projservo: stacked ended in diverged: text ä"
+    assert projservo("servo", "-o", "out", "-q").err == ""
+    # Also where a later law fails, and of that law once.
+    stages.verdicts["direct_two"] = "failed"
+    answer = projservo("servo", "-o", "out", "--law", "stacked", "--law", "direct_two")
+    assert answer.code == 1
+    said = [line for line in answer.err.splitlines() if line.startswith("projservo:")]
+    assert said == [second, "projservo: servo/direct_two: text ä"]
+
+
+def test_without_a_truth_the_table_tells_errors_in_the_images(projservo, stages, monkeypatch):
+    drive = stages.servo
+    told = {"image_error_px": 0.25, "estimated_position_error_mm": 0.5}
+    monkeypatch.setattr(stages, "servo", lambda *given: replace(drive(*given), **told))
+    answer = projservo("servo", "-c", "tiny.yaml", "-o", "out", "--law", "exact")
+    head, columns, row = answer.out.splitlines()[:3]
+    assert head == "servo: image errors at the end, self-occluded steps left/right"
+    assert columns.split() == ["law", "verdict", "steps", "px", "about", "mm", "occluded"]
+    assert row.split() == ["exact", "converged", "3", "0.25", "0.5", "3/3"]
+    told |= {"position_error_mm": 2.0, "estimated_position_error_mm": None}
+    answer = projservo("servo", "-o", "out", "--law", "exact", "--force")
+    assert answer.out.startswith("servo: true errors at the end")
+    assert answer.out.splitlines()[2].split() == ["exact", "converged", "3", "2", "-", "3/3", "-"]
 
 
 def test_what_a_robot_or_law_prints_is_no_data(projservo, stages, monkeypatch):

@@ -132,6 +132,8 @@ INCONSISTENT = [
     ("robot.dh.joints.1.limits_m=[2, 1]", "robot.dh.joints.1.limits_m", "below"),
     ("robot.dh.joints.1={type: P, limits_deg: [0, 1]}", "robot.dh.joints.1.limits_deg", "takes limits_m"),
     ("robot.dh.joints.0.limits_rad=[0, 1]", "robot.dh.joints.0.limits_rad", "keep one"),
+    ("robot.dh.joints.0={type: R, limits_rad: [-110, 110]}", "robot.dh.joints.0.limits_rad",
+     "-110 to 110 rad is more than two turns to a side: degrees?"),
     (f"robot.screws={{reference: {{joints: [0, 0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}", "robot",
      "exactly one of dh, screws"),
     (f"robot={{screws: {{reference: {{joints: [0], unit: rad}}, {SCREWS}, base_tool: {POSE}}}}}",
@@ -328,3 +330,13 @@ def test_a_configuration_made_in_python_is_checked_as_well(good):
     values["control"]["gain_t"] = 25.0
     with pytest.raises(ValueError, match="gain_t"):
         Config.model_validate(values)
+
+
+def test_limits_of_a_robot_of_yours_that_look_like_degrees_are_refused(good):
+    limits = "robot={{limits: {{joints: [[{}, {}], [-100, 100]], unit: {}}}}}"
+    task = ("task.goal.turn_deg=null", "task.goal.joints={joints: [1, 0.5], unit: deg}")
+    data = ("data={table: t.csv, joints: RP}", *task)
+    (found,) = errors(good, *data, limits.format(-110, 110, "rad"))
+    assert "robot.limits.joints.0: -110 to 110 rad is more than two turns to a side: degrees? set" in found
+    for low, high, unit in ((-110, 110, "deg"), (-6.3, 12.5, "rad")):  # of a prismatic joint 100 m are right
+        load_config(good, [*data, limits.format(low, high, unit)])

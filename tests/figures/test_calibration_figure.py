@@ -1,4 +1,5 @@
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import CrossValidation, Observation
 from projservo_cli.report import style
 from projservo_cli.report.material import Fit
+from projservo_cli.robots.driven import Film
 from projservo_cli.stages import calibrate, report
 from projservo_cli.stages.steps import steps_for
 from projservo_cli.store import Result, Run
@@ -200,6 +202,49 @@ def test_a_recorded_run_without_a_task_is_reported_on_with_its_calibration(tmp_p
         spec.name for spec in SPECS.values() if spec.task and not spec.frames
     ]
     assert all("task" in entry["reason"] for entry in made.left_out)
+
+
+def test_runs_of_a_robot_without_a_model_are_reported_on_with_their_frames_and_their_plan(tmp_path):
+    """Runs that are up to date, of one law of two; the others are not asked for, and no robot is moved."""
+    table = tmp_path / "table.csv"
+    table.write_text("pose,marker\n")
+    material = case()[2]
+    trace = material.traces["direct_three"]
+    film = Film()
+    for k in range(trace.steps + 1):
+        film.show(k, np.ones((2, 3, 2)), np.full((2, 8, 16), 99, dtype=np.uint8))
+    settings = {
+        "task": {"start": {"joints": [0.0] * 6, "unit": "rad"}, "goal": {"turn_deg": 9.0}},
+        "markers": {"numbers": [0, 1, 2, 3], "face": [0, 1, 2]},
+        "control": {"laws": ["direct_three", "exact"]},
+    }
+    overrides = [f"{key}={json.dumps(value)}" for key, value in settings.items()]
+    config = load_config(None, [f"data.table={table}", "report.formats=[svg]", *overrides])
+    records = {"calibration": material.calibration, "observation": material.observation}
+    blank = Run(tmp_path / "run.h5", to_yaml(config), {"calibrate": Result("", "", {}, {}, records)})
+    keys = {step.name: step.key for step in steps_for(config, blank, ["servo"])}
+    filmed = {"": dataclasses.replace(trace, **film.told())}
+    made = {
+        "calibrate": records,
+        "plan": {"": material.plan},
+        "servo/direct_three": filmed,
+        "servo/exact": filmed,
+    }
+    results = {name: Result(keys[name], "", {}, {}, one) for name, one in made.items()}
+    results["servo/exact"] = dataclasses.replace(results["servo/exact"], key="of another configuration")
+    run = dataclasses.replace(blank, results=results)
+    steps = steps_for(config, run, ["report"])
+    assert [step.name for step in steps if not step.why] == ["calibrate", "plan", "servo/direct_three"]
+    assert [step.name for step in steps if step.why] == ["report"]
+    run.results.pop("servo/exact")
+    told = report.run(run, tmp_path)
+    assert told.figures == ("figures/fig13_calibration.svg", "figures/fig17_frames.svg")
+    assert {entry["reason"] for entry in told.left_out} == {
+        "no model of robot and cameras is known that could be drawn: set robot, rig and markers"
+    }
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"directTHREE: {trace.verdict} after {trace.steps} steps" in page
+    assert material.plan.reason.split(";")[0] in page
 
 
 def test_with_joint_noise_residuals_are_drawn_as_they_are_tested():

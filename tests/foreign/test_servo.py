@@ -164,7 +164,7 @@ def test_ctrl_c_stops_the_robot(servo):
     ],
 )
 def test_a_disturbance_ends_the_run_with_what_moved(servo, fault, culprit):
-    answer = servo(*faulty(fault, 100), "--json", law="exact")  # no law that must converge
+    answer = servo(*faulty(fault, 100), "--json", law="exact")
     assert answer.code == 1
     (told,) = answer.json["laws"]
     assert told["verdict"] == "disturbed"
@@ -301,7 +301,8 @@ def test_a_law_that_fails(servo, law, code, message):
 
 def test_a_law_that_waits_is_waited_for(servo):
     answer = servo("--set", "stop.lost_steps=3", "--json", law=f"{HERE}:Silent")
-    assert answer.code == 0
+    assert answer.code == 1  # a law that is named must converge
+    assert "Silent must converge, but ended in markers lost: " in answer.err
     assert (answer.json["laws"][0]["verdict"], answer.json["laws"][0]["steps"]) == ("markers lost", 3)
 
 

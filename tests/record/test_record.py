@@ -8,10 +8,11 @@ import pytest
 from projservo_cli import files
 from projservo_cli.cli.output import Console
 from projservo_cli.config import load_config
-from projservo_cli.records import WorkFailed
+from projservo_cli.config.markers import cells_of
+from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import ForeignRobot
 from projservo_cli.stages import record as stage
-from projservo_cli.stages.own_robot import bounds_of
+from projservo_cli.stages.own_robot import bounds_of, foreign_robot
 from projservo_cli.stages.record import simulate, trial_motions
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.store import load
@@ -215,7 +216,7 @@ class Arm:
 
 def driven(config, robot):
     bounds = bounds_of(config, joints_of(config))
-    return ForeignRobot(robot, "plant Arm", len(config.markers.known), bounds, 1.0, 1.0)
+    return ForeignRobot(robot, "plant Arm", len(config.markers.known), bounds, 30.0, 1.0)
 
 
 TEN = ["calibration.frames_per_joint=2"]
@@ -302,8 +303,8 @@ class Shaking(Arm):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (Stuck, r"joint 1 was sent to 4.18.* and stands at 3.7, 0.48\d short"),
-        (Backwards, r"joint 2 was sent to -1.678.*went away from there, from -1.378.*: look at its sign"),
+        (Stuck, r"joint 1 was sent to 4.18.* rad and stands at 3.7 rad, 0.48\d rad short"),
+        (Backwards, r"joint 2 was sent to -1.678.*went away from there, from -1.378.* rad: look at its sign"),
         (Shaking, r"joint 6 does not come to rest within 20 s"),
     ],
 )
@@ -377,3 +378,169 @@ def test_a_robot_with_faults_is_recorded_at_rest_and_on_the_way_as_calibrate_see
     table = read_table(tmp_path / "trials.csv", "RRRRR")
     np.testing.assert_array_equal(table.images, seen.images)
     np.testing.assert_array_equal(table.t_q, seen.t_q)
+
+
+ROOF = (
+    "markers={tags: roof, tag_size_m: 0.3}",  # of ten
+    "task.goal={turn_deg: 10}",
+)
+
+
+class Masked(Arm):
+    """An arm of which both cameras see what a function of the look, its joints and its pixels leaves."""
+
+    def __init__(self, config, seen):
+        super().__init__(config, lag=0.05)
+        self.seen, self.looks = seen, 0
+
+    def read(self):
+        q, s, *more = super().read()
+        self.looks += 1
+        return q, self.seen(q, s.copy()), *more
+
+
+def without(view, *markers):
+    def seen(q, s):
+        s[view, [*markers] or slice(None)] = np.nan
+        return s
+
+    return seen
+
+
+def shrunk(q, s):
+    """Images in which the widest tag is 11 px wide."""
+    middle, tags = s.mean(axis=1, keepdims=True), s[:, :8].reshape(2, 2, 4, 2)
+    side = np.linalg.norm(tags - np.roll(tags, 1, axis=2), axis=-1).max()
+    return middle + 11.0 / max(side, 300.0) * (s - middle)
+
+
+@pytest.mark.parametrize(
+    ("seen", "message"),
+    [
+        (
+            without(slice(None)),
+            r"neither camera sees one of the 20 markers where the robot stands: .*dictionary",
+        ),
+        (
+            without(1),
+            r"the right camera sees none of the 20 markers where the robot stands, the left one 20:",
+        ),
+        (
+            without(0, *range(2, 20)),
+            r"both cameras see only 2 of the 20 markers where the robot stands \(3 at",
+        ),
+        (
+            shrunk,
+            r"tags are 11\.\d px wide in the left image .*, 1\.\d+ px a cell \(2\.3 at least\)",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_named_before_anything_moves(seen, message):
+    config = load_config(UR5, [*TEN, *ROOF])
+    recording = stage.new_recording(config, Path("t.csv"))
+    robot = Masked(config, seen)
+    with pytest.raises(WorkFailed, match=f"record: {message}.*; nothing was moved"):
+        stage.record(config, recording, driven(config, robot))
+    assert robot.sent == []
+    assert robot.calls == ["open", "stop", "close"]
+    assert not Path("t.csv").exists()
+
+
+def test_a_camera_may_need_a_moment_for_its_first_image():
+    config = load_config(UR5, [*TEN, *ROOF])
+    recording = stage.new_recording(config, Path("t.csv"))
+    robot = Masked(config, lambda q, s: s if robot.looks > 3 else s * np.nan)
+    stage.record(config, recording, driven(config, robot))
+    assert not recording.pending
+
+
+def test_after_each_joint_what_it_showed_must_be_of_use_and_is_kept():
+    config = load_config(UR5, [*TEN, *ROOF])
+    recording = stage.new_recording(config, Path("t.csv"))
+    reference = recording.targets[0]
+
+    def seen(q, s):
+        """Joint 2 alone turns the tool away."""
+        if abs(q[1] - reference[1]) > 0.1 and abs(q[0] - reference[0]) < 0.01:
+            s[0, 2:] = np.nan
+        return s
+
+    few = r"only 2 of the 20 markers in the 3 poses of joint 2, half of them or more \(3 at least\)"
+    with pytest.raises(WorkFailed, match=f"{few}.*calibration.amplitude_deg; then begin anew with --force"):
+        stage.record(config, recording, driven(config, Masked(config, seen)))
+    assert read_table("t.csv").at_rest.pose.tolist() == [0, 1, 2, 3, 4]
+    # It does not go on until the table is begun anew.
+    again, sound = stage.new_recording(config, Path("t.csv")), Masked(config, lambda q, s: s)
+    assert again.found == 5
+    with pytest.raises(WorkFailed, match="begin anew"):
+        stage.record(config, again, driven(config, sound))
+    assert sound.sent == []
+    stage.record(config, stage.new_recording(config, Path("t.csv"), force=True), driven(config, sound))
+    assert len(np.unique(read_table("t.csv").at_rest.pose)) == 13
+
+
+def test_the_face_must_be_seen_by_both_cameras_once():
+    config = load_config(UR5, [*TEN, *ROOF, "markers.face=[0, 1, 2]"])
+    recording = stage.new_recording(config, Path("t.csv"))
+    robot = Masked(config, without(1, 2))
+    with pytest.raises(
+        WorkFailed, match=r"marker 2 of the face, markers.face \[0, 1, 2\], at none of 3 poses"
+    ):
+        stage.record(config, recording, driven(config, robot))
+    assert len(recording.done) == 3
+
+
+def test_markers_that_are_no_tags_have_no_cells():
+    """Shrunk as much, ten points are recorded: nothing is known of their size."""
+    config = load_config(UR5, TEN)
+    recording = stage.new_recording(config, Path("t.csv"))
+    stage.record(config, recording, driven(config, Masked(config, shrunk)))
+    assert not recording.pending
+
+
+@pytest.mark.parametrize(
+    ("name", "cells"),
+    [("4X4_50", 6), ("DICT_7X7_1000", 9), ("apriltag_36h11", 8), ("APRILTAG_16H5", 6), ("ARUCO_ORIGINAL", 7)],
+)
+def test_a_dictionary_tells_how_many_cells_its_tags_have(name, cells):
+    assert cells_of(name) == cells
+    cv2 = pytest.importorskip("cv2")
+    known = {key.upper(): key for key in dir(cv2.aruco) if key.startswith("DICT_")}
+    name = known["DICT_" + name.upper().removeprefix("DICT_")]
+    assert cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)).markerSize + 2 == cells
+
+
+class Named(Arm):
+    def __init__(self, dictionary="4X4_50", **options):
+        self.given = {"dictionary": dictionary, **options}
+
+
+class Unnamed(Arm):
+    def __init__(self, **options):
+        self.given = options
+
+
+def made(kind, *settings):
+    config = load_config(UR5, [f"plant.use='tests.record.test_record:{kind}'", *settings])
+    return foreign_robot(config, joints_of(config), 10).robot.given
+
+
+def test_a_dictionary_reaches_the_class_or_is_refused():
+    other = "markers.dictionary=APRILTAG_36H11"
+    assert made("Named") == {"dictionary": "4X4_50"}
+    assert made("Named", other, "plant.options={more: 1}") == {"dictionary": "APRILTAG_36H11", "more": 1}
+    assert made("Unnamed", "plant.options={dictionary: A}") == {"dictionary": "A"}
+    with pytest.raises(
+        InputError, match=r"^markers\.dictionary: .*without effect: plant\.use .*:Unnamed takes"
+    ):
+        made("Unnamed", other)
+    with pytest.raises(InputError, match=r"markers\.dictionary: plant\.options gives .* as well; keep one"):
+        made("Named", other, "plant.options={dictionary: A}")
+
+
+def test_joints_are_told_in_the_unit_of_the_configuration():
+    for path, told in ((CONFIGS / "hobby.yaml", "90 deg"), (UR5, "1.57 rad")):
+        config = load_config(path)
+        assert bounds_of(config, joints_of(config)).told(1, np.pi / 2, 3) == told
+    config = load_config(STANFORD)
+    assert bounds_of(config, joints_of(config)).told(2, 0.5) == "0.5 m"

@@ -1,11 +1,13 @@
 """Traces: what is recorded of a run against the truth, and every way it may be told to end."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from projservo_cli.loop.step import plateau_stretch
+from projservo_cli.stages.servo import drive
 from tests.stages.cases import Case, case
 
 
@@ -87,3 +89,36 @@ def test_plateau_is_the_longest_stretch_without_a_fall():
     assert plateau_stretch(100 * 0.9 ** np.arange(30), 5) is None
     assert plateau_stretch(np.ones(3), 5) is None
     assert np.diff(plateau_stretch(np.ones(30), 5)) == 29
+
+
+@pytest.mark.parametrize("steps", [10, 25])
+def test_the_size_of_the_face_tells_about_how_far_it_is_off(steps):
+    """The error in the images holds the rotation that is left too: it is compared once that is small."""
+    trace = case("stanford").servo("direct_three", max_steps=steps)
+    assert trace.image_error_px == trace.image_error[-1]
+    moved = np.linalg.norm(_corners(trace, trace.pose[-1]) - _corners(trace, trace.goal_pose), axis=1)
+    assert trace.estimated_position_error_mm == pytest.approx(1e3 * np.sqrt(np.mean(moved**2)), rel=0.4)
+
+
+def _corners(trace, pose):
+    """Corners (k, 3) of the face of the case at a pose of the tool."""
+    truth = case("stanford").truth
+    return (truth.M_face @ np.linalg.inv(truth.robot.base_tool).T @ pose.T)[:, :3]
+
+
+def test_no_size_and_no_images_that_agree_are_no_measure():
+    example = case("ur5")
+    run = drive(replace(example.scenario, limits=example.limits._replace(max_steps=5)), example.plan, "exact")
+    assert run.trace().estimated_position_error_mm > 0.0
+    assert replace(run, verdict="disturbed").trace().estimated_position_error_mm is None
+    for left_px, agrees in ((0.03, True), (0.05, False)):  # of 8 markers, with 10 coordinates to spare
+        fit = np.full_like(run.log.fit, np.nan)
+        fit[run.steps] = 0.0, 10.0 * left_px**2, 8.0
+        told = replace(run, log=run.log._replace(fit=fit)).trace()
+        assert told.fit_px[-1] == pytest.approx(left_px)
+        assert (told.estimated_position_error_mm is not None) == agrees
+    unsized = example.config.markers.model_copy(update={"positions_m": None})
+    for markers, size in ((unsized, None), (unsized.model_copy(update={"tag_size_m": 0.1}), 0.1)):
+        config = example.config.model_copy(update={"markers": markers})
+        told = replace(run, scenario=replace(run.scenario, config=config)).trace()
+        assert (told.estimated_position_error_mm is None) == (size is None)

@@ -110,22 +110,31 @@ def test_a_robot_that_can_let_go_is_held_again_before_it_is_looked_at(tmp_path, 
     (tmp_path / "by_hand.py").write_text(
         "import numpy as np\n"
         "class Arm:\n"
-        "    def __init__(self): self.q, self.calls = np.zeros(5), []\n"
+        "    falls_at = 0\n"
+        "    def __init__(self, **more):\n"
+        "        vars(self).update(more)\n"
+        "        self.q, self.goal, self.held, self.looks = np.zeros(5), np.full(5, 0.5), True, 0\n"
         "    def open(self): pass\n"
-        "    def read(self): return self.q, np.full((2, 8, 2), 100.0 + 10 * self.q[0])\n"
-        "    def command(self, target, speed, due): raise RuntimeError('nobody may move it')\n"
+        "    def read(self):\n"
+        "        self.looks += 1\n"
+        "        if self.looks == self.falls_at: self.q = self.q + [0, 0, 0.856, 0, 0]\n"
+        "        return self.q, np.full((2, 8, 2), 100.0 + 10 * self.q[0])\n"
+        "    def command(self, target, speed, due):\n"
+        "        self.goal = target\n"
+        "        if self.held: self.q = target\n"
         "    def stop(self): pass\n"
         "    def close(self): pass\n"
-        "    def release(self): self.q = self.q + 0.3\n"
-        "    def hold(self): self.q = self.q - 0.01\n",
+        "    def release(self): self.held, self.q = False, self.q + 0.3\n"
+        # Its servos are only switched on again: it leaps to where it was sent last, and sags from there.
+        "    def hold(self): self.held, self.q = True, self.goal - 0.01\n",
         encoding="utf-8",
     )
     monkeypatch.syspath_prepend(str(tmp_path))
     given = config("plant=by_hand:Arm", "control.period_s=0.001", "control.gain=1")
     told = []
     taught = teach(given, 3, None, told.append)
-    assert taught.q == pytest.approx(np.full(5, 0.29))
-    assert taught.moved == pytest.approx(np.full(5, -0.01))
+    assert taught.q == pytest.approx(np.full(5, 0.3))  # sent there once more
+    assert taught.moved == pytest.approx(np.zeros(5))
     assert taught.frames.tolist() == [1, 1]  # the same image comes again
     assert [words.split(":")[0] for words in told] == [
         "take hold of the arm", "move it to where it is to be", "take your hands away",
@@ -135,3 +144,23 @@ def test_a_robot_that_can_let_go_is_held_again_before_it_is_looked_at(tmp_path, 
         teach(given, 3, AT)
     with pytest.raises(InputError, match="give the joints"):
         teach(config(), 3)
+    for words, look, since in (
+        (told.append, 4, "since the arm was held again"),
+        (None, 200, "while images were taken"),
+    ):
+        plant = f"plant={{use: 'by_hand:Arm', settle_s: 0.02, options: {{falls_at: {look}}}}}"
+        with pytest.raises(WorkFailed, match=rf"joint 3 moved by 49 deg {since} \(1\.06 deg at most\)"):
+            teach(config(plant, "control.period_s=0.001", "control.gain=1"), 100, None, words)
+
+
+def test_what_is_unseen_has_no_deviation():
+    """A camera that sees no marker of three, with and without a deviation of its own."""
+    s = np.full((2, 3, 2), 100.0)
+    s[1, 2] = np.nan
+    for told in (None, np.full((2, 3), 0.1)):
+        stamps = iter(range(1, 99))
+        look = lambda told=told, stamps=stamps: Reading(AT, s, 0.0, np.full(2, float(next(stamps))), told)  # noqa: E731
+        mean, *_ = averaged(look(), look, 3)
+        assert np.isnan(mean.s[1, 2]).all()
+        if told is not None:
+            assert np.isfinite(mean.sigma_px).sum() == 5

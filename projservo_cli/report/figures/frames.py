@@ -6,7 +6,8 @@ import numpy as np
 
 from projservo_cli.records import BODY_LAWS, ByteArray, IntArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Material, registered, title
+from projservo_cli.report.material import VIEWS, Data, Driven, Material, registered, title
+from projservo_cli.task.face import cyclic_order
 
 _MOMENTS = ("start", "on the way", "end")
 _HALO = 1.2  # points, by which lines over a frame are wider in white
@@ -38,15 +39,15 @@ def frames_of(trace: Trace, shown: IntArray | None = None, width: int | None = N
     return np.array(pairs)
 
 
-def _filmed(material: Material) -> str:
+def _filmed(material: Driven | Material) -> str:
     """The run that is shown: of those with frames the first of a direct law, else the first."""
     names = [name for name, trace in material.traces.items() if trace.frame_instant is not None]
     return next((name for name in names if name in BODY_LAWS), names[0])
 
 
-def _data(material: Material) -> Data:
+def _data(material: Driven | Material) -> Data:
     """Frames of three moments, all that was found in them, the path of the face and its goal."""
-    name, order = _filmed(material), material.plant.order
+    name, order = _filmed(material), cyclic_order(material.plan.A)
     trace = material.traces[name]
     assert trace.frame_instant is not None
     assert trace.frame_s is not None
