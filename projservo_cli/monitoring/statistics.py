@@ -174,7 +174,7 @@ class Errors:
         rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
         rows = solve_triangular(np.linalg.cholesky(residual.R), rows, lower=True, check_finite=False)
         bias = 2.0 * residual.seen * (self.bias_px / residual.noise) ** 2
-        return Sums(1, t, rows.T @ rows, 2.0 * residual.seen, bias)
+        return Sums(1, t, rows.T @ rows, np.where(residual.seen, 2.0, 0.0), bias)
 
     def nothing(self) -> Sums:
         """Sums of no look."""
