@@ -71,7 +71,8 @@ def calibrate(
     joint_types : one letter a joint, R or P.
     method : ``refined`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
     sigma_px : noise per coordinate, px; None takes the root mean square of the observation's ``sigma``,
-        else estimates it from the epipolar geometry. Readings with a sigma of their own are weighed by it.
+        of a recording times the common factor that both views show, else estimates it from the epipolar
+        geometry. Readings with a sigma of their own are weighed by it.
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : of the random starts.
@@ -113,11 +114,13 @@ def calibrate(
         require_motion(readings)
         if lens and image_size is not None:
             _require_size(readings, image_size)
-        require_images(readings, sigma_px or readings.stated_px)
+        require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
         epipolar = Epipolar.of(readings, rng)
         expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=readings.stated_px)
         expected = expect(epipolar)
+        if not lens:  # else after it, for it bends the epipolar lines
+            expected.require_scale()
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
             result = _closed_form(readings, epipolar, expected)
@@ -156,6 +159,7 @@ def _most_likely(
             search.tell("calibration, lens", 0, 1)
             solution, epipolar = with_lens(solution, search)
             expected = expect(epipolar)
+            expected.require_scale()
         solution = with_joint_noise(solution, expected, search.joint_noise)
         result = _refined(solution, epipolar, expected, search.frame)
     except Misfit as refused:
@@ -305,6 +309,8 @@ def _record(
         advice=verdict.advice,
         rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
+        sigma_scale=expected.scale,
+        sigma_scale_interval=expected.scale_interval,
         sigma_fitted_px=solution.sigma_px,
         chi2_per_dof=expected.ratio(solution) ** 2,
         dof=solution.dof,
