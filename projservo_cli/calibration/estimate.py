@@ -15,6 +15,8 @@ from projservo_cli.calibration.diagnosis import (
     Outliers,
     blamed_joint,
     listed,
+    noise_at_free_poses,
+    other_motion,
     share_explained,
     unexplained,
     why_lost,
@@ -187,18 +189,21 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
         doubt = unexplained(solution, found, epipolar)
         kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
         out, gone = 1.0 - kept_by / whole.problem.readings.seen.sum()
+        suspicion = "lens" if share else "joint readings"
         if doubt or out > _MUCH or gone > _MOST:
-            why = _contradiction(whole, solution, expected)
+            why = _contradiction(whole, solution, found, epipolar)
+            if not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # joints are cleared
+                suspicion = "outliers"
             if why or (doubt and share >= _DECISIVE_SHARE):
-                doubt = doubt or f"{100.0 * gone:.0f} % of the readings do not fit it, and {why}"
-                raise Misfit(f"the fit does not describe the data: {doubt}")
+                told = f"{100.0 * gone:.0f} % of the readings do not fit it, and {why}"
+                told = other_motion(solution, found, epipolar) or doubt or told
+                raise Misfit(f"the fit does not describe the data: {told}")
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
             raise
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
     errors = solution.errors()
-    suspicion = "lens" if share else "joint readings"
     record = _record(Projective.of(solution), solution, expected, errors, found, suspicion)
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
@@ -227,16 +232,25 @@ def _unmoved(solution: Solution) -> str | None:
     return f"the fit leaves out most motion of joint {i + 1}; check its readings and its type (R or P)"
 
 
-def _contradiction(whole: Solution, solution: Solution, expected: Expected) -> str:
-    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing."""
-    ratio = expected.ratio(solution)
+def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing.
+
+    By noise that the images show themselves, whatever was said about it. Where a fit leaves more than that
+    of the rig, it must leave no more than bodies that move freely would, as points that slip do, and what is
+    left out must agree on no other motion.
+    """
     if solution.used.sum() < _KEPT * whole.problem.readings.seen.sum():
         return "that is most of them; leave out what is not on the robot, and check the joint readings"
-    if ratio > _DOUBTED_RATIO:
-        return (
-            f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types (R or P)"
-        )
-    held_out = cross_validate(solution.kept(), expected.noise_px(solution), _PARTS, 0)
+    if solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:
+        ratio = solution.sigma_px / max(epipolar.noise_px, noise_at_free_poses(solution))
+        if ratio > _DOUBTED_RATIO:
+            return (
+                f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types "
+                "(R or P)"
+            )
+        if other := other_motion(solution, found, epipolar):
+            return other
+    held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
     if held_out.failed or rms is None or predicted is None or rms > _DOUBTED_ERROR * predicted:
         return "the rest does not predict poses that it has not seen; record more poses and more markers"

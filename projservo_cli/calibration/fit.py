@@ -56,13 +56,14 @@ class Solution:
         """``residual`` at the joints as read, zero where it does not count."""
         return self.problem.with_noise(None).residual(self.scene) * self.used[..., None]
 
-    @property
-    def joint_effect_px(self) -> float:
-        """By how much joints that are off move a coordinate of the images, rms, px."""
+    def joint_effect(self) -> tuple[float, float]:
+        """Root mean square by which joints that are off move a coordinate: over its noise, and px."""
         if self.problem.tau is None:
-            return 0.0
+            return 0.0, 0.0
         G = self.problem.joint_derivative(self.scene)[self.used] * self.problem.tau
-        return self.sigma_px * float(np.sqrt((G**2).sum(axis=-1).mean()))
+        square, weight = (G**2).sum(axis=-1), self.problem.readings.weight[self.used]
+        plain = square / weight[:, None] ** 2
+        return float(np.sqrt(square.mean())), self.sigma_px * float(np.sqrt(plain.mean()))
 
     @property
     def sigma_px(self) -> float:
