@@ -272,6 +272,12 @@ class Calibration:
         "view", "s", "deviation of single images from the delay", default=None
     )
     model_px: float = _scalar("px", "error of the model per coordinate, 0 within noise", default=0.0)
+    sigma_scale: float | None = _scalar(
+        about="true deviations of pixels over those stated, if these were judged by the images", default=None
+    )
+    sigma_scale_interval: FloatArray | None = _array(
+        "limit", about="95 % interval of sigma_scale", default=None
+    )
 
     def places(self, numbers: Iterable[int]) -> list[int]:
         """Where markers stand in ``marker`` and ``M``, by their numbers; ValueError for one that does not."""

@@ -60,7 +60,9 @@ class _Frames:
         s = np.where(np.array(columns)[:, None] >= 0, observation.images[:, view, columns], np.nan)
         sigma = np.full(s.shape[:2], max(calibration.sigma_px, calibration.sigma_fitted_px))
         if (stated := observation.sigma) is not None:
-            stated = stated[:, view, columns] * (sigma / calibration.sigma_px)
+            stated = (
+                stated[:, view, columns] * (calibration.sigma_scale or 1.0) * (sigma / calibration.sigma_px)
+            )
             sigma = np.where(stated > 0.0, stated, sigma)
         seen = np.isfinite(s[..., 0]).sum(axis=1) >= min(_LEAST_MARKERS, s.shape[1])
         rows = np.flatnonzero(np.isin(moving, list(ways)) & np.isfinite(t_q) & seen)

@@ -11,10 +11,10 @@ from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.special import fdtri
 
-from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
+from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
-from projservo_cli.calibration.fit import Solution, fit_from, median_px
-from projservo_cli.calibration.forward import LENS, Scene
+from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution, fit_from, median_px
+from projservo_cli.calibration.forward import CAMERA, LENS, Scene
 from projservo_cli.calibration.readings import MOST_JUDGED, RAYLEIGH, Readings
 from projservo_cli.calibration.start import Search, carrying, starts, still
 from projservo_cli.geometry.lens import straight_views, within
@@ -28,6 +28,10 @@ _SHOWN, _SEEN = 50, 3
 _CONSISTENT = 3.0
 # Share of sightings both views agree on that may be left out of a fit.
 _MOST_UNEXPLAINED = 0.02
+# Sightings of one pose that agree on joints by more than chance.
+_AGREEING = 5
+# Markers by which the noise at free poses is told.
+_FREED = 150
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,20 +152,84 @@ def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma:
     return float(np.median(np.linalg.norm(found.fun[: 2 * int(seen.sum())].reshape(-1, 2), axis=1)))
 
 
+def _doubtful(solution: Solution, found: Outliers, epipolar: Epipolar) -> BoolArray:
+    """Sightings (N,) left out without explanation that both views agree on.
+
+    Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
+    """
+    readings = _straight(solution.problem.readings, solution.scene.lens)
+    both = readings.both
+    out = both & ~solution.used.all(axis=0) & ~found.explained.any(axis=0)
+    out[both] &= epipolar.within(readings.rows(both), _CONSISTENT)
+    return np.asarray(out)
+
+
 def unexplained(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
     """What speaks against a fit: sightings left out that both views agree on, in words, else empty."""
-    readings, used = _straight(solution.problem.readings, solution.scene.lens), solution.used
-    # Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
-    both = readings.both
-    out = (both & ~used.all(axis=0) & ~found.explained.any(axis=0))[both]
-    agree = epipolar.within(readings.rows(both), _CONSISTENT)
-    count, sightings = int((out & agree).sum()), int(both.sum())
+    sightings = int(solution.problem.readings.both.sum())
+    count = int(_doubtful(solution, found, epipolar).sum())
     if count <= max(3.0, _MOST_UNEXPLAINED * sightings):
         return ""
     return (
         f"in {count} of {sightings} sightings both cameras agree with each other but not with the robot; "
         "check the joint readings and types (R or P)"
     )
+
+
+def other_motion(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+    """Other joints than those read that sightings left out agree on, in words, else empty.
+
+    Of sightings that both views agree on, at poses of which the rest is kept.
+    """
+    problem, sightings = solution.problem, int(solution.problem.readings.both.sum())
+    out, count = _doubtful(solution, found, epipolar), 0
+    for k in np.unique(problem.readings.pose_of[out]):
+        rows = np.flatnonzero(out & (problem.readings.pose_of == k))
+        if rows.size < _AGREEING:
+            continue
+        some = rows[:: max(1, rows.size // _SHOWN)]
+        alone = LeastSquares.of(problem.readings.rows(some), problem.q_reference).with_noise(problem.tau)
+        count += rows.size if _is_elsewhere(alone, solution.scene, problem.q, solution.sigma_px) else 0
+    if count <= max(3.0, _MOST_UNEXPLAINED * sightings):
+        return ""
+    return (
+        f"{count} of {sightings} sightings show other joints than those read; check how poses and images are "
+        "paired, and the joint readings and types (R or P)"
+    )
+
+
+def noise_at_free_poses(solution: Solution) -> float:
+    """Noise per coordinate that is left where the body may move freely to each pose, px.
+
+    No error of joints has a part in it: residuals are cleared, to first order, of what cameras, markers and
+    rigid motions of the poses can undo. What a robot does to images is among these.
+    """
+    solution = solution.kept().of_some(_FREED)
+    problem, readings, used = solution.problem, solution.problem.readings, solution.used[..., None, None]
+    (K, m), N = (len(problem.q), readings.marker.size), readings.pose_of.size
+    images = solution.scene.images(problem.joints(solution.scene), readings.pose_of, readings.marker_of)
+    points = images.points[0][:, :3]
+    turned = cross_matrix(np.median(points, axis=0) - points)  # about the middle, negative
+    J, by_place = problem.derivative(solution.scene), images.by_point[0][..., :3]
+    by_motion = np.concatenate([by_place @ turned, by_place], axis=3) * readings.weight[..., None, None]
+    X = np.zeros((2, N, 2, 2 * CAMERA + 3 * m + 6 * K))
+    for v in (0, 1):
+        X[v, ..., v * CAMERA : (v + 1) * CAMERA] = J[v, ..., :CAMERA]
+    for block, values, first in (
+        (readings.marker_of, J[..., -3:], 2 * CAMERA),
+        (readings.pose_of, by_motion, 2 * CAMERA + 3 * m),
+    ):
+        width = values.shape[-1]
+        columns = first + width * block[:, None, None] + np.arange(width)
+        np.put_along_axis(X, np.broadcast_to(columns, values.shape), values, axis=3)
+    rows = (X * used).reshape(4 * N, -1)
+    rows /= np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    left = (solution.residual * used[..., 0]).ravel()
+    squares, basis = np.linalg.eigh(rows.T @ rows)
+    known = squares > OPEN_DIRECTION * squares[-1]
+    explained = (basis[:, known].T @ (rows.T @ left)) ** 2 / squares[known]
+    dof = 2 * int(np.count_nonzero(solution.used)) - int(np.count_nonzero(known))
+    return float(np.sqrt(max(left @ left - explained.sum(), 0.0) / max(dof, 1)))
 
 
 def listed(readings: Readings, out: BoolArray) -> IntArray:

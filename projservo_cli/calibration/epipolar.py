@@ -7,10 +7,12 @@ from, never a result. All of it is free in the adjustment, whose result is proje
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
 from projservo_cli.calibration.readings import LEAST_SIGMA, MAD, Readings, medians
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
@@ -21,6 +23,11 @@ OUTLIER = 5.0
 _CORRESPONDENCES, _SAMPLES, _JUDGES = 20_000, 500, 1000
 _PARAMETERS = 7  # of a fundamental matrix
 _TIGHT = 1e-14  # relative change of the loss, the parameters and the gradient at the end of its search
+# Deviations within which residuals are the core of their distribution, and the mean square of a normal
+# variable there; rounds of its search, the change that ends it, and the step of its derivative; logarithm of
+# a factor that is as good as open.
+_CORE, _CORE_MEAN = 3.0, 0.9733369246625415
+_CORE_ROUNDS, _CORE_SETTLED, _CORE_STEP, _CORE_OPEN = 100, 1e-9, 0.1, 10.0
 # Least median distance of the right view from a homography of the left one, in units of the noise.
 _LEAST_PARALLAX = 3.0
 
@@ -32,6 +39,7 @@ class Epipolar:
     F: FloatArray  # (3, 3) with rightᵀ F left = 0, unit norm, px
     sigma_px: float  # noise per image coordinate from the residuals, px
     inlier: BoolArray  # (N,) which of the correspondences taken agree with F
+    core: "Core"  # the same noise where many correspondences are wrong, and how sure it is
 
     @classmethod
     def of(cls, readings: Readings, rng: np.random.Generator) -> "Epipolar":
@@ -50,9 +58,11 @@ class Epipolar:
                 "rows hold the pixels of both views"
             )
         T, T_ = _normalization(left), _normalization(right)
+        pose_of = readings.pose_of[readings.both]
         if count > _CORRESPONDENCES:
             some = rng.choice(count, _CORRESPONDENCES, replace=False)
             left, right, weight, count = left[some], right[some], weight[:, some], _CORRESPONDENCES
+            pose_of = pose_of[some]
         a, b = homogeneous(left) @ T.T, homogeneous(right) @ T_.T
         picks = np.stack([rng.choice(count, 8, replace=False, shuffle=False) for _ in range(_SAMPLES)])
         candidates = _eight_point(a[picks], b[picks])
@@ -77,7 +87,7 @@ class Epipolar:
                 "with all markers always in one plane, there is no depth; move the cameras apart, or the "
                 "markers in depth"
             )
-        return cls(in_pixels, sigma, inlier)
+        return cls(in_pixels, sigma, inlier, Core.of(residual, pose_of))
 
     @property
     def noise_px(self) -> float:
@@ -93,6 +103,50 @@ class Epipolar:
         """Which of readings (N,) that both views saw obey the geometry to so many standard deviations."""
         left, right = homogeneous(readings.pixels)
         return np.abs(_sampson(self.F, left, right, readings.weight)[0]) <= deviations * self.sigma_px
+
+
+class Core(NamedTuple):
+    """Deviation of the normal core of residuals, and its 95 % interval (2,), px.
+
+    What lies within so many deviations counts, less as much of a flat background as lies beyond them up to
+    twice as many: neither few gross errors nor many that begin within the noise widen it. Poses, not
+    residuals, are the independent draws of the interval: corners err alike in one image.
+    """
+
+    sigma_px: float
+    interval: FloatArray
+
+    @classmethod
+    def of(cls, residual: FloatArray, pose_of: IntArray) -> "Core":
+        """From residuals (N,) at poses (N,), seven of which are fitted."""
+        r, s = np.abs(residual), _deviation(residual, 1e-12)
+        for _ in range(_CORE_ROUNDS):
+            before, s = s, s * float(np.sqrt(min(max(_core_square(r / s), 0.25), 4.0)))
+            if abs(s - before) <= _CORE_SETTLED * s:
+                break
+        below, above = (
+            float(_core_scores(r / (s * (1.0 + step))).sum()) for step in (-_CORE_STEP, _CORE_STEP)
+        )
+        slope = max(0.5 * (below - above) / _CORE_STEP, 1e-300)
+        error = float(np.sqrt((np.bincount(pose_of, _core_scores(r / s)) ** 2).sum())) / slope
+        error = min(error * float(stdtrit(max(np.unique(pose_of).size - 1, 1), 0.975)), _CORE_OPEN)
+        s *= float(np.sqrt(r.size / (r.size - _PARAMETERS)))
+        return cls(s, s * np.exp(np.array([-error, error])))
+
+
+def _core_scores(ratio: FloatArray) -> FloatArray:
+    """Scores (N,) of sizes of residuals in deviations (N,): they add up to nothing at the right one."""
+    inside, beyond = ratio < _CORE, (ratio >= _CORE) & (ratio < 2.0 * _CORE)
+    return np.where(inside, ratio**2 - _CORE_MEAN, 0.0) - np.where(beyond, _CORE**2 / 3.0 - _CORE_MEAN, 0.0)
+
+
+def _core_square(ratio: FloatArray) -> float:
+    """Variance of the core over that by which sizes of residuals are divided (N,)."""
+    inside = ratio < _CORE
+    count = int(np.count_nonzero(inside))
+    flat = min(int(np.count_nonzero((ratio >= _CORE) & (ratio < 2.0 * _CORE))), count // 2)
+    square = float((ratio[inside] ** 2).sum()) - flat * _CORE**2 / 3.0
+    return square / max(count - flat, 1) / _CORE_MEAN
 
 
 def _deviation(r: FloatArray, least: float) -> float:

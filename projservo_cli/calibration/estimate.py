@@ -15,6 +15,8 @@ from projservo_cli.calibration.diagnosis import (
     Outliers,
     blamed_joint,
     listed,
+    noise_at_free_poses,
+    other_motion,
     share_explained,
     unexplained,
     why_lost,
@@ -71,7 +73,8 @@ def calibrate(
     joint_types : one letter a joint, R or P.
     method : ``refined`` (maximum likelihood) or ``closed_form`` (eqs. 4, 5).
     sigma_px : noise per coordinate, px; None takes the root mean square of the observation's ``sigma``,
-        else estimates it from the epipolar geometry. Readings with a sigma of their own are weighed by it.
+        of a recording times the common factor that both views show, else estimates it from the epipolar
+        geometry. Readings with a sigma of their own are weighed by it.
     source : ``simulated`` (χ² decides against ``sigma_px``) or ``recorded``.
     image_size : width and height, px, for the start of the search; None takes the extent of the data.
     seed : of the random starts.
@@ -113,11 +116,13 @@ def calibrate(
         require_motion(readings)
         if lens and image_size is not None:
             _require_size(readings, image_size)
-        require_images(readings, sigma_px or readings.stated_px)
+        require_images(readings, sigma_px)
         rng = np.random.default_rng(seed)
         epipolar = Epipolar.of(readings, rng)
         expect = partial(Expected.of, sigma_px=sigma_px, source=source, stated_px=readings.stated_px)
         expected = expect(epipolar)
+        if not lens:  # else after it, for it bends the epipolar lines
+            expected.require_scale()
         require_images(readings, max(epipolar.sigma_px, expected.sigma_px))
         if method == "closed_form":
             result = _closed_form(readings, epipolar, expected)
@@ -156,6 +161,7 @@ def _most_likely(
             search.tell("calibration, lens", 0, 1)
             solution, epipolar = with_lens(solution, search)
             expected = expect(epipolar)
+            expected.require_scale()
         solution = with_joint_noise(solution, expected, search.joint_noise)
         result = _refined(solution, epipolar, expected, search.frame)
     except Misfit as refused:
@@ -183,18 +189,21 @@ def _refined(whole: Solution, epipolar: Epipolar, expected: Expected, frame: Ima
         doubt = unexplained(solution, found, epipolar)
         kept_by = np.sum([solution.used | found.explained, solution.used], axis=(1, 2))
         out, gone = 1.0 - kept_by / whole.problem.readings.seen.sum()
+        suspicion = "lens" if share else "joint readings"
         if doubt or out > _MUCH or gone > _MOST:
-            why = _contradiction(whole, solution, expected)
+            why = _contradiction(whole, solution, found, epipolar)
+            if not share and solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:  # joints are cleared
+                suspicion = "outliers"
             if why or (doubt and share >= _DECISIVE_SHARE):
-                doubt = doubt or f"{100.0 * gone:.0f} % of the readings do not fit it, and {why}"
-                raise Misfit(f"the fit does not describe the data: {doubt}")
+                told = f"{100.0 * gone:.0f} % of the readings do not fit it, and {why}"
+                told = other_motion(solution, found, epipolar) or doubt or told
+                raise Misfit(f"the fit does not describe the data: {told}")
     except Misfit as refused:
         if share < _DECISIVE_SHARE:
             raise
         hint = f"lens distortion would explain {100.0 * share:.0f} % of their squares: try --lens"
         raise Misfit(f"{refused}; {hint}") from None
     errors = solution.errors()
-    suspicion = "lens" if share else "joint readings"
     record = _record(Projective.of(solution), solution, expected, errors, found, suspicion)
     lens = _lens_advice(record, share, frame.known)
     advice = (*lens, *record.advice) if share else (*record.advice, *lens)
@@ -223,16 +232,25 @@ def _unmoved(solution: Solution) -> str | None:
     return f"the fit leaves out most motion of joint {i + 1}; check its readings and its type (R or P)"
 
 
-def _contradiction(whole: Solution, solution: Solution, expected: Expected) -> str:
-    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing."""
-    ratio = expected.ratio(solution)
+def _contradiction(whole: Solution, solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
+    """What speaks against what is kept where much is not, in words, and what would help; empty if nothing.
+
+    By noise that the images show themselves, whatever was said about it. Where a fit leaves more than that
+    of the rig, it must leave no more than bodies that move freely would, as points that slip do, and what is
+    left out must agree on no other motion.
+    """
     if solution.used.sum() < _KEPT * whole.problem.readings.seen.sum():
         return "that is most of them; leave out what is not on the robot, and check the joint readings"
-    if ratio > _DOUBTED_RATIO:
-        return (
-            f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types (R or P)"
-        )
-    held_out = cross_validate(solution.kept(), expected.noise_px(solution), _PARTS, 0)
+    if solution.sigma_px > _DOUBTED_RATIO * epipolar.noise_px:
+        ratio = solution.sigma_px / max(epipolar.noise_px, noise_at_free_poses(solution))
+        if ratio > _DOUBTED_RATIO:
+            return (
+                f"the rest errs {ratio:.2g} times as much as noise; check the joint readings and types "
+                "(R or P)"
+            )
+        if other := other_motion(solution, found, epipolar):
+            return other
+    held_out = cross_validate(solution.kept(), solution.sigma_px, _PARTS, 0)
     rms, predicted = held_out.rms_px, held_out.predicted_rms_px
     if held_out.failed or rms is None or predicted is None or rms > _DOUBTED_ERROR * predicted:
         return "the rest does not predict poses that it has not seen; record more poses and more markers"
@@ -305,6 +323,8 @@ def _record(
         advice=verdict.advice,
         rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
+        sigma_scale=expected.scale,
+        sigma_scale_interval=expected.scale_interval,
         sigma_fitted_px=solution.sigma_px,
         chi2_per_dof=expected.ratio(solution) ** 2,
         dof=solution.dof,

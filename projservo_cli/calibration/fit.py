@@ -23,6 +23,8 @@ WARN_RATIO, _WARN_ERRORS, REFUSE_RATIO = 1.15, 4.0, 3.0
 _CHI2_TAIL = 1e-4
 # Standard error of stated noise as a share of it: who states it estimates it, too.
 _STATED_ERROR = 0.1
+# Factors of stated noise that are believed: beyond them it is not of this detector, or in other units.
+_LEAST_SCALE, _MOST_SCALE = 0.3, 5.0
 # A direction whose singular value is this share of the largest is open.
 OPEN_DIRECTION = 1e-10
 # Numbers of the derivative that are dealt with at once: 16 MB.
@@ -54,13 +56,14 @@ class Solution:
         """``residual`` at the joints as read, zero where it does not count."""
         return self.problem.with_noise(None).residual(self.scene) * self.used[..., None]
 
-    @property
-    def joint_effect_px(self) -> float:
-        """By how much joints that are off move a coordinate of the images, rms, px."""
+    def joint_effect(self) -> tuple[float, float]:
+        """Root mean square by which joints that are off move a coordinate: over its noise, and px."""
         if self.problem.tau is None:
-            return 0.0
+            return 0.0, 0.0
         G = self.problem.joint_derivative(self.scene)[self.used] * self.problem.tau
-        return self.sigma_px * float(np.sqrt((G**2).sum(axis=-1).mean()))
+        square, weight = (G**2).sum(axis=-1), self.problem.readings.weight[self.used]
+        plain = square / weight[:, None] ** 2
+        return float(np.sqrt(square.mean())), self.sigma_px * float(np.sqrt(plain.mean()))
 
     @property
     def sigma_px(self) -> float:
@@ -196,19 +199,44 @@ class Expected:
     known: bool  # whether it is the true noise of a simulation, so that χ² decides
     origin: str  # where it comes from, in words
     error: float  # its own standard error as a share of it, zero where it was given
+    scale: float | None = None  # true deviations over those stated, where these are judged by the images
+    scale_interval: FloatArray | None = None  # (2,) of 95 %
 
     @classmethod
     def of(
         cls, epipolar: Epipolar, sigma_px: float | None, source: str, stated_px: float | None
     ) -> "Expected":
-        """What was given, px, or is stated, known for a ``simulated`` source; else the noise of the rig."""
-        if sigma_px is None and stated_px is not None:
-            return cls(
-                stated_px, source == "simulated", "that the sigmas of the markers state", _STATED_ERROR
-            )
-        if sigma_px is None:
+        """What was given, px, or is stated, known for a ``simulated`` source; else the noise of the rig.
+
+        What is stated in a recording is stated up to a common factor, which both views tell: no joint has a
+        part in their epipolar geometry. It is one where its interval holds one.
+        """
+        if sigma_px is not None:
+            return cls(sigma_px, source == "simulated", "that were given", 0.0)
+        if stated_px is None:
             return cls(epipolar.noise_px, False, "that the epipolar geometry shows", epipolar.relative_error)
-        return cls(sigma_px, source == "simulated", "that were given", 0.0)
+        origin = "that the sigmas of the markers state"
+        if source == "simulated":
+            return cls(stated_px, True, origin, _STATED_ERROR)
+        low, high = interval = epipolar.core.interval / stated_px
+        if low <= 1.0 <= high:
+            return cls(stated_px, False, origin, _STATED_ERROR, 1.0, interval)
+        scale = epipolar.core.sigma_px / stated_px
+        origin = f"{origin}, times {scale:.3g} (95 %: {low:.3g} to {high:.3g}) as both views show"
+        return cls(scale * stated_px, False, origin, _STATED_ERROR, scale, interval)
+
+    def require_scale(self) -> None:
+        """Refuse deviations that are wrong by a factor beyond what can be a matter of the finder."""
+        if self.scale is None or self.scale_interval is None:
+            return
+        low, high = self.scale_interval
+        if high < _LEAST_SCALE or low > _MOST_SCALE:
+            raise WorkFailed(
+                f"the stated deviations of the markers are wrong: both views disagree by {self.scale:.3g} "
+                f"times (95 %: {low:.3g} to {high:.3g}) what sigma_left and sigma_right state, "
+                f"{_LEAST_SCALE:g} to {_MOST_SCALE:g} times is believed; state them {self.scale:.3g} times "
+                "as large, or leave both columns out"
+            )
 
     def ratio(self, solution: Solution) -> float:
         """Fitted over expected noise."""

@@ -42,6 +42,8 @@ _MOST_OUTLIERS = 0.05
 WEAK_NOISE = 3.0
 # Poses at which predictions are judged; how sure they stay below the bound; halvings of an empty range.
 _POSES, _SURE, _HALVINGS = 60, 0.99, 10
+# Share of its range by which a joint that stands still may differ, as by play.
+_STANDS = 0.03
 # Frames of the trial motion that is advised; the least range of it, in reaches, and how often the
 # logarithm of the range between it and the farthest is halved: to a twentieth.
 _FRAMES, _LEAST_REACHES, _BISECTIONS = 8, 0.01, 7
@@ -101,6 +103,14 @@ class _Uncertainty:
         q_reference = self.problem.q_reference
         return np.asarray(q_reference + offsets[:, None] * np.eye(len(q_reference))[i])
 
+    def at_reach(self) -> list[FloatArray]:
+        """``spread`` of each joint at its reach on both sides."""
+        sides = np.array([1.0, -1.0])
+        return [
+            self.spread(self.at(i, self.reach(i) * sides), nearer=True)
+            for i in range(len(self.problem.q_reference))
+        ]
+
     def reach(self, i: int) -> float:
         """Reach of joint i at which predictions are judged, rad or m."""
         return REACH_M if self.scene.prismatic[i] else REACH_RAD
@@ -119,6 +129,15 @@ def _needed_spans(sure: _Uncertainty, spreads: list[FloatArray]) -> FloatArray:
             low, high = (low, middle) if enough else (middle, high)
         needed[i] = high
     return needed
+
+
+def _moved_alone(readings: Readings) -> FloatArray:
+    """Widest range (n,) of each joint over poses that differ in it alone, rad or m."""
+    q = readings.q[np.unique(readings.pose_of)]
+    change = np.abs(q[:, None] - q[None])
+    apart = change > _STANDS * np.ptp(q, axis=0)
+    alone = [(apart.sum(axis=2) == apart[..., i]) * change[..., i] for i in range(q.shape[1])]
+    return np.array([each.max() for each in alone])
 
 
 def _rms(T: FloatArray) -> float:
@@ -182,11 +201,11 @@ def judged(
     sigma = expected.sigma_px if errors is None else expected.noise_px(solution)
     span = _require_joints_seen(solution, sigma)
     noise, error = np.full(len(span), np.nan), None
+    weak = np.zeros(len(span), dtype=np.bool_)  # by what the joints of the data show, whatever their noise
     advice: list[str] = []
     if errors is not None:
         sure = _Uncertainty.of(solution, errors)
-        sides = np.array([1.0, -1.0])
-        spreads = [sure.spread(sure.at(i, sure.reach(i) * sides), nearer=True) for i in range(len(span))]
+        spreads = sure.at_reach()
         noise = np.array([_rms(T) for T in spreads])
         typical, bound = _predicted_error(sure)
         error = (sigma * typical, sigma * bound)
@@ -198,7 +217,14 @@ def judged(
                 f"{noise[i]:.3g} times the pixel noise; "
                 + "".join(describe_joints(np.array([i]), span, prismatic, needed))
             )
-        advice += describe_joints(np.flatnonzero(noise > WEAK_NOISE), span, prismatic, needed)
+        weak = noise > WEAK_NOISE
+        if weak.any() and solution.problem.tau is not None:
+            exact = dataclasses.replace(solution, problem=solution.problem.with_noise(None))
+            weak &= (
+                np.array([_rms(T) for T in _Uncertainty.of(exact, exact.errors()).at_reach()]) > WEAK_NOISE
+            )
+        alone = _moved_alone(solution.problem.readings)
+        advice += describe_joints(np.flatnonzero(weak), span, prismatic, needed, alone)
     warned, share = expected.warns(solution), expected.ratio(solution)
     found = f"{solution.sigma_px:.3g} px a coordinate"
     wanted = f"the {expected.sigma_px:.3g} px {expected.origin}"
@@ -218,13 +244,14 @@ def judged(
         advice.append(told)
     if words := _joint_words(solution):
         reason = f"{reason}, with joint readings off by {words}"
-        if solution.joint_effect_px > solution.sigma_px:
+        over, effect_px = solution.joint_effect()
+        if over > 1.0:
             limit = "joint readings"
-            effect = f"these move images by {solution.joint_effect_px:.3g} px, more than pixel noise"
+            effect = f"these move images by {effect_px:.3g} px, more than pixel noise"
             advice.append(f"joint readings are off, and {effect}: finer or stiffer joints would help")
     if warned or suspicion == "lens":
         limit = suspicion
-    elif (weak := noise > WEAK_NOISE).any():
+    elif weak.any():
         few = span[weak] < np.where(prismatic[weak], REACH_M, REACH_RAD)
         limit = "amplitude" if few.any() else "geometry"
     elif many:

@@ -224,20 +224,27 @@ def require_motion(readings: Readings) -> FloatArray:
 
 
 def describe_joints(
-    which: IntArray, span: FloatArray, prismatic: BoolArray, needed: FloatArray
+    which: IntArray,
+    span: FloatArray,
+    prismatic: BoolArray,
+    needed: FloatArray,
+    alone: FloatArray | None = None,
 ) -> tuple[str, ...]:
     """Advice for the joints that moved too little, or never apart from the others: a line for all alike.
 
     ``which`` (k,) are they; of all joints (n,) there is the range and that of a trial motion that determines
-    them, rad or m; NaN where none does. Where there is one joint only, no other is asked for.
+    them, rad or m; NaN where none does; and that over which they moved ``alone``, if known. Where there is
+    one joint only, no other is asked for.
     """
     single = len(span) == 1
     reach = np.where(prismatic, REACH_M, REACH_RAD)
     hopeless = ~(needed <= MOST_REACHES * reach)
     apart, enough = ~hopeless & (span >= reach) & (not single), ~hopeless & (needed <= span)
+    if alone is not None:  # and yet more poses of the same kind are asked for
+        apart &= ~(needed <= alone)
     rest, lines = np.isin(np.arange(len(span)), which), []
     elsewhere = "markers farther from its axis" if single else "trials of every joint"
-    alone = "" if single else " in which {it} moves alone"
+    by_itself = "" if single else " in which {it} moves alone"
     only = "" if single else " alone"
     for alike, text in (
         (hopeless, f"{{joints}} moved {{moved}}; no motion of {{it}}{only} would do: record {elsewhere}"),
@@ -248,7 +255,7 @@ def describe_joints(
         ),
         (
             enough,
-            f"{{joints}} moved {{moved}}, in too few poses: record further ones{alone}, by {{needed}} "
+            f"{{joints}} moved {{moved}}, in too few poses: record further ones{by_itself}, by {{needed}} "
             "or more",
         ),
         (np.ones_like(rest), "{joints} moved only {moved}: move {it} at least {needed}"),

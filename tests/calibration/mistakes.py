@@ -19,6 +19,7 @@ KINDS = ("right", "swapped", "drift", "drift of one view", "body", "still", "far
 TRACKS = ("body", "still", "far")
 MISTAKES = (*KINDS[1:], "mixture")
 _SPEEDS = 1.0, 10.0  # px a sighting by which a track drifts
+_PX_PER_M = 850.0  # at the body
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +77,12 @@ def table(
     share: float = 0.2,
     length: int = 5,
     sigma: float = SIGMA,
+    slip: float = 0.0,
 ) -> Mistaken:
     """A table with a share of its sightings wrong; of its poses for readings, half of it.
 
-    ``joint_types`` may be "turntable"; its tracks are of consecutive poses.
+    ``joint_types`` may be "turntable"; its tracks are of consecutive poses. Every sighting may ``slip`` a
+    little on the body, by so many px a coordinate, in both views alike: the epipolar geometry shows none.
     """
     rng = np.random.default_rng([seed, MISTAKES.index(mistake) + 1 if mistake != "right" else 0])
     table_turns = joint_types == "turntable"
@@ -105,6 +108,8 @@ def table(
         read[wrong] = _misread(q, wrong, rng)
         kind[wrong] = np.where(kind[wrong] == 0, KINDS.index("readings"), kind[wrong])
     noise = sigma * rng.standard_normal(images.shape)
+    if slip:
+        noise += _slip(robot, q, slip, rng)
     off = np.linalg.norm(images - robot.images(read), axis=3).max(axis=1)
     seen = np.where(shown[:, None, :, None], images + noise, np.nan)
     observation = Observation(np.arange(len(q)), np.arange(points), read, seen)
@@ -162,7 +167,7 @@ def _drift(robot, q, images, kind, left, what, rng):
         poses = track[first:]
         if name == "drift":
             toward = rng.standard_normal(3)
-            toward /= np.linalg.norm(toward) * 850.0  # px per m at the body
+            toward /= np.linalg.norm(toward) * _PX_PER_M
             for k, amount in zip(poses, slip, strict=True):
                 moved = dataclasses.replace(
                     robot, markers=np.append(robot.markers[j, :3] + amount * toward, 1)[None]
@@ -174,6 +179,20 @@ def _drift(robot, q, images, kind, left, what, rng):
         kind[poses, j] = KINDS.index(name)
         wrong += len(poses)
     return left[:0]
+
+
+def _slip(robot, q, slip, rng):
+    """Change of all images (K, 2, m, 2) by each point of each pose off by so many px a coordinate."""
+    off, step, still = (
+        slip / _PX_PER_M * rng.standard_normal((len(q), len(robot.markers), 3)),
+        1e-5,
+        robot.images(q),
+    )
+    change = np.zeros_like(still)
+    for axis in range(3):
+        moved = dataclasses.replace(robot, markers=robot.markers + step * np.eye(4)[axis])
+        change += (moved.images(q) - still) / step * off[:, None, :, None, axis]
+    return change
 
 
 def _swap(images, kind, share, rng):

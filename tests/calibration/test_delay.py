@@ -103,6 +103,20 @@ def test_ticks_wrong_frames_and_lost_markers_do_no_harm(known):
     assert found.delay_s == pytest.approx(truth, abs=2e-3)
 
 
+def test_deviations_count_times_their_factor(known):
+    robot, calibration = known
+    rng = np.random.default_rng(5)
+    seen, _ = on_the_way(robot, Cameras(0.1, None, 5e-3, rng), rng)
+    right = dataclasses.replace(seen, sigma=np.full(seen.images.shape[:3], calibration.sigma_px))
+    third = dataclasses.replace(right, sigma=right.sigma / 3.0)
+    told, found = (
+        with_delay(calibration, right),
+        with_delay(dataclasses.replace(calibration, sigma_scale=3.0), third),
+    )
+    assert found.delay_interval_s == pytest.approx(told.delay_interval_s, rel=1e-9)
+    assert with_delay(calibration, third).delay_interval_s != pytest.approx(told.delay_interval_s, rel=1e-6)
+
+
 def test_without_frames_that_tell_it_there_is_no_delay(known):
     robot, calibration = known
     rng = np.random.default_rng(4)

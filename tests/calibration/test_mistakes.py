@@ -1,19 +1,22 @@
 """Tracks with mistakes of every kind: left out, told by kind, and as good as if they had never been seen."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate
+from projservo_cli.records import WorkFailed
 from projservo_cli.report.material import findings
 from tests.calibration.bound import errors_of_the_best
 from tests.calibration.mistakes import KINDS, MISTAKES, table
 from tests.calibration.mistakes_study import median_error, shares_left_out
 
 
-def calibrated(mistaken):
+def calibrated(mistaken, **given):
     letters = mistaken.robot.joint_types
-    return calibrate(mistaken.observation, letters, source="recorded", image_size=(1280, 1024))
+    return calibrate(mistaken.observation, letters, source="recorded", image_size=(1280, 1024), **given)
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -52,6 +55,37 @@ def test_one_joint_is_enough_for_a_turntable():
     off, deviation = axis_missed(mistaken.robot, found)
     assert np.abs(off / deviation).max() < 3.0
     assert deviation.max() < 2.0  # of 0.5 px a reading
+
+
+@pytest.mark.parametrize("said", [None, 1.0])
+def test_the_noise_that_is_said_does_not_decide(said):
+    """Points of a turntable that slip on it, all a little and a fifth of them away, in both views alike."""
+    mistaken = table("drift", 1, 200, 36, joint_types="turntable", share=0.22, sigma=0.2, slip=0.15)
+    found = calibrated(mistaken, sigma_px=said)
+    assert found.usable
+    assert "limited by outliers" in found.reason
+    assert not any("joint" in text for text in found.advice)
+    assert found.sigma_fitted_px == pytest.approx(0.25, rel=0.1)
+    markers = np.intersect1d(found.marker, np.flatnonzero(mistaken.counted))
+    assert median_error(mistaken, found, markers) < 0.6
+
+
+def test_points_that_slip_with_wrong_joint_types_are_refused():
+    mistaken = table("drift", 3, 30, 15, joint_types="RR", share=0.2, sigma=0.2, slip=0.15, length=8)
+    with pytest.raises(WorkFailed, match="joint"):
+        calibrate(mistaken.observation, "RP", source="recorded", sigma_px=1.0)
+
+
+def test_sightings_left_out_that_agree_on_other_joints_are_told():
+    """A third of the points of each pose is where the poses before show it, and all slip a little."""
+    mistaken = table("right", 1, 40, 30, joint_types="RR", sigma=0.2, slip=0.25, length=30)
+    images = mistaken.observation.images.copy()
+    late = np.random.default_rng(0).random((30, 40)) < 0.3
+    late[0] = False
+    for k, j in np.argwhere(late):
+        images[k, :, j] = mistaken.observation.images[k - 1, :, j]
+    with pytest.raises(WorkFailed, match="sightings show other joints than those read; check how poses and"):
+        calibrate(dataclasses.replace(mistaken.observation, images=images), "RR", source="recorded")
 
 
 def axis_missed(robot, calibration):

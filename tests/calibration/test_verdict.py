@@ -132,3 +132,30 @@ def test_a_single_joint_asks_for_no_other(needed):
     assert "alone" not in text
     assert "other joints" not in text
     assert "every joint" not in text
+
+
+def test_a_joint_that_moved_alone_is_not_told_to():
+    needed, alike = np.array([0.03, 0.03]), np.array([False, False])
+    told = describe_joints(np.arange(2), np.ones(2), alike, needed, np.array([0.9, 0.01]))
+    assert told == (
+        "joint 2 moved 57.3° but hardly apart from the other joints: move it alone, by 1.72° or more",
+        "joint 1 moved 57.3°, in too few poses: record further ones in which it moves alone, by 1.72° or "
+        "more",
+    )
+
+
+def test_joints_that_are_off_are_told_in_px_and_no_joint_is_to_move_for_them():
+    """Sharp and blurred markers, joints that move images by many times the noise of the sharp ones."""
+    robot = random_robot("RRR", np.random.default_rng(3), markers=6)
+    rng, q = np.random.default_rng(5), trials(robot, 4)
+    found = robot.observe(q, 0.0, rng)
+    sigma = np.broadcast_to(np.where(np.arange(6) < 4, 0.01, 0.5), found.images.shape[:3])
+    images = found.images + sigma[..., None] * rng.standard_normal(found.images.shape)
+    off = 1e-3 * rng.standard_normal(q.shape)
+    effect = np.sqrt(np.mean((robot.images(q + off) - robot.images(q)) ** 2))
+    observation = Observation(found.pose, found.marker, q + off, images, sigma=sigma)
+    calibration = calibrate(observation, "RRR", source="recorded", joint_noise=None)
+    assert "limited by joint readings" in calibration.reason
+    (text,) = (text for text in calibration.advice if "move images" in text)
+    assert float(re.search(r"by ([\d.]+) px", text)[1]) == pytest.approx(effect, rel=0.35)
+    assert not any("alone" in text for text in calibration.advice)

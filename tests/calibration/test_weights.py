@@ -1,12 +1,15 @@
 """Readings with deviations of their own: the bound is reached, and residuals are what is stated."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, cross_validate, predict, prediction_variance
-from projservo_cli.records import InputError
+from projservo_cli.calibration.epipolar import Core, Epipolar
+from projservo_cli.calibration.readings import Readings
+from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.tables import read_table, write_table
 from tests.calibration.bound import Bound
 from tests.calibration.simulated_robot import around, random_robot, trials
@@ -92,3 +95,91 @@ def test_tables_keep_deviations_to_the_bit_and_refuse_what_is_none(draws, tmp_pa
         path.write_text(wrong, encoding="utf-8")
         with pytest.raises(InputError, match=message):
             read_table(path)
+
+
+def misstated(observation, factor):
+    """The same, with deviations as many times as large."""
+    return dataclasses.replace(observation, sigma=factor * observation.sigma)
+
+
+@pytest.fixture(scope="module")
+def plenty():
+    rng = np.random.default_rng(6)
+    robot = random_robot("RPR", rng, markers=12)
+    q, held_out = around(robot, 40, rng), around(robot, 40, rng)
+    return robot, held_out, stated(robot, q, 1), calibrate(stated(robot, q, 1), "RPR", source="recorded")
+
+
+@pytest.mark.parametrize("factor", [0.3, 3.0])
+def test_a_common_factor_of_stated_deviations_is_found_and_changes_no_verdict(plenty, factor):
+    robot, held_out, observation, right = plenty
+    found = calibrate(misstated(observation, factor), robot.joint_types, source="recorded")
+    assert found.usable
+    assert "of the markers state, times" in found.reason
+    low, high = found.sigma_scale_interval
+    assert low < 1.0 / factor < high < 1.5 * low
+    assert low < found.sigma_scale < high
+    assert found.sigma_px == pytest.approx(found.sigma_scale * factor * right.sigma_px)
+    assert found.chi2_per_dof == pytest.approx(1.0, abs=0.2)
+    np.testing.assert_allclose(predict(found, held_out), predict(right, held_out), atol=1e-5)
+
+
+def test_a_factor_of_one_is_one(plenty):
+    robot, _, observation, found = plenty
+    assert found.sigma_scale == 1.0
+    assert "times" not in found.reason
+    assert found.sigma_px == pytest.approx(np.sqrt(np.mean(observation.sigma**2)), rel=1e-12)
+    given = calibrate(observation, robot.joint_types, source="recorded", sigma_px=0.9)
+    assert given.sigma_scale is given.sigma_scale_interval is None
+    assert calibrate(observation, robot.joint_types).sigma_scale is None
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_deviations_that_are_wrong_are_told_before_anything_is_accused(plenty, factor):
+    robot, _, observation, _ = plenty
+    told = r"stated deviations .* wrong: .* by ([\d.]+) times .* 0.3 to 5 times .* leave both columns out"
+    with pytest.raises(WorkFailed, match=told) as refused:
+        calibrate(misstated(observation, factor), robot.joint_types, source="recorded")
+    assert float(re.search(told, str(refused.value))[1]) == pytest.approx(1.0 / factor, rel=0.15)
+    assert "joint" not in str(refused.value)
+
+
+def test_the_factor_is_right_where_a_third_of_the_sightings_are_wrong(plenty):
+    robot, _, observation, _ = plenty
+    scales = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        # As many begin within the noise as are far off, in the left view.
+        off = np.exp(rng.uniform(np.log(2.0), np.log(100.0), observation.sigma[:, 0].shape))
+        off *= observation.sigma[:, 0] * (rng.random(off.shape) < 0.3)
+        images = observation.images.copy()
+        images[:, 0] += off[..., None] * rng.choice([-1.0, 1.0], (*off.shape, 2))
+        readings = Readings.of(dataclasses.replace(observation, images=images), robot.joint_types)
+        core = Epipolar.of(readings, rng).core
+        scales.append(core.sigma_px / readings.stated_px)
+        assert core.interval[0] < core.sigma_px < core.interval[1]
+    assert np.mean(scales) == pytest.approx(1.0, abs=0.12)
+
+
+def test_the_interval_of_the_factor_holds_it_as_often_as_it_says():
+    rng = np.random.default_rng(11)
+    poses = np.repeat(np.arange(30), 20)
+    held = [low < 0.5 < high for low, high in (Core.of(0.5 * rng.standard_normal(600), poses).interval
+            for _ in range(400))]  # fmt: skip
+    assert np.mean(held) == pytest.approx(0.95, abs=0.04)
+
+
+def test_a_wrong_joint_type_is_not_taken_for_noise_of_pixels(plenty):
+    _, _, observation, _ = plenty
+    with pytest.raises(WorkFailed, match="joint"):
+        calibrate(misstated(observation, 0.5), "RRR", source="recorded")
+
+
+def test_noise_of_joints_is_not_taken_for_noise_of_pixels(plenty):
+    robot, _, observation, _ = plenty
+    q = observation.q + np.random.default_rng(0).normal(0.0, 0.005, observation.q.shape) * [1.0, 0.3, 1.0]
+    wrong = misstated(dataclasses.replace(observation, q=q), 0.5)
+    found = calibrate(wrong, robot.joint_types, source="recorded", joint_noise=None)
+    assert found.sigma_scale == pytest.approx(2.0, rel=0.15)
+    assert found.sigma_q_interval[0] < 0.005 < found.sigma_q_interval[1]
+    assert found.chi2_per_dof == pytest.approx(1.0, abs=0.3)
