@@ -272,6 +272,14 @@ class Calibration:
         "view", "s", "deviation of single images from the delay", default=None
     )
     model_px: float = _scalar("px", "error of the model per coordinate, 0 within noise", default=0.0)
+    corner_squares: FloatArray | None = _array(
+        "corner_pose view marker",
+        about="squared residuals over their variance, mean of both coordinates, NaN where unseen",
+        default=None,
+    )
+    corner_q: FloatArray | None = _array(
+        "corner_pose joint", "rad or m", "joint readings of corner_squares", default=None
+    )
     sigma_scale: float | None = _scalar(
         about="true deviations of pixels over those stated, if these were judged by the images", default=None
     )
@@ -308,6 +316,7 @@ class Calibration:
             M=self.M[indices],
             marker_error=few.marker,
             own_error=few.own,
+            corner_squares=None if self.corner_squares is None else self.corner_squares[..., indices],
         )
 
     def model(self) -> Model:

@@ -311,6 +311,7 @@ def _record(
     counts = (len(outlier), len(found.suspect) + len(found.poses), len(found.swapped))
     verdict = judged(solution, errors, expected, counts, suspicion)
     operator_defect, trace_defect, plane_defect = result.defects()
+    corner_squares, corner_q = solution.corners()
     used_rows, joint_noise = solution.used.any(axis=0), solution.joint_noise
     # More than noise, as far as the readings tell.
     over = solution.sigma_px**2 - expected.sigma_px**2 if expected.warns(solution) else 0.0
@@ -323,6 +324,8 @@ def _record(
         advice=verdict.advice,
         rms_px=solution.rms_px,
         sigma_px=expected.sigma_px,
+        corner_squares=corner_squares,
+        corner_q=corner_q,
         sigma_scale=expected.scale,
         sigma_scale_interval=expected.scale_interval,
         sigma_fitted_px=solution.sigma_px,

@@ -1,6 +1,7 @@
 """Fits: a robust search from each start, then least squares of the readings that count, and their noise."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -29,6 +30,8 @@ _LEAST_SCALE, _MOST_SCALE = 0.3, 5.0
 OPEN_DIRECTION = 1e-10
 # Numbers of the derivative that are dealt with at once: 16 MB.
 _AT_ONCE = 2**21
+# Corners whose squared residuals are kept, at most.
+_MOST_CORNERS = 50_000
 
 
 class Misfit(WorkFailed):
@@ -64,6 +67,18 @@ class Solution:
         square, weight = (G**2).sum(axis=-1), self.problem.readings.weight[self.used]
         plain = square / weight[:, None] ** 2
         return float(np.sqrt(square.mean())), self.sigma_px * float(np.sqrt(plain.mean()))
+
+    def corners(self) -> tuple[FloatArray | None, FloatArray | None]:
+        """Squared residuals (K, 2, m) over their variance, and joints (K, n); None where there are many."""
+        readings = self.problem.readings
+        shape = (len(readings.q), 2, len(readings.marker))
+        if math.prod(shape) > _MOST_CORNERS or not self.sigma_px > 0.0:
+            return None, None
+        squares = np.full(shape, np.nan)
+        found = np.where(self.used, np.square(self.residual).mean(axis=-1) / self.sigma_px**2, np.nan)
+        for view in (0, 1):
+            squares[readings.pose_of, view, readings.marker_of] = found[view]
+        return squares, readings.q.copy()
 
     @property
     def sigma_px(self) -> float:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from projservo_cli.calibration.forward import CAMERA, Scene
+from projservo_cli.calibration.forward import Scene
 from projservo_cli.monitoring.looks import Look
 from projservo_cli.monitoring.statistics import Errors, Residual, Sums
 from projservo_cli.records import BoolArray, FloatArray, IntArray
@@ -61,6 +61,7 @@ class Explanation(NamedTuple):
     cost: float  # of its parameters, by their prior
     left: float  # χ² that stays
     changed_px: float  # by how much it changes images of the markers that it touches, rms
+    least_px: float  # the same in the view where that is less
 
     @property
     def score(self) -> float:
@@ -171,10 +172,13 @@ class Evidence:
         step = np.linalg.solve(normal, right)
         return -unit * step, float(np.linalg.slogdet(normal)[1]), float(right @ step)
 
+    def _touched(self, cause: Cause) -> BoolArray:
+        """Sightings (K, 2, m') that a cause touches."""
+        return self.seen[..., list(cause.markers)] if cause.markers else self.seen
+
     def _count(self, cause: Cause) -> float:
         """Coordinates seen that a cause touches."""
-        touched = self.seen[..., list(cause.markers)] if cause.markers else self.seen
-        return max(2.0 * float(touched.sum()), 1.0)
+        return max(2.0 * float(self._touched(cause).sum()), 1.0)
 
     def _fitted(self, cause: Cause, theta: FloatArray) -> Explanation:
         """Fit of a cause, with the prior of its parameters."""
@@ -192,9 +196,12 @@ class Evidence:
             fell, theta, here, square = square - less, theta + halved, there, less
             if fell < _FALLS:
                 break
-        change = np.square(here - self.at_first).reshape(-1, 2).sum(axis=1)
+        change = np.square(here - self.at_first).reshape(len(here), 2, -1, 2).sum(axis=-1)
         changed_px = float(np.sqrt(change[change > 0.0].mean())) if change.any() else 0.0
-        return Explanation(cause, theta, self.before - square, cost, square, changed_px)
+        by_view = change.sum(axis=(0, 2)) / np.maximum(self._touched(cause).sum(axis=(0, 2)), 1)
+        return Explanation(
+            cause, theta, self.before - square, cost, square, changed_px, float(np.sqrt(by_view.min()))
+        )
 
 
 _NONE = np.zeros((1, 0))
@@ -294,7 +301,7 @@ def _image_causes(centre: FloatArray | None) -> Iterator[Cause]:
 
 
 def _camera_causes(evidence: Evidence) -> Iterator[Cause]:
-    twists, bases, d = evidence._errors.twists, evidence._errors.cameras, len(evidence._errors.twists)
+    twists, d = evidence._errors.twists, len(evidence._errors.twists)
 
     def turned(s: Changed, theta: FloatArray, views: tuple[int, ...]) -> Changed:
         P = s.P.copy()
@@ -307,13 +314,7 @@ def _camera_causes(evidence: Evidence) -> Iterator[Cause]:
         def rigid(s: Changed, theta: FloatArray, v: int = v) -> Changed:
             return turned(s, theta, (v,))
 
-        def free(s: Changed, theta: FloatArray, v: int = v) -> Changed:
-            P = s.P.copy()
-            P[v] += np.linalg.norm(P[v]) * (bases[v] @ theta).reshape(3, 4)
-            return s._replace(P=P)
-
         yield Cause("camera", v, np.zeros((1, d)), rigid)
-        yield Cause("camera", v, np.zeros((1, CAMERA - 1)), free)
     yield Cause("cameras", -1, np.zeros((1, 2 * d)), lambda s, theta: turned(s, theta, (0, 1)))
     yield Cause(
         "cameras",

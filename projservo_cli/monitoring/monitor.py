@@ -29,16 +29,18 @@ from projservo_cli.records import VIEWS, BoolArray, Calibration, FloatArray, Int
 _MOST_TESTED = 40
 # A corner that is so many times less certain than most is not tested: its error is the finder's, and lasts.
 _VAGUE = 10.0
-# A cause is looked for after so many looks that disagree, since blur passes; after the last it is told.
-_NAMED_AT = (5, 7, 10, 15)
+# A cause is looked for after so many looks that disagree, since blur passes; from the fourth time on two are
+# named that are as likely, and after the last the fault is told without a name: a hand passes in two seconds.
+_NAMED_AT = (5, 7, 10, 15, 25, 40, 60)
+_TWO_AT = 15
 # Advantage over the next cause, twice the logarithm of odds, at which one is named alone.
 _CLEAR = 2.0 * np.log(100.0)
 # Share of what images are off that a cause may leave.
-_LEFT = 0.25
+_LEFT = 0.05
 # A corner that is off by less, px, in one view of the tool is an edge that the finder took for another.
 _LEAST_MOVED_PX = 1.0
 # Looks that are remembered one by one.
-_REMEMBERED = 60
+_REMEMBERED = 80
 # Joints that differ by no more since the first look have not moved, rad or m.
 _AT_REST = 1e-3
 
@@ -58,7 +60,7 @@ class ImageMonitor:
     Detection and isolation are two things. Each look is tested: whether it disagrees needs no cause. While
     looks disagree they are ``pending``; after ``WINDOW`` of them the arm ``holds``; ``WINDOW`` looks in a row
     that agree clear them. Meanwhile causes are fitted to them by the images that they predict, and one that
-    explains them, clearly better than others, is named. After fifteen looks the fault is told without.
+    explains them, clearly better than others, is named. After sixty looks the fault is told without.
 
     Sources: R. Isermann, "Fault-Diagnosis Systems", Springer 2006, chapters 2 and 16; D. J. C. MacKay,
     "Bayesian interpolation", Neural Computation 4 (1992) 415–447, for the odds of causes.
@@ -194,10 +196,12 @@ class ImageMonitor:
         if self._off not in _NAMED_AT:
             return
         found = self._explanations(self._since_onset(), self._before)
-        best, patient = found[0], self._off < _NAMED_AT[-1]
+        best = found[0]
         if self._is_edge(best, len({one.view for one in self._since_onset()})):
             self._forgive([int(j) for j in best.cause.markers])
-        elif not patient or (self._explains(best) and len(_rivals(found)) == 1):
+        elif (
+            self._explains(best) and (self._off >= _TWO_AT or len(_rivals(found)) == 1)
+        ) or self._off == _NAMED_AT[-1]:
             self.fault = self._told(found)
 
     def _clear(self) -> None:
@@ -260,13 +264,13 @@ class ImageMonitor:
             return False
         seen = self._evidence_now.seen[:, :, list(found.cause.markers)]
         alone = seen.all(axis=1).sum() <= 0.5 * seen.any(axis=1).sum()
-        return bool(alone) or (found.changed_px < _LEAST_MOVED_PX and views < WINDOW)
+        return bool(alone) or (found.least_px < _LEAST_MOVED_PX and views < WINDOW)
 
     def _judge_markers(self) -> None:
         """Name markers that both views show off by themselves for long."""
         both, either = self._asides.min(axis=0), self._asides.max(axis=0)
         # What hides an edge shows in one view, and passes.
-        if self.pending or not ((both == _NAMED_AT[0]).any() or (either == _NAMED_AT[-1]).any()):
+        if self.pending or not ((both == _NAMED_AT[0]).any() or (either == _TWO_AT).any()):
             return
         before, moved = self._detector.memory.total, []
         for j in np.flatnonzero(either).tolist():

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import chdtri
 
-from projservo_cli.calibration.forward import CAMERA
+from projservo_cli.calibration.forward import CAMERA, Scene
 from projservo_cli.calibration.prediction import all_changed, scene_of
 from projservo_cli.calibration.readings import LEAST_SIGMA, per_rad
 from projservo_cli.monitoring.looks import Look
@@ -26,6 +26,11 @@ _LASTING = np.sqrt(2.0)
 # The part of a corner's error that is not new in each frame may last beyond a view: of many corners some are
 # off by so many deviations all along.
 _LASTING_CORNER = 2.0
+# Sightings of the calibration tell how a corner errs that is seen from within about this angle, rad; beside
+# them count so many of typical ones.
+_SLANT, _PRIOR_SIGHTINGS = 0.25, 4.0
+# In a view that the calibration has not seen all of them are, by so many.
+_UNUSUAL = 1.0
 # Joints (rad or m) and instants (s) are known no better than this, whatever is stated.
 LEAST_ERROR = 1e-6
 # A direction counts where it keeps this share of its size beside the others; what is added for solving.
@@ -35,7 +40,7 @@ _AT_ONCE_S = 1e-4
 # A view lasts while markers move by no more than this, px rms; its looks are forgotten at this rate.
 _SAME_VIEW_PX, _FORGET = 20.0, 1.0 - 1.0 / 30.0
 # Share of the markers of a view that may be off one by one before the view itself is.
-_MOST_ASIDE = 1.0 / 3.0
+_MOST_ASIDE = 0.5
 
 
 class Residual(NamedTuple):
@@ -99,7 +104,7 @@ class Errors:
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(bent, LEAST_SIGMA)
         self._sigma = max(sigma_px, self._least)
-        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA)
+        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA) * (calibration.sigma_scale or 1.0)
         self.bias_px = max(calibration.model_px, bent)
         sigma_q = calibration.sigma_q or 0.0
         if calibration.sigma_q_interval is not None:
@@ -110,6 +115,13 @@ class Errors:
         self.twists = _rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
         self.cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
         self.parts, self.touches, self.f = _directions_of(n, m, len(self.twists))
+        # Squares (K, 2, m) by which corners erred while it was recorded, and where they were seen from.
+        self._squares = calibration.corner_squares
+        if self._squares is not None and calibration.corner_q is not None:
+            self._counts: BoolArray = np.isfinite(self._squares)
+            self._typical = float(self._squares[self._counts].mean()) if self._counts.any() else 1.0
+            q = calibration.corner_q - calibration.q_reference
+            self._rays = _rays(self.scene, self.directions, q)
 
     def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
         """Standard deviation (2, m) of pixels, px: those stated, as the calibration found them, if any."""
@@ -125,6 +137,7 @@ class Errors:
         predicted = scene.seen(away)[views, views]
         r = look.images - predicted
         seen = np.isfinite(r[..., 0])
+        noise = look.noise * np.sqrt(self._excess(away))
         at = scene.everywhere(away)
         B = all_changed(scene, self.errors, away, at)[views, views]
         D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
@@ -142,8 +155,23 @@ class Errors:
             new = np.concatenate([new * left, new * ~left], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
         bend = 0.5 * np.abs(look.q_dot).sum(axis=1).max() * (late @ look.late)
-        R = new @ new.T + np.diag(np.repeat(look.noise.ravel(), 2) ** 2 + bend**2)
-        return Residual(seen, look.noise, predicted, r.ravel(), B.reshape(rows, -1), F, R)
+        R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
+        return Residual(seen, noise, predicted, r.ravel(), B.reshape(rows, -1), F, R)
+
+    def _excess(self, away: FloatArray) -> FloatArray:
+        """Variance of corners (2, m) over their noise, as sightings of the calibration from near them err.
+
+        A corner that is seen from another side, or under another slant, errs otherwise.
+        away : (2, n) joints of both views from the reference.
+        """
+        if self._squares is None:
+            return np.ones((2, len(self.scene.M)))
+        rays = np.stack([_rays(self.scene, self.directions, away[v : v + 1])[0, v] for v in (0, 1)])
+        apart = 2.0 * (1.0 - np.abs(np.einsum("vmx,kwmx->vmkw", rays, self._rays)))
+        near = np.exp(-0.5 * apart / _SLANT**2) * self._counts.transpose(2, 0, 1)
+        squares = np.where(self._counts, self._squares, 0.0).transpose(2, 0, 1)
+        found = (near * squares).sum(axis=(2, 3)) + _PRIOR_SIGHTINGS * self._typical
+        return np.asarray(np.maximum(found / (near.sum(axis=(2, 3)) + _PRIOR_SIGHTINGS), 1.0))
 
     def _fault_derivative(
         self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, look: Look
@@ -329,17 +357,37 @@ class Detector:
         sightings = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
         markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
         aside = (sightings | (markers & ~sightings.any(axis=0))) & residual.seen
-        many = aside.sum(axis=1) > _MOST_ASIDE * residual.seen.sum(axis=1)
-        if many.any():
+        by_itself = gains(
+            S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), rows.reshape(2 * m, 2), 0.0
+        )
+        off = [self._is_off(S, r, residual, aside, v, by_itself[0].reshape(2, m)[v]) for v in (0, 1)]
+        if any(off):
             aside[:] = False
-        left = residual.without(aside)
-        off = self._beyond(S, r, rows.reshape(2, 2 * m), left)
-        return Parts(bool(off.any() or many.any()), aside)
+        return Parts(any(off), aside)
+
+    def _is_off(
+        self, S: FloatArray, r: FloatArray, residual: Residual, aside: BoolArray, v: int, square: FloatArray
+    ) -> bool:
+        """Whether a view disagrees even without its worst sightings, up to half of them, which go aside.
+
+        square : (m,) χ² of each of its sightings by itself.
+        """
+        m = len(square)
+        allowed = int(_MOST_ASIDE * residual.seen[v].sum())
+        for j in [-1, *np.argsort(-np.where(residual.seen[v] & ~aside[v], square, -1.0)).tolist()]:
+            if j >= 0:
+                aside[v, j] = True
+            if (aside[v] & residual.seen[v]).sum() > allowed:
+                return True
+            if not self._beyond(S, r, 2 * m * v + np.arange(2 * m)[None], residual.without(aside))[0]:
+                return False
+        return True
 
     def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
         """Which parts (h,) of residuals, by their rows (h, p), are beyond chance and errors of the model."""
         seen = np.repeat(residual.seen.ravel(), 2)[parts]
         bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
+        bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
         most = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
         gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
         return np.asarray(gain > most**2)
@@ -397,6 +445,16 @@ def gains(
     b = right[parts] / size
     x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
     return np.maximum((b * x).sum(axis=1), 0.0), x / size
+
+
+def _rays(scene: Scene, directions: FloatArray, q: FloatArray) -> FloatArray:
+    """Lines of sight (K, 2, m, 3) of all markers in the frame of the tool, unit vectors but for their sign.
+
+    directions : (3, 4) of points at infinity; q : (K, n) joints from the reference.
+    """
+    by_marker = scene.everywhere(q).by_point[-1].reshape(2, len(q), len(scene.M), 2, 4) @ directions.T
+    ray = np.cross(by_marker[..., 0, :], by_marker[..., 1, :])
+    return np.asarray((ray / np.linalg.norm(ray, axis=-1, keepdims=True)).swapaxes(0, 1))
 
 
 def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:

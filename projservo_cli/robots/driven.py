@@ -27,7 +27,7 @@ _STILL = 0.2
 # Weight in the fit of a law that a sighting keeps which is off by itself.
 _REJECTED = 1e-3
 # Looks before the first motion, until enough agree or a fault is named.
-_MOST_LOOKS = 40
+_MOST_LOOKS = 120
 
 
 class SetPoint:

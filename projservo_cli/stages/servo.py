@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
 from projservo_cli.control import CODES
@@ -360,7 +361,8 @@ class _Asked:
         if own and (scenario.calibration is None or not scenario.calibration.usable):
             raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
         controller, driven = self._controller(), own_robot.connected(scenario, self.law)
-        with at_rest_after(driven.robot):
+        # The matrices of a look are small: a second thread costs more than it gives.
+        with threadpool_limits(limits=1), at_rest_after(driven.robot):
             if own:
                 wrong = driven.fits()
                 if wrong:
