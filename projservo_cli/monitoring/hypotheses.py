@@ -370,6 +370,20 @@ def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
         yield Cause("marker", int(j), np.zeros((1, 3)), moved, (int(j),))
 
 
+def together(moved: list[Explanation]) -> Explanation:
+    """Displacements of markers, each fitted by itself, as one cause."""
+    first = moved[0]
+    markers = tuple(j for one in moved for j in one.cause.markers)
+    return first._replace(
+        cause=first.cause._replace(markers=markers),
+        gain=sum(one.gain for one in moved),
+        cost=sum(one.cost for one in moved),
+        left=first.left - sum(one.gain for one in moved[1:]),
+        changed_px=max(one.changed_px for one in moved),
+        least_px=min(one.least_px for one in moved),
+    )
+
+
 # What a cause contains: with more parameters it explains as much.
 _CONTAINS = {
     "camera": ("shifted", "focused", "sized", "camera"),

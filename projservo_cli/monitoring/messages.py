@@ -59,16 +59,16 @@ def sentence(found: Explanation, calibration: Calibration) -> str:
             "their size, or recalibrate"
         )
     if kind in ("tag", "marker"):
-        return moved_sentence([found], calibration)
+        return _moved(found, calibration)
     if kind == "tool":
         return f"the tool was moved in its holder, by {px}; put it back, or recalibrate"
     return f"both cameras were moved alike, or the base was, by {px}; recalibrate"
 
 
-def moved_sentence(found: list[Explanation], calibration: Calibration) -> str:
+def _moved(found: Explanation, calibration: Calibration) -> str:
     """Sentence on markers that moved on the tool, those of a tag together."""
-    moved = sorted({int(calibration.marker[j]) for one in found for j in one.cause.markers})
-    px, listed = max(one.changed_px for one in found), ", ".join(map(str, moved))
+    moved = sorted(int(calibration.marker[j]) for j in found.cause.markers)
+    px, listed = found.changed_px, ", ".join(map(str, moved))
     tag = moved[0] // CORNERS
     if len(moved) == CORNERS and moved[-1] // CORNERS == tag:
         return f"tag {tag} (markers {listed}) moved on the tool, by {px:.2g} px; put it back, or recalibrate"

@@ -11,9 +11,10 @@ from projservo_cli.monitoring.hypotheses import (
     causes_of,
     contains,
     is_possible,
+    together,
 )
 from projservo_cli.monitoring.looks import Frame, Look, Pairing
-from projservo_cli.monitoring.messages import group_of, moved_sentence, sentence
+from projservo_cli.monitoring.messages import group_of, sentence
 from projservo_cli.monitoring.statistics import (
     LEAST_ERROR,
     WINDOW,
@@ -52,6 +53,7 @@ class _Kept(NamedTuple):
     residual: Residual
     aside: BoolArray  # (2, m) sightings that were off by themselves
     view: int  # number of the view that it is of
+    views: int  # views that agreed up to it
 
 
 class ImageMonitor:
@@ -99,6 +101,7 @@ class ImageMonitor:
             0  # looks off, the number of the first, and looks in a row that agree
         )
         self._before = self._detector.memory.total  # sums up to the onset
+        self._unit = 1.0  # of χ², by what the best cause left
         self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # looks in a row
         self._forgiven: list[int] = []
         self.fault, self.agreeing = "", 0
@@ -167,13 +170,14 @@ class ImageMonitor:
         self._asides = np.where(tested.aside, self._asides + 1, self._asides * ~residual.seen)
         self.rejected[:, self._shown] = tested.aside
         self.rejected[:, self._shown[self._forgiven]] = True
-        self._kept = [*self._kept[-_REMEMBERED:], _Kept(look, residual, tested.aside, self._view)]
+        self._kept = [*self._kept[-_REMEMBERED:], _Kept(look, residual, tested.aside, self._view, 0)]
         since = None
         clean = residual.without(tested.aside)
         memory.learn(clean, tested.disagrees)
+        if not tested.disagrees and not self.holds:
+            memory.keep(clean, float(look.t.mean()))
+        self._kept[-1] = self._kept[-1]._replace(views=memory.total.looks)
         if not tested.disagrees:
-            if not self.holds:
-                memory.keep(clean, float(look.t.mean()))
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
             since = self._detector.significant(self.looks, look.late, free, self.pending)
         if not tested.disagrees and since is None:
@@ -187,10 +191,11 @@ class ImageMonitor:
 
     def _disagree(self, since: Sums | None) -> None:
         """Count a look that disagrees, and name the fault where that can be done."""
-        if not self._off:
-            self._onset, self._before = self.looks - 1, since or self._detector.memory.total
-            if since is not None:
-                self._onset = self.looks - len(self._kept)
+        if since is not None:  # the likeliest onset, as far as looks are remembered
+            after = [one for one in self._kept if one.views > since.looks]
+            self._onset, self._before = self.looks - max(1, len(after)), since
+        elif not self._off:
+            self._onset, self._before = self.looks - 1, self._detector.memory.total
         self._off += 1
         self.agreeing = self._agreed = 0
         if self._off not in _NAMED_AT:
@@ -234,11 +239,13 @@ class ImageMonitor:
         found = [one for one in evidence.explanations(causes) if is_possible(one)]
         # Where even the best leaves more than chance does, the unit is what that leaves.
         least = min(found, key=lambda one: one.left)
-        unit = max(1.0, least.left / max(1.0, evidence.rows - least.theta.size))
-        return sorted(
-            (one._replace(gain=one.gain / unit, left=one.left / unit) for one in found),
-            key=lambda one: -one.score,
-        )
+        self._unit = max(1.0, least.left / max(1.0, evidence.rows - least.theta.size))
+        found = [one._replace(gain=one.gain / self._unit, left=one.left / self._unit) for one in found]
+        found.sort(key=lambda one: -one.score)
+        if found[0].cause.kind != "marker":
+            return found
+        moved = [one for one in found if one.cause.kind == "marker" and one.score > _CLEAR] or found[:1]
+        return [together(moved), *(one for one in found if one.cause.kind != "marker")]
 
     def _evidence(self, kept: list[_Kept], before: Sums) -> Evidence:
         """Looks to be explained, those of one view worth what they are."""
@@ -251,9 +258,9 @@ class ImageMonitor:
 
     def _explains(self, found: Explanation) -> bool:
         """Whether a cause explains most of what images are off."""
-        evidence = self._evidence_now
-        allowed = evidence.rows + (np.sqrt(evidence.rows) * 3.0) + evidence.bias
-        return bool(found.left <= allowed + _LEFT * max(0.0, found.gain))
+        rows, lasting = self._evidence_now.rows, 1.0 - self._detector.memory.fresh
+        allowed = (1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + self._evidence_now.bias
+        return bool(self._unit * found.left <= allowed + _LEFT * self._unit * max(0.0, found.gain))
 
     def _is_edge(self, found: Explanation, views: int) -> bool:
         """Whether what seems to have moved is perhaps an edge that a finder took for that of a marker.
@@ -284,22 +291,20 @@ class ImageMonitor:
             if lasts and best.score > _CLEAR and self._explains(best):
                 moved.append(best)
         if moved:
-            self.fault = self._told(moved, together=True)
+            self.fault = self._told([together(moved)])
 
     def _forgive(self, markers: list[int]) -> None:
         """Leave markers out from here on, and take up the run again."""
         self._forgiven += [j for j in markers if j not in self._forgiven]
         self._off = 0
 
-    def _told(self, found: list[Explanation], together: bool = False) -> str:
-        """Sentence on the fault by the likeliest of causes, or by all of them together."""
+    def _told(self, found: list[Explanation]) -> str:
+        """Sentence on the fault by the likeliest of causes."""
         residual = self._kept[-1].residual
         rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
         off = f"images are {rms:.3g} px rms per coordinate off what the calibration predicts"
         if not self._explains(found[0]):
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
-        if together:
-            return f"{off}: {moved_sentence(found, self.calibration)}"
         names = [sentence(one, self.calibration) for one in _rivals(found)[:2]]
         return f"{off}: {'; or '.join(names)}"
 

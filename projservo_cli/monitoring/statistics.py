@@ -39,6 +39,8 @@ _RANK, RIDGE = 1e-6, 1e-9
 _AT_ONCE_S = 1e-4
 # A view lasts while markers move by no more than this, px rms; its looks are forgotten at this rate.
 _SAME_VIEW_PX, _FORGET = 20.0, 1.0 - 1.0 / 30.0
+# χ² of a sighting that may be off by itself: once in ten thousand by chance.
+_OFF_ALONE = 18.4
 # Share of the markers of a view that may be off one by one before the view itself is.
 _MOST_ASIDE = 0.5
 
@@ -374,7 +376,8 @@ class Detector:
         """
         m = len(square)
         allowed = int(_MOST_ASIDE * residual.seen[v].sum())
-        for j in [-1, *np.argsort(-np.where(residual.seen[v] & ~aside[v], square, -1.0)).tolist()]:
+        worst = [j for j in np.argsort(-square).tolist() if square[j] > _OFF_ALONE and not aside[v, j]]
+        for j in [-1, *worst]:
             if j >= 0:
                 aside[v, j] = True
             if (aside[v] & residual.seen[v]).sum() > allowed:
@@ -404,12 +407,15 @@ class Detector:
         lengths = _LONGER ** np.arange(1 + int(np.log(total.looks) / np.log(_LONGER)))
         tail = self._chance / (looks + _SOON) / len(self._sizes)
         by_chance = np.sqrt(chdtri(self._sizes, tail))
+        found: Sums | None = None
+        most = 0.0
         for length in lengths if thorough else lengths[[looks % len(lengths)]]:
             since = min(onsets, key=lambda sums: abs(total.looks - length - sums.looks))
             gain, bias = self._gain(since, total, late, free)
-            if bool((np.sqrt(gain) > by_chance + np.sqrt(bias)).any()):
-                return since
-        return None
+            excess = float((np.sqrt(gain) - by_chance - np.sqrt(bias)).max())
+            if excess > most:
+                found, most = since, excess
+        return found
 
     def _gain(
         self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]

@@ -118,19 +118,29 @@ def test_ticks_that_last_at_rest_do_not_average_into_a_slip(arm):
     for seed in range(4):
         q, _ = arm.way(seed)
         q = np.concatenate([q, np.repeat(q[-1:], 60, axis=0)])
-        coarse = 4.0 * TICK
+        coarse = 12.0 * TICK
         read, s = coarse * np.round(q / coarse), noisy(arm.images(at_once(q)), seed)
         assert first_alarm(arm.with_joint_noise(coarse / np.sqrt(12.0)), read, s) == (None, "")
-        assert first_alarm(arm, read, s)[1]
+        test = ImageMonitor(arm.calibration, SIGMA, LOOKS)
+        held = []
+        for k in range(len(read)):
+            test.look(
+                np.full(2, PERIOD * k), *at_once(np.stack([read[k], 0 * q[k]])), np.zeros(2), s[k], [1, 1]
+            )
+            held.append(test.holds)
+        assert any(held)
 
 
-def test_a_constant_error_of_the_model_does_not_average_into_a_disturbance(arm):
+def test_an_error_of_corners_that_lasts_is_no_fault_until_it_is_far_beyond_noise(arm):
+    """Then it is told although no cause explains it, and where images are off most."""
     q, _ = arm.way(1)
-    bent = 0.4 * np.sqrt(2.0) * np.sin(np.arange(20.0)).reshape(1, 2, 10, 1)
+    bent = np.sqrt(2.0) * np.sin(np.arange(20.0)).reshape(1, 2, 10, 1)
     s = noisy(arm.images(at_once(q)), 1)
-    s[10:] += bent
+    s[10:] += 0.4 * bent
     assert first_alarm(arm.with_joint_noise(0.0, model_px=0.4), q, s) == (None, "")
-    assert first_alarm(arm, q, s)[1]
+    assert first_alarm(arm, q, s) == (None, "")
+    s[10:] += 2.6 * bent
+    assert "no single cause explains it" in first_alarm(arm, q, s)[1]
 
 
 def test_single_slips_of_the_detector_and_unseen_markers_are_no_disturbance(arm):
@@ -171,12 +181,12 @@ def test_instants_that_are_uncertain_are_not_taken_for_a_disturbance(arm):
 
 
 def test_a_frame_that_comes_twice_is_no_second_measurement(arm):
-    """One slip of the detector, shown again and again, stays one."""
+    """A slip of the detector, shown again and again, stays one; a camera that shows it anew was moved."""
     q, _ = arm.way(4)
     s = noisy(arm.images(at_once(q)), 4)
-    s[20:26, 0] = s[20, 0] + 30.0
+    s[20:32, 0] += 30.0
     fresh = np.ones((len(q), 2), dtype=bool)
-    fresh[21:26, 0] = False
+    fresh[21:32, 0] = False
     assert first_alarm(arm, q, s, fresh=fresh) == (None, "")
     assert "left camera" in first_alarm(arm, q, s)[1]
 
@@ -268,7 +278,7 @@ def test_each_fault_is_named_soon(arm, strikes, name, seed):
         name = name.replace(f"{{{j}}}", str(number))
     assert name in said
     assert " or " + name not in said
-    assert onset + WINDOW - 1 <= k <= onset + 20
+    assert onset + WINDOW - 1 <= k <= onset + 30
     if "slipped" in name:
         assert float(re.search(r"slipped by (\S+) deg", said)[1]) == pytest.approx(3.0, abs=0.2)
 
