@@ -18,6 +18,8 @@ _EXPECTED_PX = 30.0
 _HIDDEN_PX = 1e3
 # Steps of Gauss and Newton, halvings of each, and the change of parameters that derivatives are taken by.
 _STEPS, _HALVINGS, _EPSILON = 8, 6, 1e-6
+# A cause that changes images by more than this, px, is far off.
+_NEAR_PX = 5.0
 # Causes that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
 _FITTED, _FALLS = 8, 0.05
 # Starts of a joint that was homed anew, factors of images of another size.
@@ -80,11 +82,9 @@ class Evidence:
         self, errors: Errors, looks: list[Look], residuals: list[Residual], weights: FloatArray, agreed: Sums
     ) -> None:
         few = np.unique(np.linspace(0, len(looks) - 1, min(len(looks), _MOST_LOOKS)).round().astype(int))
-        self.looks = [looks[i] for i in few]
-        residuals, factor = (
-            [residuals[i] for i in few],
-            np.sqrt(weights[few] * (weights.sum() / weights[few].sum())),
-        )
+        self.looks, residuals = [looks[i] for i in few], [residuals[i] for i in few]
+        self._weights, self._agreed = weights[few] * (weights.sum() / weights[few].sum()), agreed
+        factor = np.sqrt(self._weights)
         self._errors = errors
         self.scene: Scene = errors.scene
         self.away = np.array([look.q for look in self.looks]) - errors.calibration.q_reference
@@ -140,7 +140,32 @@ class Evidence:
         """Fits of the causes that a first step of each makes the likeliest."""
         tried = [self._tried(cause) for cause in causes]
         tried.sort(key=lambda one: -one[0])
-        return [self._fitted(cause, start) for _, cause, start in tried[:_FITTED]]
+        return [self._anew(self._fitted(cause, start)) for _, cause, start in tried[:_FITTED]]
+
+    def _anew(self, found: Explanation) -> Explanation:
+        """Explanation of a cause that is far off, with errors of joints and calibration as they act there.
+
+        Looks are taken back to where nothing is wrong, and what is left of the cause is fitted to those.
+        """
+        kind, changed = found.cause.kind, found.cause.change(self.nothing, found.theta)
+        if kind not in ("exchanged", "mirrored", "slipped", "sized") or found.changed_px < _NEAR_PX:
+            return found
+        looks = []
+        for look, away in zip(self.looks, changed.away, strict=True):
+            images, noise = look.images, look.noise
+            if kind == "exchanged":
+                images, noise = images[::-1], noise[::-1]
+            images = (images - changed.shift[:, None] + 0.5) / changed.scale[:, None, None] - 0.5
+            noise = noise / changed.scale[:, None]
+            q = away + self._errors.calibration.q_reference
+            looks.append(look._replace(q=q, images=images, noise=noise))
+        residuals = [self._errors.residual(look) for look in looks]
+        there = Evidence(self._errors, looks, residuals, self._weights, self._agreed)
+        left, theta = there.before, found.theta
+        if theta.size:
+            nearer = there._fitted(found.cause, np.full(1, 1.0 if kind == "sized" else 0.0))
+            left, theta = nearer.left, theta * nearer.theta if kind == "sized" else theta + nearer.theta
+        return found._replace(theta=theta, gain=self.before - left, left=left)
 
     def _changed_by(self, cause: Cause, theta: FloatArray) -> FloatArray:
         return self._off(cause.change(self.nothing, theta))
@@ -390,7 +415,6 @@ _CONTAINS = {
     "cameras": ("shifted", "focused", "sized", "camera", "rig"),
     "focused": ("shifted",),
     "flexible": ("slipped",),
-    "frozen": ("slipped", "mirrored"),
     "slipped": ("mirrored",),
     "tag": ("marker",),
     "tool": ("larger",),

@@ -23,9 +23,7 @@ def sentence(found: Explanation, calibration: Calibration) -> str:
     theta, px = found.theta, f"{found.changed_px:.2g} px"
     side = "both cameras" if i < 0 else f"the {VIEWS[min(i, 1)]} camera"
     if kind == "exchanged":
-        return (
-            "the left and the right camera are exchanged; exchange them in the configuration or their cables"
-        )
+        return "the left and the right camera are exchanged; exchange their sources or cables"
     if kind == "mirrored":
         return (
             f"joint {i + 1} has the other sign than when it was calibrated; restore its sign, or recalibrate"
@@ -42,13 +40,13 @@ def sentence(found: Explanation, calibration: Calibration) -> str:
         return f"images of {side} come {ms} ms later than was taken; give plant.delay_s, or recalibrate"
     if kind == "sized":
         return (
-            f"images of {side} have another size: {theta[0]:.4g} times that of the calibration; set the size "
-            "of before, or recalibrate"
+            f"the image size of {side} is {theta[0]:.4g} times that of the calibration; set the size of "
+            "before, or recalibrate"
         )
     if kind == "focused":
         return (
-            f"the focal length of {side} changed by {100.0 * theta[0]:+.2g} %, or it was moved along its "
-            "optical axis; restore and lock focus and zoom, put it back, or recalibrate"
+            f"{side} was moved along its optical axis, or its focal length changed by "
+            f"{100.0 * theta[0]:+.2g} % (focus or zoom); put it back and lock focus and zoom, or recalibrate"
         )
     if kind in ("camera", "shifted") and i >= 0:
         return f"{side} was moved, by {px}; put it back, or recalibrate"
@@ -62,7 +60,8 @@ def sentence(found: Explanation, calibration: Calibration) -> str:
         return _moved(found, calibration)
     if kind == "tool":
         return f"the tool was moved in its holder, by {px}; put it back, or recalibrate"
-    return f"both cameras were moved alike, or the base was, by {px}; recalibrate"
+    cropped = "images are cropped otherwise, or " if kind == "shifted" else ""
+    return f"{cropped}both cameras were moved alike, or the base was, by {px}; put it back, or recalibrate"
 
 
 def _moved(found: Explanation, calibration: Calibration) -> str:

@@ -37,7 +37,7 @@ _TWO_AT = 15
 # Advantage over the next cause, twice the logarithm of odds, at which one is named alone.
 _CLEAR = 2.0 * np.log(100.0)
 # Share of what images are off that a cause may leave.
-_LEFT = 0.05
+_LEFT = 0.15
 # A corner that is off by less, px, in one view of the tool is an edge that the finder took for another.
 _LEAST_MOVED_PX = 1.0
 # Looks that are remembered one by one.
@@ -222,8 +222,12 @@ class ImageMonitor:
         self._off = 0
 
     def _since_onset(self) -> list[_Kept]:
-        """Looks since the onset of what is pending, those before it left out."""
-        return self._kept[-max(1, self.looks - self._onset) :]
+        """Looks since the onset of what is pending, but for the first, which may show half of it.
+
+        Frames of both views that come one after the other may make that two.
+        """
+        kept = self._kept[-max(1, self.looks - self._onset) :]
+        return kept[1 + (self._off > _NAMED_AT[0]) :] if len(kept) >= _NAMED_AT[0] else kept
 
     def _explanations(
         self, kept: list[_Kept], before: Sums, markers: list[int] | None = None

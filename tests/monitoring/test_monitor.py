@@ -280,7 +280,8 @@ def test_each_fault_is_named_soon(arm, strikes, name, seed):
     assert " or " + name not in said
     assert onset + WINDOW - 1 <= k <= onset + 30
     if "slipped" in name:
-        assert float(re.search(r"slipped by (\S+) deg", said)[1]) == pytest.approx(3.0, abs=0.2)
+        # By five looks of 0.5 px noise, most of one view.
+        assert float(re.search(r"slipped by (\S+) deg", said)[1]) == pytest.approx(3.0, abs=0.4)
 
 
 @pytest.fixture(scope="module")
