@@ -149,12 +149,13 @@ class Errors:
         for part in (r, B, F):
             part[~seen] = 0.0
         F = F.reshape(rows, -1)
-        sigma_q = np.hypot(self.sigma_q, look.curved)
-        new = F[:, [*range(n), 2 * n, 2 * n + 1]] * np.append(sigma_q, look.late)
-        late = new[:, n:]
-        if abs(look.t[0] - look.t[1]) > _AT_ONCE_S:  # joints were read anew for the other view
+        J_q, late = F[:, :n], F[:, 2 * n : 2 * n + 2] * look.late
+        # Errors of joints are the same in both views of a look, but for what they move between both frames.
+        new = np.concatenate([J_q * self.sigma_q, late], axis=1)
+        if abs(look.t[0] - look.t[1]) > _AT_ONCE_S:
             left = np.arange(rows)[:, None] < rows // 2
-            new = np.concatenate([new * left, new * ~left], axis=1)
+            between = J_q * look.curved
+            new = np.concatenate([new, between * left, between * ~left], axis=1)
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
         bend = 0.5 * np.abs(look.q_dot).sum(axis=1).max() * (late @ look.late)
         R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
@@ -340,7 +341,7 @@ class Detector:
         m = len(errors.calibration.M)
         tail = _FALSE_ALARM / observations
         self._chance = _FALSE_ALARM / np.log1p(observations / _SOON)
-        self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (2 + m)))
+        self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (3 + m)))
         self._sizes = np.array([len(columns) for columns in errors.parts])
         self._by_size = [
             (which, np.array([errors.parts[i] for i in which]))
@@ -359,30 +360,39 @@ class Detector:
         sightings = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
         markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
         aside = (sightings | (markers & ~sightings.any(axis=0))) & residual.seen
-        by_itself = gains(
-            S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), rows.reshape(2 * m, 2), 0.0
-        )
-        off = [self._is_off(S, r, residual, aside, v, by_itself[0].reshape(2, m)[v]) for v in (0, 1)]
+        shown = np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0)
+        square = gains(S, shown, rows.reshape(2 * m, 2), 0.0)[0]
+        parts = (np.arange(2 * m) < m, np.arange(2 * m) >= m, np.ones(2 * m, dtype=np.bool_))
+        off = [self._is_off(S, r, residual, aside, part, square) for part in parts]
         if any(off):
             aside[:] = False
         return Parts(any(off), aside)
 
     def _is_off(
-        self, S: FloatArray, r: FloatArray, residual: Residual, aside: BoolArray, v: int, square: FloatArray
+        self,
+        S: FloatArray,
+        r: FloatArray,
+        residual: Residual,
+        aside: BoolArray,
+        part: BoolArray,
+        square: FloatArray,
     ) -> bool:
-        """Whether a view disagrees even without its worst sightings, up to half of them, which go aside.
+        """Whether a view, or both, disagree even without their worst sightings, up to half, which go aside.
 
-        square : (m,) χ² of each of its sightings by itself.
+        part : (2 m,) its sightings; square : (2 m,) χ² of each sighting by itself.
         """
-        m = len(square)
-        allowed = int(_MOST_ASIDE * residual.seen[v].sum())
-        worst = [j for j in np.argsort(-square).tolist() if square[j] > _OFF_ALONE and not aside[v, j]]
+        shown, out = residual.seen.ravel() & part, aside.reshape(-1)
+        allowed = int(_MOST_ASIDE * shown.sum())
+        rows = np.flatnonzero(np.repeat(part, 2))[None]
+        worst = [
+            j for j in np.argsort(-square).tolist() if square[j] > _OFF_ALONE and shown[j] and not out[j]
+        ]
         for j in [-1, *worst]:
             if j >= 0:
-                aside[v, j] = True
-            if (aside[v] & residual.seen[v]).sum() > allowed:
+                out[j] = True
+            if (out & shown).sum() > allowed:
                 return True
-            if not self._beyond(S, r, 2 * m * v + np.arange(2 * m)[None], residual.without(aside))[0]:
+            if not self._beyond(S, r, rows, residual.without(aside))[0]:
                 return False
         return True
 
