@@ -7,8 +7,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.forward import Scene
+from projservo_cli.monitoring.detector import ErrorModel, Residual, Sums
 from projservo_cli.monitoring.looks import Look
-from projservo_cli.monitoring.statistics import Errors, Residual, Sums
 from projservo_cli.records import BoolArray, FloatArray, IntArray
 
 CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
@@ -79,7 +79,12 @@ class Evidence:
     """
 
     def __init__(
-        self, errors: Errors, looks: list[Look], residuals: list[Residual], weights: FloatArray, agreed: Sums
+        self,
+        errors: ErrorModel,
+        looks: list[Look],
+        residuals: list[Residual],
+        weights: FloatArray,
+        agreed: Sums,
     ) -> None:
         few = np.unique(np.linspace(0, len(looks) - 1, min(len(looks), _MOST_LOOKS)).round().astype(int))
         self.looks, residuals = [looks[i] for i in few], [residuals[i] for i in few]

@@ -5,6 +5,15 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.readings import even_choice
+from projservo_cli.monitoring.detector import (
+    LEAST_ERROR,
+    WINDOW,
+    Detector,
+    ErrorModel,
+    Residual,
+    Sums,
+    columns_of_marker,
+)
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
     Explanation,
@@ -15,15 +24,6 @@ from projservo_cli.monitoring.hypotheses import (
 )
 from projservo_cli.monitoring.looks import Frame, Look, Pairing
 from projservo_cli.monitoring.messages import group_of, sentence
-from projservo_cli.monitoring.statistics import (
-    LEAST_ERROR,
-    WINDOW,
-    Detector,
-    Errors,
-    Residual,
-    Sums,
-    columns_of_marker,
-)
 from projservo_cli.records import VIEWS, BoolArray, Calibration, FloatArray, IntArray
 
 # Markers that are tested, at most.
@@ -91,7 +91,7 @@ class ImageMonitor:
         self.calibration = calibration.with_markers(self._shown)
         known = image_size is not None and bool(np.isfinite(image_size).all())
         self._centre = 0.5 * (np.asarray(image_size) - 1.0) if known else None
-        self._errors = Errors(self.calibration, sigma_px)
+        self._errors = ErrorModel(self.calibration, sigma_px)
         self._detector = Detector(self._errors, observations)
         self._pairing = Pairing()
         self._first: FloatArray | None = None  # (n,) joints of the first look, rad or m

@@ -15,8 +15,8 @@ import numpy as np
 from projservo_cli.calibration.readings import LEAST_SIGMA
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward
+from projservo_cli.monitoring.detector import WINDOW
 from projservo_cli.monitoring.monitor import ImageMonitor
-from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
 from projservo_cli.robots.instants import DelayPrior, Delays, History

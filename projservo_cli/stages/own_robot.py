@@ -10,8 +10,8 @@ import numpy as np
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config
 from projservo_cli.geometry.algebra import mat
+from projservo_cli.monitoring.detector import WINDOW
 from projservo_cli.monitoring.monitor import ImageMonitor
-from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot

@@ -12,9 +12,9 @@ from projservo_cli.calibration import calibrate as calibrated
 from projservo_cli.calibration import predict
 from projservo_cli.calibration.forward import Scene, displacements, image_points, moved_points
 from projservo_cli.calibration.prediction import all_changed, scene_of
-from projservo_cli.monitoring import statistics
+from projservo_cli.monitoring import detector
+from projservo_cli.monitoring.detector import WINDOW
 from projservo_cli.monitoring.monitor import ImageMonitor
-from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.world import truth_of
 from tests.calibration.simulated_robot import random_robot, trials
@@ -95,7 +95,7 @@ def test_residuals_of_the_model_itself_set_nothing_off(arm, monkeypatch):
     """Errors of calibration, joints and instants of the first order, at a chance of one run in five."""
     arm = arm.with_joint_noise(1e-3)
     calibration, runs, alarms = arm.calibration, 30, 0
-    monkeypatch.setattr(statistics, "_FALSE_ALARM", 0.2)
+    monkeypatch.setattr(detector, "_FALSE_ALARM", 0.2)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         q, q_dot = arm.way(seed % 3)

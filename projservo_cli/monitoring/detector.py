@@ -87,7 +87,7 @@ class Sums(NamedTuple):
         return self._replace(normal=factor * self.normal, seen=factor * self.seen, bias=factor * self.bias)
 
 
-class Errors:
+class ErrorModel:
     """What a calibration allows images to be off, and directions in which faults would change them.
 
     At given joint readings the calibration predicts the pixels of every marker. What is seen differs by
@@ -233,7 +233,7 @@ class Errors:
 class Memory:
     """Looks that agreed, view by view: looks of one view share the errors of their corners."""
 
-    def __init__(self, errors: Errors) -> None:
+    def __init__(self, errors: ErrorModel) -> None:
         self._errors = errors
         self._closed = [errors.nothing()]
         self._view = errors.nothing()  # looks of the view that lasts, fading
@@ -316,7 +316,7 @@ def _alike(before: FloatArray, now: FloatArray) -> bool:
     return bool(np.nanmean(np.append(moved, 0.0)) <= _SAME_VIEW_PX**2)
 
 
-class Parts(NamedTuple):
+class Tested(NamedTuple):
     """Tests of one look."""
 
     disagrees: bool  # whether the whole of it does
@@ -336,7 +336,7 @@ class Detector:
     errors : what images may be off; observations : most looks of one sequence, which sets the thresholds.
     """
 
-    def __init__(self, errors: Errors, observations: int) -> None:
+    def __init__(self, errors: ErrorModel, observations: int) -> None:
         self._errors, self.memory = errors, Memory(errors)
         m = len(errors.calibration.M)
         tail = _FALSE_ALARM / observations
@@ -348,7 +348,7 @@ class Detector:
             for which in (np.flatnonzero(self._sizes == size) for size in np.unique(self._sizes))
         ]
 
-    def tested(self, residual: Residual) -> Parts:
+    def tested(self, residual: Residual) -> Tested:
         """Test χ² of each view and each marker in one look, sightings that are off by themselves aside."""
         errors, (_, m) = self._errors, residual.seen.shape
         total = self.memory.total
@@ -366,7 +366,7 @@ class Detector:
         off = [self._is_off(S, r, residual, aside, part, square) for part in parts]
         if any(off):
             aside[:] = False
-        return Parts(any(off), aside)
+        return Tested(any(off), aside)
 
     def _is_off(
         self,
@@ -504,7 +504,7 @@ def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, 
     return list(columns), np.array([part.ravel() for part in touches]), at_tool + 2 * d
 
 
-def columns_of_marker(errors: Errors, marker: int) -> IntArray:
+def columns_of_marker(errors: ErrorModel, marker: int) -> IntArray:
     """Columns of the displacement of a marker among the directions of faults."""
     n = len(errors.sigma_q)
     return np.asarray(2 * n + 2 + 2 * (CAMERA - 1) + 3 * marker + np.arange(3))
