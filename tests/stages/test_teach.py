@@ -95,6 +95,15 @@ def test_what_does_not_fit_the_calibration_is_told(calibration):
         require_face(config(), taught)
 
 
+@pytest.mark.volume
+def test_a_goal_taught_after_a_camera_was_moved_names_the_camera(calibration):
+    taught = teach(config(), 10, AT)
+    taught.s[1] += [0.0, 8.0]
+    check = checked(config(), calibration, taught)
+    assert not check.reached
+    assert "the right camera was moved, by 8" in check.reason
+
+
 def test_a_file_that_was_not_taught_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"task\.goal: .*ur5\.yaml: is no file that projservo teach wrote"):
         config("task.goal=ur5.yaml")
