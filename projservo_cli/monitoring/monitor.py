@@ -73,8 +73,9 @@ class ImageMonitor:
     shown : indices of the markers that images may show, None all; of many, some stand for all.
     image_size : (2,) px; None or infinite where it is not known.
     ``fault``: what is wrong, in words; empty while nothing is, or while it is not clear what.
-    ``looks``: how many were tested. ``agreeing``: looks of one view in a row that agree. ``rejected``: (2, m)
-    sightings of the last look that are off by themselves, of all markers of the calibration.
+    ``looks``: how many showed a marker and were tested. ``agreeing``: looks of one view in a row that agree.
+    ``rejected``: (2, m) sightings of the last look that are off by themselves, of all markers of the
+    calibration.
     """
 
     def __init__(
@@ -97,9 +98,8 @@ class ImageMonitor:
         self._first: FloatArray | None = None  # (n,) joints of the first look, rad or m
         self._kept: list[_Kept] = []
         self.looks = self._view = 0
-        self._off = self._onset = self._agreed = (
-            0  # looks off, the number of the first, and looks in a row that agree
-        )
+        # Looks that disagree, the number of the first of them, and looks in a row that agree.
+        self._off = self._onset = self._agreed = 0
         self._before = self._detector.memory.total  # sums up to the onset
         self._unit = 1.0  # of χ², by what the best cause left
         self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # looks in a row
@@ -160,10 +160,10 @@ class ImageMonitor:
 
     def _take(self, look: Look) -> None:
         """Test a look, and judge what is known by now."""
-        self.looks += 1
         memory, residual = self._detector.memory, self._errors.residual(look)
         if not residual.seen.any():
             return
+        self.looks += 1
         lasts = memory.lasts(residual)
         self._view += not lasts
         tested = self._detector.tested(residual)
@@ -202,11 +202,14 @@ class ImageMonitor:
             return
         found = self._explanations(self._since_onset(), self._before)
         best = found[0]
-        if self._is_edge(best, len({one.view for one in self._since_onset()})):
-            self._forgive([int(j) for j in best.cause.markers])
-        elif (
-            self._explains(best) and (self._off >= _TWO_AT or len(_rivals(found)) == 1)
-        ) or self._off == _NAMED_AT[-1]:
+        explains, views = self._explains(best), len({one.view for one in self._since_onset()})
+        anew = not set(best.cause.markers) <= set(self._forgiven)
+        if explains and anew and self._is_edge(best, views):
+            self._forgiven += best.cause.markers
+            self._off = 0
+            return
+        clear = self._off >= _TWO_AT or len(_rivals(found)) == 1
+        if (explains and clear) or self._off == _NAMED_AT[-1]:
             self.fault = self._told(found)
 
     def _clear(self) -> None:
@@ -296,11 +299,6 @@ class ImageMonitor:
                 moved.append(best)
         if moved:
             self.fault = self._told([together(moved)])
-
-    def _forgive(self, markers: list[int]) -> None:
-        """Leave markers out from here on, and take up the run again."""
-        self._forgiven += [j for j in markers if j not in self._forgiven]
-        self._off = 0
 
     def _told(self, found: list[Explanation]) -> str:
         """Sentence on the fault by the likeliest of causes."""
