@@ -26,6 +26,8 @@ from projservo_cli.robots.simulated import Plant, observe
 _STILL = 0.2
 # Weight in the fit of a law that a sighting keeps which is off by itself.
 _REJECTED = 1e-3
+# A held arm that so long shows the same image to the bit, s, shows nothing else: a simulated one without noise.
+_STALE_S = 0.5
 # Looks before the first motion, until enough agree or a fault is named.
 _MOST_LOOKS = 120
 
@@ -223,6 +225,7 @@ class DrivenRobot:
         self.hidden = np.zeros(2)
         self.disturbance = ""
         self.weight: FloatArray | None = None
+        self._stale = 0  # looks in a row without a new frame while the arm is held
         self.begin()
 
     def begin(self) -> None:
@@ -263,6 +266,9 @@ class DrivenRobot:
                 frames.t, q_then, q_dot, frames.sigma, images, frames.fresh, stated=stated
             )
             self.disturbance = fault or self.disturbance
+            self._stale = 0 if frames.fresh.any() or not self.holds else self._stale + 1
+            if self._stale * self.robot.bounds.period > _STALE_S:
+                self.give_up()
             self._leave_out(self.monitor.rejected[:, self._place], stated is None)
         q = self.steered.set_point.at_rest
         there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]

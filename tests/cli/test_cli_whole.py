@@ -130,7 +130,9 @@ def test_what_the_first_chain_prints_is_read_in_ten_seconds(first_chain):
     told = (first_chain / "told.txt").read_text(encoding="utf-8")
     assert len(told.splitlines()) <= 45
     assert len(told.split()) <= 350
-    assert max(len(line) for line in told.splitlines() if str(first_chain) not in line) <= 80
+    # The reason of a run that did not converge is one line, however long.
+    short = [line for line in told.splitlines() if str(first_chain) not in line and " ended in " not in line]
+    assert max(map(len, short)) <= 80
     for law in ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"):
         assert sum(line.split()[:1] == [law] for line in told.splitlines()) == 1
     assert f"page: {first_chain / 'report.html'}" in told

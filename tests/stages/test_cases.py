@@ -129,7 +129,7 @@ def test_what_befalls_the_readings_is_in_the_trace(driven):
 def test_images_that_a_disturbance_sets_off_the_calibration_are_noticed(driven):
     slip = driven(turn(180, SLIP))
     assert (slip.verdict, slip.success) == ("disturbed", False)
-    assert 10 < slip.steps < 20
+    assert 10 < slip.steps < 30  # without noise a held arm shows the same image, for half a second
     moved = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: [1.5, -1]}"))
     assert (moved.verdict, "right camera" in moved.reason) == ("disturbed", True)
     untested = driven(turn(180, "disturbance.camera_moved={at_step: 12, view: right, by_px: 3}", UNTESTED))
