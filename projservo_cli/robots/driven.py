@@ -26,7 +26,7 @@ from projservo_cli.robots.simulated import Plant, observe
 _STILL = 0.2
 # Weight in the fit of a law that a sighting keeps which is off by itself.
 _REJECTED = 1e-3
-# A held arm that so long shows the same image to the bit, s, shows nothing else: a simulated one without noise.
+# A held arm that so long shows the same image to the bit, s, shows no other: a simulated one without noise.
 _STALE_S = 0.5
 # Looks before the first motion, until enough agree or a fault is named.
 _MOST_LOOKS = 120
