@@ -5,6 +5,7 @@ dimensions and the unit to a field, so that the run file can label what it store
 knows how it is stored.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
@@ -368,6 +369,11 @@ METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as 
 # Laws that need the points of the face themselves, and those that can measure with the body.
 POINT_LAWS = ("stacked", "blockwise", "euclidean_points")
 BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)
+
+
+def in_unit(value: float, unit: str, digits: int = 6) -> str:
+    """Write a joint reading, rad or m, in the unit deg, rad or m."""
+    return f"{math.degrees(value) if unit == 'deg' else value:.{digits}g} {unit}"
 
 
 def in_sense(theta_r: float, theta_p: float, q_hat: FloatArray) -> FloatArray:

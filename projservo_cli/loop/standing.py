@@ -111,9 +111,10 @@ class Standing:
             return NOT_FOLLOWING
         if stands and (sent <= _LEAST).all():
             self.minimum = True
+            most = self._robot.robot.bounds.told(int(np.argmax(sent)), float(sent.max()), 2)
             self.why = (
-                f"set-points moved by no more than {sent.max():.2g} (rad or m): play in the joints, coarse "
-                "set-points or coarse readings hide what is left"
+                f"set-points moved by no more than {most}: play in the joints, coarse set-points or coarse "
+                "readings hide what is left"
                 if near
                 else "the law asks for no motion there, a local minimum"
             )
@@ -126,19 +127,18 @@ class Standing:
     def _say_who_stays(self, stays: BoolArray) -> None:
         """A joint stays where it is however far its set-point goes."""
         gap = np.abs(self._sent[-1] - self._read[-1]) * stays
-        i = int(np.argmax(gap))
+        i, told = int(np.argmax(gap)), self._robot.robot.bounds.told
         self.why = (
-            f"joint {i + 1} stands at {self._read[-1][i]:.6g}, {gap[i]:.3g} (rad or m) off its set-point: "
+            f"joint {i + 1} stands at {told(i, self._read[-1][i])}, {told(i, gap[i], 3)} off its set-point: "
             "look whether it is blocked, braked or in a protective stop, or raise plant.sag_deg or "
             "plant.lead_deg"
         )
 
     def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:
         """What a robot that moves to and fro without coming nearer is held by."""
-        i = int(np.argmax(sent / self._still))
-        what = (
-            f"set-points of joint {i + 1} moved by {sent[i]:.3g}, its readings by {moved[i]:.3g} (rad or m)"
-        )
+        i, told = int(np.argmax(sent / self._still)), self._robot.robot.bounds.told
+        amounts = f"{told(i, sent[i], 3)}, its readings by {told(i, moved[i], 3)}"
+        what = f"set-points of joint {i + 1} moved by {amounts}"
         if moved[i] <= 0.5 * sent[i]:
             self.why = f"{what}: it does not follow such small steps; coarse set-points, or friction"
         else:

@@ -42,6 +42,8 @@ _LEFT = 0.15
 _LEAST_MOVED_PX = 1.0
 # Looks that are remembered one by one.
 _REMEMBERED = 80
+# Chance of a false alarm of one look alone: that of a look among so many.
+_SINGLE = 1000
 # Joints that differ by no more since the first look have not moved, rad or m.
 _AT_REST = 1e-3
 
@@ -316,6 +318,29 @@ class ImageMonitor:
         view, j = np.unravel_index(int(np.argmax(square)), square.shape)
         number = int(self.calibration.marker[j])
         return f"in the {VIEWS[view]} image, at marker {number}"
+
+
+def fault_shown(
+    calibration: Calibration,
+    q: FloatArray,
+    marker: IntArray,
+    images: FloatArray,
+    image_size: FloatArray | None,
+) -> str:
+    """Return what changed since the calibration, by images of one posture at rest; empty for nothing.
+
+    q : (n,) joint readings there, rad or m; images : (2, b, 2) pixels of the markers with the numbers
+    marker (b,), NaN where unseen, those that the calibration does not know among them; image_size : (2,) px.
+    """
+    if not calibration.usable or not calibration.has_covariance:
+        return ""
+    known = np.isin(marker, calibration.marker)
+    pixels = np.full((2, len(calibration.marker), 2), np.nan)
+    pixels[:, calibration.places(marker[known])] = images[:, known]
+    monitor = ImageMonitor(calibration, calibration.sigma_px, _SINGLE, image_size=image_size)
+    rest, instants = np.zeros((2, len(q))), np.zeros(2)
+    monitor.look(instants, np.stack([q, q]), rest, instants, pixels, np.ones(2, dtype=np.bool_))
+    return monitor.give_up()
 
 
 def _rivals(found: list[Explanation]) -> list[Explanation]:

@@ -298,7 +298,7 @@ def _calibration(run: Run, config: Config) -> dict[str, Any]:
             for view, (u, v, r, k1, k2) in terms
         }
     held_out = {"cross_validation": _scalars(run.cross_validation)} if run.cross_validation else {}
-    names = ("sigma_q_interval", "delay_s", "delay_interval_s", "delay_jitter_s")
+    names = ("sigma_q_interval", "sigma_scale_interval", "delay_s", "delay_interval_s", "delay_jitter_s")
     own = {name: getattr(calibration, name) for name in names}
     return _scalars(calibration) | own | {"joints": joints, "lens": lens} | findings(calibration) | held_out
 

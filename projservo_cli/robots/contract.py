@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from projservo_cli.calibration.delay import comes_again
-from projservo_cli.records import ByteArray, FloatArray, InputError, WorkFailed
+from projservo_cli.records import ByteArray, FloatArray, InputError, WorkFailed, in_unit
 from projservo_cli.robots.plugins import what_failed
 
 # Time a robot has to come to rest, and then to be closed, s; until then not even Ctrl-C ends the waiting.
@@ -59,8 +59,7 @@ class Bounds(NamedTuple):
 
     def told(self, i: int, value: float, digits: int = 6) -> str:
         """Write a value of joint i, rad or m, in its unit."""
-        unit = self.units[i] if self.units else "rad or m"
-        return f"{math.degrees(value) if unit == 'deg' else value:.{digits}g} {unit}"
+        return in_unit(value, self.units[i] if self.units else "rad or m", digits)
 
     def within_limits(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Least and most (n,) that a set-point may be at a reading (n,): one beyond a limit may return."""
@@ -117,14 +116,22 @@ class ForeignRobot:
     markers : how many it observes.
     bounds : of its commands; they tell the number of joints, too.
     timeout_s, open_s : most time an answer may take, s, and opening it.
+    image_size : width and height of its frames, px; None for any.
     All methods raise ``WorkFailed`` where the robot fails, is late or answers nonsense. Calls are made in one
     thread of its own, so that the loop goes on where one never returns.
     """
 
     def __init__(
-        self, robot: Robot, name: str, markers: int, bounds: Bounds, timeout_s: float, open_s: float
+        self,
+        robot: Robot,
+        name: str,
+        markers: int,
+        bounds: Bounds,
+        timeout_s: float,
+        open_s: float,
+        image_size: tuple[int, int] | None = None,
     ) -> None:
-        self.robot, self.name, self.bounds = robot, name, bounds
+        self.robot, self.name, self.bounds, self.image_size = robot, name, bounds, image_size
         self.timeout_s, self.open_s = timeout_s, open_s
         self._joints, self._markers = len(bounds.speed), markers
         self._now: Callable[[], Any] = getattr(robot, "now", time.monotonic)
@@ -160,6 +167,14 @@ class ForeignRobot:
         ):
             raise WorkFailed(f"{self.name}: frames must be an array (2, height, width) of uint8, or None")
         self.frames = None if frames is None else frames.copy()
+        if frames is not None and self.image_size not in (None, frames.shape[:0:-1]):
+            shown, asked = (
+                " x ".join(map(str, size or ())) for size in (frames.shape[:0:-1], self.image_size)
+            )
+            raise WorkFailed(
+                f"{self.name}: the image size of its frames is {shown} px, not the {asked} of the "
+                "configuration; set resolution and crop of the cameras as they were calibrated with"
+            )
         return self._last
 
     def _look(self) -> tuple[Any, Any, Any]:
@@ -347,10 +362,11 @@ class ForeignRobot:
         slack = _ROUND_OFF * (1.0 + np.abs(target))
         for what, (low, high) in allowed.items():
             for i in np.flatnonzero((target < low - slack) | (target > high + slack)):
-                limits = f"{low[i]:.6g} to {high[i]:.6g} (rad or m)"
-                return f"the set-point of joint {i + 1}, {target[i]:.6g}, is {what}: allowed are {limits}"
+                at, least, most = (bounds.told(i, float(value)) for value in (target[i], low[i], high[i]))
+                return f"the set-point of joint {i + 1}, {at}, is {what}: allowed are {least} to {most}"
         for i in np.flatnonzero(np.abs(speed) > bounds.speed * (1.0 + _ROUND_OFF)):
-            return f"the speed of joint {i + 1}, {speed[i]:.6g}, is beyond its limit {bounds.speed[i]:.6g}"
+            at, most = (bounds.told(i, float(value)) for value in (speed[i], bounds.speed[i]))
+            return f"the speed of joint {i + 1}, {at}/s, is beyond its limit of {most}/s"
         return ""
 
     def _numbers(self, what: str, answer: Any, shape: tuple[int, ...], *, finite: bool = False) -> FloatArray:

@@ -39,9 +39,7 @@ def bounds_of(config: Config, joints: Joints) -> Bounds:
     lead = speed * (plant.lag_s + period) + sag
     if plant.lead_deg is not None:
         lead = joints.length_of(plant.lead_deg)
-    turns = "rad" if config.reference is None else config.reference.unit
-    units = tuple("m" if kind == "P" else turns for kind in joints.types)
-    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag, units)
+    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag, joints.units)
 
 
 def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
@@ -63,7 +61,8 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
         options["dictionary"] = dictionary
     robot: Robot = plugins.make("plant", target, (), options)
     bounds = bounds_of(config, joints)
-    return ForeignRobot(robot, f"plant {target}", markers, bounds, plant.timeout_s, plant.open_s)
+    name, size = f"plant {target}", config.image_size_px
+    return ForeignRobot(robot, name, markers, bounds, plant.timeout_s, plant.open_s, size)
 
 
 def way_to(

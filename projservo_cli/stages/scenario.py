@@ -33,7 +33,15 @@ from projservo_cli.records import (
 from projservo_cli.robots.driven import weights
 from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
 from projservo_cli.stages.simulation import shown_in_frames
-from projservo_cli.stages.world import Joints, Truth, center_index, joints_of, limit_passed, truth_of
+from projservo_cli.stages.world import (
+    Joints,
+    Truth,
+    center_index,
+    joints_of,
+    limit_passed,
+    truth_of,
+    units_of,
+)
 from projservo_cli.task.body import NO_BODY, Body, body_of
 from projservo_cli.task.face import center_of, cyclic_order, face_plane
 from projservo_cli.task.target import Shown
@@ -382,7 +390,7 @@ def _simulated_ends(
 
     def images(q: FloatArray, key: str) -> FloatArray:
         """Both apart, so that the face has the same bits with any pins."""
-        if wrong := limit_passed(q, robot.lower, robot.upper):
+        if wrong := limit_passed(q, robot.lower, robot.upper, units_of(task.start, types)):
             raise WorkFailed(f"{key}: {wrong}: choose others or wider limits")
         return np.concatenate([truth.images(q, truth.M_face), truth.images(q, M_pins)], axis=1)
 
@@ -436,7 +444,7 @@ def _predicted_ends(
             raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")
 
     def images(q: FloatArray, key: str) -> FloatArray:
-        if wrong := limit_passed(q, joints.lower, joints.upper):
+        if wrong := limit_passed(q, joints.lower, joints.upper, joints.units):
             raise InputError(f"{key}: {wrong}: choose another")
         s = predict(calibration, q[None])[0][:, columns]
         if np.isnan(s[:, :m]).any():

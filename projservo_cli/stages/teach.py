@@ -11,7 +11,6 @@ import numpy as np
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config, plain_yaml
 from projservo_cli.config.task import TaskSettings
-from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.stages import plan as planning
@@ -92,7 +91,7 @@ def teach(
     else:
         if at is None:
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
-        if wrong := limit_passed(np.array(at), joints.lower, joints.upper):
+        if wrong := limit_passed(np.array(at), joints.lower, joints.upper, joints.units):
             raise InputError(f"--at: {wrong}: choose others")
         robot = simulated_robot(config, joints, _put_to(config, np.array(at)))
     period, moved = config.control.period_s, None
@@ -176,8 +175,6 @@ def checked(config: Config, calibration: Calibration, taught: _Taught) -> _Check
         q = plan.q[-1] if reached else taught.q
     except WorkFailed as error:
         reached, reason, q = False, str(error), taught.q
-    if fault := _fault_of(config, calibration, taught):
-        reached, reason = False, f"what was taught is not of this calibration: {fault}"
     numbers = taught.marker.tolist()
     both = np.flatnonzero(np.isin(numbers, calibration.marker))
     off = np.full(taught.sigma.shape, np.nan)
@@ -189,21 +186,6 @@ def checked(config: Config, calibration: Calibration, taught: _Taught) -> _Check
         for view, k in np.argwhere(off > _FAR * math.sqrt(2.0) * noise).tolist()
     ]
     return _Checked(off, far, reached, reason)
-
-
-def _fault_of(config: Config, calibration: Calibration, taught: _Taught) -> str:
-    """Return what changed since the calibration, by images taught at joints that were read, or nothing."""
-    if not calibration.usable or not calibration.has_covariance:
-        return ""
-    numbers = calibration.marker.tolist()
-    known = [k for k, number in enumerate(taught.marker.tolist()) if number in numbers]
-    images = np.full((2, len(numbers), 2), np.nan)
-    images[:, calibration.places(taught.marker[known])] = taught.s[:, known]
-    size = None if config.rig is None else np.array(config.rig.image_size_px, dtype=np.float64)
-    monitor = ImageMonitor(calibration, calibration.sigma_px, 1, image_size=size)
-    at, still = np.stack([taught.q, taught.q]), np.zeros((2, len(taught.q)))
-    monitor.look(np.zeros(2), at, still, np.zeros(2), images, np.ones(2, dtype=np.bool_))
-    return monitor.give_up()
 
 
 def require_face(config: Config, taught: _Taught) -> None:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from projservo_cli.calibration.readings import per_rad
 from projservo_cli.config import Config
 from projservo_cli.config.markers import Markers
-from projservo_cli.config.robot import Camera, Rig, RobotSettings
+from projservo_cli.config.robot import Camera, JointVector, Rig, RobotSettings
 from projservo_cli.config.task import Goal
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators, project
 from projservo_cli.records import (
@@ -25,6 +25,7 @@ from projservo_cli.records import (
     InputError,
     Model,
     WorkFailed,
+    in_unit,
 )
 from projservo_cli.rendered.model import lens_of
 from projservo_cli.robots.simulated import Arm, Ends, camera_center, roll_axis
@@ -42,17 +43,18 @@ class Joints(NamedTuple):
     upper: FloatArray  # lower, upper: (n,) limits, rad or m; infinite where none is set
     speed: FloatArray  # (n,) most motion per second, rad/s or m/s; infinite for none
     acceleration: FloatArray  # (n,) most in the profile joint, rad/s² or m/s²
+    units: tuple[str, ...]  # in which messages give readings: deg, rad or m
 
     def length_of(self, degrees: float) -> FloatArray:
         """An angle as (n,) rad, for prismatic joints the length, m, that makes as much of a difference."""
         return math.radians(degrees) * per_rad(np.array([*self.types]) == "P")
 
 
-def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray) -> str:
-    """Which of the readings (n,) lies beyond its limits, in words; empty where none does."""
+def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray, units: Sequence[str]) -> str:
+    """Return which of the readings (n,), rad or m, lies beyond its limits, in its unit; empty for none."""
     for i in np.flatnonzero((q < lower) | (q > upper)):
-        limits = f"{lower[i]:.6g} to {upper[i]:.6g} (rad or m)"
-        return f"joint {i + 1} would be at {q[i]:.6g}, beyond its limits {limits}"
+        at, low, high = (in_unit(float(value), units[i]) for value in (q[i], lower[i], upper[i]))
+        return f"joint {i + 1} would be at {at}, beyond its limits {low} to {high}"
     return ""
 
 
@@ -71,7 +73,12 @@ def joints_of(config: Config, default_types: str = "", calibration: Calibration 
     turning = math.radians(c.joint_acceleration_limit_deg_s2 or _ACCELERATION_DEG_S2)
     sliding = c.prismatic_acceleration_limit_m_s2 or _ACCELERATION_M_S2
     acceleration = np.array([sliding if kind == "P" else turning for kind in types])
-    return Joints(types, lower, upper, speed, acceleration)
+    return Joints(types, lower, upper, speed, acceleration, units_of(vector, types))
+
+
+def units_of(vector: JointVector | None, types: str) -> tuple[str, ...]:
+    """Units in which somebody gave readings of joints (n,) by their types; rad where nobody did."""
+    return tuple("m" if kind == "P" else "rad" if vector is None else vector.unit for kind in types)
 
 
 def _limits_of(

@@ -35,6 +35,16 @@ def test_frames_are_thinned_evenly_and_the_first_and_last_are_kept(looks):
     assert shown[:, 1].mean(axis=(1, 2)) == pytest.approx(255 - instant % 251, abs=1.0)
 
 
+def test_frames_of_another_size_than_the_configuration_are_refused_at_once():
+    robot = Scripted(lambda: ([0, 0], robot.s))
+    robot.frames = np.zeros((2, 4, 6), np.uint8)
+    said = "the image size of its frames is 6 x 4 px, not the 8 x 4 of the configuration"
+    with opened(robot) as foreign:
+        foreign.image_size = (8, 4)
+        with pytest.raises(WorkFailed, match=said):
+            foreign.read()
+
+
 @pytest.mark.parametrize(
     "frames", [np.zeros((2, 4, 4)), np.zeros((4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8), "none"]
 )

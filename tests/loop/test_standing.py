@@ -7,10 +7,12 @@ import pytest
 
 from projservo_cli.loop.standing import Standing
 from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
+from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.instants import NOTHING_KNOWN
 from tests.scene import limits
 
 PERIOD, TICK = 0.1, 1.5e-3
+BOUNDS = Bounds(*np.zeros((4, 2)), PERIOD, 0.15, np.full(2, 0.017), ("rad", "deg"))
 LIMITS = limits(2, image_px=1.0, max_steps=1000)
 
 
@@ -19,7 +21,7 @@ class Robot:
 
     def __init__(self):
         self.known = SimpleNamespace(delays=NOTHING_KNOWN, sigma_q=np.full(2, TICK / 12**0.5))
-        self.robot = SimpleNamespace(bounds=SimpleNamespace(lag_s=0.15, sag=np.full(2, 0.017), period=PERIOD))
+        self.robot = SimpleNamespace(bounds=BOUNDS)
         point = SimpleNamespace(short=np.zeros(2, dtype=bool))
         self.steered = SimpleNamespace(reading=None, target=None, set_point=point)
         self.carried_px = 0.0
@@ -67,7 +69,7 @@ def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
         lambda k: 50.0, lambda k: (0.5, 0.1), lambda k: (0.9, min(0.1 + 0.01 * k, 0.4)), short=(True, False)
     )
     assert ruled == NOT_FOLLOWING
-    assert standing.why.startswith("joint 1 stands at 0.5, 0.4 (rad or m) off")
+    assert standing.why.startswith("joint 1 stands at 0.5 rad, 0.4 rad off")
     assert k < 60
 
 

@@ -118,6 +118,7 @@ def config_of(rig, task, table, options):
     start, goal = task if task is not None else (arm.home, arm.home)
     here = {"joints": list(start), "unit": "deg"}
     goal = goal if isinstance(goal, dict) else {"joints": {"joints": list(goal), "unit": "deg"}}
+    size = {"image_size_px": [800, 600]} if options.get("frames") else {}
     told = {
         "name": "stand-in",
         "plant": {
@@ -126,7 +127,7 @@ def config_of(rig, task, table, options):
             "timeout_s": 20,
             "settle_s": 0.3,
         },
-        "data": {"table": str(table), "joints": "R" * len(arm.axes)},
+        "data": {"table": str(table), "joints": "R" * len(arm.axes)} | size,
         "markers": {"numbers": list(range(20)), "face": [0, 1, 2, 3]},
         "robot": {"limits": {"joints": [list(pair) for pair in arm.limits], "unit": "deg"}},
         "calibration": {
@@ -319,6 +320,8 @@ def driven(job):
         row |= {"at": (fault or {}).get("at", 0.0), "task": [start, goal], "by": json.dumps(fault)} | found
         row["error_mm"] = off_mm(there[1]) if LAST else float("nan")
         named = named_in(found["reason"]) if found["verdict"] not in BLAMELESS else set()
+        if level[0] == "taught":  # why the goal is not of the calibration is said beside it
+            named -= {f"{('left', 'right')[level[1]]} camera"}
         row |= {"named": ", ".join(sorted(named)), "judged": judged(expected, named, len(arm.home))}
         rows.append(row)
     return rows

@@ -101,6 +101,7 @@ def test_a_goal_taught_after_a_camera_was_moved_names_the_camera(calibration):
     taught.s[1] += [0.0, 8.0]
     check = checked(config(), calibration, taught)
     assert not check.reached
+    assert "the goal was taught after a change since the calibration: images are" in check.reason
     assert "the right camera was moved, by 8" in check.reason
 
 
