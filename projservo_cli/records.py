@@ -19,6 +19,7 @@ BoolArray = npt.NDArray[np.bool_]
 ByteArray = npt.NDArray[np.uint8]
 
 VIEWS = ("left", "right")
+CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
 # Why a marker is left out whole: it stands still in the images, is of another body, slips, or hardly any
 # of its readings fits.
 WHY_LOST = ("still", "other body", "drifting", "hardly seen")

@@ -10,10 +10,7 @@ from pydantic import Field, PlainValidator, StringConstraints, WithJsonSchema
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.config.robot import Finding, Matrix44, Positive, Section, Vector3, Whole, not_rigid
-from projservo_cli.records import FloatArray
-
-CORNERS = 4
-"""Of a tag; corner k of tag t is marker 4 t + k."""
+from projservo_cli.records import CORNERS, FloatArray
 
 GROUND = 4.0 / 3.0
 """How much wider a tag of six cells is with a bright margin of one cell than without."""

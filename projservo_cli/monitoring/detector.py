@@ -236,6 +236,7 @@ class Memory:
     def __init__(self, errors: ErrorModel) -> None:
         self._errors = errors
         self._closed = [errors.nothing()]
+        self._total: Sums | None = None  # as last asked for
         self._view = errors.nothing()  # looks of the view that lasts, fading
         self._count = 0.0
         self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
@@ -258,11 +259,18 @@ class Memory:
         return looks / (self.fresh + looks * (1.0 - self.fresh)) if looks else 0.0
 
     @property
+    def views(self) -> int:
+        """Number of views that agreed."""
+        return self._closed[-1].looks + (self._count > 0.0)
+
+    @property
     def total(self) -> Sums:
         """Sums of all looks."""
-        if not self._count:
-            return self._closed[-1]
-        return self._closed[-1].plus(self._view.times(self.worth(self._count) / self._count))
+        if self._total is None:
+            self._total = self._closed[-1]
+            if self._count:
+                self._total = self._total.plus(self._view.times(self.worth(self._count) / self._count))
+        return self._total
 
     def onsets(self) -> list[Sums]:
         """Sums before each time that something may have begun, the earliest first."""
@@ -286,6 +294,7 @@ class Memory:
                     if sums.looks % (1 << (a.bit_length() - 1)) == 0
                 ]
             self._view, self._count, self._first = self._errors.nothing(), 0.0, residual.predicted
+        self._total = None
         new = self._errors.sums(residual, t)
         self._view = self._view.times(_FORGET).plus(new)._replace(looks=1)
         self._count = _FORGET * self._count + 1.0
@@ -308,6 +317,7 @@ class Memory:
             # Fading, so that what a finder does in one light does not count for ever.
             self._squares = 0.99 * self._squares + 0.5 * float(off @ off - np.square(off @ basis).sum())
             self._freedom = 0.99 * self._freedom + freedom
+            self._total = None
 
 
 def _alike(before: FloatArray, now: FloatArray) -> bool:

@@ -9,9 +9,8 @@ from scipy.linalg import cho_factor, cho_solve, expm
 from projservo_cli.calibration.forward import Scene
 from projservo_cli.monitoring.detector import ErrorModel, Residual, Sums
 from projservo_cli.monitoring.looks import Look
-from projservo_cli.records import BoolArray, FloatArray, IntArray
+from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
-CORNERS = 4  # of a tag: corner k of tag t is marker 4 t + k
 # Images are expected to be changed by so much by any cause, px rms: the prior of its parameters.
 _EXPECTED_PX = 30.0
 # A point that a cause puts behind a camera is off by so much, px.
@@ -20,7 +19,7 @@ _HIDDEN_PX = 1e3
 _STEPS, _HALVINGS, _EPSILON = 8, 6, 1e-6
 # A cause that changes images by more than this, px, is far off.
 _NEAR_PX = 5.0
-# Causes that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
+# Causes of several parameters that are fitted, the likeliest after one step; a fall of χ² that ends a fit.
 _FITTED, _FALLS = 8, 0.05
 # Starts of a joint that was homed anew, factors of images of another size.
 _TURNS = 12
@@ -142,10 +141,17 @@ class Evidence:
         return float(r @ r + self._offset - b @ cho_solve(self._factor, b))
 
     def explanations(self, causes: Iterable[Cause]) -> list[Explanation]:
-        """Fits of the causes that a first step of each makes the likeliest."""
+        """Fits of the causes that a first step of each makes the likeliest, and of all with one parameter.
+
+        A first step tells little of a joint that is far off, whose images move on curves.
+        """
         tried = [self._tried(cause) for cause in causes]
         tried.sort(key=lambda one: -one[0])
-        return [self._anew(self._fitted(cause, start)) for _, cause, start in tried[:_FITTED]]
+        return [
+            self._anew(self._fitted(cause, start))
+            for rank, (_, cause, start) in enumerate(tried)
+            if rank < _FITTED or start.size <= 1
+        ]
 
     def _anew(self, found: Explanation) -> Explanation:
         """Explanation of a cause that is far off, with errors of joints and calibration as they act there.

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from projservo_cli.monitoring.hypotheses import CORNERS, Explanation
-from projservo_cli.records import VIEWS, Calibration
+from projservo_cli.monitoring.hypotheses import Explanation
+from projservo_cli.records import CORNERS, VIEWS, Calibration
 
 # By so much a link may flex under its load, rad, which looks like a joint that slipped.
 _FLEXIBLE = np.radians(1.0)
@@ -60,8 +60,12 @@ def sentence(found: Explanation, calibration: Calibration) -> str:
         return _moved(found, calibration)
     if kind == "tool":
         return f"the tool was moved in its holder, by {px}; put it back, or recalibrate"
-    cropped = "images are cropped otherwise, or " if kind == "shifted" else ""
-    return f"{cropped}both cameras were moved alike, or the base was, by {px}; put it back, or recalibrate"
+    if kind == "shifted":
+        return (
+            f"images are cropped otherwise, or both cameras were moved alike, by {px}; put it back, or "
+            "recalibrate"
+        )
+    return f"both cameras were moved alike, or the base was, by {px}; put it back, or recalibrate"
 
 
 def _moved(found: Explanation, calibration: Calibration) -> str:

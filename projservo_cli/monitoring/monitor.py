@@ -40,6 +40,8 @@ _CLEAR = 2.0 * np.log(100.0)
 _LEFT = 0.15
 # A corner that is off by less, px, in one view of the tool is an edge that the finder took for another.
 _LEAST_MOVED_PX = 1.0
+# Share of the markers that a view saw shortly before: one that sees less is covered by something.
+_COVERED = 0.5
 # Looks that are remembered one by one.
 _REMEMBERED = 80
 # Chance of a false alarm of one look alone: that of a look among so many.
@@ -53,7 +55,6 @@ class _Kept(NamedTuple):
 
     look: Look
     residual: Residual
-    aside: BoolArray  # (2, m) sightings that were off by themselves
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
 
@@ -172,13 +173,12 @@ class ImageMonitor:
         self._asides = np.where(tested.aside, self._asides + 1, self._asides * ~residual.seen)
         self.rejected[:, self._shown] = tested.aside
         self.rejected[:, self._shown[self._forgiven]] = True
-        self._kept = [*self._kept[-_REMEMBERED:], _Kept(look, residual, tested.aside, self._view, 0)]
-        since = None
-        clean = residual.without(tested.aside)
+        since, clean = None, residual.without(tested.aside)
         memory.learn(clean, tested.disagrees)
         if not tested.disagrees and not self.holds:
             memory.keep(clean, float(look.t.mean()))
-        self._kept[-1] = self._kept[-1]._replace(views=memory.total.looks)
+        kept = _Kept(look, residual, self._view, memory.views)
+        self._kept = [*self._kept[-_REMEMBERED:], kept]
         if not tested.disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
             since = self._detector.significant(self.looks, look.late, free, self.pending)
@@ -211,8 +211,13 @@ class ImageMonitor:
             self._off = 0
             return
         clear = self._off >= _TWO_AT or len(_rivals(found)) == 1
-        if (explains and clear) or self._off == _NAMED_AT[-1]:
+        if (explains and clear and not self._is_covered()) or self._off == _NAMED_AT[-1]:
             self.fault = self._told(found)
+
+    def _is_covered(self) -> bool:
+        """Whether a view sees less than half of what it saw: something passes before it, and hides edges."""
+        seen = np.array([one.residual.seen.sum(axis=1) for one in self._kept])
+        return bool((seen[-1] < _COVERED * seen.max(axis=0)).any())
 
     def _clear(self) -> None:
         """Clear what is pending where looks agree again; a fault that shows in motion alone is named."""

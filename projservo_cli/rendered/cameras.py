@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.config.markers import CORNERS
-from projservo_cli.records import ByteArray, FloatArray, InputError
+from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError
 from projservo_cli.rendered.model import CAMERAS, FINER, RenderedModel, drawn_at, lens_of
 from projservo_cli.robots.described import mujoco, no_gl
 

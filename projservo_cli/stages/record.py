@@ -14,10 +14,10 @@ import numpy as np
 
 from projservo_cli.calibration.readings import per_rad
 from projservo_cli.config import Config, digest
-from projservo_cli.config.markers import CORNERS, DICTIONARY, cells_of
+from projservo_cli.config.markers import DICTIONARY, cells_of
 from projservo_cli.config.models import FAULTS
 from projservo_cli.detection import LEAST_CELL
-from projservo_cli.records import VIEWS, FloatArray, InputError, IntArray, Observation, WorkFailed
+from projservo_cli.records import CORNERS, VIEWS, FloatArray, InputError, IntArray, Observation, WorkFailed
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
 from projservo_cli.robots.driven import Steered
 from projservo_cli.stages import Progress, silent

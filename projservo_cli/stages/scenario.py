@@ -13,7 +13,6 @@ from scipy.optimize import least_squares
 
 from projservo_cli.calibration import predict
 from projservo_cli.config import Config
-from projservo_cli.config.markers import CORNERS
 from projservo_cli.config.task import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
@@ -21,6 +20,7 @@ from projservo_cli.guidance.margins import Demands
 from projservo_cli.loop.step import Limits
 from projservo_cli.records import (
     BODY_LAWS,
+    CORNERS,
     METRIC_LAWS,
     VIEWS,
     Calibration,
