@@ -61,8 +61,8 @@ class Standing:
         self.why, self.minimum = "", False
 
     def ruled(self, log: Log, k: int, verdict: int) -> int:
-        """What becomes of the verdict of an instant."""
-        steered = self._robot.steered
+        """What becomes of the verdict of an instant; none while the arm is held."""
+        steered, now = self._robot.steered, len(self._read)
         self._read.append(steered.reading.q)
         self._sent.append(steered.target)
         self._short.append(steered.set_point.short)
@@ -70,13 +70,13 @@ class Standing:
         # What the law has left, and what is still to come: the sag that is not yet learnt, too.
         left = error + self._robot.carried_px
         if left < (1.0 - _FALL) * self._best:
-            self._best, self._since = left, k
+            self._best, self._since = left, now
         ends = verdict not in (RUNNING, WAITING, CONVERGED)
         if ends or k == self._limits.max_steps or math.isnan(error):
             return verdict
         within = tolerance(self._limits, log.fit[k, 2])
         verdict = self._arrived(verdict, error, within)
-        return verdict if verdict == CONVERGED else self._stuck(k, verdict, error <= _GROWN * within)
+        return verdict if verdict == CONVERGED else self._stuck(now, verdict, error <= _GROWN * within)
 
     def _arrived(self, verdict: int, error: float, within: float) -> int:
         """``CONVERGED`` where the robot stands at the goal; until then the law goes on, then waits."""
@@ -93,12 +93,12 @@ class Standing:
         self._looks -= 1
         return verdict if verdict == CONVERGED or not self._looks else WAITING
 
-    def _stuck(self, k: int, verdict: int, near: bool) -> int:
+    def _stuck(self, now: int, verdict: int, near: bool) -> int:
         """``PLATEAU`` or ``NOT_FOLLOWING`` where the robot makes no progress; else the verdict as it is.
 
         ``near``: whether it is so near the goal that what the law asks for may be lost in its joints.
         """
-        idle, window = k - self._since, self._window
+        idle, window = now - self._since, self._window
         if idle < window:
             return verdict
         moved, sent = (np.ptp(rows[-window:], axis=0) for rows in (self._read, self._sent))

@@ -39,6 +39,8 @@ _RANK, RIDGE = 1e-6, 1e-9
 _AT_ONCE_S = 1e-4
 # A view lasts while markers move by no more than this, px rms; its looks are forgotten at this rate.
 _SAME_VIEW_PX, _FORGET = 20.0, 1.0 - 1.0 / 30.0
+# Markers that move by no more, px rms, show the same pixels; coordinates of such looks that tell enough.
+_AT_REST_PX, _ENOUGH = 0.2, 100.0
 # χ² of a sighting that may be off by itself: once in ten thousand by chance.
 _OFF_ALONE = 18.4
 # Share of the markers of a view that may be off one by one before the view itself is.
@@ -241,7 +243,8 @@ class Memory:
         self._count = 0.0
         self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
         self._before: tuple[Residual, bool] | None = None  # the last look, and whether it disagreed
-        self._squares = self._freedom = 0.0  # of differences from look to look, over σ²
+        # Of differences from look to look, over σ²: in motion, and at rest.
+        self._squares, self._freedom = np.zeros(2), np.zeros(2)
 
     @property
     def fresh(self) -> float:
@@ -249,10 +252,11 @@ class Memory:
 
         No more than is sure; a finder that makes the same error in each frame has none.
         """
-        if not self._freedom:
+        i = int(self._freedom[1] >= _ENOUGH)
+        if not self._freedom[i]:
             return 0.0
-        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom)
-        return float(np.clip(self._squares / self._freedom, 0.0, 1.0) * max(0.0, sure))
+        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom[i])
+        return float(np.clip(self._squares[i] / self._freedom[i], 0.0, 1.0) * max(0.0, sure))
 
     def worth(self, looks: float) -> float:
         """How many single looks so many looks of one view are worth."""
@@ -279,7 +283,7 @@ class Memory:
 
     def lasts(self, residual: Residual) -> bool:
         """Whether a look is of the view before."""
-        return self._first is not None and _alike(self._first, residual.predicted)
+        return self._first is not None and _alike(self._first, residual.predicted, _SAME_VIEW_PX)
 
     def keep(self, residual: Residual, t: float) -> None:
         """Add a look; of earlier views those are kept that tell an onset to a quarter of its age."""
@@ -302,11 +306,17 @@ class Memory:
     def learn(self, now: Residual, disagrees: bool) -> None:
         """Learn what is new in each frame from two in a row, beside errors of joints and instants.
 
+        Those at rest tell it, once there are enough: a corner that moves by part of a pixel errs otherwise.
         disagrees : whether this look does; one that does and one that does not tell nothing.
         """
         last, self._before = self._before, (now, disagrees)
-        if last is None or last[1] != disagrees or not _alike(last[0].predicted, now.predicted):
+        if (
+            last is None
+            or last[1] != disagrees
+            or not _alike(last[0].predicted, now.predicted, _SAME_VIEW_PX)
+        ):
             return
+        i = int(_alike(last[0].predicted, now.predicted, _AT_REST_PX))
         before, n = last[0], len(self._errors.sigma_q)
         rows = np.repeat((before.seen & now.seen).ravel(), 2)
         weight = 1.0 / np.repeat(now.noise.ravel(), 2)[rows]
@@ -315,15 +325,16 @@ class Memory:
         freedom = len(off) - basis.shape[1]
         if freedom > 0:
             # Fading, so that what a finder does in one light does not count for ever.
-            self._squares = 0.99 * self._squares + 0.5 * float(off @ off - np.square(off @ basis).sum())
-            self._freedom = 0.99 * self._freedom + freedom
+            self._squares[i] *= 0.99
+            self._squares[i] += 0.5 * float(off @ off - np.square(off @ basis).sum())
+            self._freedom[i] = 0.99 * self._freedom[i] + freedom
             self._total = None
 
 
-def _alike(before: FloatArray, now: FloatArray) -> bool:
-    """Whether predicted pixels (2, m, 2) are of one view."""
+def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
+    """Whether predicted pixels (2, m, 2) are the same within so many px rms."""
     moved = np.square(now - before).sum(axis=-1)
-    return bool(np.nanmean(np.append(moved, 0.0)) <= _SAME_VIEW_PX**2)
+    return bool(np.nanmean(np.append(moved, 0.0)) <= within_px**2)
 
 
 class Tested(NamedTuple):
@@ -370,47 +381,39 @@ class Detector:
         sightings = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
         markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
         aside = (sightings | (markers & ~sightings.any(axis=0))) & residual.seen
-        shown = np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0)
-        square = gains(S, shown, rows.reshape(2 * m, 2), 0.0)[0]
         parts = (np.arange(2 * m) < m, np.arange(2 * m) >= m, np.ones(2 * m, dtype=np.bool_))
-        off = [self._is_off(S, r, residual, aside, part, square) for part in parts]
+        off = [self._is_off(S, r, residual, aside, part) for part in parts]
         if any(off):
             aside[:] = False
         return Tested(any(off), aside)
 
     def _is_off(
-        self,
-        S: FloatArray,
-        r: FloatArray,
-        residual: Residual,
-        aside: BoolArray,
-        part: BoolArray,
-        square: FloatArray,
+        self, S: FloatArray, r: FloatArray, residual: Residual, aside: BoolArray, part: BoolArray
     ) -> bool:
         """Whether a view, or both, disagree even without their worst sightings, up to half, which go aside.
 
-        part : (2 m,) its sightings; square : (2 m,) χ² of each sighting by itself.
+        part : (2 m,) its sightings.
         """
-        shown, out = residual.seen.ravel() & part, aside.reshape(-1)
-        allowed = int(_MOST_ASIDE * shown.sum())
-        rows = np.flatnonzero(np.repeat(part, 2))[None]
-        worst = [
-            j for j in np.argsort(-square).tolist() if square[j] > _OFF_ALONE and shown[j] and not out[j]
-        ]
-        for j in [-1, *worst]:
-            if j >= 0:
-                out[j] = True
-            if (out & shown).sum() > allowed:
-                return True
-            if not self._beyond(S, r, rows, residual.without(aside))[0]:
+        shown, out = residual.seen & part.reshape(aside.shape), aside.reshape(-1)
+        allowed, bias = _MOST_ASIDE * shown.sum(axis=1), 2.0 * self._bias(residual).ravel()
+        while ((aside & shown).sum(axis=1) <= allowed).all():
+            left = np.flatnonzero(shown.ravel() & ~out)
+            gain, square = beside_others(S, r, left)
+            if gain <= (self._most_once[2 * len(left)] + np.sqrt(bias[left].sum())) ** 2:
                 return False
+            if square.max() <= _OFF_ALONE:
+                return True
+            out[left[np.argmax(square)]] = True
         return True
+
+    def _bias(self, residual: Residual) -> FloatArray:
+        """Squared errors (2, m) of a coordinate by the model, and of corners seen as never before."""
+        return (self._errors.bias_px / residual.noise) ** 2 + _UNUSUAL**2 * (1.0 - self.memory.fresh)
 
     def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
         """Which parts (h,) of residuals, by their rows (h, p), are beyond chance and errors of the model."""
         seen = np.repeat(residual.seen.ravel(), 2)[parts]
-        bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
-        bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
+        bias = np.repeat(self._bias(residual).ravel(), 2)[parts]
         most = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
         gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
         return np.asarray(gain > most**2)
@@ -471,6 +474,20 @@ def gains(
     b = right[parts] / size
     x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
     return np.maximum((b * x).sum(axis=1), 0.0), x / size
+
+
+def beside_others(S: FloatArray, r: FloatArray, sightings: IntArray) -> tuple[float, FloatArray]:
+    """Return χ² of sightings (k,) together, and (k,) of each given the others; residuals r, covariance S.
+
+    Errors of joints move all of them: one by itself hardly shows what it is off.
+    """
+    if not len(sightings):
+        return 0.0, np.zeros(0)
+    rows = (2 * sightings[:, None] + np.arange(2)).ravel()
+    P = np.linalg.inv(S[np.ix_(rows, rows)])
+    u, k = (P @ r[rows]).reshape(-1, 2, 1), np.arange(len(sightings))
+    blocks = P.reshape(len(k), 2, len(k), 2)[k, :, k]
+    return float(u.ravel() @ r[rows]), (u * np.linalg.solve(blocks, u)).sum(axis=(1, 2))
 
 
 def _rays(scene: Scene, directions: FloatArray, q: FloatArray) -> FloatArray:

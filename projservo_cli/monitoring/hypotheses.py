@@ -119,6 +119,8 @@ class Evidence:
         )
         self.at_first = self._off(self.nothing)
         self.before = self._square(self._whitened(self.at_first))
+        seen = max(float(self.seen.sum()), 1.0)
+        self.off_px = float(np.sqrt(np.square(self.at_first).sum() / seen))  # rms of each sighting
 
     def _whitened(self, rows: FloatArray) -> FloatArray:
         """Rows (K, 4 m, …) over the root of their covariance, (K 4 m, …)."""

@@ -38,6 +38,9 @@ _TWO_AT = 15
 _CLEAR = 2.0 * np.log(100.0)
 # Share of what images are off that a cause may leave.
 _LEFT = 0.15
+# Share of the pixels that images are off by which a cause changes them at least: play in the joints that is
+# more than the calibration found is no turn of a camera by the rest.
+_LEAST_PART = 0.2
 # A corner that is off by less, px, in one view of the tool is an edge that the finder took for another.
 _LEAST_MOVED_PX = 1.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
@@ -103,6 +106,7 @@ class ImageMonitor:
         self.looks = self._view = 0
         # Looks that disagree, the number of the first of them, and looks in a row that agree.
         self._off = self._onset = self._agreed = 0
+        self._sound = 0  # looks in a row that agree by themselves
         self._before = self._detector.memory.total  # sums up to the onset
         self._unit = 1.0  # of χ², by what the best cause left
         self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # looks in a row
@@ -175,10 +179,12 @@ class ImageMonitor:
         self.rejected[:, self._shown[self._forgiven]] = True
         since, clean = None, residual.without(tested.aside)
         memory.learn(clean, tested.disagrees)
-        if not tested.disagrees and not self.holds:
+        self._kept = [*self._kept[-_REMEMBERED:], _Kept(look, residual, self._view, memory.views)]
+        self._sound = (self._sound + 1) * (not tested.disagrees)
+        # What a hand leaves of a view tells nothing, nor looks between those that disagree.
+        if self._sound > WINDOW * self.holds and not self._is_covered():
             memory.keep(clean, float(look.t.mean()))
-        kept = _Kept(look, residual, self._view, memory.views)
-        self._kept = [*self._kept[-_REMEMBERED:], kept]
+            self._kept[-1] = self._kept[-1]._replace(views=memory.views)
         if not tested.disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
             since = self._detector.significant(self.looks, look.late, free, self.pending)
@@ -271,7 +277,7 @@ class ImageMonitor:
         return Evidence(self._errors, looks, residuals, weights, before)
 
     def _explains(self, found: Explanation) -> bool:
-        """Whether a cause explains most of what images are off."""
+        """Whether a cause explains most of what images are off, beside joints in error."""
         rows, lasting = self._evidence_now.rows, 1.0 - self._detector.memory.fresh
         allowed = (1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + self._evidence_now.bias
         return bool(self._unit * found.left <= allowed + _LEFT * self._unit * max(0.0, found.gain))
@@ -312,7 +318,8 @@ class ImageMonitor:
         residual = self._kept[-1].residual
         rms = np.sqrt(np.square(residual.r).sum() / max(2.0 * residual.seen.sum(), 1.0))
         off = f"images are {rms:.3g} px rms per coordinate off what the calibration predicts"
-        if not self._explains(found[0]):
+        least = 0.0 if found[0].cause.markers else _LEAST_PART * self._evidence_now.off_px
+        if not self._explains(found[0]) or found[0].changed_px < least:
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
         names = [sentence(one, self.calibration) for one in _rivals(found)[:2]]
         return f"{off}: {'; or '.join(names)}"

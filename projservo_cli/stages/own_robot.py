@@ -65,6 +65,20 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
     return ForeignRobot(robot, name, markers, bounds, plant.timeout_s, plant.open_s, size)
 
 
+def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:
+    """Refuse joints (n,) of which one reads a whole turn off: it would turn back by that, with its cables."""
+    beyond = ((q < bounds.lower) | (q > bounds.upper)) & np.isfinite(bounds.upper - bounds.lower)
+    for i in np.flatnonzero(beyond).tolist():
+        turns = np.round((q[i] - 0.5 * (bounds.lower[i] + bounds.upper[i])) / (2.0 * np.pi))
+        if bounds.units[i] == "m" or not bounds.lower[i] <= q[i] - 2.0 * np.pi * turns <= bounds.upper[i]:
+            continue
+        limits = f"{bounds.told(i, bounds.lower[i])} to {bounds.told(i, bounds.upper[i])}"
+        raise WorkFailed(
+            f"nothing was moved: joint {i + 1} reads {bounds.told(i, q[i])}, a whole turn beyond its limits "
+            f"{limits}: home it again where it stands"
+        )
+
+
 def way_to(
     robot: Steered, q: FloatArray, settle_s: float, what: str, fit: Callable[[Reading], None] | None = None
 ) -> Iterator[Reading]:
@@ -73,10 +87,12 @@ def way_to(
     what : the command it is for, in messages.
     fit : is shown the first reading, before anything moves; it raises where nothing should.
     Yields what is read after each command. The robot has then stood still for so many s, and so have the
-    images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest.
+    images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest, or if
+    one reads a whole turn beyond its limits.
     """
     bounds, still = robot.robot.bounds, _Standstill(settle_s)
     begun = robot.look().q
+    _require_no_turn_off(bounds, begun)
     if fit is not None:
         fit(robot.reading)
     while (gap := q - robot.target).any():

@@ -52,7 +52,7 @@ class Joints(NamedTuple):
 
 def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray, units: Sequence[str]) -> str:
     """Return which of the readings (n,), rad or m, lies beyond its limits, in its unit; empty for none."""
-    for i in np.flatnonzero((q < lower) | (q > upper)):
+    for i in np.flatnonzero((q < lower) | (q > upper)).tolist():
         at, low, high = (in_unit(float(value), units[i]) for value in (q[i], lower[i], upper[i]))
         return f"joint {i + 1} would be at {at}, beyond its limits {low} to {high}"
     return ""

@@ -13,9 +13,13 @@ import pytest
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots import contract
 from projservo_cli.robots.contract import Bounds, ForeignRobot, at_rest_after
+from projservo_cli.robots.driven import Steered
+from projservo_cli.stages.own_robot import way_to
 
 PERIOD = 0.04
-BOUNDS = Bounds(np.full(2, -1.0), np.ones(2), np.ones(2), np.full(2, 0.3), PERIOD, 0.15, np.zeros(2))
+BOUNDS = Bounds(
+    np.full(2, -1.0), np.ones(2), np.ones(2), np.full(2, 0.3), PERIOD, 0.15, np.full(2, 1e-3), ("rad",) * 2
+)
 
 
 class Scripted:
@@ -119,9 +123,9 @@ def test_nonsense_readings(answer, message):
         (
             (0.1, 0.3),
             (0.0, 0.0),
-            r"joint 2, 0.3 rad or m, is too far from the last one: .* 0.12 rad or m to 0.2",
+            r"joint 2, 0.3 rad, is too far from the last one: .* 0.12 rad to 0.2",
         ),
-        ((0.1, 0.2), (0.0, -1.1), r"speed of joint 2, -1.1 rad or m/s, is beyond its limit of 1 rad or m/s$"),
+        ((0.1, 0.2), (0.0, -1.1), r"speed of joint 2, -1.1 rad/s, is beyond its limit of 1 rad/s$"),
     ],
 )
 def test_what_must_not_be_sent_is_not(target, speed, message):
@@ -133,19 +137,35 @@ def test_what_must_not_be_sent_is_not(target, speed, message):
     assert robot.sent == []
 
 
+@pytest.mark.parametrize(
+    ("reads", "beyond"), [(0.4 + 2.0 * np.pi, "6.68319"), (-0.9 - 4.0 * np.pi, "-13.4664")]
+)
+def test_a_joint_that_was_homed_a_turn_off_is_named_before_it_turns_back(reads, beyond):
+    """Images cannot show it."""
+    robot = Scripted(((0.1, reads), S))
+    with opened(robot) as foreign:
+        said = (
+            f"nothing was moved: joint 2 reads {beyond} rad, a whole turn beyond its limits -1 rad to 1 rad"
+        )
+        with pytest.raises(WorkFailed, match=said):
+            next(way_to(Steered(foreign), np.zeros(2), 0.1, "test"))
+        assert robot.sent == []
+        robot.answer = (0.1, 1.4), S  # beyond its limits, and no turn off: it may return
+        next(way_to(Steered(foreign), np.zeros(2), 0.1, "test"))
+    assert robot.sent
+
+
 def test_set_points_lead_the_reading_by_so_much_and_stay_within_limits():
     robot = Scripted(((0.1, 0.9), S))
     with opened(robot) as foreign:
         foreign.read()
         for k in range(1, 8):  # the robot does not move: seven steps of 0.04 lead by 0.28
             foreign.command(np.array([0.1 - 0.04 * k, 0.9]), np.zeros(2), PERIOD * k)
-        with pytest.raises(
-            WorkFailed, match=r"joint 1, -0.22 rad or m, is too far ahead .* -0.2 rad or m to 0.4"
-        ):
+        with pytest.raises(WorkFailed, match=r"joint 1, -0.22 rad, is too far ahead .* -0.2 rad to 0.4"):
             foreign.command(np.array([-0.22, 0.9]), np.zeros(2), 8 * PERIOD)
         for k in range(8, 10):
             foreign.command(np.array([-0.18, 0.9 + 0.04 * (k - 7)]), np.zeros(2), PERIOD * k)
-        with pytest.raises(WorkFailed, match=r"joint 2, 1.02 rad or m, is beyond its limits"):
+        with pytest.raises(WorkFailed, match=r"joint 2, 1.02 rad, is beyond its limits"):
             foreign.command(np.array([-0.18, 1.02]), np.zeros(2), 10 * PERIOD)
         # Back to the reading it may jump; after a pause it may not make up for the time.
         foreign.command(np.array([0.1, 0.9]), np.zeros(2), 10 * PERIOD)
