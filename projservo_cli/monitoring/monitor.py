@@ -257,6 +257,8 @@ class ImageMonitor:
         if markers is not None:
             causes = (cause for cause in causes if cause.kind == "marker" and cause.which in markers)
         found = [one for one in evidence.explanations(causes) if is_possible(one)]
+        if not found:  # markers that the chosen looks do not show
+            return found
         # Where even the best leaves more than chance does, the unit is what that leaves.
         least = min(found, key=lambda one: one.left)
         self._unit = max(1.0, least.left / max(1.0, evidence.rows - least.theta.size))
@@ -305,8 +307,10 @@ class ImageMonitor:
                 one._replace(residual=one.residual.without(_all_but(one.residual.seen, j)))
                 for one in self._kept[-max(_NAMED_AT[0], int(either[j])) :]
             ]
-            best = self._explanations(kept, before, [j])[0]
-            views = len({one.view for one in kept})
+            found = self._explanations(kept, before, [j])
+            if not found:
+                continue
+            best, views = found[0], len({one.view for one in kept})
             lasts = (both[j] or views >= WINDOW) and not self._is_edge(best, views)
             if lasts and best.score > _CLEAR and self._explains(best):
                 moved.append(best)

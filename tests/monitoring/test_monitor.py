@@ -284,6 +284,23 @@ def test_each_fault_is_named_soon(arm, strikes, name, seed):
         assert float(re.search(r"slipped by (\S+) deg", said)[1]) == pytest.approx(3.0, abs=0.4)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_sightings_that_come_and_go_and_are_wrong_end_in_no_error(arm, seed):
+    """Of any share of markers, in one view more than in the other, single ones wrong for long."""
+    rng = np.random.default_rng(seed)
+    q, _ = arm.way(seed)
+    s = noisy(arm.images(at_once(q)), seed)
+    s[:, :, rng.integers(10)] += rng.normal(0.0, 20.0, (2, 2))
+    s[rng.random(s.shape[:3]) < 0.1] += 30.0
+    s[rng.random(s.shape[:3]) < rng.random((len(s), 2, 1))] = np.nan
+    test = ImageMonitor(arm.calibration, SIGMA, LOOKS)
+    for k in range(len(q)):
+        test.look(
+            np.full(2, PERIOD * k), q[[k, k]], np.zeros((2, 6)), np.zeros(2), s[k], np.ones(2, dtype=bool)
+        )
+    assert test.give_up() == test.fault
+
+
 @pytest.fixture(scope="module")
 def sliding():
     """A robot with a prismatic joint, what its trials showed, and smooth joints (k, n)."""
