@@ -509,6 +509,8 @@ def _joint_vectors(
         vectors["task", "start"] = task.start
         vectors["task", "start_offset"] = task.start_offset
         vectors["task", "goal", "joints"] = task.goal.joints
+        if task.goal.images is not None:
+            vectors["task", "goal", "images", "joints"] = task.goal.images.joints
     for path, vector in vectors.items():
         if vector is not None and types:
             yield from vector.miscounted(types, *path)

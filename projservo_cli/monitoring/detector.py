@@ -395,25 +395,23 @@ class Detector:
         part : (2 m,) its sightings.
         """
         shown, out = residual.seen & part.reshape(aside.shape), aside.reshape(-1)
-        allowed, bias = _MOST_ASIDE * shown.sum(axis=1), 2.0 * self._bias(residual).ravel()
+        allowed = _MOST_ASIDE * shown.sum(axis=1)
         while ((aside & shown).sum(axis=1) <= allowed).all():
             left = np.flatnonzero(shown.ravel() & ~out)
-            gain, square = beside_others(S, r, left)
-            if gain <= (self._most_once[2 * len(left)] + np.sqrt(bias[left].sum())) ** 2:
+            rows = (2 * left[:, None] + np.arange(2)).ravel()
+            if not self._beyond(S, r, rows[None], residual)[0]:
                 return False
+            square = beside_others(S[np.ix_(rows, rows)], r[rows])
             if square.max() <= _OFF_ALONE:
                 return True
             out[left[np.argmax(square)]] = True
         return True
 
-    def _bias(self, residual: Residual) -> FloatArray:
-        """Squared errors (2, m) of a coordinate by the model, and of corners seen as never before."""
-        return (self._errors.bias_px / residual.noise) ** 2 + _UNUSUAL**2 * (1.0 - self.memory.fresh)
-
     def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
         """Which parts (h,) of residuals, by their rows (h, p), are beyond chance and errors of the model."""
         seen = np.repeat(residual.seen.ravel(), 2)[parts]
-        bias = np.repeat(self._bias(residual).ravel(), 2)[parts]
+        bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
+        bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
         most = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
         gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
         return np.asarray(gain > most**2)
@@ -476,18 +474,14 @@ def gains(
     return np.maximum((b * x).sum(axis=1), 0.0), x / size
 
 
-def beside_others(S: FloatArray, r: FloatArray, sightings: IntArray) -> tuple[float, FloatArray]:
-    """Return χ² of sightings (k,) together, and (k,) of each given the others; residuals r, covariance S.
+def beside_others(S: FloatArray, r: FloatArray) -> FloatArray:
+    """Return χ² (k,) of each sighting given all others, of residuals r (2 k,) with covariance S.
 
     Errors of joints move all of them: one by itself hardly shows what it is off.
     """
-    if not len(sightings):
-        return 0.0, np.zeros(0)
-    rows = (2 * sightings[:, None] + np.arange(2)).ravel()
-    P = np.linalg.inv(S[np.ix_(rows, rows)])
-    u, k = (P @ r[rows]).reshape(-1, 2, 1), np.arange(len(sightings))
-    blocks = P.reshape(len(k), 2, len(k), 2)[k, :, k]
-    return float(u.ravel() @ r[rows]), (u * np.linalg.solve(blocks, u)).sum(axis=(1, 2))
+    P, k = np.linalg.inv(S), np.arange(len(r) // 2)
+    u, blocks = (P @ r).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
+    return np.asarray((u * np.linalg.solve(blocks, u)).sum(axis=(1, 2)))
 
 
 def _rays(scene: Scene, directions: FloatArray, q: FloatArray) -> FloatArray:

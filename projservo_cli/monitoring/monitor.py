@@ -60,6 +60,7 @@ class _Kept(NamedTuple):
     residual: Residual
     view: int  # number of the view that it is of
     views: int  # views that agreed up to it
+    covered: bool  # whether something passes before a view
 
 
 class ImageMonitor:
@@ -179,12 +180,12 @@ class ImageMonitor:
         self.rejected[:, self._shown[self._forgiven]] = True
         since, clean = None, residual.without(tested.aside)
         memory.learn(clean, tested.disagrees)
-        self._kept = [*self._kept[-_REMEMBERED:], _Kept(look, residual, self._view, memory.views)]
+        kept, covered = self._kept[-_REMEMBERED:], self._is_covered(residual)
         self._sound = (self._sound + 1) * (not tested.disagrees)
         # What a hand leaves of a view tells nothing, nor looks between those that disagree.
-        if self._sound > WINDOW * self.holds and not self._is_covered():
+        if self._sound > WINDOW * self.holds and not covered:
             memory.keep(clean, float(look.t.mean()))
-            self._kept[-1] = self._kept[-1]._replace(views=memory.views)
+        self._kept = [*kept, _Kept(look, residual, self._view, memory.views, covered)]
         if not tested.disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
             since = self._detector.significant(self.looks, look.late, free, self.pending)
@@ -217,13 +218,13 @@ class ImageMonitor:
             self._off = 0
             return
         clear = self._off >= _TWO_AT or len(_rivals(found)) == 1
-        if (explains and clear and not self._is_covered()) or self._off == _NAMED_AT[-1]:
+        if (explains and clear and not self._kept[-1].covered) or self._off == _NAMED_AT[-1]:
             self.fault = self._told(found)
 
-    def _is_covered(self) -> bool:
+    def _is_covered(self, residual: Residual) -> bool:
         """Whether a view sees less than half of what it saw: something passes before it, and hides edges."""
-        seen = np.array([one.residual.seen.sum(axis=1) for one in self._kept])
-        return bool((seen[-1] < _COVERED * seen.max(axis=0)).any())
+        seen = [one.residual.seen.sum(axis=1) for one in self._kept[-_REMEMBERED:]]
+        return bool((residual.seen.sum(axis=1) < _COVERED * np.max(seen or [[0, 0]], axis=0)).any())
 
     def _clear(self) -> None:
         """Clear what is pending where looks agree again; a fault that shows in motion alone is named."""

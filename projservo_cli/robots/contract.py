@@ -362,10 +362,10 @@ class ForeignRobot:
         slack = _ROUND_OFF * (1.0 + np.abs(target))
         for what, (low, high) in allowed.items():
             for i in np.flatnonzero((target < low - slack) | (target > high + slack)).tolist():
-                at, least, most = (bounds.told(i, float(value)) for value in (target[i], low[i], high[i]))
+                at, least, most = (bounds.told(i, values[i]) for values in (target, low, high))
                 return f"the set-point of joint {i + 1}, {at}, is {what}: allowed are {least} to {most}"
         for i in np.flatnonzero(np.abs(speed) > bounds.speed * (1.0 + _ROUND_OFF)).tolist():
-            at, most = (bounds.told(i, float(value)) for value in (speed[i], bounds.speed[i]))
+            at, most = (bounds.told(i, values[i]) for values in (speed, bounds.speed))
             return f"the speed of joint {i + 1}, {at}/s, is beyond its limit of {most}/s"
         return ""
 

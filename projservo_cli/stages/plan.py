@@ -123,26 +123,21 @@ def run(config: Config, calibration: Calibration, joints: Joints | None = None) 
         )
     scenario, trajectory = scenario_of(config, calibration, joints=joints), config.trajectory
     if not scenario.untested:
-        _require_taught_since(config, calibration)
+        _require_taught_since(scenario, calibration)
     search = search_of(scenario) if trajectory.needs_covariance else None
     return plan_task(scenario.model, scenario.ends, trajectory, scenario.demands, search)
 
 
-def _require_taught_since(config: Config, calibration: Calibration) -> None:
+def _require_taught_since(scenario: Scenario, calibration: Calibration) -> None:
     """Refuse goal images with joint readings that the calibration contradicts, with a WorkFailed."""
-    images = config.task.goal.images if config.task is not None else None
+    task = scenario.config.task
+    images = task.goal.images if task is not None else None
     if images is None or images.joints is None:
         return
-    if len(images.joints.joints) != len(calibration.q_reference):
-        raise InputError(
-            f"task.goal.images.joints: {len(images.joints.joints)} values for "
-            f"{len(calibration.q_reference)} joints"
-        )
-    pixels = images.pixels(config.face_numbers)
+    pixels = images.pixels(scenario.config.face_numbers)
     q = np.array(images.joints.values(calibration.joint_types))
-    size = None if config.image_size_px is None else np.array(config.image_size_px, dtype=np.float64)
     shown = np.swapaxes(np.array([*pixels.values()]), 0, 1)
-    if fault := fault_shown(calibration, q, np.array([*pixels]), shown, size):
+    if fault := fault_shown(calibration, q, np.array([*pixels]), shown, scenario.demands.image_size):
         raise WorkFailed(f"the goal was taught after a change since the calibration: {fault}; teach it again")
 
 

@@ -30,7 +30,7 @@ from projservo_cli.stages.own_robot import (
 )
 from projservo_cli.stages.scenario import CALIBRATION_NOISE, TRIAL_POSES, generator
 from projservo_cli.stages.simulation import robot_by_itself
-from projservo_cli.stages.world import Truth, joints_of, limit_passed, truth_of
+from projservo_cli.stages.world import Truth, joints_of, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
 
 # What a recorded pixel depends on, apart from the joints, which the table itself tells.
@@ -149,7 +149,7 @@ def trial_motions(config: Config) -> FloatArray:
         for offset in np.linspace(-farthest, farthest, settings.frames_per_joint):
             q = reference.copy()
             q[i] += offset
-            if wrong := limit_passed(q, joints.lower, joints.upper, joints.units):
+            if wrong := joints.limit_passed(q):
                 raise InputError(
                     f"calibration: in a trial {wrong}: choose another calibration.reference or a smaller "
                     "amplitude"
@@ -176,7 +176,7 @@ def _random_pose(
     joints, truth = joints_of(config), truth_of(config) if config.plant.simulated else None
     for draw in range(_DRAWS):
         q = reference + amplitude * _SHRINKING**draw * rng.uniform(-1.0, 1.0, len(reference))
-        if limit_passed(q, joints.lower, joints.upper, joints.units):
+        if joints.limit_passed(q):
             continue
         if truth is None:
             return q
@@ -221,7 +221,7 @@ def new_recording(
         raise InputError("record needs to know which markers the robot observes: set markers.numbers")
     if motions is not None:
         for pose, q in zip(motions.pose, motions.q, strict=True):
-            if wrong := limit_passed(q, joints.lower, joints.upper, joints.units):
+            if wrong := joints.limit_passed(q):
                 raise InputError(f"motions: pose {pose}: {wrong}: choose another")
         targets = np.vstack([targets, motions.q])
     plant = config.plant.use or "simulated"

@@ -439,12 +439,14 @@ def _predicted_ends(
     task = config.task
     assert task is not None
     m, columns = len(config.face_numbers), calibration.places(numbers)
-    for vector, key in ((task.start, "task.start"), (task.goal.joints, "task.goal.joints")):
+    taught = None if task.goal.images is None else task.goal.images.joints
+    given = (task.start, "start"), (task.goal.joints, "goal.joints"), (taught, "goal.images.joints")
+    for vector, key in given:
         if vector is not None and len(vector.joints) != len(joints.types):
-            raise InputError(f"{key}: {len(vector.joints)} values for {len(joints.types)} joints")
+            raise InputError(f"task.{key}: {len(vector.joints)} values for {len(joints.types)} joints")
 
     def images(q: FloatArray, key: str) -> FloatArray:
-        if wrong := limit_passed(q, joints.lower, joints.upper, joints.units):
+        if wrong := joints.limit_passed(q):
             raise InputError(f"{key}: {wrong}: choose another")
         s = predict(calibration, q[None])[0][:, columns]
         if np.isnan(s[:, :m]).any():

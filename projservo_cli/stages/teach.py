@@ -17,7 +17,7 @@ from projservo_cli.stages import plan as planning
 from projservo_cli.stages.own_robot import at_rest, averaged, foreign_robot, simulated_robot
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
 from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself
-from projservo_cli.stages.world import joints_of, limit_passed, truth_of
+from projservo_cli.stages.world import joints_of, truth_of
 
 _FAR = 4.0  # standard deviations that a marker may be off
 _DIGITS = 4  # of pixels that are written
@@ -91,7 +91,7 @@ def teach(
     else:
         if at is None:
             raise InputError("teach puts a simulated robot to --at q1,...,qN: give the joints")
-        if wrong := limit_passed(np.array(at), joints.lower, joints.upper, joints.units):
+        if wrong := joints.limit_passed(np.array(at)):
             raise InputError(f"--at: {wrong}: choose others")
         robot = simulated_robot(config, joints, _put_to(config, np.array(at)))
     period, moved = config.control.period_s, None

@@ -49,11 +49,15 @@ class Joints(NamedTuple):
         """An angle as (n,) rad, for prismatic joints the length, m, that makes as much of a difference."""
         return math.radians(degrees) * per_rad(np.array([*self.types]) == "P")
 
+    def limit_passed(self, q: FloatArray) -> str:
+        """Return which of the readings (n,), rad or m, lies beyond its limits, in words; empty for none."""
+        return limit_passed(q, self.lower, self.upper, self.units)
+
 
 def limit_passed(q: FloatArray, lower: FloatArray, upper: FloatArray, units: Sequence[str]) -> str:
     """Return which of the readings (n,), rad or m, lies beyond its limits, in its unit; empty for none."""
     for i in np.flatnonzero((q < lower) | (q > upper)).tolist():
-        at, low, high = (in_unit(float(value), units[i]) for value in (q[i], lower[i], upper[i]))
+        at, low, high = (in_unit(values[i], units[i]) for values in (q, lower, upper))
         return f"joint {i + 1} would be at {at}, beyond its limits {low} to {high}"
     return ""
 
