@@ -1,5 +1,6 @@
 """How images may differ from their prediction while nothing is wrong, and tests of that."""
 
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,9 @@ _AT_ONCE_S = 1e-4
 _SAME_VIEW_PX, _FORGET = 20.0, 1.0 - 1.0 / 30.0
 # Markers that move by no more, px rms, show the same pixels; coordinates of such looks that tell enough.
 _AT_REST_PX, _ENOUGH = 0.2, 100.0
+# Differences between so many frames at rest tell how a sighting trembles: the median of χ² with two degrees
+# of freedom, which is beyond the second number once in ten thousand.
+_DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
 # χ² of a sighting that may be off by itself: once in ten thousand by chance.
 _OFF_ALONE = 18.4
 # Share of the markers of a view that may be off one by one before the view itself is.
@@ -242,9 +246,24 @@ class Memory:
         self._view = errors.nothing()  # looks of the view that lasts, fading
         self._count = 0.0
         self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
-        self._before: tuple[Residual, bool] | None = None  # the last look, and whether it disagreed
+        self._before: tuple[Residual, BoolArray, bool] | None = (
+            None  # the last look, as ``learn`` is given it
+        )
         # Of differences from look to look, over σ²: in motion, and at rest.
         self._squares, self._freedom = np.zeros(2), np.zeros(2)
+        # Of each sighting (2, m) from look to look at rest, px².
+        self._steps: deque[FloatArray] = deque(maxlen=_DIFFERENCES)
+
+    def noise(self, stated: FloatArray) -> FloatArray:
+        """Standard deviations (2, m) of pixels, px: those stated, or as sightings tremble where that is more.
+
+        The median of differences at rest tells it, which a step does not move, such as a fault makes.
+        """
+        if len(self._steps) < _DIFFERENCES:
+            return stated
+        square = np.median(np.array(self._steps), axis=0)
+        more = square > _MEDIAN_AT_MOST * stated**2
+        return np.where(more, np.sqrt(square / _MEDIAN, where=more, out=stated.copy()), stated)
 
     @property
     def fresh(self) -> float:
@@ -303,30 +322,40 @@ class Memory:
         self._view = self._view.times(_FORGET).plus(new)._replace(looks=1)
         self._count = _FORGET * self._count + 1.0
 
-    def learn(self, now: Residual, disagrees: bool) -> None:
+    def learn(self, now: Residual, aside: BoolArray, disagrees: bool) -> None:
         """Learn what is new in each frame from two in a row, beside errors of joints and instants.
 
         Those at rest tell it, once there are enough: a corner that moves by part of a pixel errs otherwise.
+        aside : (2, m) sightings that are off by themselves, which tell how they tremble alone.
         disagrees : whether this look does; one that does and one that does not tell nothing.
         """
-        last, self._before = self._before, (now, disagrees)
+        last, self._before = self._before, (now, aside, disagrees)
+        i = int(last is not None and _alike(last[0].predicted, now.predicted, _AT_REST_PX))
+        if not i:
+            self._steps.clear()
         if (
             last is None
-            or last[1] != disagrees
+            or last[2] != disagrees
             or not _alike(last[0].predicted, now.predicted, _SAME_VIEW_PX)
         ):
             return
-        i = int(_alike(last[0].predicted, now.predicted, _AT_REST_PX))
         before, n = last[0], len(self._errors.sigma_q)
-        rows = np.repeat((before.seen & now.seen).ravel(), 2)
-        weight = 1.0 / np.repeat(now.noise.ravel(), 2)[rows]
-        off = (now.r - before.r)[rows] * weight
-        basis = np.linalg.qr(now.F[rows][:, [*range(n), 2 * n, 2 * n + 1]] * weight[:, None])[0]
-        freedom = len(off) - basis.shape[1]
+        seen = before.seen & now.seen
+        rows = np.repeat((seen & ~aside & ~last[1]).ravel(), 2)
+        weight = 1.0 / np.repeat(now.noise.ravel(), 2)
+        off, moved = (now.r - before.r) * weight, now.F[:, [*range(n), 2 * n, 2 * n + 1]] * weight[:, None]
+        basis, R = np.linalg.qr(moved[rows])
+        along = basis.T @ off[rows]
+        freedom = len(basis) - basis.shape[1]
         if freedom > 0:
+            square = float(off[rows] @ off[rows] - along @ along)
+            off -= moved @ np.linalg.lstsq(R, along)[0]
+            if i:
+                step = 0.5 * np.square(off / weight).reshape(*seen.shape, 2).sum(axis=2)
+                self._steps.append(np.where(seen, step, np.nan))
             # Fading, so that what a finder does in one light does not count for ever.
             self._squares[i] *= 0.99
-            self._squares[i] += 0.5 * float(off @ off - np.square(off @ basis).sum())
+            self._squares[i] += 0.5 * square
             self._freedom[i] = 0.99 * self._freedom[i] + freedom
             self._total = None
 

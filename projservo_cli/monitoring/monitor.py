@@ -168,7 +168,9 @@ class ImageMonitor:
 
     def _take(self, look: Look) -> None:
         """Test a look, and judge what is known by now."""
-        memory, residual = self._detector.memory, self._errors.residual(look)
+        memory = self._detector.memory
+        look = look._replace(noise=memory.noise(look.noise))
+        residual = self._errors.residual(look)
         if not residual.seen.any():
             return
         self.looks += 1
@@ -179,7 +181,7 @@ class ImageMonitor:
         self.rejected[:, self._shown] = tested.aside
         self.rejected[:, self._shown[self._forgiven]] = True
         since, clean = None, residual.without(tested.aside)
-        memory.learn(clean, tested.disagrees)
+        memory.learn(residual, tested.aside, tested.disagrees)
         kept, covered = self._kept[-_REMEMBERED:], self._is_covered(residual)
         self._sound = (self._sound + 1) * (not tested.disagrees)
         # What a hand leaves of a view tells nothing, nor looks between those that disagree.

@@ -284,6 +284,20 @@ def test_each_fault_is_named_soon(arm, strikes, name, seed):
         assert float(re.search(r"slipped by (\S+) deg", said)[1]) == pytest.approx(3.0, abs=0.4)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_corner_that_trembles_at_rest_is_no_alarm_and_hides_no_marker_that_moves(arm, seed):
+    """By eight times what the finder errs elsewhere, in one view, as under a slant never calibrated."""
+    q, _ = arm.way(1)
+    q = q[:1].repeat(70, axis=0)
+    s = noisy(arm.images(at_once(q)), seed)
+    s[:, 0, 4] += 8.0 * SIGMA * np.random.default_rng([seed, 1]).standard_normal((len(q), 2))
+    assert first_alarm(arm, q, s) == (None, "")
+    s[40:, :, 4] += 60.0
+    k, said = first_alarm(arm, q, s)
+    assert 40 <= k < 60
+    assert "marker 4 moved" in said
+
+
 def test_a_marker_that_was_off_and_is_gone_is_not_judged(arm):
     """By no two looks alike, so that nothing is named while it is seen; the looks since do not show it."""
     q, _ = arm.way(1)
