@@ -66,6 +66,7 @@ class Demands(NamedTuple):
     # (t, 4) corners of tags, markers of the body in the order of their numbers, of which one is to be seen by
     # both cameras; none where the face is
     tags: IntArray = np.zeros((0, 4), np.int64)
+    units: tuple[str, ...] = ()  # of each joint, as it is told: deg, rad or m
 
 
 def limits_alone(lower: FloatArray, upper: FloatArray) -> Demands:

@@ -96,6 +96,7 @@ class Delays:
 
     predicted : pixels (k, 2, m, 2) at joints (k, n).
     prior : of the delays; sigma_px : pixel noise; timeout_s : longest that an image may stand still, s.
+    sigma_q : (n,) deviation of the joint readings, rad or m; 0 where none shows.
     """
 
     def __init__(
@@ -104,9 +105,10 @@ class Delays:
         prior: DelayPrior,
         sigma_px: float,
         timeout_s: float,
+        sigma_q: FloatArray,
     ) -> None:
-        error_px = math.hypot(sigma_px, _MODEL_PX)
-        self._views = [_View(view, predicted, prior, error_px, timeout_s) for view in range(2)]
+        self._predicted, self._sigma_q, self._error_px = predicted, sigma_q, math.hypot(sigma_px, _MODEL_PX)
+        self._views = [_View(view, predicted, prior, self._error_px, timeout_s) for view in range(2)]
 
     @property
     def mean(self) -> FloatArray:
@@ -120,11 +122,24 @@ class Delays:
         history : of the readings, that of this look the last.
         Raises WorkFailed if the clock of a camera jumped, or its image stands still while the joints move.
         """
+        if self._sigma_q.any():
+            self._reckon_with_joints(history.last[1])
         found = [
             view.look(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
         ]
         t, sigma, fresh = zip(*found, strict=True)
         return _Frames(np.array(t), np.array(sigma), np.array(fresh))
+
+    def _reckon_with_joints(self, q: FloatArray) -> None:
+        """Take what errors of the readings at joints (n,) do to images into what the model is off.
+
+        While a joint goes through its play, readings move and images do not: as they would if they were late.
+        """
+        s = self._predicted(np.concatenate([q[None], q + np.diag(self._sigma_q)]))
+        squares = np.square(s[1:] - s[0]).sum(axis=0)
+        for view, square in zip(self._views, squares, strict=True):
+            by_joints = square[np.isfinite(square)]
+            view.error_px = math.hypot(self._error_px, math.sqrt(by_joints.mean() if by_joints.size else 0.0))
 
 
 class _View:
@@ -146,7 +161,7 @@ class _View:
         error_px: float,
         timeout_s: float,
     ) -> None:
-        self._view, self._predicted, self._error_px, self._timeout_s = view, predicted, error_px, timeout_s
+        self._view, self._predicted, self.error_px, self._timeout_s = view, predicted, error_px, timeout_s
         mean, sigma, jitter = (float(both[view]) for both in prior)
         self.mean, self._variance, self._jitter, self._follows = mean, sigma**2, jitter, sigma > 0.0
         blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / jitter) ** 2)
@@ -233,7 +248,7 @@ class _View:
         """Instant of a fresh image, s, among all; each delay has its chance."""
         assert self._log_chance is not None
         misfit = self._misfit(image, nominal - _DELAYS, history)
-        least = max(float(misfit.min()), self._error_px**2)
+        least = max(float(misfit.min()), self.error_px**2)
         chance = np.exp(-0.5 * _COUNTED * np.maximum(misfit / least - 1.0, 0.0))
         before = self._blur @ np.exp(self._log_chance - self._log_chance.max())
         t = nominal - float(_DELAYS[np.argmax(chance * before)])
@@ -265,7 +280,7 @@ class _View:
     def _stray(self, image: FloatArray, nominal: float, history: History) -> None:
         """A frame that is far from its instant is another delay's, where it clearly fits that."""
         here, *others = self._misfit(image, nominal - np.append(self.mean, _DELAYS), history)
-        self._strays += here > _CLEARLY * max(min(others), self._error_px**2)
+        self._strays += here > _CLEARLY * max(min(others), self.error_px**2)
         if self._follows and self._strays >= _STRAYS:
             self._strays, self._variance = 0, UNKNOWN_S**2
             self._log_chance = self._open(self.mean, UNKNOWN_S)
@@ -284,4 +299,4 @@ class _View:
         off, speed = image[known] - predicted[1, known], 0.5 * (before + after)
         shift = float(np.sum(speed * off) / np.sum(speed**2))
         left = float(np.sqrt(np.mean((off - shift * speed) ** 2)))
-        return shift, max(self._error_px, left) / math.sqrt(square)
+        return shift, max(self.error_px, left) / math.sqrt(square)

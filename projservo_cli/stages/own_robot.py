@@ -299,7 +299,7 @@ def connected(scenario: Scenario, law: str) -> DrivenRobot:
 
 def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
     """What the calibration takes the robot and its face for."""
-    task, rig = scenario.ends.by_points().task(scenario.model), scenario.config.rig
+    task = scenario.ends.by_points().task(scenario.model)
     return Plant(
         scenario.model,
         np.ascontiguousarray(calibration.M[calibration.places(scenario.numbers[: scenario.m])]),
@@ -307,7 +307,7 @@ def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
         task.center,
         task.O,
         task.visible,
-        np.array(rig.image_size_px if rig is not None else (math.inf, math.inf), dtype=np.float64),
+        scenario.demands.image_size,
         scenario.joints.lower,
         scenario.joints.upper,
         False,

@@ -122,7 +122,8 @@ class Scenario:
         margins = trajectory.joint_margin_m, math.radians(trajectory.joint_margin_deg)
         keep = np.array([margins[kind != "P"] for kind in joints.types])
         border, condition = trajectory.border_px, trajectory.least_condition
-        return Demands(*limits, size, border, condition, keep, trajectory.least_face_px, self._tags())
+        face, units = trajectory.least_face_px, self.joints.units
+        return Demands(*limits, size, border, condition, keep, face, self._tags(), units)
 
     def _tags(self) -> IntArray:
         """Corners (t, 4) of tags among the markers; none for tools of which no tag is on the face."""

@@ -14,7 +14,7 @@ from projservo_cli.guidance.margins import (
     Motion,
     joint_margin,
 )
-from projservo_cli.records import VIEWS, FloatArray
+from projservo_cli.records import VIEWS, FloatArray, in_unit
 
 
 def verdict_of(motion: Motion) -> tuple[bool, str, str]:
@@ -51,8 +51,9 @@ def _words(motion: Motion, constraint: int, instant: int) -> str:
     if constraint == JOINTS:
         q = found.q[instant]
         i = min(range(len(q)), key=lambda i: joint_margin(demands, q, i))
-        limits = f"its limits are {demands.lower[i]:.4g} to {demands.upper[i]:.4g} (rad or m)"
-        return f"joint {i + 1} is at {q[i]:.4g}, {limits}, {at}"
+        unit = demands.units[i] if demands.units else "rad or m"
+        here, low, high = (in_unit(values[i], unit, 4) for values in (q, demands.lower, demands.upper))
+        return f"joint {i + 1} is at {here}, its limits are {low} to {high}, {at}"
     return (
         f"the reciprocal condition of the image Jacobian is {found.condition[instant]:.2g} "
         f"({demands.conditioning:.2g} allowed) {at}"

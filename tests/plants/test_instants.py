@@ -7,6 +7,7 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.robots.instants import NOTHING_KNOWN, DelayPrior, Delays, History
 
 PERIOD, NOISE = 0.04, 0.5
+EXACT, PLAY = np.zeros(2), 0.04  # of readings; rad
 RNG = np.random.default_rng(0)
 FAR = RNG.uniform(300.0, 900.0, (2, 5, 2))
 PULL = 300.0 * RNG.standard_normal((2, 2, 5, 2))  # px per rad of two joints
@@ -40,16 +41,36 @@ def looks(delays, late, steps=60, stamped=None, noise=NOISE, first=-4):
 @pytest.mark.parametrize("late", [(0.0, 0.0), (0.04, 0.12), (0.3, 0.25)])
 @pytest.mark.parametrize("clock", [None, 0.003, 5e4])
 def test_an_unknown_delay_is_found_as_soon_as_joints_move(late, clock):
-    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0)
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
     off = looks(delays, late, stamped=clock)
     assert np.abs(off[20:]).max() < 0.01
     if clock is None:
         np.testing.assert_allclose(delays.mean, late, atol=0.004)
 
 
+@pytest.mark.parametrize("late", [0.0, 0.08])
+def test_play_in_the_joints_is_no_delay(late):
+    """While joints go through it readings move and images do not; by 12 px here, 24 times the noise."""
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, np.full(2, PLAY / np.sqrt(12.0)))
+    history, rng, links, off = History(), np.random.default_rng(4), [np.zeros(2)], []
+    for k in range(-10, 60):
+        now = k * PERIOD
+        history.add(now, motion(now))
+        # What is driven follows at the end of its play, which it went to before.
+        links.append(np.clip(links[-1], motion(now) - PLAY, motion(now)))
+        times = PERIOD * np.arange(-11, k + 1)
+        link = [np.interp(now - late, times, [q[i] for q in links]) for i in range(2)]
+        s = predicted(np.array(link)[None])[0]
+        off.append(delays.look(np.full(2, np.nan), s + NOISE * rng.standard_normal(s.shape), history).t - now)
+    assert np.abs(np.array(off)[10:] + late).max() < 0.15
+    assert np.abs(np.array(off)[30:] + late).max() < 0.06
+
+
 def test_a_given_delay_is_kept_and_a_wrong_one_is_not_hidden():
     for given, wrong in ((0.1, False), (0.3, True)):
-        delays = Delays(predicted, DelayPrior(np.full(2, given), np.zeros(2), np.full(2, 0.005)), NOISE, 1.0)
+        delays = Delays(
+            predicted, DelayPrior(np.full(2, given), np.zeros(2), np.full(2, 0.005)), NOISE, 1.0, EXACT
+        )
         off = looks(delays, (0.1, 0.1))
         np.testing.assert_array_equal(delays.mean, [given, given])
         moving = np.abs(off[25:40])
@@ -57,7 +78,7 @@ def test_a_given_delay_is_kept_and_a_wrong_one_is_not_hidden():
 
 
 def test_a_delay_that_changes_is_followed():
-    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0)
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
     history, rng = History(), np.random.default_rng(3)
     for k in range(120):
         now, late = k * PERIOD, 0.05 if k < 50 else 0.2
@@ -68,7 +89,7 @@ def test_a_delay_that_changes_is_followed():
 
 
 def test_an_image_that_comes_twice_keeps_its_instant():
-    delays = Delays(predicted, NOTHING_KNOWN._replace(sigma=np.zeros(2)), NOISE, 1.0)
+    delays = Delays(predicted, NOTHING_KNOWN._replace(sigma=np.zeros(2)), NOISE, 1.0, EXACT)
     history, unstamped = History(), np.full(2, np.nan)
     history.add(0.0, motion(0.0))
     s = predicted(motion(0.0)[None])[0]
@@ -82,7 +103,11 @@ def test_an_image_that_comes_twice_keeps_its_instant():
 
 
 def test_a_camera_that_stands_still_while_joints_move_is_named():
-    delays, history, rng = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0), History(), np.random.default_rng(0)
+    delays, history, rng = (
+        Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT),
+        History(),
+        np.random.default_rng(0),
+    )
     still = predicted(np.zeros((1, 2)))[0, 1]
 
     def look(now, q):
@@ -100,7 +125,7 @@ def test_a_camera_that_stands_still_while_joints_move_is_named():
 
 def test_a_clock_of_a_camera_that_jumps_is_named():
     delays, history, s = (
-        Delays(predicted, NOTHING_KNOWN, NOISE, 1.0),
+        Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT),
         History(),
         predicted(np.zeros((1, 2)))[0],
     )
