@@ -4,7 +4,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import chdtri
 
 from projservo_cli.calibration.forward import CAMERA, Scene
@@ -111,8 +111,10 @@ class ErrorModel:
         self.errors, self.e = calibration.errors, calibration.shared_error.shape[1] + 3 * m
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(bent, LEAST_SIGMA)
-        self._sigma = max(sigma_px, self._least)
-        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA) * (calibration.sigma_scale or 1.0)
+        self.sigma_px = max(sigma_px, self._least)
+        self._stated = (
+            self.sigma_px / max(calibration.sigma_px, LEAST_SIGMA) * (calibration.sigma_scale or 1.0)
+        )
         self.bias_px = max(calibration.model_px, bent)
         sigma_q = calibration.sigma_q or 0.0
         if calibration.sigma_q_interval is not None:
@@ -133,7 +135,7 @@ class ErrorModel:
 
     def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
         """Standard deviation (2, m) of pixels, px: those stated, as the calibration found them, if any."""
-        common = np.full(seen.shape, self._sigma)
+        common = np.full(seen.shape, self.sigma_px)
         if stated is None:
             return common
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
@@ -223,6 +225,12 @@ class ErrorModel:
         """Root (e, e) of the information on the errors of the calibration."""
         return np.asarray(np.linalg.cholesky(np.eye(self.e) + sums.normal[: self.e, : self.e]))
 
+    def strays(self, sums: Sums) -> bool:
+        """Whether sums put the calibration where it is not by chance, once in ten thousand."""
+        root = self.root(sums)
+        off = cho_solve((root, True), sums.normal[: self.e, -1], check_finite=False)
+        return bool(off @ off > chdtri(self.e, 1e-4))
+
     def lasting(self, seconds: float, late: FloatArray) -> FloatArray:
         """Information (2 n + 2, 2 n + 2) on errors of joints, their drift with time, and of instants.
 
@@ -300,14 +308,16 @@ class Memory:
         seen = self.total.seen.sum()
         return [sums for sums in self._closed if sums.seen.sum() < seen]
 
-    def lasts(self, residual: Residual) -> bool:
-        """Whether a look is of the view before."""
-        return self._first is not None and _alike(self._first, residual.predicted, _SAME_VIEW_PX)
+    def keep(self, residual: Residual, t: float, whole: bool) -> None:
+        """Add a look; of earlier views those are kept that tell an onset to a quarter of its age.
 
-    def keep(self, residual: Residual, t: float) -> None:
-        """Add a look; of earlier views those are kept that tell an onset to a quarter of its age."""
-        lasts = self.lasts(residual)
-        if not lasts:
+        whole : whether no sighting of it is aside. What else is left is perhaps of the same hand or blur, and
+        is no look that agrees where the calibration would have to be off beyond chance.
+        """
+        new = self._errors.sums(residual, t)
+        if not whole and self._errors.strays(self.total.plus(new)):
+            return
+        if self._first is None or not is_same_view(self._first, residual.predicted):
             if self._count:
                 self._closed.append(self.total)
                 age = [max(1, (self._closed[-1].looks - sums.looks) // 4) for sums in self._closed]
@@ -318,7 +328,6 @@ class Memory:
                 ]
             self._view, self._count, self._first = self._errors.nothing(), 0.0, residual.predicted
         self._total = None
-        new = self._errors.sums(residual, t)
         self._view = self._view.times(_FORGET).plus(new)._replace(looks=1)
         self._count = _FORGET * self._count + 1.0
 
@@ -333,11 +342,7 @@ class Memory:
         i = int(last is not None and _alike(last[0].predicted, now.predicted, _AT_REST_PX))
         if not i:
             self._steps.clear()
-        if (
-            last is None
-            or last[2] != disagrees
-            or not _alike(last[0].predicted, now.predicted, _SAME_VIEW_PX)
-        ):
+        if last is None or last[2] != disagrees or not is_same_view(last[0].predicted, now.predicted):
             return
         before, n = last[0], len(self._errors.sigma_q)
         seen = before.seen & now.seen
@@ -358,6 +363,11 @@ class Memory:
             self._squares[i] += 0.5 * square
             self._freedom[i] = 0.99 * self._freedom[i] + freedom
             self._total = None
+
+
+def is_same_view(before: FloatArray, now: FloatArray) -> bool:
+    """Whether predicted pixels (2, m, 2) are of one view, of which corners err alike."""
+    return _alike(before, now, _SAME_VIEW_PX)
 
 
 def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:

@@ -13,6 +13,7 @@ from projservo_cli.monitoring.detector import (
     Residual,
     Sums,
     columns_of_marker,
+    is_same_view,
 )
 from projservo_cli.monitoring.hypotheses import (
     Evidence,
@@ -105,6 +106,7 @@ class ImageMonitor:
         self._first: FloatArray | None = None  # (n,) joints of the first look, rad or m
         self._kept: list[_Kept] = []
         self.looks = self._view = 0
+        self._at_view: FloatArray | None = None  # (2, m, 2) px predicted where the view began
         # Looks that disagree, the number of the first of them, and looks in a row that agree.
         self._off = self._onset = self._agreed = 0
         self._sound = 0  # looks in a row that agree by themselves
@@ -174,8 +176,9 @@ class ImageMonitor:
         if not residual.seen.any():
             return
         self.looks += 1
-        lasts = memory.lasts(residual)
-        self._view += not lasts
+        lasts = self._at_view is not None and is_same_view(self._at_view, residual.predicted)
+        if not lasts:
+            self._view, self._at_view = self._view + 1, residual.predicted
         tested = self._detector.tested(residual)
         self._asides = np.where(tested.aside, self._asides + 1, self._asides * ~residual.seen)
         self.rejected[:, self._shown] = tested.aside
@@ -186,7 +189,7 @@ class ImageMonitor:
         self._sound = (self._sound + 1) * (not tested.disagrees)
         # What a hand leaves of a view tells nothing, nor looks between those that disagree.
         if self._sound > WINDOW * self.holds and not covered:
-            memory.keep(clean, float(look.t.mean()))
+            memory.keep(clean, float(look.t.mean()), not tested.aside.any())
         self._kept = [*kept, _Kept(look, residual, self._view, memory.views, covered)]
         if not tested.disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
@@ -285,7 +288,8 @@ class ImageMonitor:
         """Whether a cause explains most of what images are off, beside joints in error."""
         rows, lasting = self._evidence_now.rows, 1.0 - self._detector.memory.fresh
         allowed = (1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + self._evidence_now.bias
-        return bool(self._unit * found.left <= allowed + _LEFT * self._unit * max(0.0, found.gain))
+        left = self._unit * found.left
+        return bool(found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain)
 
     def _is_edge(self, found: Explanation, views: int) -> bool:
         """Whether what seems to have moved is perhaps an edge that a finder took for that of a marker.
