@@ -13,7 +13,8 @@ from projservo_cli.calibration import predict
 from projservo_cli.calibration.forward import Scene, displacements, image_points, moved_points
 from projservo_cli.calibration.prediction import all_changed, scene_of
 from projservo_cli.monitoring import detector
-from projservo_cli.monitoring.detector import WINDOW
+from projservo_cli.monitoring.detector import WINDOW, ErrorModel, Memory
+from projservo_cli.monitoring.looks import Look
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.world import truth_of
@@ -296,6 +297,19 @@ def test_a_corner_that_trembles_at_rest_is_no_alarm_and_hides_no_marker_that_mov
     k, said = first_alarm(arm, q, s)
     assert 40 <= k < 60
     assert "marker 4 moved" in said
+
+
+def test_a_look_with_sightings_aside_is_not_kept_where_it_moves_the_calibration_beyond_chance(arm):
+    """As when a hand has pulled corners of a view before it hides them; one that is whole is evidence."""
+    errors = ErrorModel(arm.calibration, SIGMA)
+    memory, still = Memory(errors), np.zeros((2, 6))
+    for k, (pulled, whole, views) in enumerate([(0, False, 1), (40, False, 1), (0, False, 2), (40, True, 3)]):
+        q = np.repeat(arm.way(k)[0][-1:], 2, axis=0)
+        s = noisy(arm.images(at_once(q[:1])), k)[0] + pulled
+        noise = np.full((2, len(arm.scene.M)), SIGMA)
+        look = Look(np.full(2, PERIOD * k), q, still, np.zeros(2), s, noise, np.zeros(6))
+        memory.keep(errors.residual(look), PERIOD * k, whole)
+        assert memory.views == views
 
 
 def test_a_marker_that_was_off_and_is_gone_is_not_judged(arm):
