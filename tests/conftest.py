@@ -4,10 +4,14 @@ import contextlib
 import io
 import json
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+# In the background of a shell SIGINT is ignored, and by all children: tests of what it does need it back.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared" / "data"
