@@ -111,10 +111,8 @@ class ErrorModel:
         self.errors, self.e = calibration.errors, calibration.shared_error.shape[1] + 3 * m
         bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
         self._least = max(bent, LEAST_SIGMA)
-        self.sigma_px = max(sigma_px, self._least)
-        self._stated = (
-            self.sigma_px / max(calibration.sigma_px, LEAST_SIGMA) * (calibration.sigma_scale or 1.0)
-        )
+        self._sigma = max(sigma_px, self._least)
+        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA) * (calibration.sigma_scale or 1.0)
         self.bias_px = max(calibration.model_px, bent)
         sigma_q = calibration.sigma_q or 0.0
         if calibration.sigma_q_interval is not None:
@@ -135,7 +133,7 @@ class ErrorModel:
 
     def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
         """Standard deviation (2, m) of pixels, px: those stated, as the calibration found them, if any."""
-        common = np.full(seen.shape, self.sigma_px)
+        common = np.full(seen.shape, self._sigma)
         if stated is None:
             return common
         return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
@@ -254,9 +252,8 @@ class Memory:
         self._view = errors.nothing()  # looks of the view that lasts, fading
         self._count = 0.0
         self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
-        self._before: tuple[Residual, BoolArray, bool] | None = (
-            None  # the last look, as ``learn`` is given it
-        )
+        # The last look, as ``learn`` is given it.
+        self._before: tuple[Residual, BoolArray, bool] | None = None
         # Of differences from look to look, over σ²: in motion, and at rest.
         self._squares, self._freedom = np.zeros(2), np.zeros(2)
         # Of each sighting (2, m) from look to look at rest, px².
@@ -271,7 +268,7 @@ class Memory:
             return stated
         square = np.median(np.array(self._steps), axis=0)
         more = square > _MEDIAN_AT_MOST * stated**2
-        return np.where(more, np.sqrt(square / _MEDIAN, where=more, out=stated.copy()), stated)
+        return np.sqrt(square / _MEDIAN, where=more, out=stated.copy())
 
     @property
     def fresh(self) -> float:

@@ -19,7 +19,7 @@ from projservo_cli.monitoring.detector import WINDOW
 from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
-from projservo_cli.robots.instants import DelayPrior, Delays, History
+from projservo_cli.robots.instants import DelayPrior, Delays, History, squares_by_joints
 from projservo_cli.robots.simulated import Plant, observe
 
 # Share of the sag allowed for that a servo may still be behind where sag is told from lag.
@@ -357,8 +357,8 @@ class DrivenRobot:
             return False
         q, face = self.steered.set_point.at_rest, self._place[: len(self.plant.M)]
         if self.known.sigma_q.any():
-            s = self.known.predicted(np.concatenate([q[None], q + np.diag(self.known.sigma_q)]))[:, :, face]
-            within_px = max(within_px, math.sqrt(float(np.nansum((s[1:] - s[0]) ** 2)) / (2 * len(face))))
+            squares = squares_by_joints(self.known.predicted, q, self.known.sigma_q)[:, face]
+            within_px = max(within_px, math.sqrt(float(np.nansum(squares)) / (2 * len(face))))
         return self.carried_px <= within_px
 
     def distance(self) -> float:

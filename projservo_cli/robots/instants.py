@@ -91,6 +91,14 @@ class _Frames(NamedTuple):
     fresh: BoolArray  # (2,) whether the image is another one than before
 
 
+def squares_by_joints(
+    predicted: Callable[[FloatArray], FloatArray], q: FloatArray, sigma_q: FloatArray
+) -> FloatArray:
+    """Variances (2, m, 2) of pixels, px², by deviations (n,) of the readings at joints (n,), rad or m."""
+    s = predicted(np.concatenate([q[None], q + np.diag(sigma_q)]))
+    return np.asarray(np.square(s[1:] - s[0]).sum(axis=0))
+
+
 class Delays:
     """The delays of both views, and the instants of frames.
 
@@ -135,8 +143,7 @@ class Delays:
 
         While a joint goes through its play, readings move and images do not: as they would if they were late.
         """
-        s = self._predicted(np.concatenate([q[None], q + np.diag(self._sigma_q)]))
-        squares = np.square(s[1:] - s[0]).sum(axis=0)
+        squares = squares_by_joints(self._predicted, q, self._sigma_q)
         for view, square in zip(self._views, squares, strict=True):
             by_joints = square[np.isfinite(square)]
             view.error_px = math.hypot(self._error_px, math.sqrt(by_joints.mean() if by_joints.size else 0.0))

@@ -68,9 +68,8 @@ def test_play_in_the_joints_is_no_delay(late):
 
 def test_a_given_delay_is_kept_and_a_wrong_one_is_not_hidden():
     for given, wrong in ((0.1, False), (0.3, True)):
-        delays = Delays(
-            predicted, DelayPrior(np.full(2, given), np.zeros(2), np.full(2, 0.005)), NOISE, 1.0, EXACT
-        )
+        prior = DelayPrior(np.full(2, given), np.zeros(2), np.full(2, 0.005))
+        delays = Delays(predicted, prior, NOISE, 1.0, EXACT)
         off = looks(delays, (0.1, 0.1))
         np.testing.assert_array_equal(delays.mean, [given, given])
         moving = np.abs(off[25:40])
@@ -103,11 +102,8 @@ def test_an_image_that_comes_twice_keeps_its_instant():
 
 
 def test_a_camera_that_stands_still_while_joints_move_is_named():
-    delays, history, rng = (
-        Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT),
-        History(),
-        np.random.default_rng(0),
-    )
+    delays = Delays(predicted, NOTHING_KNOWN, NOISE, 1.0, EXACT)
+    history, rng = History(), np.random.default_rng(0)
     still = predicted(np.zeros((1, 2)))[0, 1]
 
     def look(now, q):
