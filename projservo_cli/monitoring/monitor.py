@@ -46,6 +46,8 @@ _LEAST_PART = 0.2
 _LEAST_MOVED_PX = 1.0
 # Share of the markers that a view saw shortly before: one that sees less is covered by something.
 _COVERED = 0.5
+# Share of the sightings of a view that may not be off by themselves for long: then the view is.
+_MOST_FOR_LONG = 0.25
 # Looks that are remembered one by one.
 _REMEMBERED = 80
 # Chance of a false alarm of one look alone: that of a look among so many.
@@ -113,6 +115,7 @@ class ImageMonitor:
         self._before = self._detector.memory.total  # sums up to the onset
         self._unit = 1.0  # of χ², by what the best cause left
         self._asides = np.zeros((2, len(self._shown)), dtype=np.int64)  # looks in a row
+        self._crowded = 0  # looks in a row of which many sightings are off by themselves
         self._forgiven: list[int] = []
         self.fault, self.agreeing = "", 0
         self.rejected = np.zeros((2, self._all), dtype=np.bool_)
@@ -191,10 +194,13 @@ class ImageMonitor:
         if self._sound > WINDOW * self.holds and not covered:
             memory.keep(clean, float(look.t.mean()), not tested.aside.any())
         self._kept = [*kept, _Kept(look, residual, self._view, memory.views, covered)]
-        if not tested.disagrees:
+        crowd = (tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)).any()
+        self._crowded = (self._crowded + 1) * bool(crowd and not covered)
+        disagrees = tested.disagrees or self._crowded >= _TWO_AT
+        if not disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
             since = self._detector.significant(self.looks, look.late, free, self.pending)
-        if not tested.disagrees and since is None:
+        if not disagrees and since is None:
             self.agreeing = 1 + self.agreeing * lasts
             self._agreed += 1
             self._clear()
