@@ -26,8 +26,9 @@ _CORRECTED = 3.0
 _SHOWN, _SEEN = 50, 3
 # Sightings both views agree on, in units of the epipolar noise, are no errors of detection.
 _CONSISTENT = 3.0
-# Share of sightings both views agree on that may be left out of a fit.
-_MOST_UNEXPLAINED = 0.02
+# Share of sightings both views agree on that may be left out of a fit, and share of the sightings of a pose
+# that a wrong motion puts off at least: single corners under a slant err along the epipolar line.
+_MOST_UNEXPLAINED, _LEAST_OF_POSE = 0.02, 0.25
 # Sightings of one pose that agree on joints by more than chance.
 _AGREEING = 5
 # Markers by which the noise at free poses is told.
@@ -153,7 +154,7 @@ def _corrected_level(pose: LeastSquares, scene: Scene, joints: list[int], sigma:
 
 
 def _doubtful(solution: Solution, found: Outliers, epipolar: Epipolar) -> BoolArray:
-    """Sightings (N,) left out without explanation that both views agree on.
+    """Sightings (N,) left out without explanation that both views agree on, where they are not alone.
 
     Errors of detection break the epipolar geometry; what obeys it speaks against the model of the robot.
     """
@@ -161,7 +162,9 @@ def _doubtful(solution: Solution, found: Outliers, epipolar: Epipolar) -> BoolAr
     both = readings.both
     out = both & ~solution.used.all(axis=0) & ~found.explained.any(axis=0)
     out[both] &= epipolar.within(readings.rows(both), _CONSISTENT)
-    return np.asarray(out)
+    at, poses = readings.pose_of, len(readings.q)
+    share = np.bincount(at[out], minlength=poses) / np.maximum(np.bincount(at[both], minlength=poses), 1)
+    return np.asarray(out & (share >= _LEAST_OF_POSE)[at])
 
 
 def unexplained(solution: Solution, found: Outliers, epipolar: Epipolar) -> str:
