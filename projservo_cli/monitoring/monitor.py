@@ -196,7 +196,7 @@ class ImageMonitor:
         self._kept = [*kept, _Kept(look, residual, self._view, memory.views, covered)]
         crowd = (tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)).any()
         self._crowded = (self._crowded + 1) * bool(crowd and not covered)
-        disagrees = tested.disagrees or self._crowded >= _TWO_AT
+        disagrees = tested.disagrees or self._crowd_is_fault()
         if not disagrees:
             free = [columns_of_marker(self._errors, j) for j in self._forgiven]
             since = self._detector.significant(self.looks, look.late, free, self.pending)
@@ -231,6 +231,16 @@ class ImageMonitor:
         clear = self._off >= _TWO_AT or len(_rivals(found)) == 1
         if (explains and clear and not self._kept[-1].covered) or self._off == _NAMED_AT[-1]:
             self.fault = self._told(found)
+
+    def _crowd_is_fault(self) -> bool:
+        """Whether many sightings are aside for long, and all of these looks together are beyond chance."""
+        if self._crowded < _TWO_AT or self.pending:
+            return self._crowded >= _TWO_AT
+        evidence = self._evidence(self._kept[-_TWO_AT:], self._detector.memory.total)
+        if evidence.before > self._by_chance(evidence):
+            return True
+        self._crowded = 0
+        return False
 
     def _is_covered(self, residual: Residual) -> bool:
         """Whether a view sees less than half of what it saw: something passes before it, and hides edges."""
@@ -292,10 +302,13 @@ class ImageMonitor:
 
     def _explains(self, found: Explanation) -> bool:
         """Whether a cause explains most of what images are off, beside joints in error."""
-        rows, lasting = self._evidence_now.rows, 1.0 - self._detector.memory.fresh
-        allowed = (1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + self._evidence_now.bias
-        left = self._unit * found.left
+        left, allowed = self._unit * found.left, self._by_chance(self._evidence_now)
         return bool(found.score > 0.0 and left <= allowed + _LEFT * self._unit * found.gain)
+
+    def _by_chance(self, evidence: Evidence) -> float:
+        """χ² of evidence that chance, lasting errors of corners and those of the model may leave."""
+        rows, lasting = evidence.rows, 1.0 - self._detector.memory.fresh
+        return float((1.0 + lasting) * rows + 3.0 * np.sqrt(2.0 * rows) + evidence.bias)
 
     def _is_edge(self, found: Explanation, views: int) -> bool:
         """Whether what seems to have moved is perhaps an edge that a finder took for that of a marker.
