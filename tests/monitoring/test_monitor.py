@@ -312,6 +312,28 @@ def test_a_look_with_sightings_aside_is_not_kept_where_it_moves_the_calibration_
         assert memory.views == views
 
 
+@pytest.mark.parametrize("shift", [0.0, 6.0])
+def test_a_view_of_which_many_sightings_stay_aside_is_off_where_chance_does_not_explain_it(
+    arm, monkeypatch, shift
+):
+    q, _ = arm.way(3)
+    read = np.repeat(q[:1], 60, axis=0)
+    s = noisy(arm.images(at_once(read)), 3)
+    s[:, 1, :, 0] += shift
+
+    def some_aside(self, residual):
+        """As play in the joints lets them: some sightings are off, and the view is not."""
+        aside = np.zeros_like(residual.seen)
+        aside[1, : aside.shape[1] // 3] = True
+        return detector.Tested(False, aside)
+
+    monkeypatch.setattr(detector.Detector, "tested", some_aside)
+    monkeypatch.setattr(detector.Detector, "significant", lambda *_: None)
+    _, said = first_alarm(arm, read, s)
+    assert ("right camera" in said) == bool(shift)
+    assert bool(said) == bool(shift)
+
+
 def test_a_marker_that_was_off_and_is_gone_is_not_judged(arm):
     """By no two looks alike, so that nothing is named while it is seen; the looks since do not show it."""
     q, _ = arm.way(1)
