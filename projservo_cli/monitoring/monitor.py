@@ -351,7 +351,11 @@ class ImageMonitor:
         least = 0.0 if found[0].cause.markers else _LEAST_PART * self._evidence_now.off_px
         if not self._explains(found[0]) or found[0].changed_px < least:
             return f"{off}, most {self._where(residual)}, and no single cause explains it; recalibrate"
-        names = [sentence(one, self.calibration) for one in _rivals(found)[:2]]
+        # A mirrored reading near zero is a small slip: with backlash, images tell neither from the other.
+        most = self._by_chance(self._evidence_now) / self._unit
+        simpler = (one for one in found if not one.theta.size and contains(found[0].cause, one.cause))
+        said = [found[0], *(one for one in simpler if one.left <= most), *_rivals(found)[1:]]
+        names = [sentence(one, self.calibration) for one in said[:2]]
         return f"{off}: {'; or '.join(names)}"
 
     def _where(self, residual: Residual) -> str:

@@ -33,8 +33,8 @@ FOUND = 0
     NOT_MEASURED,
 ) = range(1, 11)
 _OTHER_SIDE = (
-    "the {} camera sees opposite sides of the face at the start and at the goal: choose a start "
-    "and a goal at which both cameras see its front"
+    "the {} camera sees one side of the face at the start and the other at the goal, by the order in which "
+    "its markers appear: move the goal, or else the start, to where that camera sees the side that is printed"
 )
 _UNSEEN = (
     "the images at the {} show too few markers, {{}} in both views together, to tell where the body is: show "

@@ -312,6 +312,18 @@ def test_a_look_with_sightings_aside_is_not_kept_where_it_moves_the_calibration_
         assert memory.views == views
 
 
+@pytest.mark.parametrize(("backlash", "slip", "sign"), [(0.0, 0, 1), (0.022, 1, 1), (0.05, 1, 0)])
+def test_a_mirrored_reading_near_zero_and_a_small_slip_are_both_said(arm, backlash, slip, sign):
+    noisy_arm, q = arm.with_joint_noise(0.002), arm.way(3)[0][:1]
+    q[0, -1] = 0.03
+    true = q.copy()
+    true[0, -1] = -0.03 - backlash
+    s = noisy(arm.images(at_once(np.repeat(true, 20, axis=0))), 5)
+    _, said = first_alarm(noisy_arm, np.repeat(q, 20, axis=0), s)
+    assert ("joint 6 slipped" in said) == slip
+    assert ("joint 6 has the other sign" in said) == sign
+
+
 @pytest.mark.parametrize("shift", [0.0, 6.0])
 def test_a_view_of_which_many_sightings_stay_aside_is_off_where_chance_does_not_explain_it(
     arm, monkeypatch, shift

@@ -90,7 +90,7 @@ def test_a_task_that_can_be_done_is_done(driven, name):
 
 
 def test_faces_opposite_are_refused_in_words(driven):
-    with pytest.raises(WorkFailed, match="opposite sides of the face"):
+    with pytest.raises(WorkFailed, match="sees one side of the face"):
         driven(moved(180, (0.0, 1.0, 0.0), shift=(0.0, 0.0, -0.3)))
 
 

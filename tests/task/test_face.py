@@ -107,11 +107,11 @@ def test_task_from_images_alone():
 def test_a_goal_that_shows_the_back_is_refused():
     """To one camera or to both; the camera is named."""
     model, s_start, s_star = images(SQUARE, turned(SQUARE_CENTER, [math.pi, 0, 0]))
-    with pytest.raises(WorkFailed, match="left camera sees opposite sides"):
+    with pytest.raises(WorkFailed, match="left camera sees one side of the face"):
         shown_to(model, s_start, s_star)
     # Turned by 88° about the vertical the face is seen from the left only.
     model, s_start, s_star = images(SQUARE, turned(SQUARE_CENTER, [0, math.radians(88), 0]))
-    with pytest.raises(WorkFailed, match=r"(left|right) camera sees opposite sides"):
+    with pytest.raises(WorkFailed, match=r"(left|right) camera sees one side of the face"):
         shown_to(model, s_start, s_star)
 
 
