@@ -102,6 +102,9 @@ _EDGE = 6  # numbers of an edge
 _BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
 # What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
 _FLOOR, _LEAK = 0.002, (0.5, 0.6)
+# White that a camera clips, grey value, less what noise and JPEG take of it. An edge fitted to min(k Φ, 1) is off by
+# a share of the blur that is fitted; this is its root mean square for exposures k from 1 to 1½.
+_CLIPPED, _OVEREXPOSED = 252.0, 0.42
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
 # the blur that is reckoned with where no edge tells it, in cells; from what cell on, px, it grows no more.
 _UNREFINED, _BY_CELL, _BLURRED, _LEAST_UNREFINED = 1.2, -0.75, 0.4, 1.25
@@ -246,7 +249,7 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
 
     Roughly by few profiles, else by all but those that something covers, if these are few. Grey values err
     independently, by what the residuals of the side show. Besides, the model errs by what blur carries over
-    from the next edge, one cell away, which depends on the code.
+    from the next edge, one cell away, which depends on the code, and by white that is clipped.
     """
     line, variance, edge = (np.full((len(before), size), np.nan) for size in (3, 2, _EDGE))
     found = _Edges(line, variance, edge, np.zeros(len(before), dtype=np.bool_))
@@ -269,9 +272,11 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     good = clean & (count > 5.0) & (x[:, 1] > 0.0) & (np.abs(x[:, 2]) + 0.5 * np.abs(x[:, 3]) < reach)
     found.spoilt[fits] = tried & ~good
     sides, x, A, fits = _Sides(*(part[good] for part in sides)), x[good], A[good], fits[good]
-    residual = _edge_model(x, _Strips(*(part[good] for part in strips)))[0]
+    strips = _Strips(*(part[good] for part in strips))
+    residual = _edge_model(x, strips)[0]
     C = np.linalg.inv(A) * ((residual**2).sum(axis=(1, 2)) / (count[good] - 5.0))[:, None, None]
-    left_out = _FLOOR**2 + (_LEAK[0] * sides.cell * ndtr(-_LEAK[1] * sides.cell / x[:, 4])) ** 2
+    leak = _LEAK[0] * sides.cell * ndtr(-_LEAK[1] * sides.cell / x[:, 4])
+    left_out = _FLOOR**2 + leak**2 + (_OVEREXPOSED * _clipped(strips) * x[:, 4]) ** 2
     by_place = np.array([[1.0, -0.5, 2.0 / 3.0], [1.0, 0.5, 2.0 / 3.0]])  # of n at both ends by n_0, k, c
     C = C[:, [2, 3, 5]][:, :, [2, 3, 5]]
     ends = (by_place @ C * by_place).sum(axis=2)
@@ -283,6 +288,13 @@ def _edges_along(image: FloatArray, all_sides: _Sides, before: FloatArray, *, ro
     found.line[fits] = np.column_stack([across, -(across * middle).sum(axis=1)])
     found.variance[fits], found.x[fits] = ends + left_out[:, None], x
     return found
+
+
+def _clipped(strips: _Strips) -> FloatArray:
+    """Share (S,) of the pixels outside of edges that are as bright as an image can be."""
+    outside = strips.weight * (strips.n > 0.0)
+    clipped = outside * (strips.grey >= _CLIPPED)
+    return np.asarray(clipped.sum(axis=(1, 2)) / np.maximum(outside.sum(axis=(1, 2)), 1.0))
 
 
 def _uncovered(
