@@ -102,8 +102,8 @@ _EDGE = 6  # numbers of an edge
 _BOW, _LEAST_NOISE, _RIGID = 0.01, 0.3, 1e3
 # What the model of an edge leaves out, px; and beyond how many cells the next edge is, times how much of it.
 _FLOOR, _LEAK = 0.002, (0.5, 0.6)
-# White that a camera clips, grey value, less what noise and JPEG take of it. An edge fitted to min(k Φ, 1) is off by
-# a share of the blur that is fitted; this is its root mean square for exposures k from 1 to 1½.
+# White that a camera clips, grey value, less what noise and JPEG take of it. An edge fitted to min(k Φ, 1)
+# is off by a share of the blur that is fitted: this is its root mean square for exposures k from 1 to 1½.
 _CLIPPED, _OVEREXPOSED = 252.0, 0.42
 # Deviation of a corner that OpenCV finds where blur and cell are one pixel, and how it falls with the cell;
 # the blur that is reckoned with where no edge tells it, in cells; from what cell on, px, it grows no more.
