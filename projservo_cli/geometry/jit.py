@@ -2,14 +2,16 @@
 
 Numba decides whether cached machine code is fresh by the file of the function itself, so an edited
 helper in another file would go unnoticed. The cache folder therefore carries a hash of all sources
-of the compiled packages; where no folder can be written, the functions compile anew in each process.
+that compiled functions may come from, by what these import; where no folder can be written, the functions
+compile anew in each process.
 """
 
 import hashlib
 import os
+import re
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -21,16 +23,40 @@ from numba.extending import register_jitable
 _Params = ParamSpec("_Params")
 _Result = TypeVar("_Result")
 
-COMPILED_PARTS = ("records.py", "geometry", "task", "guidance", "control", "loop", "robots")
+_DECORATED = re.compile(rb"^@(?:allocating|composed|inline|internal|merged|njit)$", re.MULTILINE)
+_IMPORT = re.compile(rb"^\s*from projservo_cli(?:\.([\w.]+))? import (\([^)]*\)|[^\n]*)", re.MULTILINE)
+
+
+def compiled_sources(root: Path) -> dict[str, bytes]:
+    """Sources of a package, by their paths in it, that have compiled functions or are imported by such."""
+    sources = {file.relative_to(root).as_posix(): file.read_bytes() for file in root.rglob("*.py")}
+    found: dict[str, bytes] = {}
+    due = [name for name, source in sources.items() if _DECORATED.search(source)]
+    while due:
+        name = due.pop()
+        if name in sources and name not in found:
+            found[name] = sources[name]
+            due += _imported(sources[name])
+    return dict(sorted(found.items()))
+
+
+def _imported(source: bytes) -> Iterator[str]:
+    """Paths that imports of a source may stand for: a module, a package, a module of a package."""
+    for module, names in _IMPORT.findall(source):
+        parts = module.decode().split(".") if module else []
+        yield "/".join([*parts, "__init__.py"])
+        if parts:
+            yield "/".join(parts) + ".py"
+        for name in re.findall(r"\w+", names.decode()):
+            yield "/".join([*parts, f"{name}.py"])
 
 
 def _source_hash(root: Path) -> str:
     """Hash of the sources that machine code depends on, and of the compiler's version."""
     digest = hashlib.sha256(f"{sys.version}|{numba.__version__}|{np.__version__}".encode())
-    for part in COMPILED_PARTS:
-        for file in sorted((root / part).glob("*.py")) or [root / part]:
-            digest.update(file.relative_to(root).as_posix().encode())
-            digest.update(file.read_bytes())
+    for name, source in compiled_sources(root).items():
+        digest.update(name.encode())
+        digest.update(source)
     return digest.hexdigest()[:16]
 
 

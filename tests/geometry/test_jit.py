@@ -1,17 +1,19 @@
 """Where machine code is cached: keyed by every source it depends on, or not at all."""
 
+import importlib
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core.registry import CPUDispatcher
 
 import projservo_cli
-from projservo_cli.geometry.jit import COMPILED_PARTS, cache_folder
+from projservo_cli.geometry.jit import cache_folder, compiled_sources
+from tests.conftest import INTERPRETED
 
 PACKAGE = Path(projservo_cli.__file__).parent
 
@@ -24,24 +26,46 @@ def copy(tmp_path):
     return root
 
 
-@pytest.mark.parametrize("package", COMPILED_PARTS)
-def test_an_edited_helper_or_a_new_file_makes_another_cache(copy, package, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "name", ["records.py", "control/law.py", "geometry/stereo.py", "robots/simulated.py"]
+)
+def test_an_edited_helper_or_a_new_kernel_makes_another_cache(copy, name, tmp_path, monkeypatch):
     monkeypatch.setenv("PROJSERVO_CACHE_DIR", str(tmp_path / "cache"))
     before = cache_folder(copy)
     assert before.parent == tmp_path / "cache" / "projservo"
     assert before.is_dir()
     assert before == cache_folder(copy) == cache_folder(PACKAGE)
-    file = max([copy / package, *(copy / package).glob("*.py")])
+    file = copy / name
     file.write_text(file.read_text(encoding="utf-8") + "\n# edited\n", encoding="utf-8")
     edited = cache_folder(copy)
-    (copy / "control" / "new_law.py").write_text("", encoding="utf-8")
-    assert len({before, edited, cache_folder(copy)}) == 3
+    (copy / "cli" / "new.py").write_text("", encoding="utf-8")
+    assert cache_folder(copy) == edited != before
+    (copy / "cli" / "new.py").write_text("@njit\ndef f(x):\n    return x\n", encoding="utf-8")
+    assert cache_folder(copy) not in (before, edited)
 
 
-def test_every_compiled_function_lies_in_a_hashed_package():
+@pytest.mark.skipif(INTERPRETED, reason="nothing is compiled: NUMBA_DISABLE_JIT is set")
+def test_what_a_compiled_function_calls_lies_in_a_hashed_source():
+    """By the globals of all that the compiler took in, where the hash goes by imports."""
+    hashed = compiled_sources(PACKAGE).keys()
     for file in PACKAGE.rglob("*.py"):
-        if re.search("^@(njit|internal|inline)$", file.read_text(encoding="utf-8"), re.MULTILINE):
-            assert file.relative_to(PACKAGE).parts[0] in COMPILED_PARTS
+        importlib.import_module(".".join(["projservo_cli", *file.relative_to(PACKAGE).with_suffix("").parts]))
+    functions = {
+        value
+        for name, module in list(sys.modules.items())
+        if name.startswith("projservo_cli")
+        for value in vars(module).values()
+        if isinstance(value, CPUDispatcher)
+    }
+    assert len(functions) > 100
+    for function in functions:
+        names = function.py_func.__code__.co_names
+        used = [function.py_func, *(function.py_func.__globals__.get(name) for name in names)]
+        for value in used:
+            home = getattr(value, "__module__", None) or ""
+            if home.startswith("projservo_cli"):
+                path = home.removeprefix("projservo_cli.").replace(".", "/")
+                assert {f"{path}.py", f"{path}/__init__.py"} & hashed, (function, value)
 
 
 def test_no_cache_where_nothing_can_be_written(copy, tmp_path, monkeypatch):
