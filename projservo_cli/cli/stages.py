@@ -250,7 +250,7 @@ def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) ->
 
     chain = _asked(console, names, options)
     if options["dry_run"]:
-        words = (f"{s.name}: {f'would be made ({s.why})' if s.why else 'up to date'}" for s in chain.steps)
+        words = (f"{s.name}: {f'would be made ({s.why})' if s.why else s.standing}" for s in chain.steps)
         steps = [{"stage": s.stage, "law": s.law or None, "why": s.why or None} for s in chain.steps]
         console.tell({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
         return 0
@@ -424,9 +424,10 @@ def _announce(chain: _Chain) -> None:
             continue  # it was said before it was made
         needed = "" if step.stage in chain.names else f", needed by {chain.names[-1]}"
         if step.why or not needed:
-            reasons.setdefault(step.why and step.why + needed, []).append(step.name)
-    for why, found in reasons.items():
-        chain.console.say(f"{', '.join(found)}: {f'making ({why})' if why else 'up to date'}")
+            said = f"making ({step.why}{needed})" if step.why else step.standing
+            reasons.setdefault(said, []).append(step.name)
+    for said, found in reasons.items():
+        chain.console.say(f"{', '.join(found)}: {said}")
 
 
 def _make_steps(chain: _Chain) -> None:

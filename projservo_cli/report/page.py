@@ -219,7 +219,7 @@ def _made(run: Run, config: Config) -> Iterator[tuple[str, str]]:
     yield "seed", str(config.seed)
     inputs = {key: text for result in run.results.values() for key, text in result.inputs.items()}
     for key, text in inputs.items():
-        yield key.replace("_", " "), text
+        yield key.replace("_sha256", " sha256"), text
     for key, label in (*_MADE.items(), ("", "versions")):
         by_value: dict[str, list[str]] = {}
         for name, result in run.results.items():

@@ -6,7 +6,7 @@ anything is done.
 """
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.config.models import FAULTS
 from projservo_cli.records import InputError, law_and_mode, names_of
 from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
+from projservo_cli.robots.source import source_hash
 from projservo_cli.store import SERVO, Result, Run
 
 STAGES = ("calibrate", "plan", "servo", "report")
@@ -58,13 +59,19 @@ class Step:
     stage: str  # name of the stage
     law: str  # name of the run of a law for ``servo``, such as ``exact`` or ``exact_track``, else empty
     key: str  # what the key of the result will be
-    inputs: dict[str, str]  # files read and their hashes
+    inputs: Mapping[str, str]  # files read and their hashes, and the hash of the source of a law of one's own
     why: str = ""  # why it has to be made; empty where the stored one is up to date
+    gone: bool = False  # whether the source of its law is not there any more
 
     @property
     def name(self) -> str:
         """Name of the result in the run file."""
         return f"{SERVO}{self.law}" if self.law else self.stage
+
+    @property
+    def standing(self) -> str:
+        """How a result stands that need not be made."""
+        return "up to date, though the source of its law is gone" if self.gone else "up to date"
 
 
 def steps_for(
@@ -88,7 +95,7 @@ def steps_for(
 
     def planned(stages: Sequence[str], laws: Sequence[str]) -> list[Step]:
         steps: list[Step] = []
-        for step in _needed(config, inputs, laws, stages):
+        for step in _needed(config, inputs, _sources(laws, config, run), stages):
             remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
             steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
         return steps
@@ -122,17 +129,38 @@ def affects(key: str, stage: str) -> bool:
     return any(part.startswith(f"{key}.") or f"{key}.".startswith(part) for part in parts)
 
 
+def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, tuple[Mapping[str, str], bool]]:
+    """What is read for the run of each law, by its name: the hash of its source, if it is one's own.
+
+    Beside it, whether that source is gone since; the stored hash stands then.
+    """
+    found: dict[str, tuple[Mapping[str, str], bool]] = {}
+    for law in names_of(laws, config.control.mode):
+        name, stored = law_and_mode(law)[0], run.results.get(f"{SERVO}{law}")
+        source = source_hash(name) if ":" in name else ""
+        if ":" in name and not source and stored is not None:
+            found[law] = (stored.inputs, True)
+        else:
+            found[law] = ({f"source of {name}": source} if source else {}, False)
+    return found
+
+
 def _needed(
-    config: Config, inputs: dict[str, str], laws: Sequence[str], stages: Sequence[str]
+    config: Config,
+    inputs: dict[str, str],
+    laws: Mapping[str, tuple[Mapping[str, str], bool]],
+    stages: Sequence[str],
 ) -> Iterator[Step]:
     """Every result of the stages with its key, each made from those before."""
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     before += [inputs["mjcf_sha256"]] if "mjcf" in inputs else []
     for stage in stages:
         keys = []
-        for law in names_of(laws, config.control.mode) if stage == "servo" else [""]:
-            keys.append(key_of(config, stage, before=before, law=law))
-            yield Step(stage, law, keys[-1], inputs if stage == "calibrate" else {})
+        of_none: Mapping[str, str] = inputs if stage == "calibrate" else {}
+        for law, (read, gone) in (laws if stage == "servo" else {"": (of_none, False)}).items():
+            own = {"source": read} if law and read else {}
+            keys.append(key_of(config, stage, before=before, law=law, **own))
+            yield Step(stage, law, keys[-1], read, gone=gone)
         before = [*keys]
 
 
@@ -162,6 +190,8 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
     stored = run.results.get(step.name)
     if stored is None:
         return "none yet"
+    if step.law and stored.inputs != step.inputs:
+        return "the source of its law changed"
     if stored.key != step.key:
         return "outdated"
     if step.law and stored.records[""].verdict == "failed":

@@ -28,6 +28,7 @@ from projservo_cli.records import (
     names_of,
 )
 from projservo_cli.robots.simulated import METRIC_A_INF
+from projservo_cli.robots.source import source_hash
 from projservo_cli.stages.steps import affects, key_of
 from projservo_cli.stages.world import Truth, truth_of
 
@@ -230,6 +231,14 @@ class Design:
         values = {name: value for name, value in self.recipe["sweep"].items() if name not in left_out}
         text = json.dumps([values, self.recipe["bases"]], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    @cached_property
+    def sources(self) -> dict[str, str]:
+        """Hashes of the sources of laws of one's own, by ``module:Class``; empty where one is gone."""
+        names = {value for axis in self.axes if LAW in axis.keys for value in axis.values}
+        names |= {changed[LAW] for axis in self.axes for changed in axis.also.values() if LAW in changed}
+        own = {law_and_mode(str(name))[0] for name in names if ":" in str(name)}
+        return {law: source_hash(law) for law in sorted(own)}
 
     def numbers(self, run: int) -> tuple[int, int, int, int]:
         """Cell of a run, and the numbers of its draw, calibration and task; an InputError without one."""

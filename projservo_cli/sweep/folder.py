@@ -111,6 +111,13 @@ class Folder:
                 f"{self.manifest}: of another configuration; choose another folder with -o, or begin anew "
                 "with --force"
             )
+        made_by = manifest.get("sources", {})
+        changed = [law for law, source in design.sources.items() if source and source != made_by.get(law)]
+        if changed:
+            raise InputError(
+                f"{self.manifest}: the source of {', '.join(changed)} changed since; choose another folder "
+                "with -o, or begin anew with --force"
+            )
         made_with = manifest["provenance"]
         other = [f"{name} {made_with[name]}, now {now[name]}" for name in now if made_with[name] != now[name]]
         if other:
@@ -137,7 +144,13 @@ class Folder:
     def begin(self, design: Design, chunk: int) -> None:
         """Write the manifest."""
         origin = provenance.collect(seed=design.sweep.seed)
-        values = {"key": design.key, "chunk": chunk, "provenance": origin, "recipe": design.recipe}
+        values = {
+            "key": design.key,
+            "chunk": chunk,
+            "provenance": origin,
+            "sources": design.sources,
+            "recipe": design.recipe,
+        }
         write_whole(self.manifest, json.dumps(values))
 
     def clear(self) -> None:

@@ -9,6 +9,7 @@ import pytest
 from projservo_cli.config import load_config, to_yaml
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots import plugins
+from projservo_cli.robots.source import source_hash
 
 UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
 HERE = "tests.foreign.robots"
@@ -136,3 +137,74 @@ def test_bad_values_are_refused_where_they_stand(override, message):
         load_config(UR5, [override])
     assert message in str(caught.value)
     assert f"--set {override}" in str(caught.value)
+
+
+def test_the_source_of_a_law_is_its_module_and_what_of_ones_own_it_imports():
+    """Found without running any; what is installed counts by its version."""
+    written("mine_gains", "raise AssertionError('nothing is run')\nGAIN = 1\n")
+    written("mine_other", "x = 1\n")
+    Path("mine_package").mkdir()
+    written("mine_package/__init__", "")
+    written("mine_package/deep", "from . import beside\n")
+    written("mine_package/beside", "x = 1\n")
+    written(
+        "mine_law",
+        "import json\nimport numpy as np\nfrom mine_package.deep import x\n"
+        "def f():\n    from mine_gains import GAIN\n",
+    )
+    hashes = [source_hash("mine_law:f")]
+    for name in (
+        "mine_law",
+        "mine_gains",
+        "mine_package/deep",
+        "mine_package/beside",
+        "mine_package/__init__",
+    ):
+        path = Path(f"{name}.py")
+        path.write_text(path.read_text() + "# edited\n")
+        hashes.append(source_hash("mine_law:f"))
+    assert len(set(hashes)) == 6
+    Path("mine_other.py").write_text("x = 2\n")
+    assert source_hash("mine_law:f") == hashes[-1]
+    assert not source_hash("mine_gone:f")
+    assert not {"mine_law", "mine_gains", "mine_package"} & sys.modules.keys()
+
+
+LAW = """
+class Law:
+    def __init__(self, setup):
+        self.n = len(setup.calibration.H_hat_0)
+
+    def __call__(self, s, q):
+        return [0.0] * self.n
+"""
+
+
+def test_a_law_that_is_edited_is_run_anew_and_one_that_is_gone_stands(projservo):
+    written("mine_edited", LAW)
+    command = ("servo", "-c", UR5, "--law", "mine_edited:Law", "-o", "run")
+
+    def said():
+        return projservo(*command, "--dry-run").out
+
+    assert projservo(*command).code == 1  # it does not converge
+    assert "servo/mine_edited:Law: up to date\n" in said()
+    written("mine_edited", LAW + "# edited\n")
+    assert "servo/mine_edited:Law: would be made (the source of its law changed)" in said()
+    projservo(*command)
+    Path("mine_edited.py").unlink()
+    assert "servo/mine_edited:Law: up to date, though the source of its law is gone" in said()
+
+
+def test_a_sweep_is_not_continued_with_another_source(projservo):
+    written("mine_swept", LAW)
+    Path("sweep.yaml").write_text(
+        f"base: {UR5}\nseed: 1\nruns: 1\ngrid: {{law: ['mine_swept:Law']}}\nset: {{stop.max_steps: 3}}\n"
+    )
+    command = ("sweep", "-c", "sweep.yaml", "-o", "swept")
+    assert projservo(*command).code == 0
+    assert projservo(*command).code == 0
+    written("mine_swept", LAW + "# edited\n")
+    again = projservo(*command)
+    assert again.code == 2
+    assert "the source of mine_swept:Law changed since; choose another folder" in again.err
