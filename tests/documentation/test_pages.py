@@ -15,7 +15,7 @@ from projservo_cli.config import load_config
 from projservo_cli.robots.described import mujoco
 from projservo_cli.stages.world import truth_of
 from tests.detection.rendering import render, square
-from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, run_page
+from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, matches, run_page
 
 PAGES = sorted(DOCS.glob("*.md"))
 # Those that run laws or plan: only with the compiler.
@@ -23,6 +23,21 @@ DRIVING = {"api", "commands", "guidance", "law", "report", "run-file", "sweeps",
 LANGUAGES = {"sh", "python", "text", "xml", "yaml"}
 # What cannot be run by a test, and how often it stands there.
 NOT_RUN = {"installation": 1, "rendered": 1, "sweeps": 1}
+
+
+@pytest.mark.parametrize(
+    ("shown", "same"),
+    [
+        ("steps 101 mm\n0.0118, 0.4 s", True),
+        ("steps 103 mm 0.01185, 9 s", True),
+        ("steps 106 mm 0.0118, 0.4 s", False),
+        ("steps 101 mm 0.0121, 0.4 s", False),
+        ("15 left out", False),
+        ("left out", True),
+    ],
+)
+def test_an_output_is_compared_with_its_numbers_but_not_how_long_it_took(shown, same):
+    assert matches(shown, "law: steps 101 mm 0.0118, 0.4 s\n16 left out") == same
 
 
 @pytest.fixture
