@@ -460,11 +460,9 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError as error:
-        raise InputError("detect needs OpenCV: pip install 'projservo[detect]'") from error
+        raise InputError("detect needs OpenCV: pip install '.[detect]'") from error
     if not hasattr(getattr(cv2, "aruco", None), "ArucoDetector"):
-        raise InputError(
-            f"detect needs OpenCV 4.7 or newer, not {cv2.__version__}: pip install 'projservo[detect]'"
-        )
+        raise InputError(f"detect needs OpenCV 4.7 or newer, not {cv2.__version__}: pip install '.[detect]'")
     return cv2
 
 

@@ -167,7 +167,7 @@ def _detect(
 
     Finds tags in the images of two folders (or quoted patterns such as 'left/*.png'), with corners to a
     fraction of a pixel and how certain each is, and writes an observation table for calibrate --data. Needs
-    OpenCV: pip install 'projservo[detect]'.
+    OpenCV: pip install '.[detect]'.
 
     The list of joint readings (--joints-csv) says which images belong together. With columns left and right,
     these are the names of the two images. With a column pose, images are those whose name ends in that

@@ -132,7 +132,7 @@ def _found(value: dict[str, Any]) -> Iterator[str]:
     versions = [f"{name} {version or 'MISSING'}" for name, version in value["packages"].items()]
     yield f"packages: {', '.join(versions) or 'unknown: projservo is not installed, only run'}"
     for name, lacking in value["extras"].items():
-        lacks = f"lacks {', '.join(lacking)}: pip install 'projservo[{name}]'"
+        lacks = f"lacks {', '.join(lacking)}: pip install '.[{name}]'"
         yield f"extra {name}: {lacks if lacking else 'installed'}"
     kernels, results = value["kernels"], value["results"]
     if kernels is None:

@@ -206,7 +206,7 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
     report.html, one page that tells it all and needs no other file. Makes every stage before it where needed.
 
     --view adds view.html, a 3D view of robot, rig, face and paths with a time slider, which needs no network;
-    it needs pip install 'projservo[view]' and a robot described in metres. --animation adds animation.gif,
+    it needs pip install '.[view]' and a robot described in metres. --animation adds animation.gif,
     what both cameras see under the direct and the classical laws. The page links to both; a report that is up
     to date is not made again for them.
 

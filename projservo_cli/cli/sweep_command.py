@@ -42,7 +42,7 @@ def _sweep(
     SWEEP:INDEX makes any of them anew.
 
     projservo report SWEEP writes statistics and figures. With --scheduler the workers of a Dask cluster do
-    the work; it needs pip install 'projservo[cluster]' here and there.
+    the work; it needs pip install '.[cluster]' here and there.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # in the processes to come, from their beginning
     from projservo_cli.config import load_sweep

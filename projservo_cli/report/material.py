@@ -185,7 +185,8 @@ class _FigureSpec:
             return "the run holds a calibration and no task: set robot, rig, markers and task"
         missing = self._without_run(material)
         if missing and (not self.any_law or len(missing) == len(self.laws)):
-            return f"no run of {', '.join(missing)} with a step to show; make it: projservo servo report"
+            shown = {law: None for spec in REGISTER.values() for law in spec._without_run(material)}
+            return f"runs to compare are missing, of {', '.join(shown)}; make them: projservo servo report"
         if self.studies and material.studies is None:
             return f"the extra runs could not be made: {material.no_studies}"
         if self.shares and np.isnan(material.plan.mu).all():

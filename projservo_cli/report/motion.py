@@ -142,7 +142,7 @@ def plotly() -> Any:
     try:
         import plotly.graph_objects
     except ImportError as error:
-        raise InputError("the 3D view needs plotly: pip install 'projservo[view]'") from error
+        raise InputError("the 3D view needs plotly: pip install '.[view]'") from error
     return plotly.graph_objects
 
 

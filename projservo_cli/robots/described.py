@@ -31,11 +31,11 @@ def mujoco() -> Any:
         import mujoco as module
     except ImportError as error:
         what = "too old or broken" if "mujoco" not in str(error.name) else "missing"
-        raise InputError(f"MuJoCo is {what}: pip install 'projservo[mujoco]' ({error})") from error
+        raise InputError(f"MuJoCo is {what}: pip install '.[mujoco]' ({error})") from error
     except AttributeError as error:  # MuJoCo up to 3 looks for the library of GL where it is imported
         raise InputError(no_gl(error)) from error
     if tuple(map(int, module.__version__.split(".")[:2])) < (3, 7):
-        raise InputError(f"MuJoCo {module.__version__} is older than 3.7: pip install -U 'projservo[mujoco]'")
+        raise InputError(f"MuJoCo {module.__version__} is older than 3.7: pip install -U '.[mujoco]'")
     return module
 
 

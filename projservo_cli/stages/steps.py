@@ -95,7 +95,8 @@ def steps_for(
 
     def planned(stages: Sequence[str], laws: Sequence[str]) -> list[Step]:
         steps: list[Step] = []
-        for step in _needed(config, inputs, _sources(laws, config, run), stages):
+        sources = _sources(laws, config, run) if "servo" in stages else {}
+        for step in _needed(config, inputs, sources, stages):
             remade = bool(recording) or any(before.why for before in steps if before.stage != step.stage)
             steps.append(replace(step, why=_reason(step, run, force and step.stage in named, remade)))
         return steps

@@ -154,7 +154,7 @@ class Cluster(Engine):
             from distributed.scheduler import KilledWorker
         except ImportError as error:
             raise InputError(
-                f"{self._name}: the package distributed is missing: pip install 'projservo[cluster]'"
+                f"{self._name}: the package distributed is missing: pip install '.[cluster]'"
             ) from error
         self.losses = (*Engine.losses, KilledWorker)
         for name in list(logging.root.manager.loggerDict):  # what matters is said in our words
@@ -181,7 +181,7 @@ class Cluster(Engine):
             what = " ".join(str(error).split())
             raise InputError(
                 f"{self._name}: a worker cannot import projservo ({what}): install the same "
-                "version there, pip install 'projservo[cluster]'"
+                "version there, pip install '.[cluster]'"
             ) from error
         here = versions()
         for name, there in ((name, of_one[name]) for of_one in found.values() for name in here):

@@ -421,12 +421,12 @@ def test_a_view_and_an_animation_are_made_beside_a_report_that_is_up_to_date(
 
 def test_a_view_that_cannot_be_made_is_refused_before_any_work(projservo, stages, monkeypatch):
     def lacks():
-        raise InputError("the 3D view needs plotly: pip install 'projservo[view]'")
+        raise InputError("the 3D view needs plotly: pip install '.[view]'")
 
     monkeypatch.setattr(reporting, "plotly", lacks)
     answer = projservo("report", "-c", "tiny.yaml", "-o", "out", "--view")
     assert answer.code == 2
-    assert answer.err == "projservo: the 3D view needs plotly: pip install 'projservo[view]'\n"
+    assert answer.err == "projservo: the 3D view needs plotly: pip install '.[view]'\n"
     assert projservo("calibrate", "-c", "tiny.yaml", "--view").code == 2
     answer = projservo("calibrate", "report", "--data", "t.csv", "--joints", "RR", "-o", "new", "--animation")
     assert answer.code == 2

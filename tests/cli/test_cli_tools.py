@@ -114,5 +114,5 @@ def test_doctor_names_what_is_missing(projservo, stages, monkeypatch):
     answer = projservo("doctor")
     assert answer.code == 1
     assert "not-there-at-all MISSING" in answer.out
-    assert "extra other: lacks neither: pip install 'projservo[other]'" in answer.out
+    assert "extra other: lacks neither: pip install '.[other]'" in answer.out
     assert projservo("doctor", "--json").json["missing"] == ["not-there-at-all"]

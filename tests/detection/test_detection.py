@@ -16,7 +16,7 @@ from projservo_cli.tables import read_table
 from tests.detection.rendering import render, square
 from tests.detection.sigma_study import errors
 
-cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'projservo[detect]'")
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
 
 SIZE = (320, 240)
 TAGS = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)

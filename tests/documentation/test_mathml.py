@@ -13,7 +13,7 @@ ACCENTS = {"ˆ", "˙", "‾", "¯"}
 
 @pytest.fixture(scope="module")
 def mathml():
-    pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
+    pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install '.[docs]'")
     (module,) = imported("mathml")
     return module
 

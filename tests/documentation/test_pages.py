@@ -52,7 +52,7 @@ def folder(tmp_path, monkeypatch):
 
 def put_tags(folder):
     """Two pairs of images with a tag, and their joint readings."""
-    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install 'projservo[detect]'")
+    cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
     tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     for side in ("left", "right"):
         (folder / "images" / side).mkdir(parents=True)
@@ -175,7 +175,7 @@ def check_guidance(folder, names, read):
 
 def check_run_file(folder, names, read):
     """What the page says of groups is what is there, and in which."""
-    pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
+    pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install '.[docs]'")
     (reference,) = imported("reference")
     with h5py.File("results/paper/run.h5") as file:
         found = {}
@@ -227,7 +227,7 @@ def test_page(folder, page, capsys):
         pytest.importorskip("xarray")
         pytest.importorskip("h5netcdf")
     if page.stem == "report":
-        pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+        pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
     if page.stem == "rendered":
         require_gl()
     for put in HAS.get(page.stem, ()):

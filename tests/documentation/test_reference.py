@@ -14,7 +14,7 @@ from projservo_cli.equations import REGISTER
 from projservo_cli.sweep.runs import BETWEEN, MEASURED, NUMBERED
 from tests.documentation.blocks import DOCS, ROOT, imported
 
-pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install 'projservo[docs]'")
+pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install '.[docs]'")
 docstrings, keys, mathml, reference = imported("docstrings", "keys", "mathml", "reference")
 
 

@@ -72,7 +72,7 @@ def opened(browser, path, width=1400, dark=False):
 
 @pytest.fixture(scope="module")
 def view(run):
-    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
     return extras.view(run)
 
 

@@ -29,7 +29,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def view(run):
-    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
     return report.view(run)
 
 
@@ -68,7 +68,7 @@ def test_without_plotly_the_view_says_what_to_install(run, monkeypatch):
 
 
 def test_what_has_no_metres_or_no_task_is_refused_with_the_remedy():
-    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
     config = configured("paper")
     projective = config.model_copy(update={"robot": None})
     with pytest.raises(InputError, match=r"--view: .*no metres.*robot\.dh or robot\.screws.*--animation"):
@@ -101,7 +101,7 @@ def test_the_animation_is_small_and_has_all_frames(run, monkeypatch):
 
 @pytest.mark.parametrize("make", [report.view, report.animation])
 def test_runs_without_a_step_have_nothing_to_show(run, make):
-    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'projservo[view]'")
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install '.[view]'")
     kept = {name: result for name, result in run.results.items() if not name.startswith("servo/")}
     with pytest.raises(WorkFailed, match="projservo servo"):
         make(dataclasses.replace(run, results=kept))
