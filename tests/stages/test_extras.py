@@ -62,7 +62,7 @@ def test_the_view_holds_every_instant_of_every_law(run, view):
 
 def test_without_plotly_the_view_says_what_to_install(run, monkeypatch):
     monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
-    with pytest.raises(InputError, match=r"pip install 'projservo\[view\]'"):
+    with pytest.raises(InputError, match=r"pip install '\.\[view\]'"):
         report.require(configured("paper"), ["view"])
     report.require(configured("paper"), ["animation"])
 
