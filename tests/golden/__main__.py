@@ -67,7 +67,7 @@ def commands_of(name: str, folder: Path) -> list[list[str]]:
             ["validate", str(folder / name), "--data", str(DATA / held_out), "--json"],
         ]
     path = CONFIGS / f"{name}.yaml"
-    if name.startswith("sweep"):
+    if "grid" in yaml.safe_load(path.read_text(encoding="utf-8")):
         return [["sweep", "-c", str(small_sweep(path, folder)), *output]]
     return [["calibrate", "plan", "servo", "report", "-c", str(path), *output]]
 
