@@ -4,77 +4,51 @@ The method is that of A. Ruf and R. Horaud, "Vision-based Guidance and Control o
 Projective Space", ECCV 2000, cited below as [RH00].
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from projservo_cli.provenance import __version__
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from projservo_cli.api import calibrate, load, plan, record, servo, simulate, sweep
+    from projservo_cli.config import Config
+    from projservo_cli.experiment import Experiment
+    from projservo_cli.observations import Observations
+    from projservo_cli.records import InputError, WorkFailed
 
-    from numpy.typing import ArrayLike
+_PLACES = {
+    "Config": "config",
+    "Experiment": "experiment",
+    "InputError": "records",
+    "Observations": "observations",
+    "WorkFailed": "records",
+    **dict.fromkeys(("calibrate", "load", "plan", "record", "servo", "simulate", "sweep"), "api"),
+}
 
-    from projservo_cli.records import Plan
-    from projservo_cli.results import Experiment
-
-__all__ = ["__version__", "guide", "load"]
-
-
-def load(run: "Path | str") -> "Experiment":
-    """Open a run: its configuration, observation, calibration, plan and traces.
-
-    Parameters
-    ----------
-    run : folder of a run, or its ``run.h5``.
-
-    Returns
-    -------
-    Experiment
-        ``calibration.predict(q)``, ``calibration.jacobian(q)`` and ``calibration.project(points)`` are
-        about images; ``plan`` and ``traces`` (by law) hold named arrays.
-
-    Raises
-    ------
-    projservo_cli.records.InputError
-        When there is none, it is cut short, or another version made it.
-    """
-    from projservo_cli.results import Experiment  # so that importing the package stays light
-    from projservo_cli.store import load as stored
-
-    found = stored(run)
-    return Experiment(found.path, found.configuration, found.results)
+__all__ = [
+    "Config",
+    "Experiment",
+    "InputError",
+    "Observations",
+    "WorkFailed",
+    "__version__",
+    "calibrate",
+    "load",
+    "plan",
+    "record",
+    "servo",
+    "simulate",
+    "sweep",
+]
 
 
-def guide(
-    run: "Experiment",
-    q_start: "ArrayLike",
-    goal: "ArrayLike",
-    *,
-    limits: "ArrayLike | None" = None,
-    speed: "ArrayLike | None" = None,
-) -> "Plan":
-    """Find a way from joints to a face in the images, by the calibration of a run alone.
+def __getattr__(name: str) -> Any:
+    """Import what is asked for when it is asked for, so that importing the package stays light."""
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
 
-    Parameters
-    ----------
-    run : a run with a calibration, from ``load``.
-    q_start : (n,) joint readings at the start, rad or m.
-    goal : (2, m, 2) pixels of the markers of ``markers.face`` in the left and the right image, in that order.
-    limits : (n, 2) lowest and highest reading of each joint, rad or m; by default those of the configuration.
-    speed : (n,) most motion of each joint per second, rad/s or m/s; likewise.
+    return getattr(import_module(f"projservo_cli.{_PLACES[name]}"), name)
 
-    Returns
-    -------
-    Plan
-        ``time`` (k,), s, and ``q`` (k, n), rad or m, even in time, from rest to rest; ``s`` the images.
-        What else it keeps to is set in ``trajectory`` and ``control`` of the configuration of the run.
 
-    Raises
-    ------
-    projservo_cli.records.InputError
-        When an array has another shape, the start is beyond a limit, or a joint has no speed limit.
-    projservo_cli.records.WorkFailed
-        When no way was found; the message says what was in the way.
-    """
-    from projservo_cli.stages.plan import plan_between  # so that importing the package stays light
-
-    return plan_between(run, q_start, goal, limits, speed)
+def __dir__() -> list[str]:
+    return [*__all__]

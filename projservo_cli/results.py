@@ -1,48 +1,85 @@
-"""A run file as an object: its calibration predicts images, its plan and traces are arrays."""
+"""Results of stages for those who call them: calibrations that predict, plans and traces."""
 
 import dataclasses
+import math
+from typing import Any, Literal, Self, overload
 
 import numpy as np
+import numpy.typing as npt
 
-from projservo_cli.calibration import predict
-from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
+from projservo_cli.calibration import predict, prediction_variance, residual_statistics
+from projservo_cli.calibration.prediction import error_factor, joint_derivative
 from projservo_cli.geometry.kinematics import project as pixels_of
-from projservo_cli.geometry.lens import bent_derivative
-from projservo_cli.records import Calibration, FloatArray, InputError
-from projservo_cli.store import Run
+from projservo_cli.records import (
+    Calibration,
+    CrossValidation,
+    FloatArray,
+    InputError,
+    Observation,
+    Plan,
+    Trace,
+)
+from projservo_cli.shown import Shown
 
 _AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class ImageModel(Calibration):
-    """A calibration that says where markers appear: all of its arrays, and three functions.
+def _fields_of(record: Any, kind: type) -> dict[str, Any]:
+    return {field.name: getattr(record, field.name) for field in dataclasses.fields(kind)}
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class ImageModel(Shown, Calibration):
+    """A calibration that says where markers appear: all of its arrays, and what they are for.
 
     Views are left and right, markers in the order of ``marker``, pixels are raw u and v, joint
     readings rad or m. A point that is not in front of a camera has no pixels there: NaN.
     """
 
-    def predict(self, q: FloatArray) -> FloatArray:
+    cross_validation: CrossValidation | None = None  # held-out errors, where they were asked for
+
+    @classmethod
+    def of(cls, calibration: Calibration, cross_validation: CrossValidation | None = None) -> "ImageModel":
+        """Return a record with its functions."""
+        if isinstance(calibration, cls):
+            return calibration
+        return cls(**_fields_of(calibration, Calibration), cross_validation=cross_validation)
+
+    @overload
+    def predict(self, q: npt.ArrayLike, *, return_std: Literal[False] = False) -> FloatArray: ...
+    @overload
+    def predict(self, q: npt.ArrayLike, *, return_std: Literal[True]) -> tuple[FloatArray, FloatArray]: ...
+    def predict(
+        self, q: npt.ArrayLike, *, return_std: bool = False
+    ) -> FloatArray | tuple[FloatArray, FloatArray]:
         """Pixels of all markers at joint readings, [RH00] eqs. (1), (6).
 
         Parameters
         ----------
         q : (n,) or (K, n) readings, rad or m.
+        return_std : whether to return the standard deviations of the predictions as well, px, by the
+            covariance of the calibration to first order; the noise of an image is not in them.
 
         Returns
         -------
-        (2, m, 2) or (K, 2, m, 2) pixels.
+        (2, m, 2) or (K, 2, m, 2) pixels, and as many deviations where they are asked for.
 
         Raises
         ------
         InputError
-            If the readings have another number of joints or are not finite.
+            If the readings have another number of joints or are not finite, or deviations are asked for of
+            a calibration without a covariance.
         """
         rows, single = self._rows(q)
         pixels = predict(self, rows)
-        return pixels[0] if single else pixels
+        if not return_std:
+            return pixels[0] if single else pixels
+        if not self.has_covariance or not self.shared_error.size:
+            raise InputError(f"return_std: the method {self.method} has no covariance; use refined")
+        sigma = np.sqrt(prediction_variance(self, rows))
+        return (pixels[0], sigma[0]) if single else (pixels, sigma)
 
-    def jacobian(self, q: FloatArray) -> FloatArray:
+    def jacobian(self, q: npt.ArrayLike) -> FloatArray:
         """Derivative of the predicted pixels by the joint readings, [RH00] eqs. (7), (19).
 
         Parameters
@@ -59,16 +96,45 @@ class ImageModel(Calibration):
             If the readings have another number of joints or are not finite.
         """
         rows, single = self._rows(q)
-        model = self.model()
-        moved = [self.M @ forward_kinematics(model, row).T for row in rows]
-        straight = np.array([pixels_of(model.P, A) for A in moved])
-        operators = [joint_operators(model, row) for row in rows]
-        J = np.array([image_jacobian(model.P, A, H) for A, H in zip(moved, operators, strict=True)])
-        J = bent_derivative(model.lens[:, None], straight)[0] @ J
-        J[np.isnan(predict(self, rows)[..., 0])] = np.nan
-        return np.asarray(J[0] if single else J)
+        J = joint_derivative(self, rows)
+        return J[0] if single else J
 
-    def project(self, points: FloatArray) -> FloatArray:
+    def score(self, observation: Observation) -> dict[str, Any]:
+        """Compare predictions with images that the calibration has not seen, as ``projservo validate`` does.
+
+        Parameters
+        ----------
+        observation : images of the same robot, rig and markers; those in motion do not count.
+
+        Returns
+        -------
+        ``count`` of marker-view pairs; ``rms_px``, ``median_px``, ``p95_px`` of their Euclidean distances,
+        None without a pair; ``skipped`` by why.
+
+        Raises
+        ------
+        InputError
+            If the readings have another number of joints or are not finite.
+        """
+        return residual_statistics(self, observation)
+
+    def covariance(self) -> FloatArray:
+        """Covariance of P, H_hat_0, lenses (k1, k2 of both, if estimated) and M, each raveled, in this order.
+
+        Of all errors that change images alike it has the smallest: frame and scales, which no image shows,
+        vary by nothing. For many markers it is large: (24 + 16 n + 4 m)² numbers.
+
+        Raises
+        ------
+        InputError
+            If the method has no covariance.
+        """
+        if not self.has_covariance or not self.shared_error.size:
+            raise InputError(f"covariance: the method {self.method} has none; use refined")
+        factor = error_factor(self)
+        return np.asarray(factor @ factor.T)
+
+    def project(self, points: npt.ArrayLike) -> FloatArray:
         """Pixels of points of the calibration's projective frame, such as ``M``, [RH00] eq. (1).
 
         Parameters
@@ -94,7 +160,22 @@ class ImageModel(Calibration):
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             return np.where(ahead[..., None], pixels_of(self.P, A, self.model().lens), np.nan)
 
-    def _rows(self, q: FloatArray) -> tuple[FloatArray, bool]:
+    def summary(self) -> dict[str, str]:
+        """Return what there is to tell, in words, by name."""
+        weak = ", ".join(f"q{i + 1}" for i in np.flatnonzero(self.weak)) or "none"
+        left_out = len(self.outlier)
+        return {
+            "usable": f"{'yes' if self.usable else 'no'}: {self.reason}",
+            "source": f"{self.source}, method {self.method}",
+            "joints": f"{self.joint_types}, weak: {weak}",
+            "poses": f"{self.merged_poses}",
+            "markers": f"{self.merged_markers}",
+            "left out": f"{left_out} readings",
+            "residual": f"{self.rms_px:.4g} px rms per marker and view",
+            "noise": f"{self.sigma_px:.4g} px per coordinate",
+        }
+
+    def _rows(self, q: npt.ArrayLike) -> tuple[FloatArray, bool]:
         readings = np.asarray(q, dtype=np.float64)
         n = len(self.joint_types)
         if readings.ndim not in (1, 2) or readings.shape[-1] != n or not np.isfinite(readings).all():
@@ -104,11 +185,52 @@ class ImageModel(Calibration):
         return np.atleast_2d(readings), readings.ndim == 1
 
 
-@dataclasses.dataclass(frozen=True)
-class Experiment(Run):
-    """All that a run file holds."""
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class MotionPlan(Shown, Plan):
+    """A plan that shows itself."""
 
-    @property
-    def calibration(self) -> ImageModel:
-        """The calibration, with functions that predict images."""
-        return ImageModel(**vars(super().calibration))
+    @classmethod
+    def of(cls, plan: Plan) -> Self:
+        """Return a record with its functions."""
+        return plan if isinstance(plan, cls) else cls(**_fields_of(plan, Plan))
+
+    def summary(self) -> dict[str, str]:
+        """Return what there is to tell, in words, by name."""
+        r, p, s = (math.degrees(angle) for angle in (self.theta_r, self.theta_p, self.theta_s))
+        return {
+            "feasible": f"{'yes' if self.feasible else 'no'}: {self.reason}",
+            "profile": self.profile,
+            "rotation": f"{r:.4g} deg onto the plane, {p:.4g} deg within it, {s:.4g} deg together",
+            "duration": "none" if self.duration is None else f"{self.duration:.4g} s",
+            "nearest to failing": self.constraint,
+            "samples": str(len(self.sigma)),
+        }
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class RunTrace(Shown, Trace):
+    """A trace that shows itself."""
+
+    @classmethod
+    def of(cls, trace: Trace) -> Self:
+        """Return a record with its functions."""
+        return trace if isinstance(trace, cls) else cls(**_fields_of(trace, Trace))
+
+    def coordinates(self) -> dict[str, Any]:
+        """Return coordinates of dimensions, by their names; ``time`` in s of every instant."""
+        time = ("instant", self.period * np.arange(len(self.q)), {"units": "s"})
+        return super().coordinates() | {"time": time}
+
+    def summary(self) -> dict[str, str]:
+        """Return what there is to tell, in words, by name."""
+        found = {
+            "law": self.law if self.mode == "replan" else f"{self.law}, {self.mode}",
+            "verdict": f"{self.verdict}: {self.reason}",
+            "steps": f"{self.steps}, {self.steps * self.period:.4g} s",
+            "image error": f"{self.image_error[-1]:.4g} px rms",
+        }
+        if self.position_error_mm is not None:
+            found["position error"] = f"{self.position_error_mm:.4g} mm"
+        if self.rotation_error_deg is not None:
+            found["rotation error"] = f"{self.rotation_error_deg:.4g} deg"
+        return found

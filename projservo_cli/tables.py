@@ -212,6 +212,27 @@ def _shown(value: Any) -> str:
     return str(int(value)) if isinstance(value, bool) else str(value)
 
 
+def in_radians(
+    where: str, joint_types: str, pose: IntArray, q: FloatArray, unit: str | None, option: str
+) -> FloatArray:
+    """Readings (K, n) in rad and m; those that can hardly be rad are refused unless a unit is given.
+
+    where, option : what holds them, and how to give a unit, for messages.
+    """
+    revolute = np.array([letter in "Rr" for letter in joint_types])
+    if unit == "deg":
+        return np.where(revolute, np.radians(q), q)
+    beyond = np.argwhere(revolute & (np.abs(q) > _TWO_TURNS))
+    if unit is None and beyond.size:
+        k, i = beyond[0]
+        raise InputError(
+            f"{where}: q{i + 1} of pose {pose[k]} is {q[k, i]:g}, more than two turns in rad "
+            f"({len(beyond)} such readings): they look like degrees; give {option.format('deg')}, or "
+            f"{option.format('rad')} if they are radians after all"
+        )
+    return q
+
+
 class _Row(dict[str, str]):
     """Cells of one line of a file by the names of their columns."""
 
@@ -347,15 +368,4 @@ class _Sheet:
 
     def in_radians(self, pose: IntArray, q: FloatArray, unit: str | None) -> FloatArray:
         """Readings (K, n) in rad and m; those that can hardly be rad are refused unless it is asked for."""
-        revolute = np.array([letter in "Rr" for letter in self._joint_types])
-        if unit == "deg":
-            return np.where(revolute, np.radians(q), q)
-        beyond = np.argwhere(revolute & (np.abs(q) > _TWO_TURNS))
-        if unit is None and beyond.size:
-            k, i = beyond[0]
-            raise InputError(
-                f"{self.file}: q{i + 1} of pose {pose[k]} is {q[k, i]:g}, more than two turns in rad "
-                f"({len(beyond)} such readings): they look like degrees; give --joint-unit deg, or "
-                "--joint-unit rad if they are radians after all"
-            )
-        return q
+        return in_radians(self.file, "".join(self._joint_types), pose, q, unit, "--joint-unit {}")

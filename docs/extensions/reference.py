@@ -18,7 +18,7 @@ from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.equations import REGISTER
-from projservo_cli.sweep.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
+from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
 
 # Where a run file holds which record.
 GROUPS = {

@@ -148,11 +148,11 @@ def configured(
     teaching : goal and start may name files that are still to be taught.
     Raises UsageError where a robot is named by the run alone, which starts no code.
     """
-    from projservo_cli.config import load_config
+    from projservo_cli.config import load_config, shipped
 
     stored = None if config or run is None else _stored(run)
     if stored is None or not stored.configuration:
-        return load_config(config or _shipped(), _overrides(options), teaching=teaching)
+        return load_config(config or shipped("paper"), _overrides(options), teaching=teaching)
     found = load_config(stored.path, _overrides(options), text=stored.configuration)
     if not found.plant.simulated:
         raise click.UsageError(
@@ -199,7 +199,7 @@ def _from_sweep(options: Mapping[str, Any]) -> tuple["Config", "Run"]:
     """Configuration of a run of a sweep, and a run that holds the calibration it was made with."""
     from projservo_cli.config import load_config, to_yaml
     from projservo_cli.store import Run
-    from projservo_cli.sweep.folder import run_of
+    from projservo_cli.sweeps.folder import run_of
 
     if options["config"]:
         raise click.UsageError("-c and --from: the configuration is that of the sweep; leave -c out")
@@ -230,13 +230,6 @@ def _stored(target: str | Path) -> "Run | None":
     from projservo_cli.store import load, run_path
 
     return load(target) if run_path(target).exists() else None
-
-
-def _shipped() -> Path:
-    """The configuration that comes with projservo, in a checkout as in an installed package."""
-    package = Path(__file__).resolve().parent.parent
-    path = package / "configs" / "paper.yaml"
-    return path if path.is_file() else package.parent / "configs" / "paper.yaml"
 
 
 def _overrides(options: Mapping[str, Any]) -> list["Override"]:

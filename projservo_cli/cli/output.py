@@ -5,15 +5,14 @@ import math
 import re
 import sys
 import textwrap
-import threading
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
-TICK_S = 0.5
+from projservo_cli.progress import Bar
+
 _UNSEEN = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 _NOTES = {  # on runs, and their reasons
     "unplanned": "driven without a plan",
@@ -64,13 +63,13 @@ class Console:
         self.verbose = verbose
         self.as_json = as_json
         self._data = sys.stdout  # while a command works, what others print goes elsewhere
-        self._bar: Any = None
+        self._bar = Bar()
 
     def __enter__(self) -> "Console":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._finish()
+        self._bar.close()
 
     def tell(self, value: dict[str, Any], lines: Iterable[str]) -> None:
         """Data on standard output: one object of strict JSON in UTF-8, whatever the locale, or in words."""
@@ -83,10 +82,8 @@ class Console:
 
     def say(self, text: str) -> None:
         """A message on standard error."""
-        if self._bar is not None:
-            self._bar.write(wrapped(visible(text)), file=sys.stderr)
-        elif not self.quiet:
-            click.echo(wrapped(visible(text)), err=True)
+        if not self.quiet:
+            self._bar.say(wrapped(visible(text)))
 
     def detail(self, text: str) -> None:
         """A message that only -v shows."""
@@ -95,7 +92,7 @@ class Console:
 
     def confirm(self, command: str, plant: Any) -> None:
         """Ask before the first motion of a ``plant``; a KeyboardInterrupt where the answer is not yes."""
-        self._finish()
+        self._bar.close()
         try:
             agreed = click.confirm(
                 f"{command} will move {plant.use or 'the simulated robot'}, "
@@ -110,36 +107,14 @@ class Console:
 
     def wait(self, text: str) -> None:
         """Tell somebody at the terminal to do something, and wait for the Enter key."""
-        self._finish()
+        self._bar.close()
         click.echo(wrapped(f"{text}, then press Enter"), err=True)
         sys.stdin.readline()
 
     def progress(self, what: str, done: int, total: int) -> None:
         """Move a progress bar; silent where standard error is not a terminal."""
-        if self.quiet or not sys.stderr.isatty():
-            return
-        if self._bar is None or self._bar.desc != what:
-            from tqdm import tqdm
-
-            self._finish()
-            self._bar = tqdm(total=total, desc=what, leave=False, ncols=80)
-            threading.Thread(target=self._tick, args=(self._bar,), daemon=True).start()
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-        if done >= total:
-            self._finish()
-
-    def _finish(self) -> None:
-        """Remove the progress bar."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-    def _tick(self, bar: Any) -> None:
-        """Let the clock of a bar go on while its work reports nothing."""
-        while self._bar is bar:
-            bar.refresh()
-            time.sleep(TICK_S)
+        if not self.quiet:
+            self._bar(what, done, total)
 
 
 def words_of(stage: str, value: dict[str, Any], *, detailed: bool = False) -> Iterator[str]:

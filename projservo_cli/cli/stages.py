@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,6 @@ from projservo_cli.cli import options as option
 from projservo_cli.cli.group import FAILED, main
 from projservo_cli.cli.output import Console, visible, words_of, wrapped
 
-_FIGURES = "figures"  # folder of a run in which a killed report may have left something
 _NAMING = {"plant": {"plant", "plant.use"}, "law": {"control", "control.laws"}}  # keys of --set
 _UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  # by the report of a sweep
 
@@ -219,63 +217,51 @@ def _report(stages: Sequence[str], console: Console, *, sweep: Path | None, **op
 
 
 @dataclass
-class _Chain:
-    """One call of stages: what was asked for and what became of it."""
+class _Call:
+    """One call of stages: its chain, the options that it was given, and what it tells besides."""
 
     console: Console
-    names: Sequence[str]
     options: Mapping[str, Any]
-    laws: tuple[str, ...]
-    config: Any
-    run: Any
-    steps: Sequence[Any]
-    failed: str = ""
-    reason: str = ""
-    recording: Any = None  # where the call records
-    laws_done: tuple[str, ...] = ()
+    chain: Any
     beside: dict[str, dict[str, Any]] = field(default_factory=dict)  # further values of a stage's object
-
-    def lacks(self, stage: str) -> bool:
-        """Whether a stage was not completed by the call."""
-        order = [step.stage for step in self.steps]
-        return bool(self.failed) and order.index(stage) >= order.index(self.failed.split("/")[0])
 
 
 def _make(console: Console, names: Sequence[str], options: Mapping[str, Any]) -> int:
     """Make the named stages and what they lack; the exit code."""
     if options["threads"] is not None:  # read by the compiler's runtime when it is first imported
         os.environ["NUMBA_NUM_THREADS"] = str(options["threads"])
-    from projservo_cli.config import to_yaml
+    from projservo_cli.experiment import FIGURES
     from projservo_cli.files import tidy, working_in
 
-    chain = _asked(console, names, options)
+    call = _asked(console, names, options)
+    chain = call.chain
     if options["dry_run"]:
         words = (f"{s.name}: {f'would be made ({s.why})' if s.why else s.standing}" for s in chain.steps)
         steps = [{"stage": s.stage, "law": s.law or None, "why": s.why or None} for s in chain.steps]
         console.tell({"run": chain.run.path.resolve(), "dry_run": True, "steps": steps}, words)
         return 0
     folder = chain.run.path.parent
-    up_to_date = chain.run.configuration == to_yaml(chain.config) and not any(s.why for s in chain.steps)
-    if up_to_date and not _extras(options):
-        tidy(folder, _FIGURES)
-        return _work(chain)
-    with working_in(folder, _FIGURES):
+    if not chain.pending and not _extras(options):
+        tidy(folder, FIGURES)
+        return _work(call)
+    with working_in(folder, FIGURES):
         if chain.recording is None:  # anew, since another process may have written the run until now
             return _work(_asked(console, names, options))
         with option.writing(chain.recording.path):
             return _work(_recorded(_asked(console, names, options)))
 
 
-def _recorded(chain: _Chain) -> _Chain:
+def _recorded(call: _Call) -> _Call:
     """Record what is to be recorded; what is to be done with the table."""
+    chain = call.chain
     recording, why = chain.recording, chain.recording.why
     if why:
-        chain.console.say(f"record: making ({why})")
-    if reason := _drive(chain.console, chain.config, recording, confirm=chain.options["confirm"]):
+        call.console.say(f"record: making ({why})")
+    if reason := _drive(call.console, chain.config, recording, confirm=chain.confirm):
         chain.failed, chain.reason = "record", reason
-        return chain
-    unasked = {**chain.options, "confirm": chain.options["confirm"] and not why}
-    return _asked(chain.console, chain.names, unasked, replace(recording, why=""))
+        return call
+    unasked = {**call.options, "confirm": call.options["confirm"] and not why}
+    return _asked(call.console, chain.names, unasked, replace(recording, why=""))
 
 
 def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
@@ -297,11 +283,12 @@ def _recording(config: Any, run: Any, options: Mapping[str, Any]) -> Any:
 
 def _asked(
     console: Console, names: Sequence[str], options: Mapping[str, Any], recording: Any = None
-) -> _Chain:
+) -> _Call:
     """What is to be done, by the configuration and what the run holds; refused where it must not be.
 
     recording : where it was made just now.
     """
+    from projservo_cli.experiment import Chain
     from projservo_cli.stages.steps import Step, steps_for
 
     given, records = _law_names(options.get("laws", ())), "record" in names
@@ -321,11 +308,12 @@ def _asked(
     steps = steps_for(config, stored, stages, laws=given, force=options["force"], recording=why)
     if records:
         steps.insert(0, Step("record", "", "", {}, why))
-    laws = tuple(step.law for step in steps if step.law)
-    chain = _Chain(console, names, options, laws, config, stored, steps, recording=recording)
+    chain = Chain(
+        console, names, config, stored, steps, recording=recording, confirm=bool(options.get("confirm"))
+    )
     if not options["dry_run"]:
-        _require_named(chain)
-    return chain
+        _require_named(chain, options)
+    return _Call(console, options, chain)
 
 
 def _extras(options: Mapping[str, Any]) -> list[str]:
@@ -335,64 +323,53 @@ def _extras(options: Mapping[str, Any]) -> list[str]:
 
 def _law_names(names: Sequence[str]) -> tuple[str, ...]:
     """The laws of ``--law``, each once, registered names as the classes they stand for."""
-    from projservo_cli.records import LAWS
-    from projservo_cli.robots import plugins
+    from projservo_cli.experiment import law_target
+    from projservo_cli.records import InputError
 
-    found = []
-    for name in names:
-        if (target := name if name in LAWS else plugins.target_of("law", name)) is None:
-            valid = ", ".join((*LAWS, *plugins.registered("law")))
-            raise click.UsageError(f"--law {name}: no such law; laws: {valid}, or module:Class")
-        found.append(target)
-    return tuple(dict.fromkeys(found))
+    try:
+        return tuple(dict.fromkeys(map(law_target, names)))
+    except InputError as error:
+        raise click.UsageError(f"--{error}") from error
 
 
-def _require_named(chain: _Chain) -> None:
+def _require_named(chain: Any, options: Mapping[str, Any]) -> None:
     """Refuse to move a robot that no stage asks for, or to start code that only a stored run names.
 
     A run file may come from anybody: what is stored in it is shown and compared, never imported. Classes
     that are named are imported, so that what cannot be found is known before any work.
     """
     from projservo_cli.config import Override
-    from projservo_cli.control import CODES
-    from projservo_cli.records import law_and_mode
     from projservo_cli.robots import plugins
 
-    plant = None if chain.config.plant.simulated else chain.config.plant.use
-    records = any(step.stage == "record" and step.why for step in chain.steps)
-    servo = [step for step in chain.steps if step.stage == "servo" and step.why]
-    if servo and plant is not None and "servo" not in chain.names:
+    if moving := chain.moves_unasked():
         raise click.UsageError(
-            f"{chain.names[-1]} needs a run of {servo[0].law} ({servo[0].why}), which moves {plant}: "
-            "run projservo servo first"
+            f"{chain.names[-1]} needs a run of {moving.law} ({moving.why}), which moves "
+            f"{chain.config.plant.use}: run projservo servo first"
         )
-    laws = [law_and_mode(step.law)[0] for step in servo]
-    wanted = {("law", law): f"--law {law}" for law in laws if law not in CODES}
-    if (servo or records) and plant is not None:
-        wanted["plant", plant] = f"--set plant={plant}"
-    given = {Override.parse(text).key for text in chain.options["sets"]}
+    given = {Override.parse(text).key for text in options["sets"]}
     named = {kind: bool(keys & given) for kind, keys in _NAMING.items()}
-    named["law"] |= bool(chain.options.get("laws"))
-    for (kind, target), flag in wanted.items():
-        if not (chain.options["config"] or named[kind]):
+    named["law"] |= bool(options.get("laws"))
+    flags = {"law": "--law {}", "plant": "--set plant={}"}
+    code = chain.code()
+    for kind, target in code:
+        if not (options["config"] or named[kind]):
             raise click.UsageError(
                 f"{kind} {target} is named by the stored run alone, which starts no code: give the "
-                f"configuration again with -c, or {flag}"
+                f"configuration again with -c, or {flags[kind].format(target)}"
             )
-    for kind, target in wanted:
+    for kind, target in code:
         plugins.find(kind, target)
 
 
-def _work(chain: _Chain) -> int:
+def _work(call: _Call) -> int:
     """Make what has to be made, and tell what came out; the exit code."""
-    _announce(chain)
-    _say_compilation(chain)
-    with _compiling(chain):
-        _make_steps(chain)
-    if (count := chain.options.get("suggest")) is not None and not chain.lacks("calibrate"):
-        chain.beside["calibrate"] = _suggestions(chain, count)
-    if (wanted := _extras(chain.options)) and not chain.lacks("report"):
-        chain.beside["report"] = _made_extras(chain, wanted)
+    console, chain = call.console, call.chain
+    _announce(console, chain)
+    chain.make()
+    if (count := call.options.get("suggest")) is not None and not chain.lacks("calibrate"):
+        call.beside["calibrate"] = _suggestions(chain, count)
+    if (wanted := _extras(call.options)) and not chain.lacks("report"):
+        call.beside["report"] = _made_extras(console, chain, wanted)
     from projservo_cli.report.material import failed_object, stage_object
 
     values = {}
@@ -404,19 +381,19 @@ def _work(chain: _Chain) -> int:
             values[name] = failed_object(name, chain.run, chain.reason, chain.failed, chain.laws_done)
         else:
             values[name] = stage_object(name, chain.run, chain.config, chain.laws)
-            values[name] |= chain.beside.get(name, {})
-    words = [line for name in values for line in words_of(name, values[name], detailed=chain.console.verbose)]
+            values[name] |= call.beside.get(name, {})
+    words = [line for name in values for line in words_of(name, values[name], detailed=console.verbose)]
     words += [f"table: {chain.recording.path}"] if chain.recording is not None else []
     words += [f"run: {chain.run.path}"] if chain.run.results else []
-    chain.console.tell(values if len(values) > 1 else values[chain.names[0]], words)
-    findings = list(_findings(chain))
+    console.tell(values if len(values) > 1 else values[chain.names[0]], words)
+    findings = list(_findings(call))
     for text, fatal in findings:
-        if fatal or not chain.console.quiet:
+        if fatal or not console.quiet:
             click.echo(visible(f"projservo: {text}"), err=True)
     return FAILED if any(fatal for _, fatal in findings) else 0
 
 
-def _announce(chain: _Chain) -> None:
+def _announce(console: Console, chain: Any) -> None:
     """Say in one line for each reason what will be made, and what is up to date."""
     reasons: dict[str, list[str]] = {}
     for step in chain.steps:
@@ -427,110 +404,10 @@ def _announce(chain: _Chain) -> None:
             said = f"making ({step.why}{needed})" if step.why else step.standing
             reasons.setdefault(said, []).append(step.name)
     for said, found in reasons.items():
-        chain.console.say(f"{', '.join(found)}: {said}")
+        console.say(f"{', '.join(found)}: {said}")
 
 
-def _make_steps(chain: _Chain) -> None:
-    """Make what has to be made, stop at the first failure, keep what was made until then."""
-    from projservo_cli.config import to_yaml
-    from projservo_cli.records import WorkFailed
-    from projservo_cli.store import save
-
-    console = chain.console
-    if chain.failed:
-        return
-    motion = next((step for step in chain.steps if step.law and step.why), None)
-    steps = [step for step in chain.steps if step.stage != "record"]
-    for done, step in enumerate(steps):
-        console.progress("results", done, len(steps))
-        if step is motion and chain.options.get("confirm"):
-            console.confirm("servo", chain.config.plant)
-        if step.why:
-            console.detail(f"{step.name}: making it")
-            try:
-                dropped = _make_result(chain, step)
-            except WorkFailed as error:
-                chain.failed, chain.reason = step.name, " ".join(str(error).split())
-                return
-            if dropped:
-                console.say(f"{', '.join(dropped)}: dropped, made from what was replaced")
-        if step.law:
-            chain.laws_done += (step.law,)
-            trace = chain.run.traces[step.law]
-            if trace.verdict == "failed":  # nor is what failed driven by the next law
-                chain.failed, chain.reason = step.name, trace.reason
-                return
-    text = to_yaml(chain.config)
-    if chain.run.configuration != text:  # overrides are stored also where nothing had to be made
-        chain.run = save(replace(chain.run, configuration=text))
-
-
-def _compiling(chain: _Chain) -> AbstractContextManager[None]:
-    """What compiles beside the work where a calibration is made and runs are to follow."""
-    made = [step.stage for step in chain.steps if step.why]
-    if "calibrate" not in made or "servo" not in made:
-        return nullcontext()
-    from projservo_cli.loop.beside import compiling_beside
-
-    return compiling_beside()
-
-
-def _make_result(chain: _Chain, step: Any) -> list[str]:
-    """Make one result from those before it into the run file; which others that made outdated and dropped."""
-    from projservo_cli.config import to_yaml
-    from projservo_cli.stages.steps import STAGES, result_of
-    from projservo_cli.store import save
-
-    run = replace(chain.run, configuration=to_yaml(chain.config))
-    result = result_of(step, chain.config, *_made(chain, step, run))
-    place = STAGES.index(step.stage)
-    after = [name for name in run.results if STAGES.index(name.split("/")[0]) > place]
-    results = {name: stored for name, stored in run.results.items() if name not in after}
-    chain.run = save(replace(run, results={**results, step.name: result}))
-    return after
-
-
-def _made(chain: _Chain, step: Any, run: Any) -> tuple[Any, ...]:
-    """What a stage makes; its module is imported when it is needed."""
-    config, progress = chain.config, chain.console.progress
-    if step.stage == "calibrate":
-        from projservo_cli.stages import calibrate
-
-        return calibrate.run(config, progress=progress)
-    if step.stage == "plan":
-        from projservo_cli.stages import plan
-
-        return (plan.run(config, run.calibration),)
-    if step.stage == "servo":
-        from projservo_cli.stages import servo
-
-        return (servo.run(config, run.calibration, run.plan, step.law),)
-    from projservo_cli.stages import report
-
-    return (report.run(_reported(chain, run), run.path.parent, progress=progress),)
-
-
-def _reported(chain: _Chain, run: Any) -> Any:
-    """What a report is about: of the results before it those that the named runs of laws rest on."""
-    from projservo_cli.store import SERVO
-
-    made = ["plan", *(SERVO + law for law in chain.laws)] if chain.laws else []
-    return replace(run, results={name: run.results[name] for name in ["calibrate", *made]})
-
-
-def _say_compilation(chain: _Chain) -> None:
-    """The first run on a machine is slower by the time of compilation; say so."""
-    if not any(step.why for step in chain.steps) or os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        return
-    from projservo_cli.geometry.jit import CACHE_FOLDER
-
-    if CACHE_FOLDER is None:
-        chain.console.say("compiling kernels (in every run: no cache folder can be written)")
-    elif not any(CACHE_FOLDER.rglob("*.nbi")):
-        chain.console.say("compiling kernels, once")
-
-
-def _suggestions(chain: _Chain, count: int) -> dict[str, Any]:
+def _suggestions(chain: Any, count: int) -> dict[str, Any]:
     """Further poses for the calibration, as JSON values; the list of them is written beside the run."""
     from projservo_cli.records import WorkFailed
     from projservo_cli.stages.calibrate import suggest_motions
@@ -551,23 +428,24 @@ def _suggestions(chain: _Chain, count: int) -> dict[str, Any]:
     }
 
 
-def _made_extras(chain: _Chain, wanted: Sequence[str]) -> dict[str, Path]:
+def _made_extras(console: Console, chain: Any, wanted: Sequence[str]) -> dict[str, Path]:
     """Write what is wanted, and the page anew, which links to it; the paths by name."""
     from projservo_cli.report.page import write_page
     from projservo_cli.stages import report as reporting
 
-    told = _reported(chain, chain.run)
+    told = chain.reported()
     makers = {"view": reporting.view, "animation": reporting.animation}
     made = {}
     for name in wanted:
-        chain.console.detail(f"report: making the {name}")
-        made[name] = makers[name](told, chain.console.progress).resolve()
+        console.detail(f"report: making the {name}")
+        made[name] = makers[name](told, console.progress).resolve()
     write_page(replace(told, results={**told.results, "report": chain.run.results["report"]}))
     return made
 
 
-def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
+def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
     """What is not as it was asked for, and whether that ends the call with exit code 1."""
+    chain = call.chain
     if chain.failed:
         yield from _of_runs(chain)
         yield f"{chain.failed}: {chain.reason}", True
@@ -576,7 +454,7 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
     if "calibrate" in results and not chain.run.calibration.usable:
         reason = " ".join(chain.run.calibration.reason.split())
         yield f"calibrate: the calibration is not usable: {reason}", "calibrate" in chain.names
-    if (beside := chain.beside.get("calibrate", {})).get("suggestions") == []:
+    if (beside := call.beside.get("calibrate", {})).get("suggestions") == []:
         yield f"calibrate: {beside['suggestions_reason']}", True
     yield from _of_runs(chain)
     # Other profiles are those of the paper, of which the margins are only measured.
@@ -585,7 +463,7 @@ def _findings(chain: _Chain) -> Iterator[tuple[str, bool]]:
         yield f"plan: {chain.run.plan.reason}", "plan" in chain.names
 
 
-def _of_runs(chain: _Chain) -> Iterator[tuple[str, bool]]:
+def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
     """A line on each run that did not converge or missed periods, and whether the call fails by it."""
     from projservo_cli.records import POINT_LAWS, name_of
 
@@ -610,8 +488,8 @@ def _tell_sweep(console: Console, sweep: Path, options: Mapping[str, Any]) -> in
     """Write the report of a sweep and print its tables; the exit code."""
     from projservo_cli.files import working_in
     from projservo_cli.report.style import FORMATS
-    from projservo_cli.sweep.folder import Folder
-    from projservo_cli.sweep.statistics import report
+    from projservo_cli.sweeps.folder import Folder
+    from projservo_cli.sweeps.statistics import report
 
     for name in _UNUSED:
         if options[name]:

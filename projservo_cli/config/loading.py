@@ -291,6 +291,41 @@ def load_config(
     return _validated(Config, document)
 
 
+def shipped(name: pathlib.Path | str) -> pathlib.Path:
+    """The file of a configuration: a path, or the name of one that is shipped, such as ``ur5``."""
+    path, package = pathlib.Path(name), pathlib.Path(__file__).resolve().parent.parent
+    if path.suffix or path.parent != pathlib.Path() or path.exists():
+        return path
+    folder = package / "configs" if (package / "configs").is_dir() else package.parent / "configs"
+    names = sorted(file.stem for file in folder.glob("*.yaml"))
+    if str(name) not in names:
+        raise InputError(f"{name}: no file, and no shipped configuration; {_nearest(name, names)}")
+    return folder / f"{name}.yaml"
+
+
+def overrides_of(what: str, values: Mapping[str, Any]) -> list["Override"]:
+    """Values as overrides that messages call by ``what``: mappings in mappings, or keys with dots."""
+    found: list[Override] = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            found += overrides_of(what, {f"{key}.{inner}": one for inner, one in value.items()})
+            continue
+        plain = _plain(value)
+        found.append(Override(_shortened(f"{what}: {key}={plain!r}"), str(key), plain))
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """A value as YAML would give it: no arrays and numbers of NumPy, no tuples, no paths."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(inner) for inner in value]
+    if isinstance(value, Mapping):
+        return {str(key): _plain(inner) for key, inner in value.items()}
+    return str(value) if isinstance(value, pathlib.Path) else value
+
+
 def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> SweepConfig:
     """Read and check the configuration of a sweep; ``base`` becomes absolute paths."""
     document = _Document.read(path)
@@ -305,6 +340,13 @@ def load_sweep(path: pathlib.Path | str, overrides: Sequence[str] = ()) -> Sweep
     sweep = _validated(SweepConfig, document)
     base = tuple(str((file.parent / name).resolve()) for name in sweep.base)
     return sweep.model_copy(update={"base": base})
+
+
+def sweep_of(values: Mapping[str, Any]) -> SweepConfig:
+    """Check the configuration of a sweep that is at hand; an InputError as for one in a file."""
+    document = _Document("", "sweep")
+    document.values = _plain(values)
+    return _validated(SweepConfig, document)
 
 
 def _validated(model: type[_Model], document: _Document) -> _Model:

@@ -4,6 +4,7 @@ import inspect
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -680,6 +681,46 @@ class Config(Root):
         for rule, wanted in _RULES.items():
             if wanted <= sound.keys():
                 yield from rule(**{name: sound[name] for name in wanted})
+
+    @classmethod
+    def load(cls, path: Path | str) -> "Config":
+        """Read and check a configuration.
+
+        Parameters
+        ----------
+        path : the YAML file, or the name of a shipped configuration, such as ``ur5``.
+
+        Raises
+        ------
+        InputError
+            With a line ``file:line:column: key: what`` for each thing that is wrong.
+        """
+        from projservo_cli.config.loading import load_config, shipped
+
+        return load_config(shipped(path))
+
+    def replace(self, values: Mapping[str, Any]) -> "Config":
+        """Return the configuration with other values, checked as a whole.
+
+        Parameters
+        ----------
+        values : by key; nested mappings merge, keys with dots such as ``noise.servo_px`` set one value.
+
+        Raises
+        ------
+        InputError
+            With a line for each value that does not fit, as for ``--set``.
+        """
+        from projservo_cli.config.loading import load_config, overrides_of, to_yaml
+
+        return load_config(self.name, overrides_of("replace", values), text=to_yaml(self))
+
+    def __repr__(self) -> str:
+        parts = [
+            name for name in ("robot", "rig", "markers", "data", "task") if getattr(self, name) is not None
+        ]
+        plant = self.plant.use or "simulated"
+        return f"Config {self.name}: {', '.join(parts)}; plant {plant}; laws {', '.join(self.control.laws)}"
 
     @property
     def arm(self) -> RobotSettings | None:

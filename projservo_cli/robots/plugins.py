@@ -59,8 +59,15 @@ def make(kind: str, target: str, arguments: Sequence[Any], options: Mapping[str,
     Raises InputError if there is no such class, it lacks a method or does not take the arguments; WorkFailed
     if the class fails when called.
     """
+    return called(kind, target, find(kind, target), arguments, options)
+
+
+def called(kind: str, target: str, found: Any, arguments: Sequence[Any], options: Mapping[str, Any]) -> Any:
+    """Call a class, or a function that makes objects; the object, which has all methods it must have.
+
+    kind, target : as for ``find``, for messages. Raises as ``make`` does.
+    """
     where = f"{kind} {target}"
-    found = find(kind, target)
     try:
         inspect.signature(found).bind(*arguments, **options)
     except TypeError as error:
@@ -84,7 +91,12 @@ def takes(kind: str, target: str, name: str) -> bool:
         return False
 
 
+_BROUGHT: dict[str, Any] = {}  # classes of this process, by name
+
+
 def _found(where: str, module: str, name: str) -> Any:
+    if f"{module}:{name}" in _BROUGHT:
+        return _BROUGHT[f"{module}:{name}"]
     if os.getcwd() not in sys.path:  # last, so that a file there never stands in for an installed module
         sys.path.append(os.getcwd())
     try:
@@ -110,6 +122,35 @@ def _found(where: str, module: str, name: str) -> Any:
     if not callable(found):
         raise InputError(f"{where}: is no class, but of type {type(found).__name__}")
     return found
+
+
+def require_object(kind: str, target: str, given: Any) -> None:
+    """Refuse an object that lacks a method it must have, with an InputError."""
+    _require_methods(f"{kind} {target}", given, kind)
+
+
+def name_of(given: Any) -> str:
+    """Return ``module:Class`` of a class, of a function or of an object's class."""
+    kind = given if hasattr(given, "__qualname__") else type(given)
+    steps = [step for step in kind.__qualname__.split(".") if step.isidentifier()]
+    return f"{kind.__module__}:{'.'.join(steps or [kind.__class__.__name__])}"
+
+
+def bring(kind: str, given: Any) -> str:
+    """Make a class that this process has be found by its name, which is returned."""
+    target = name_of(given)
+    _require_methods(f"{kind} {target}", given, kind)
+    _BROUGHT[target] = given
+    return target
+
+
+def importable(given: Any) -> bool:
+    """Whether another process finds a class by its name: not what a notebook or a function defines."""
+    module, path = sys.modules.get(given.__module__), given.__qualname__.split(".")
+    found: Any = module if getattr(module, "__file__", None) is not None else None
+    for step in path:
+        found = getattr(found, step, None)
+    return found is given
 
 
 def _require_methods(where: str, found: Any, kind: str) -> None:

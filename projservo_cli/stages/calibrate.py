@@ -1,6 +1,6 @@
 """Stage calibrate: trial motions or a recorded table in, projective kinematics out."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from projservo_cli.calibration import (
 from projservo_cli.config import Config
 from projservo_cli.files import write_whole
 from projservo_cli.guidance.spread import Region, Suggestion, suggest
+from projservo_cli.observations import Observations
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed, seed_of_trials
@@ -30,42 +31,87 @@ def run(
 
     Returns what was seen, the calibration, and its held-out errors if the configuration asks for them.
     """
+    seen, settings = observe(config, progress=progress), config.calibration
+    if settings.joint_noise_deg is not None:
+        seen = replace(seen, joint_noise=float(np.radians(settings.joint_noise_deg)))
+    asked = Estimation(settings.method, settings.lens, settings.init, settings.cross_validate)
+    return seen.record, *estimate(seen, asked, progress=progress)
+
+
+def observe(config: Config, *, progress: Progress = silent) -> Observations:
+    """Return what the table of a configuration holds, or its simulated trial motions show."""
+    if config.data is None:
+        return simulated(config, progress=progress)
+    table, noise_px = (
+        read_table(config.data.table, config.joint_types, config.data.joint_unit),
+        config.data.noise_px,
+    )
+    return Observations.of(
+        table,
+        joint_types=config.joint_types,
+        image_size=config.image_size_px,
+        noise_px=noise_px,
+        seed=seed_of_trials(config),
+    )
+
+
+def simulated(
+    config: Config, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
+) -> Observations:
+    """Return what the trial motions of the simulated robot show, or poses (K, n), rad or m."""
+    observation, noise_px = observed(config, q, seed, progress=progress)
+    return Observations.of(
+        observation,
+        joint_types=config.joint_types,
+        image_size=config.image_size_px,
+        noise_px=noise_px,
+        # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
+        joint_noise=0.0 if config.is_ideal else None,
+        source="simulated",
+        exact=config.is_ideal,
+        seed=seed_of_trials(config),
+    )
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """How a calibration is estimated from what was seen."""
+
+    method: str = "refined"  # or closed_form
+    lens: bool = False  # whether to estimate two coefficients of radial distortion a camera
+    init: str | None = None  # JSON file of a robot and rig that are tried first as a start
+    cross_validate: int | None = None  # parts into which poses are divided to predict each from the others
+
+
+def estimate(
+    seen: Observations, asked: Estimation, *, progress: Progress = silent
+) -> tuple[Calibration, CrossValidation | None]:
+    """Return the calibration from what was seen, and its held-out errors if they are asked for."""
     from projservo_cli.config.robot import read_nominal
 
-    settings, seed = config.calibration, seed_of_trials(config)
-    ideal = config.is_ideal and not config.recorded
-    init = Nominal(**read_nominal(settings.init)) if settings.init is not None else None
-    noise_deg = 0.0 if ideal and settings.joint_noise_deg is None else settings.joint_noise_deg
-    if config.data is not None:
-        observation = read_table(config.data.table, config.joint_types, config.data.joint_unit)
-        sigma_px = config.data.noise_px
-    else:
-        observation, sigma_px = observed(config, progress=progress)
     held_out: list[CrossValidation] = []
 
     def hold_out(solution: Solution, noise_px: float) -> None:
         """Cross-validate the solution while it is at hand."""
-        assert settings.cross_validate is not None
+        assert asked.cross_validate is not None
         tell = partial(progress, "cross-validation")
-        held_out.append(cross_validate(solution, noise_px, settings.cross_validate, seed, tell))
+        held_out.append(cross_validate(solution, noise_px, asked.cross_validate, seen.seed, tell))
 
     calibration = calibrate(
-        observation,
-        config.joint_types or "R" * observation.q.shape[1],
-        method=settings.method,
-        sigma_px=sigma_px,
-        # Where joints or images have faults, χ² of pixel noise alone decides no more than in a recording.
-        source="simulated" if ideal else "recorded",
-        image_size=config.image_size_px,
-        seed=seed,
-        lens=settings.lens,
-        init=init,
-        joint_noise=None if noise_deg is None else float(np.radians(noise_deg)),
-        fitted=hold_out if settings.cross_validate is not None else None,
+        seen.record,
+        seen.joint_types,
+        method=asked.method,
+        sigma_px=seen.noise_px,
+        source="simulated" if seen.exact else "recorded",
+        image_size=seen.image_size,
+        seed=seen.seed,
+        lens=asked.lens,
+        init=Nominal(**read_nominal(asked.init)) if asked.init is not None else None,
+        joint_noise=seen.joint_noise,
+        fitted=hold_out if asked.cross_validate is not None else None,
         tell=progress,
     )
-    calibration = replace(calibration, source="recorded" if config.recorded else "simulated")
-    return observation, calibration, held_out[0] if held_out else None
+    return replace(calibration, source=seen.source), held_out[0] if held_out else None
 
 
 # The range of the recorded readings is widened at each end by this share of itself; for a robot

@@ -42,8 +42,8 @@ def bounds_of(config: Config, joints: Joints) -> Bounds:
     return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag, joints.units)
 
 
-def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
-    """Make the robot of ``plant.use``; an InputError where a joint has no speed limit."""
+def foreign_robot(config: Config, joints: Joints, markers: int, given: Robot | None = None) -> ForeignRobot:
+    """Make the robot of ``plant.use``, unless it is given; an InputError where a joint has no speed limit."""
     plant, target = config.plant, config.plant.use
     assert target is not None
     for kind, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
@@ -51,7 +51,15 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
             raise InputError(
                 f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
             )
-    options, dictionary = dict(plant.options), config.markers.dictionary if config.markers else None
+    robot = _made(config, target) if given is None else given
+    bounds = bounds_of(config, joints)
+    name, size = f"plant {target}", config.image_size_px
+    return ForeignRobot(robot, name, markers, bounds, plant.timeout_s, plant.open_s, size)
+
+
+def _made(config: Config, target: str) -> Robot:
+    """Make an object of the class of a plant, with its options."""
+    options, dictionary = dict(config.plant.options), config.markers.dictionary if config.markers else None
     if dictionary is not None:
         if not plugins.takes("plant", target, "dictionary"):
             raise InputError(
@@ -60,9 +68,7 @@ def foreign_robot(config: Config, joints: Joints, markers: int) -> ForeignRobot:
             )
         options["dictionary"] = dictionary
     robot: Robot = plugins.make("plant", target, (), options)
-    bounds = bounds_of(config, joints)
-    name, size = f"plant {target}", config.image_size_px
-    return ForeignRobot(robot, name, markers, bounds, plant.timeout_s, plant.open_s, size)
+    return robot
 
 
 def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:
@@ -279,13 +285,16 @@ def _in_the_loop(scenario: Scenario) -> FaultyRobot:
     return robot_of(config, truth, scenario.exact.q_start, points, drawn, config.disturbance)
 
 
-def connected(scenario: Scenario, law: str) -> DrivenRobot:
-    """The robot as the loop of a law sees it: beside its truth, or what the calibration takes it for."""
+def connected(scenario: Scenario, law: str, given: Robot | None = None) -> DrivenRobot:
+    """The robot as the loop of a law sees it: beside its truth, or what the calibration takes it for.
+
+    given : an object of the contract instead of one of ``plant.use``.
+    """
     config, joints, calibration = scenario.config, scenario.joints, scenario.calibration
     assert calibration is not None
     if scenario.truth is None:
         plant = _believed_plant(scenario, calibration)
-        robot = foreign_robot(config, joints, len(scenario.observed))
+        robot = foreign_robot(config, joints, len(scenario.observed), given)
     else:
         plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
     monitor = None

@@ -2,14 +2,12 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from projservo_cli.config import Config, load_config
-from projservo_cli.config.task import TaskSettings, Trajectory
+from projservo_cli.config import Config
+from projservo_cli.config.task import Trajectory
 from projservo_cli.control.law import State
 from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
@@ -42,8 +40,7 @@ from projservo_cli.stages.motions import (
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.told import reason_of, told_of
 from projservo_cli.stages.verdicts import least_of, verdict_of
-from projservo_cli.stages.world import Joints, joints_of
-from projservo_cli.store import Run
+from projservo_cli.stages.world import Joints
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts
 from projservo_cli.task.target import Shown
@@ -291,35 +288,3 @@ def rotation_sense(scenario: Scenario) -> FloatArray:
     asked, joints = scenario.config.trajectory, scenario.joints
     state, _, parts, _ = _partitioned(scenario.model, scenario.ends, asked, joints.lower, joints.upper)
     return in_sense(parts.theta_r, parts.theta_p, _joint_motions(state)[1:3])
-
-
-def plan_between(
-    made: Run, q_start: ArrayLike, goal: ArrayLike, limits: ArrayLike | None, speed: ArrayLike | None
-) -> Plan:
-    """Plan of the profile ``joint`` from joints to images by the calibration of a run alone."""
-    config, calibration = load_config(made.path, text=made.configuration), made.calibration
-    n, m = len(calibration.q_reference), len(config.face_numbers)
-    joints = joints_of(config, calibration.joint_types, calibration)
-    if limits is not None:
-        lower, upper = _array("limits", limits, (n, 2)).T.copy()
-        joints = joints._replace(lower=lower, upper=upper)
-    if speed is not None:
-        joints = joints._replace(speed=_array("speed", speed, (n,)))
-    left, right = _array("goal", goal, (2, m, 2)).tolist()
-    task: dict[str, Any] = {
-        "start": {"joints": _array("q_start", q_start, (n,)).tolist(), "unit": "rad"},
-        "goal": {"images": {"left": left, "right": right}},
-    }
-    trajectory = config.trajectory.model_copy(update={"profile": "joint"})
-    asked = {"task": TaskSettings.model_validate(task), "trajectory": trajectory}
-    plan = run(config.model_copy(update=asked), calibration, joints)
-    if not plan.feasible:
-        raise WorkFailed(plan.reason)
-    return plan
-
-
-def _array(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{name} of shape {array.shape}: expected finite numbers of shape {shape}")
-    return array

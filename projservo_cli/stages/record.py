@@ -28,7 +28,7 @@ from projservo_cli.stages.own_robot import (
     simulated_robot,
     way_to,
 )
-from projservo_cli.stages.scenario import CALIBRATION_NOISE, TRIAL_POSES, generator
+from projservo_cli.stages.scenario import CALIBRATION_NOISE, POSE_NOISE, TRIAL_POSES, generator
 from projservo_cli.stages.simulation import robot_by_itself
 from projservo_cli.stages.world import Truth, joints_of, truth_of
 from projservo_cli.tables import JointList, read_table, recording_of, write_table
@@ -191,11 +191,16 @@ def seed_of_trials(config: Config) -> int:
     return config.seed if config.calibration.seed is None else config.calibration.seed
 
 
-def simulate(config: Config, truth: Truth, q: FloatArray | None = None) -> Observation:
-    """Noisy images of all markers at poses (k, n), by default the trial motions; unseen outside an image."""
+def simulate(
+    config: Config, truth: Truth, q: FloatArray | None = None, drawn: tuple[int, int] | None = None
+) -> Observation:
+    """Noisy images of all markers at poses (k, n), by default the trial motions; unseen outside an image.
+
+    drawn : seed and stream of the noise, by default those of the trials.
+    """
     q = trial_motions(config) if q is None else q
-    drawn = generator(seed_of_trials(config), CALIBRATION_NOISE)
-    noise = config.noise.calibration_px * drawn.standard_normal((len(q), 2, len(truth.number), 2))
+    rng = generator(*(drawn or (seed_of_trials(config), CALIBRATION_NOISE)))
+    noise = config.noise.calibration_px * rng.standard_normal((len(q), 2, len(truth.number), 2))
     images = truth.within(np.stack([truth.images(row, truth.M) for row in q]) + noise)
     return Observation(np.arange(len(q)), np.array(truth.number), q, images)
 
@@ -205,10 +210,16 @@ class _OutdatedError(InputError):
 
 
 def new_recording(
-    config: Config, path: Path, *, motions: JointList | None = None, force: bool = False, redo: bool = False
+    config: Config,
+    path: Path | None,
+    *,
+    motions: JointList | None = None,
+    force: bool = False,
+    redo: bool = False,
 ) -> _Recording:
     """What there is to record, and what of it the table holds already.
 
+    path : the table; None for one that is kept in memory.
     motions : further poses after the trial motions, numbered on.
     force : begin anew, whatever stands at ``path``; else a table of another configuration is refused.
     redo : begin anew also where ``path`` is a recording of the same plant with another configuration.
@@ -226,7 +237,9 @@ def new_recording(
         targets = np.vstack([targets, motions.q])
     plant = config.plant.use or "simulated"
     key = f"{plant} {digest(config, DEPENDS_ON, without=('robot.mjcf',))[:16]}"
-    recording = _Recording(path, key, targets, np.array(numbers, dtype=np.int64))
+    recording = _Recording(path or Path(), key, targets, np.array(numbers, dtype=np.int64))
+    if path is None:
+        return recording
     if path.exists() and force:
         return replace(recording, why="asked for by --force")
     if path.exists():
@@ -270,10 +283,16 @@ def _resumed(empty: _Recording, most: FloatArray) -> _Recording:
 
 
 def record(
-    config: Config, recording: _Recording, robot: ForeignRobot | None = None, *, progress: Progress = silent
+    config: Config,
+    recording: _Recording,
+    robot: ForeignRobot | None = None,
+    *,
+    kept: bool = True,
+    progress: Progress = silent,
 ) -> None:
     """Record the pending poses, and keep those that are done however it ends.
 
+    kept : whether the table is written.
     robot : what is driven; None takes that of ``plant.use``, or simulates that of the configuration, which
         stands wherever it is sent unless something is wrong with it.
     """
@@ -281,46 +300,59 @@ def record(
         return
     robot, sight = robot or _robot_of(config, recording), _Sight(config, recording)
     poses = _simulated(config, recording) if robot is None else _recorded(robot, config, recording, sight)
-    kept, due = len(recording.done), time.monotonic() + SAVE_EVERY
+    stored, due = len(recording.done), time.monotonic() + SAVE_EVERY
     try:
         with nullcontext() if robot is None else at_rest_after(robot):
             for _ in poses:
                 progress("record", len(recording.done), len(recording.targets))
-                if (start := time.monotonic()) >= due:
+                if kept and (start := time.monotonic()) >= due:
                     recording.save()
-                    kept, now = len(recording.done), time.monotonic()
+                    stored, now = len(recording.done), time.monotonic()
                     # A long table takes long to write: most of the time must stay for recording.
                     due = now + max(SAVE_EVERY, 10.0 * (now - start))
     finally:
-        if len(recording.done) > kept:
+        if kept and len(recording.done) > stored:
             recording.save()
 
 
-def _robot_of(config: Config, recording: _Recording) -> ForeignRobot | None:
-    """The robot that is to be driven; None for one that need not be."""
+def _robot_of(
+    config: Config, recording: _Recording, drawn: tuple[int, int] | None = None
+) -> ForeignRobot | None:
+    """The robot that is to be driven; None for one that need not be.
+
+    drawn : seed and stream of what is random of a simulated one, by default those of the trials.
+    """
     joints = joints_of(config)
     if not config.plant.simulated:
         return foreign_robot(config, joints, len(recording.marker))
     if config.is_ideal:
         return None
     first, sigma_px = recording.targets[recording.pending[0]], config.noise.calibration_px
-    seed = seed_of_trials(config)
-    robot = robot_by_itself(config, truth_of(config), first, sigma_px, seed, CALIBRATION_NOISE)
+    drawn = drawn or (seed_of_trials(config), CALIBRATION_NOISE)
+    robot = robot_by_itself(config, truth_of(config), first, sigma_px, *drawn)
     return simulated_robot(config, joints, robot)
 
 
-def observed(config: Config, *, progress: Progress = silent) -> tuple[Observation, float | None]:
-    """What the trial motions of the simulated robot show, and the noise of its pixels, px, if any."""
+def observed(
+    config: Config, q: FloatArray | None = None, seed: int | None = None, *, progress: Progress = silent
+) -> tuple[Observation, float | None]:
+    """What the simulated robot shows, and the noise of its pixels, px, if any is known.
+
+    q : (K, n) poses, rad or m, with noise of a stream of its own; None for the trial motions.
+    seed : of that noise; None for that of the trials.
+    """
     if not config.plant.simulated:
         raise InputError(
             f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
             "name one with --data"
         )
     truth, sigma_px = truth_of(config), config.noise.calibration_px
-    recording = _Recording(Path(), "", trial_motions(config), np.array(truth.number))
-    robot = _robot_of(config, recording)
+    targets = trial_motions(config) if q is None else q
+    drawn = seed_of_trials(config) if seed is None else seed, CALIBRATION_NOISE if q is None else POSE_NOISE
+    recording = _Recording(Path(), "", targets, np.array(truth.number))
+    robot = _robot_of(config, recording, drawn)
     if robot is None:
-        return simulate(config, truth, recording.targets), sigma_px or None
+        return simulate(config, truth, targets, drawn), sigma_px or None
     with at_rest_after(robot):
         for _ in _recorded(robot, config, recording):
             progress("trial motions", len(recording.done), len(recording.targets))

@@ -52,7 +52,7 @@ _UNSEEN = ((math.nan, math.nan),) * 2  # pixels of a marker that neither camera 
 _GUESSED, _TRIALS, _NEAR_PX, _FAR_PX = 1e-3, 60, 1.0, 1e3
 # Independent streams of random numbers, each a child of a seed.
 CALIBRATION_NOISE, TARGET_NOISE, SERVO_NOISE, SUGGESTIONS, PIN_TARGET_NOISE, PIN_NOISE = range(6)
-TRIAL_POSES, TAUGHT_NOISE, START_FRAMES, GOAL_FRAMES = range(6, 10)
+TRIAL_POSES, TAUGHT_NOISE, START_FRAMES, GOAL_FRAMES, POSE_NOISE = range(6, 11)
 
 
 def generator(seed: int, stream: int) -> np.random.Generator:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -260,18 +260,33 @@ def _reason(run: _Outcome, joint: int, remaining: tuple[float | None, float | No
     return "; ".join(filter(None, (reasons[run.verdict], hindrance)))
 
 
-def run(config: Config, calibration: Calibration, plan: Plan, name: str) -> Trace:
+class Given(NamedTuple):
+    """What a caller in Python brings along, of whom no name need be looked up."""
+
+    law: Callable[[Any], Any] | None = None  # makes a law of its setup; None for that of the name
+    robot: Any = None  # an object of the contract; None for that of the configuration
+
+
+def run(config: Config, calibration: Calibration, plan: Plan, name: str, given: Given | None = None) -> Trace:
     """Drive one law in one mode from the start of the task to its verdict.
 
     name : of the run: that of the law, with the mode where it follows the plan, such as ``exact_track``.
+    given : what a caller brings along.
     Raises InputError if the configuration lacks a part of the simulation, or the plan to follow has no time;
     WorkFailed if the goal cannot be reached, or the joints cannot follow the plan and
     ``control.without_plan`` refuses to go without.
     """
-    return drive(scenario_of(config, calibration), plan, name).trace()
+    return drive(scenario_of(config, calibration), plan, name, given=given).trace()
 
 
-def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Model | None = None) -> _Outcome:
+def drive(
+    scenario: Scenario,
+    plan: Plan | FloatArray,
+    name: str,
+    believed: Model | None = None,
+    *,
+    given: Given | None = None,
+) -> _Outcome:
     """Drive the run of a name to its verdict.
 
     plan : of the task; a built-in law that does not follow it needs but the joint motions (2, n) of its
@@ -288,7 +303,7 @@ def drive(scenario: Scenario, plan: Plan | FloatArray, name: str, believed: Mode
             unplanned = f"no joints can follow the plan: {plan.reason}"
         elif plan.duration is not None:
             planned_s = plan.duration / scenario.config.plant.speed_scale
-    asked = _Asked(scenario, plan, law, mode == REPLAN or bool(unplanned), believed)
+    asked = _Asked(scenario, plan, law, mode == REPLAN or bool(unplanned), believed, given or Given())
     if scenario.truth is None or scenario.config.is_by_contract:
         run = asked.by_contract()
     elif isinstance(plan, Plan) and (not _in_compiled_loop(scenario.config, law) or asked.is_guided):
@@ -318,6 +333,7 @@ class _Asked:
     law: str
     replans: bool  # whether the law goes its own way instead of following the plan
     believed: Model | None  # what the law takes for robot and rig; None for what a law of its kind is given
+    given: Given  # what a caller brings along
 
     @property
     def is_guided(self) -> bool:
@@ -360,7 +376,7 @@ class _Asked:
         own = scenario.truth is None
         if own and (scenario.calibration is None or not scenario.calibration.usable):
             raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
-        controller, driven = self._controller(), own_robot.connected(scenario, self.law)
+        controller, driven = self._controller(), own_robot.connected(scenario, self.law, self.given.robot)
         # The matrices of a look are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
             if own:
@@ -443,10 +459,11 @@ class _Asked:
         assert scenario.calibration is not None
         assert isinstance(self.plan, Plan)
         face = np.array(scenario.calibration.places(scenario.numbers[: scenario.m]))
-        model, shown = ImageModel(**vars(scenario.calibration)), (ends.s_start, ends.s_star)
+        model, shown = ImageModel.of(scenario.calibration), (ends.s_start, ends.s_star)
         # Its own: what a law writes to must not be what other laws are given.
         setup = copy.deepcopy(LawSetup(model, face, *shown, self.plan, gains, gains.period))
-        return ForeignLaw(plugins.make("law", self.law, (setup,), {}), f"law {self.law}")
+        factory = self.given.law or plugins.find("law", self.law)
+        return ForeignLaw(plugins.called("law", self.law, factory, (setup,), {}), f"law {self.law}")
 
 
 @dataclass(frozen=True, eq=False)

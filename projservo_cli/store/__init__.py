@@ -322,6 +322,18 @@ def save_record(group: "h5netcdf.Group", record: Any) -> None:
             data.attrs["dtype"] = "bool"
 
 
+def dataset_of(record: Any) -> Any:
+    """A record as the xarray Dataset that its group in a run file opens as."""
+    try:
+        import xarray
+    except ImportError as error:
+        raise InputError("to_xarray needs xarray: pip install '.[tables]'") from error
+    image = io.BytesIO()
+    with h5py.File(image, "w", libver=_FORMAT, track_order=True) as new, labelled(new) as file:
+        save_record(file.create_group("record"), record)
+    return xarray.load_dataset(image, engine="h5netcdf", group="record")
+
+
 def _chunks(value: npt.NDArray[Any]) -> tuple[int, ...]:
     """Shape of what is written of an array at once: all of it, or as many rows as are not too large."""
     rows = len(value) * _AT_ONCE // value.nbytes

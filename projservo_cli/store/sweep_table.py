@@ -134,6 +134,7 @@ class SweepTable:
             self.attributes = {k: json.loads(v) if str(v).startswith(is_json) else v for k, v in found}
             self.names = tuple(self.attributes["columns"])
             self.rows = len(file["run"])
+            self.traces = tuple(sorted(map(int, file.get(_TRACES, ()))))  # numbers of runs
 
     def column(self, name: str) -> Array:
         """Values (k,) of a column; texts as Python texts would be, of fixed width."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from tqdm import tqdm
 
-from projservo_cli.cli import output
+from projservo_cli import progress
 from projservo_cli.cli.output import Console
 from projservo_cli.records import InputError
 from projservo_cli.report import page
@@ -370,7 +370,7 @@ def test_progress_shows_only_to_someone_who_watches_and_its_clock_goes_on(capsys
         console.progress("work", 1, 2)
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    monkeypatch.setattr(output, "TICK_S", 0.01)
+    monkeypatch.setattr(progress, "TICK_S", 0.01)
     with Console(quiet=True) as console:
         console.progress("work", 1, 2)
     assert capsys.readouterr().err == ""

@@ -11,7 +11,7 @@ from projservo_cli.cli import main
 from projservo_cli.config import Config
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.equations import REGISTER
-from projservo_cli.sweep.runs import BETWEEN, MEASURED, NUMBERED
+from projservo_cli.sweeps.runs import BETWEEN, MEASURED, NUMBERED
 from tests.documentation.blocks import DOCS, ROOT, imported
 
 pytest.importorskip("sphinx", reason="Sphinx is not installed: pip install '.[docs]'")

@@ -9,7 +9,7 @@ from projservo_cli.guidance.goals import Aim
 from projservo_cli.guidance.margins import Demands
 from projservo_cli.guidance.validity import Constraints, constraints_of
 from projservo_cli.stages.world import joints_of, truth_of
-from projservo_cli.sweep.design import random_tasks
+from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import Shown
 from tests.known import configured
 

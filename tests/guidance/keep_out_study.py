@@ -31,7 +31,7 @@ from projservo_cli.stages import calibrate, plan
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive
 from projservo_cli.stages.world import Truth, joints_of, truth_of
-from projservo_cli.sweep.design import random_tasks
+from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import Shown
 from tests.known import configured
 

@@ -18,7 +18,7 @@ from projservo_cli.guidance.margins import limits_alone
 from projservo_cli.guidance.validity import constraints_of
 from projservo_cli.guidance.way import Budget, find_way
 from projservo_cli.stages.world import joints_of, truth_of
-from projservo_cli.sweep.design import random_tasks
+from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import Shown
 from tests.known import configured
 

@@ -19,7 +19,7 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.stages import plan, servo
 from projservo_cli.stages.world import truth_of
 from projservo_cli.store.sweep_table import SweepTable
-from projservo_cli.sweep.folder import Folder, run_of
+from projservo_cli.sweeps.folder import Folder, run_of
 from tests.guidance.studies import has_no_way, in_two_processes, quantiles, rate, write_rows
 
 GUIDED, ALONE = "exact_track", "exact"

@@ -15,7 +15,7 @@ from projservo_cli.stages import calibrate, servo
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import random_tasks
+from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import planned
 from tests.known import asked, configured

@@ -11,7 +11,7 @@ from projservo_cli.records import InputError
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.studies import projective_twin
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import STRATA, random_tasks
+from projservo_cli.sweeps.design import STRATA, random_tasks
 from projservo_cli.task.target import Shown
 from tests.known import asked, configured, known_scenario
 from tests.planning.cases import constrained, reaching_of

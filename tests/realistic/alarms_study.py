@@ -20,7 +20,7 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import random_tasks
+from projservo_cli.sweeps.design import random_tasks
 from tests.guidance.studies import in_two_processes, quantiles, rate, write_rows
 from tests.known import configured
 

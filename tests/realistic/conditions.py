@@ -16,7 +16,7 @@ import pytest
 from projservo_cli.config.robot import JointVector
 from projservo_cli.stages.simulation import FaultyRobot
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import STRATA, random_tasks
+from projservo_cli.sweeps.design import STRATA, random_tasks
 from tests.guidance.studies import write_rows
 from tests.known import configured
 

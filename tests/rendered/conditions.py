@@ -14,7 +14,7 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.records import FloatArray
 from projservo_cli.stages.simulation import hindrance_of, robot_by_itself, shown_in_frames
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import STRATA, random_tasks
+from projservo_cli.sweeps.design import STRATA, random_tasks
 from tests.conftest import SHARED
 from tests.guidance.studies import write_rows
 from tests.known import configured

@@ -103,7 +103,7 @@ def test_a_run_says_what_it_lacks_and_how_to_make_it(run, tmp_path):
 
 def test_importing_the_package_stays_light():
     code = (
-        "import sys, projservo_cli; projservo_cli.load, projservo_cli.__version__\n"
+        "import sys, projservo_cli; projservo_cli.__all__, projservo_cli.__version__\n"
         "heavy = {'numpy', 'scipy', 'numba', 'pydantic', 'yaml', 'h5py', 'matplotlib', 'click'}\n"
         "sys.exit(' '.join(sorted(heavy & set(sys.modules))) or 0)"
     )

@@ -3,7 +3,7 @@
 import pytest
 
 from projservo_cli.config import load_sweep
-from projservo_cli.sweep.design import read_design
+from projservo_cli.sweeps.design import read_design
 from tests.sweep.cases import make
 from tests.sweep.processes import written
 

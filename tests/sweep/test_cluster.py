@@ -8,7 +8,7 @@ import time
 import pytest
 
 from projservo_cli.records import WorkFailed
-from projservo_cli.sweep import engine
+from projservo_cli.sweeps import engine
 from tests.sweep import processes
 
 pytest.importorskip("distributed", reason="distributed is not installed: the extra cluster")

@@ -10,7 +10,7 @@ from projservo_cli.config import load_sweep
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.records import InputError
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep.design import Design, read_design
+from projservo_cli.sweeps.design import Design, read_design
 from tests.conftest import ROOT
 from tests.sweep.cases import design
 

@@ -14,11 +14,11 @@ from projservo_cli.cli import run
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.store import load
 from projservo_cli.store.sweep_table import SweepTable
-from projservo_cli.sweep import engine
-from projservo_cli.sweep import folder as driver
-from projservo_cli.sweep.engine import Engine
-from projservo_cli.sweep.folder import Folder
-from projservo_cli.sweep.runs import run_part
+from projservo_cli.sweeps import engine
+from projservo_cli.sweeps import folder as driver
+from projservo_cli.sweeps.engine import Engine
+from projservo_cli.sweeps.folder import Folder
+from projservo_cli.sweeps.runs import run_part
 from tests.conftest import ROOT
 from tests.sweep import processes
 from tests.sweep.cases import columns, design, make
@@ -155,7 +155,7 @@ def test_killed_before_its_parts_were_put_together_or_removed(tmp_path, monkeypa
     found, folder = design(runs=2, chunk=2), Folder(tmp_path)
     for name in ("Folder.assemble", "shutil.rmtree"):
         with monkeypatch.context() as patched:
-            patched.setattr(f"projservo_cli.sweep.folder.{name}", killed)
+            patched.setattr(f"projservo_cli.sweeps.folder.{name}", killed)
             with pytest.raises(SystemExit):
                 make(found, tmp_path)
         status = folder.status(found)

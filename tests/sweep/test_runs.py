@@ -9,9 +9,9 @@ from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.stages.world import truth_of
-from projservo_cli.sweep import runs
-from projservo_cli.sweep.design import name_of_run
-from projservo_cli.sweep.runs import Part, is_compiled, run_part
+from projservo_cli.sweeps import runs
+from projservo_cli.sweeps.design import name_of_run
+from projservo_cli.sweeps.runs import Part, is_compiled, run_part
 from tests.known import configured
 from tests.sweep.cases import design
 

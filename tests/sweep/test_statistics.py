@@ -9,9 +9,9 @@ import pytest
 
 from projservo_cli.records import InputError
 from projservo_cli.store.sweep_table import assemble, write_part
-from projservo_cli.sweep.folder import Folder
-from projservo_cli.sweep.runs import MEASURED, NUMBERED
-from projservo_cli.sweep.statistics import report
+from projservo_cli.sweeps.folder import Folder
+from projservo_cli.sweeps.runs import MEASURED, NUMBERED
+from projservo_cli.sweeps.statistics import report
 from tests.sweep.cases import columns, design, make
 
 AXES = [["noise.servo_px", [0, 1]], ["law", ["direct_two", "stacked"]]]

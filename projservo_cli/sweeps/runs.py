@@ -21,7 +21,7 @@ from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.servo import drive, sense_is_enough
 from projservo_cli.stages.steps import key_of
-from projservo_cli.sweep.design import RUNS, Design, name_of_run
+from projservo_cli.sweeps.design import RUNS, Design, name_of_run
 
 NOT_CALIBRATED, NOT_STARTED = "not calibrated", "not started"
 ALL_VERDICTS = (*VERDICTS, NOT_CALIBRATED, NOT_STARTED)

@@ -368,13 +368,19 @@ def read_design(sweep: SweepConfig) -> Design:
     changes = [_override("set", key, value) for key, value in sweep.set.items()]
     bases = tuple((Path(base).stem, to_yaml(load_config(base, changes))) for base in sweep.base)
     design = Design(sweep, bases)
+    require_sound(design)
+    return design
+
+
+def require_sound(design: Design) -> None:
+    """Refuse a sweep of which a cell or a value that is drawn makes no configuration, with an InputError."""
+    sweep = design.sweep
     for run in (number for number in sweep.traces if number >= design.total):
         raise InputError(f"traces: there is no run {run}; the sweep has runs 0 to {design.total - 1}")
     for cell in range(design.cells):
         design.cell(cell)
     for draw in range(min(3, sweep.runs) if sweep.random else 0):
         _changed(design.cell(0), design.drawn(draw), f"run {draw}")
-    return design
 
 
 def name_of_run(config: Config) -> str:

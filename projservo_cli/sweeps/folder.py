@@ -26,9 +26,9 @@ from projservo_cli.stages import Progress, calibrate
 from projservo_cli.stages.steps import result_of, steps_for
 from projservo_cli.store import Result, Run, load, save
 from projservo_cli.store.sweep_table import TABLE, SweepTable, assemble, write_part
-from projservo_cli.sweep.design import Design, name_of_run
-from projservo_cli.sweep.engine import Engine, versions
-from projservo_cli.sweep.runs import Part, columns_of, is_compiled, run_part
+from projservo_cli.sweeps.design import Design, name_of_run
+from projservo_cli.sweeps.engine import Engine, versions
+from projservo_cli.sweeps.runs import Part, columns_of, is_compiled, run_part
 
 REFUSED = ".refused"  # a calibration that cannot be made leaves a file with the reason
 PARTS = 4  # of each worker at least

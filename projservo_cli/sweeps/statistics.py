@@ -32,7 +32,7 @@ MEASURES = (
 PAIRED = ("steps", "position_error_mm", "path_length_ratio")
 
 
-class _Rows:
+class Rows:
     """Columns of the table of a sweep as they are needed, and what follows from them."""
 
     def __init__(self, table: SweepTable) -> None:
@@ -75,7 +75,7 @@ class _Rows:
             yield int(cell), self["cell"] == cell
 
 
-def _of_runs(rows: _Rows, these: BoolArray) -> dict[str, Any]:
+def of_runs(rows: Rows, these: BoolArray) -> dict[str, Any]:
     """Statistics of some runs; quantiles of those that succeeded."""
     count, good = int(these.sum()), these & rows["success"]
     successes = int(good.sum())
@@ -110,8 +110,8 @@ def _quantiles(values: npt.NDArray[Any]) -> dict[str, float | None]:
     return {f"{share:g}": value for share, value in zip(QUANTILES, found, strict=True)}
 
 
-def _paired(rows: _Rows) -> Iterator[dict[str, Any]]:
-    """Each two laws on the same tasks with the same noise, in every combination of the other values."""
+def paired(rows: Rows, laws: Sequence[str] | None = None) -> Iterator[dict[str, Any]]:
+    """Each two laws, or two of them, on the same tasks with the same noise, by the other values."""
     names = [name for name, _ in rows.axes]
     if LAW not in names:
         return
@@ -120,13 +120,13 @@ def _paired(rows: _Rows) -> Iterator[dict[str, Any]]:
         values = rows.values(cell)
         law = values.pop(LAW)
         groups.setdefault(repr(values), {})[law] = (values, these)
-    for laws in groups.values():
-        for first, second in combinations(laws, 2):
-            values, one = laws[first]
-            yield {**values, "laws": [first, second], **_compared(rows, one, laws[second][1])}
+    for group in groups.values():
+        for first, second in combinations(group, 2) if laws is None else [laws]:
+            values, one = group[first]
+            yield {**values, "laws": [first, second], **_compared(rows, one, group[second][1])}
 
 
-def _compared(rows: _Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
+def _compared(rows: Rows, one: BoolArray, other: BoolArray) -> dict[str, Any]:
     """Runs of two laws that share their draws: how often which succeeds, and differences where both do.
 
     The probabilities are of the exact test of McNemar and of the sign test: how often a difference as
@@ -166,10 +166,10 @@ POINTS = 2_000  # of a curve
 def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict[str, Any], list[Path]]:
     """Write statistics and figures of the table of a sweep beside it; the statistics and the files."""
     table, folder = SweepTable(path), path.parent
-    rows = _Rows(table)
-    cells = [{"cell": cell, **rows.values(cell), **_of_runs(rows, these)} for cell, these in rows.cells()]
+    rows = Rows(table)
+    cells = [{"cell": cell, **rows.values(cell), **of_runs(rows, these)} for cell, these in rows.cells()]
     found = {"runs": table.rows, "total": table.attributes["total"], "cells": cells}
-    found["paired"] = list(_paired(rows))
+    found["paired"] = list(paired(rows))
     text = json.dumps(found, indent=1, allow_nan=False) + "\n"
     files = [write_whole(folder / STATISTICS, text)]
     pictures = list(_pictures(rows))
@@ -183,7 +183,7 @@ def report(path: Path, formats: Sequence[str], progress: Progress) -> tuple[dict
     return found, files
 
 
-def _pictures(rows: _Rows) -> Iterator[tuple[str, Data, Any]]:
+def _pictures(rows: Rows) -> Iterator[tuple[str, Data, Any]]:
     """Every figure that the columns of a sweep allow: the name of its files, its numbers, how it is drawn."""
     axes = [name for name, values in rows.axes if len(values) > 1 and {*map(type, values)} <= {int, float}]
     for name in axes:
@@ -202,7 +202,7 @@ def _pictures(rows: _Rows) -> Iterator[tuple[str, Data, Any]]:
         yield "final_error", errors, _draw_final_errors
 
 
-def _success(rows: _Rows, name: str, label: str, edges: Sequence[float] | None) -> Data:
+def _success(rows: Rows, name: str, label: str, edges: Sequence[float] | None) -> Data:
     """Success of each law over a column, at each of its values or within edges.
 
     Of each law ``x``, ``runs``, ``rate``, and ``low`` and ``high`` of the interval (k,).
@@ -224,7 +224,7 @@ def _success(rows: _Rows, name: str, label: str, edges: Sequence[float] | None) 
     return data
 
 
-def _basin(rows: _Rows, first: str, second: str) -> Data:
+def _basin(rows: Rows, first: str, second: str) -> Data:
     x, y, begun = np.unique(rows[first]), np.unique(rows[second]), rows["steps"] >= 0
     data: Data = {"x": x, "y": y, "label_x": np.array(first), "label_y": np.array(second)}
     for law in dict.fromkeys(rows[LAW].tolist()):
@@ -238,7 +238,7 @@ def _basin(rows: _Rows, first: str, second: str) -> Data:
     return data
 
 
-def _final_errors(rows: _Rows) -> Data:
+def _final_errors(rows: Rows) -> Data:
     data: Data = {}
     for law in dict.fromkeys(rows[LAW].tolist()):
         errors = rows["position_error_mm"][rows[LAW] == law]

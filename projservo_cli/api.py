@@ -1,0 +1,483 @@
+"""The stages of an experiment as functions: from a configuration or arrays to arrays, without files."""
+
+import ast
+import multiprocessing
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
+from projservo_cli.control import CODES
+from projservo_cli.experiment import Experiment, compilation, law_target, listening
+from projservo_cli.files import working_in
+from projservo_cli.observations import Observations, rows_of
+from projservo_cli.records import REPLAN, Calibration, InputError, Plan, law_and_mode, name_of
+from projservo_cli.results import ImageModel, MotionPlan, RunTrace
+from projservo_cli.robots import plugins
+from projservo_cli.shown import checked_array
+from projservo_cli.stages import Progress
+from projservo_cli.stages import calibrate as calibrating
+from projservo_cli.stages import plan as planning
+from projservo_cli.stages import record as recording
+from projservo_cli.stages import servo as driving
+from projservo_cli.stages.own_robot import foreign_robot
+from projservo_cli.stages.world import joints_of
+from projservo_cli.store import load as stored_run
+from projservo_cli.store import run_path
+from projservo_cli.store.sweep_table import TABLE, SweepTable
+from projservo_cli.sweeps.design import Design, require_sound
+from projservo_cli.sweeps.engine import Engine
+from projservo_cli.sweeps.folder import Folder, run_sweep
+from projservo_cli.sweeps.study import Study
+from projservo_cli.tables import JointList
+
+_WITHOUT_TASKS = 20  # runs of a cell where no number of tasks tells it
+
+
+def simulate(
+    config: Config,
+    q: npt.ArrayLike | None = None,
+    *,
+    seed: int | None = None,
+    noise_px: float | None = None,
+    progress: Progress | None = None,
+) -> Observations:
+    """Show the simulated robot of a configuration to its cameras.
+
+    Parameters
+    ----------
+    config : with a simulated robot: of points, with faults, or rendered by MuJoCo.
+    q : (K, n) joint readings of the poses, rad or m; by default the trial motions of the configuration.
+    seed : of the noise; by default that of the trials. Poses that are given have a stream of their own, so
+        that they share no noise with trials.
+    noise_px : standard deviation of a coordinate, px, where points are simulated; by default
+        ``noise.calibration_px``.
+    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+
+    Returns
+    -------
+    Observations
+        What both cameras see, NaN where unseen, with what ``calibrate`` has to know of it.
+
+    Raises
+    ------
+    InputError
+        When the configuration describes no simulated robot, or a pose is beyond a joint limit.
+    WorkFailed
+        When a robot with faults does not come to rest at a pose.
+    """
+    if noise_px is not None:
+        if config.plant.rendered is not None:
+            raise InputError("noise_px: rendered images have plant.options.grey_noise instead")
+        config = config.replace({"noise.calibration_px": noise_px})
+    if seed is not None and q is None:
+        config, seed = config.replace({"calibration.seed": seed}), None
+    with listening(progress) as listener:
+        if q is None:
+            return calibrating.simulated(config, progress=listener.progress)
+        joints = joints_of(config)
+        poses = rows_of(q, len(joints.types))
+        for k, pose in enumerate(poses):
+            if wrong := joints.limit_passed(pose):
+                raise InputError(f"q: pose {k}: {wrong}: choose another")
+        return calibrating.simulated(config, poses, seed, progress=listener.progress)
+
+
+def record(
+    config: Config,
+    robot: Any = None,
+    *,
+    path: str | Path | None = None,
+    motions: npt.ArrayLike | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Observations:
+    """Drive a robot through the trial motions of a configuration and look at each.
+
+    Parameters
+    ----------
+    config : with ``markers`` and what bounds the motion; of a robot of yours also ``robot.limits``.
+    robot : an object of the contract; by default that of ``plant.use``, or the simulated one.
+    path : table (CSV) that grows as the robot goes, and from which an interrupted recording is continued.
+    motions : (K, n) further poses after the trial motions, rad or m.
+    force : whether to begin anew, whatever stands in the table.
+    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+
+    Returns
+    -------
+    Observations
+        All poses, and frames on the way for the delay of the images.
+
+    Raises
+    ------
+    InputError
+        When something is missing in the configuration, or the table is of another one.
+    WorkFailed
+        When the robot fails, or its images show too little; what was recorded stands in the table.
+    """
+    asked = config if robot is None else _with_robot(config, robot)
+    further = None
+    if motions is not None:
+        rows = rows_of(motions, len(joints_of(asked).types))
+        further = JointList(np.arange(len(rows)), rows, numbered=False, left=None, right=None)
+    table = None if path is None else Path(path)
+    with ExitStack() as stack:
+        listener = stack.enter_context(listening(progress))
+        if table is not None:
+            stack.enter_context(working_in(table.parent, name=f".{table.name}.lock"))
+        made = recording.new_recording(asked, table, motions=further, force=force)
+        driven = None
+        if robot is not None:
+            driven = foreign_robot(asked, joints_of(asked), len(made.marker), robot)
+        recording.record(asked, made, driven, kept=table is not None, progress=listener.progress)
+    return Observations.of(
+        made.observation(),
+        joint_types=asked.joint_types,
+        image_size=asked.image_size_px,
+        seed=recording.seed_of_trials(asked),
+    )
+
+
+def calibrate(
+    observations: Observations,
+    *,
+    method: str = "refined",
+    lens: bool = False,
+    init: str | Path | None = None,
+    cross_validate: int | None = None,
+    joint_noise_deg: float | None = None,
+    noise_px: float | None = None,
+    seed: int | None = None,
+    progress: Progress | None = None,
+) -> ImageModel:
+    """Learn the projective kinematics of a robot from what cameras saw of it, [RH00] section 2.
+
+    Settings are those of the section ``calibration`` of a configuration, with the same defaults.
+
+    Parameters
+    ----------
+    observations : of ``simulate``, ``record``, or of arrays and tables of yours.
+    method : ``refined`` (maximum likelihood) or ``closed_form`` (the paper's closed forms).
+    lens : whether to estimate two coefficients of radial distortion a camera.
+    init : JSON file of a robot and rig known beforehand, tried first as a start.
+    cross_validate : parts into which poses are divided to predict each from the others; the held-out errors
+        are in ``cross_validation``.
+    joint_noise_deg : rms of joint readings less true angles (of prismatic joints × 0.3 m/rad); by default
+        what the observations know, else estimated.
+    noise_px : standard deviation of a coordinate, px; by default what the observations know, else estimated.
+    seed : of the random starts; by default that of the observations.
+    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+
+    Returns
+    -------
+    ImageModel
+        The calibration; one that is not ``usable`` says why in ``reason``.
+
+    Raises
+    ------
+    InputError
+        When a setting makes no sense.
+    WorkFailed
+        When the observations do not support a calibration: which joint or marker, and why.
+    """
+    if not isinstance(observations, Observations):
+        raise InputError(
+            f"calibrate: observations of type {type(observations).__name__}; make them with "
+            "Observations.from_arrays or Observations.from_frame"
+        )
+    given = {
+        "calibration.method": method,
+        "calibration.lens": lens,
+        "calibration.init": init,
+        "calibration.cross_validate": cross_validate,
+        "calibration.joint_noise_deg": joint_noise_deg,
+        "data.noise_px": noise_px,
+        "calibration.seed": seed,
+    }
+    checked = load_config(None, overrides_of("calibrate", given), text="data: {table: in memory}")
+    settings = checked.calibration
+    seen = observations
+    if settings.joint_noise_deg is not None:
+        seen = replace(seen, joint_noise=float(np.radians(settings.joint_noise_deg)))
+    if checked.data is not None and checked.data.noise_px is not None:
+        seen = replace(seen, noise_px=checked.data.noise_px)
+    if settings.seed is not None:
+        seen = replace(seen, seed=settings.seed)
+    asked = calibrating.Estimation(settings.method, settings.lens, settings.init, settings.cross_validate)
+    with listening(progress) as listener:
+        return ImageModel.of(*calibrating.estimate(seen, asked, progress=listener.progress))
+
+
+def plan(
+    config: Config, calibration: Calibration, *, q_start: npt.ArrayLike | None = None, goal: Any = None
+) -> MotionPlan:
+    """Split a task into a translation and two rotations and plan its motion, [RH00] section 4.
+
+    Parameters
+    ----------
+    config : whose ``trajectory`` and ``control`` say what the motion keeps to; of a robot that is not
+        described, start and goal are what the calibration predicts.
+    calibration : of the same robot and rig.
+    q_start : (n,) joint readings at the start, rad or m; by default ``task.start``.
+    goal : (n,) joint readings, (2, m, 2) pixels of ``markers.face`` in the left and the right image, or what
+        ``projservo teach`` wrote, a path or a mapping; by default ``task.goal``.
+
+    Returns
+    -------
+    MotionPlan
+        One that is not ``feasible`` says why in ``reason``.
+
+    Raises
+    ------
+    InputError
+        When an array has another shape, or the start is beyond a limit.
+    WorkFailed
+        When the task cannot be measured or split: which marker, and why.
+    """
+    n = len(calibration.joint_types)
+    asked = _with_task(config, n, q_start, goal)
+    if (asked.joint_types or calibration.joint_types) != calibration.joint_types:
+        raise InputError(
+            f"plan: the calibration is of joints {calibration.joint_types}, the configuration of "
+            f"{asked.joint_types}: take one of the same robot"
+        )
+    _say_compilation()
+    described = asked.arm is not None and asked.rig is not None
+    described = described and asked.markers is not None and asked.markers.points is not None
+    joints = None
+    if asked.plant.simulated and not described:
+        joints = joints_of(asked, calibration.joint_types, calibration)
+    return MotionPlan.of(planning.run(asked, calibration, joints))
+
+
+def servo(
+    config: Config,
+    calibration: Calibration,
+    plan: Plan,
+    law: str | Callable[[Any], Any] = "exact",
+    *,
+    mode: str = REPLAN,
+    robot: Any = None,
+) -> RunTrace:
+    """Drive a law in closed loop from the start of the task to its verdict.
+
+    Parameters
+    ----------
+    config : of the robot that is driven, and of when a run ends.
+    calibration, plan : what ``calibrate`` and ``plan`` made.
+    law : the name of a law, ``module:Class``, or a class or function that makes one of its setup.
+    mode : ``replan``, ``track`` or ``image_track``.
+    robot : an object of the contract to drive, instead of the robot of the configuration.
+
+    Returns
+    -------
+    RunTrace
+        With the verdict, and its reason.
+
+    Raises
+    ------
+    InputError
+        When there is no such law or mode, or something is missing in the configuration.
+    WorkFailed
+        When the run could not begin: the goal is out of reach, or what a robot sees disagrees with the
+        calibration.
+    """
+    factory, name = None, law
+    if not isinstance(law, str):
+        factory, name = law, plugins.name_of(law)
+    else:
+        name, own_mode = law_and_mode(law_target(law_and_mode(law)[0]))[0], law_and_mode(law)[1]
+        mode = own_mode if own_mode != REPLAN else mode
+    asked = config.replace({"control.mode": mode})
+    if robot is not None:
+        asked = _with_robot(asked, robot)
+    _say_compilation()
+    assert isinstance(name, str)
+    given = driving.Given(factory, robot)
+    return RunTrace.of(driving.run(asked, calibration, plan, name_of(name, mode), given))
+
+
+def sweep(
+    config: Config,
+    laws: Sequence[str | type],
+    *,
+    tasks: int | None = None,
+    runs: int | None = None,
+    calibrations: int = 1,
+    grid: Mapping[str, Any] | None = None,
+    random: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    workers: int = 1,
+    path: str | Path | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Study:
+    """Run laws on the same tasks, with the same calibrations and noise, over a grid of values.
+
+    Parameters
+    ----------
+    config : of a simulated robot with a task.
+    laws : names, ``module:Class`` or classes; a name may tell its mode, such as ``exact_track``.
+    tasks : random tasks within sight of both cameras; by default that of the configuration alone.
+    runs : of each cell; by default one a task, or twenty.
+    calibrations : of a cell, from noisy trials; run r is made with number r mod this.
+    grid : lists of values by key, such as ``{"noise.servo_px": [0.0, 0.5]}``.
+    random : what keys are drawn from, such as ``{"noise.servo_px": {"uniform": [0, 1]}}``.
+    seed : of all that is drawn.
+    workers : processes; with more than one, laws must be importable there.
+    path : folder of the sweep, which is continued there; by default all is kept in memory.
+    force : whether to begin anew, whatever is in the folder.
+    progress : called as ``progress(what, done, total)``; by default a bar in a terminal.
+
+    Returns
+    -------
+    Study
+        Its table, rates of success with Wilson intervals, and laws compared in pairs.
+
+    Raises
+    ------
+    InputError
+        When a value does not fit, or a law cannot be imported by other processes.
+    WorkFailed
+        When there are not enough tasks within sight, or workers were lost.
+    """
+    named = [(one if isinstance(one, str) else one.__name__, _law_of_sweep(one, workers)) for one in laws]
+    if not named:
+        raise InputError("sweep: name one law or more")
+    _require_guard(workers)
+    axes = {**(grid or {}), "law": [target for _, target in named]}
+    values = {
+        "name": config.name,
+        "base": [f"{config.name}.yaml"],
+        "seed": seed,
+        "runs": runs or tasks or _WITHOUT_TASKS,
+        "grid": axes,
+        "random": dict(random or {}),
+        "calibrations": calibrations,
+        "tasks": None if tasks is None else {"random": tasks},
+    }
+    design = Design(sweep_of(values), ((config.name, to_yaml(config)),))
+    require_sound(design)
+    # What has no source has no key: nothing tells whether what is stored is still of it.
+    begin = force or not all(design.sources.values())
+    with ExitStack() as stack:
+        folder = Folder(stack.enter_context(tempfile.TemporaryDirectory()) if path is None else path)
+        listener = stack.enter_context(listening(progress))
+        stack.enter_context(working_in(folder.path, "parts", "calibrations"))
+        say = listener.say if path is not None else listener.detail
+        run_sweep(design, folder, Engine(workers), listener.progress, say, force=begin)
+        study = Study(SweepTable(folder.table), {target: name for name, target in named})
+    study.path = None if path is None else folder.table
+    return study
+
+
+def load(path: str | Path) -> Experiment | Study:
+    """Open what is stored: a run or a sweep.
+
+    Parameters
+    ----------
+    path : folder of a run or of a sweep, or its ``run.h5`` or ``sweep.h5``.
+
+    Returns
+    -------
+    Experiment or Study
+        The experiment with what was made so far, which ``make`` goes on with; no code of others that a
+        stored run names is started by it. Of a sweep, the runs that are done.
+
+    Raises
+    ------
+    InputError
+        When there is none, it is cut short, or another version made it.
+    """
+    target = Path(path)
+    if target.suffix in (".yaml", ".yml"):
+        raise InputError(f"{path}: a configuration, which Config.load reads; load opens the folder of a run")
+    folder = target.parent if target.name == TABLE else target
+    if (folder / TABLE).is_file() and not run_path(target).is_file():
+        return Study(SweepTable(folder / TABLE))
+    return Experiment.of(stored_run(target))
+
+
+def _say_compilation() -> None:
+    """Say once that what follows takes as long as the compiler does."""
+    if told := compilation():
+        print(told, file=sys.stderr, flush=True)
+
+
+def _with_robot(config: Config, robot: Any) -> Config:
+    """The configuration with an object of the contract in place of its robot."""
+    name = plugins.name_of(robot)
+    plugins.require_object("plant", name, robot)
+    plant = config.plant.model_copy(update={"use": name, "options": {}})
+    return config.model_copy(update={"plant": plant})
+
+
+def _with_task(config: Config, n: int, q_start: npt.ArrayLike | None, goal: Any) -> Config:
+    """The configuration with another start (n,) or goal."""
+    changes = []
+    if q_start is not None:
+        start = checked_array("q_start", q_start, (n,), f"({n},), rad or m", finite=True)
+        of_joints = {"joints": start.tolist(), "unit": "rad"}
+        changes += [Override("plan: q_start", "task.start", of_joints)]
+        changes += [Override("plan: q_start", "task.start_offset", None)]
+    if goal is not None:
+        changes += [Override("plan: goal", "task.goal", _goal(config, n, goal))]
+    return load_config(config.name, changes, text=to_yaml(config)) if changes else config
+
+
+def _goal(config: Config, n: int, goal: Any) -> Any:
+    """A goal as a configuration has it."""
+    if isinstance(goal, (str, Path)):
+        return str(Path(goal).resolve())
+    if isinstance(goal, Mapping):
+        return dict(goal)
+    if np.ndim(goal) == 1:
+        joints = checked_array("goal", goal, (n,), f"({n},) joint readings, rad or m", finite=True)
+        return {"joints": {"joints": joints.tolist(), "unit": "rad"}}
+    m = len(config.face_numbers)
+    shape = f"({n},) joint readings, or (2, {m}, 2) pixels of markers.face"
+    left, right = checked_array("goal", goal, (2, m, 2), shape, finite=True).tolist()
+    return {"images": {"left": left, "right": right}}
+
+
+def _law_of_sweep(law: str | type, workers: int) -> str:
+    """A law as the grid of a sweep names it; classes of this process are found again by that name."""
+    if isinstance(law, str):
+        name, mode = law_and_mode(law)
+        return law if name in CODES else name_of(law_target(name), mode)
+    target = plugins.bring("law", law)
+    if workers > 1 and not plugins.importable(law):
+        raise InputError(
+            f"sweep: other processes cannot import {plugins.name_of(law)}: put it into a module, or use "
+            "workers=1"
+        )
+    return target
+
+
+def _require_guard(workers: int) -> None:
+    """Refuse more processes where each of them would run the script anew, and begin a sweep of its own."""
+    script = getattr(sys.modules.get("__main__"), "__file__", None)
+    if workers < 2 or script is None or not Path(script).is_file():
+        return
+    if multiprocessing.parent_process() is None and _has_guard(Path(script)):
+        return
+    raise InputError(
+        f"{script}: with workers={workers} each process imports the script again: put its calls under "
+        'if __name__ == "__main__":'
+    )
+
+
+def _has_guard(script: Path) -> bool:
+    """Whether a script tells being run from being imported."""
+    try:
+        tree = ast.parse(script.read_bytes())
+    except (OSError, SyntaxError, ValueError):
+        return True  # what it is nobody can tell
+    return any(isinstance(node, ast.Name) and node.id == "__name__" for node in ast.walk(tree))

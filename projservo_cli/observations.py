@@ -1,0 +1,215 @@
+"""What cameras saw of a robot, with all that a calibration has to know beside the pixels."""
+
+import dataclasses
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from projservo_cli.records import FloatArray, InputError, Observation
+from projservo_cli.shown import Shown, checked_array
+from projservo_cli.tables import in_radians, read_table, to_csv, write_table
+
+_TABLE = "table"  # what messages call one that is no file
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Observations(Shown, Observation):
+    """Stereo images of markers at a sequence of poses, and what is known of them.
+
+    Attributes
+    ----------
+    pose : (K,) numbers of the poses.
+    marker : (m,) numbers of the markers.
+    q : (K, n) joint readings, rad or m.
+    images : (K, 2, m, 2) pixels, left and right, NaN where unseen.
+    moving, t_q, t_view, sigma : as in [the run file]; None where unknown.
+    joint_types : one letter a joint, R or P.
+    image_size : width and height, px; None where unknown.
+    noise_px : standard deviation of a coordinate, px; None to estimate it.
+    joint_noise : rms of joint readings less true joints, rad (prismatic × 0.3 m/rad); None to estimate it.
+    source : ``simulated`` or ``recorded``.
+    exact : whether the pixel noise is all that is wrong with them, so that χ² decides against ``noise_px``.
+    seed : of the random starts of a calibration.
+    """
+
+    joint_types: str = ""
+    image_size: tuple[int, int] | None = None
+    noise_px: float | None = None
+    joint_noise: float | None = None
+    source: str = "recorded"
+    exact: bool = False
+    seed: int = 0
+
+    @classmethod
+    def of(cls, observation: Observation, **known: Any) -> "Observations":
+        """Return a record with what is known beside it."""
+        fields = {field.name: getattr(observation, field.name) for field in dataclasses.fields(Observation)}
+        types = known.pop("joint_types", None) or "R" * observation.q.shape[1]
+        return cls(**fields, joint_types=types, **known)
+
+    @property
+    def record(self) -> Observation:
+        """What a run file keeps of it."""
+        return Observation(**{one.name: getattr(self, one.name) for one in dataclasses.fields(Observation)})
+
+    @classmethod
+    def from_arrays(
+        cls,
+        q: npt.ArrayLike,
+        pixels: npt.ArrayLike,
+        *,
+        joint_types: str | None = None,
+        joint_unit: str | None = None,
+        marker: Sequence[int] | None = None,
+        pose: Sequence[int] | None = None,
+        sigma: npt.ArrayLike | None = None,
+        image_size: tuple[int, int] | None = None,
+        noise_px: float | None = None,
+    ) -> "Observations":
+        """Return what arrays hold.
+
+        Parameters
+        ----------
+        q : (K, n) joint readings, rad or m unless ``joint_unit`` says deg.
+        pixels : (K, 2, m, 2) raw pixels u, v of each marker in the left and the right image, NaN unseen.
+        joint_types : one letter a joint, R or P; by default all R.
+        joint_unit : ``deg`` or ``rad`` of revolute joints; by default rad, where readings beyond two turns
+            are taken for a mistaken unit and refused.
+        marker, pose : (m,) and (K,) numbers; by default from 0.
+        sigma : (K, 2, m) standard deviations of a coordinate, px.
+        image_size : width and height, px; by default what the pixels span.
+        noise_px : standard deviation of a coordinate, px, where there is one for all; by default estimated.
+
+        Raises
+        ------
+        InputError
+            When an array has another shape, readings are not finite or look like degrees.
+        """
+        seen = checked_array("pixels", pixels, (None, 2, None, 2), "(K, 2, m, 2)")
+        readings = checked_array("q", q, (len(seen), None), f"({len(seen)}, n), a row for each pose")
+        if not np.isfinite(readings).all():
+            raise InputError("q: holds a number that is not finite; leave such poses out")
+        n, m = readings.shape[1], seen.shape[2]
+        types = _types_of(joint_types, n)
+        numbers = _numbers("marker", marker, m), _numbers("pose", pose, len(seen))
+        readings = in_radians("q", types, numbers[1], readings, joint_unit, "joint_unit={!r}")
+        one = np.isfinite(seen).sum(axis=-1) == 1
+        if one.any():
+            k, view, j = np.argwhere(one)[0]
+            raise InputError(
+                f"pixels: one coordinate of marker {j} at pose {k}, view {view} is NaN: both or none"
+            )
+        stated = None
+        if sigma is not None:
+            stated = checked_array("sigma", sigma, seen.shape[:3], f"{seen.shape[:3]}")
+            if not (stated[np.isfinite(seen[..., 0])] > 0.0).all():
+                raise InputError("sigma: must be positive wherever a marker is seen")
+        order = np.argsort(numbers[0])
+        seen = np.where(np.isfinite(seen).all(axis=-1, keepdims=True), seen, np.nan)[:, :, order]
+        stated = None if stated is None else np.ascontiguousarray(stated[:, :, order])
+        record = Observation(
+            numbers[1], numbers[0][order], readings, np.ascontiguousarray(seen), sigma=stated
+        )
+        return cls.of(record, joint_types=types, image_size=image_size, noise_px=noise_px)
+
+    @classmethod
+    def from_frame(
+        cls,
+        table: Any,
+        *,
+        joint_types: str | None = None,
+        joint_unit: str | None = None,
+        image_size: tuple[int, int] | None = None,
+        noise_px: float | None = None,
+    ) -> "Observations":
+        """Return what an observation table holds.
+
+        Parameters
+        ----------
+        table : a pandas table or a mapping of columns, as [observation tables] have them, or the path of one.
+        joint_types : one letter a joint column, R or P; by default all R.
+        joint_unit : ``deg`` or ``rad`` of the revolute columns; by default rad.
+        image_size : width and height, px; by default what the pixels span.
+        noise_px : standard deviation of a coordinate, px; by default that of the table, else estimated.
+
+        Raises
+        ------
+        InputError
+            When a column is missing, or a row makes no sense.
+        """
+        if isinstance(table, (str, Path)):
+            found = read_table(table, joint_types, joint_unit)
+        else:
+            found = _read(_text_of(table), joint_types, joint_unit)
+        return cls.of(found, joint_types=joint_types, image_size=image_size, noise_px=noise_px)
+
+    def to_frame(self) -> Any:
+        """Return the observation table as a pandas table; an InputError without pandas."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError("to_frame needs pandas: pip install '.[tables]'") from error
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, _TABLE)
+            write_table(self, path)
+            return pandas.read_csv(path)
+
+    def summary(self) -> dict[str, str]:
+        """Return what there is to tell, in words, by name."""
+        seen = np.isfinite(self.images[..., 0])
+        moving = 0 if self.moving is None else int((self.moving > 0).sum())
+        noise = "to be estimated" if self.noise_px is None else f"{self.noise_px:g} px"
+        return {
+            "source": self.source,
+            "joints": self.joint_types,
+            "poses": f"{len(self.pose) - moving}" + (f" and {moving} in motion" if moving else ""),
+            "markers": str(len(self.marker)),
+            "seen": f"{seen.mean():.0%} of {seen.size} marker-view pairs",
+            "noise": "stated for each pixel" if self.noise_px is None and self.sigma is not None else noise,
+        }
+
+
+def _types_of(given: str | None, n: int) -> str:
+    types = "R" * n if given is None else given.upper()
+    if len(types) != n or set(types) - {"R", "P"}:
+        raise InputError(f"joint_types: {given!r}: expected {n} letters R or P, one a joint")
+    return types
+
+
+def _numbers(name: str, given: Sequence[int] | None, count: int) -> npt.NDArray[np.int64]:
+    numbers = np.arange(count) if given is None else np.asarray(given)
+    if numbers.shape != (count,) or numbers.dtype.kind not in "iu" or len(set(numbers.tolist())) < count:
+        raise InputError(f"{name}: expected {count} different whole numbers, not {given!r:.60}")
+    return numbers.astype(np.int64)
+
+
+def _text_of(table: Any) -> str:
+    if hasattr(table, "to_csv"):
+        return str(table.to_csv(index=False))
+    if isinstance(table, Mapping):
+        return to_csv({name: np.asarray(values) for name, values in table.items()})
+    raise InputError(
+        f"table: a {type(table).__name__}; expected a pandas table, a mapping of columns or a path"
+    )
+
+
+def _read(text: str, joint_types: str | None, joint_unit: str | None) -> Observation:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, _TABLE)
+        path.write_text(text, encoding="utf-8")
+        try:
+            return read_table(path, joint_types, joint_unit)
+        except InputError as error:
+            told = str(error).replace(str(path), _TABLE)
+            raise InputError(told.replace("--joint-unit deg", "joint_unit='deg'")) from error
+
+
+def rows_of(q: npt.ArrayLike, n: int) -> FloatArray:
+    """Joint readings (K, n), rad or m, from rows or from one; an InputError for anything else."""
+    given = np.asarray(q, dtype=np.float64) if not isinstance(q, np.ndarray) else q
+    rows = np.atleast_2d(given)
+    return checked_array("q", rows, (None, n), f"(K, {n}), rad or m", finite=True)

@@ -1,0 +1,86 @@
+"""How records print themselves, and turn into labelled arrays."""
+
+import dataclasses
+import html
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from projservo_cli.records import VIEWS, FloatArray, InputError
+
+_WIDTH = 100  # characters of a line
+
+
+class Shown:
+    """Adds to a record a short text, a table for notebooks, and labelled arrays.
+
+    A class that takes it up gives ``summary``, and is a dataclass after its record.
+    """
+
+    def summary(self) -> dict[str, str]:
+        """Return what there is to tell, in words, by name: eleven entries at most."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        told = self.summary()
+        width = max(map(len, told))
+        lines = [f"{name:{width}}  {value}" for name, value in told.items()]
+        short = (line if len(line) <= _WIDTH else line[: _WIDTH - 1] + "…" for line in lines)
+        return "\n".join([type(self).__name__, *(f"  {line}" for line in short)])
+
+    def _repr_html_(self) -> str:
+        rows = (
+            f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in self.summary().items()
+        )
+        return f"<table><caption>{type(self).__name__}</caption>{''.join(rows)}</table>"
+
+    def to_xarray(self) -> Any:
+        """Return all arrays and scalars as a Dataset: those of the run file, with coordinates.
+
+        Raises
+        ------
+        InputError
+            When xarray is not installed.
+        """
+        from projservo_cli.store import dataset_of
+
+        kind = next(base for base in type(self).__mro__[1:] if dataclasses.is_dataclass(base))
+        record = kind(**{field.name: getattr(self, field.name) for field in dataclasses.fields(kind)})
+        return dataset_of(record).assign_coords(self.coordinates())
+
+    def coordinates(self) -> dict[str, Any]:
+        """Return coordinates of dimensions, by their names."""
+        sizes: dict[str, int] = {}
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]  # those who take it up are dataclasses
+            value = getattr(self, field.name)
+            if value is not None and "dims" in field.metadata:
+                sizes |= dict(zip(field.metadata["dims"], np.shape(value), strict=True))
+        found: dict[str, Any] = {"view": [*VIEWS], "xy": ["u", "v"]}
+        found = {name: values for name, values in found.items() if name in sizes}
+        if "joint" in sizes:
+            found["joint"] = [f"q{i + 1}" for i in range(sizes["joint"])]
+        return found
+
+
+def checked_array(
+    name: str, given: npt.ArrayLike, shape: Sequence[int | None], said: str, *, finite: bool = False
+) -> FloatArray:
+    """Numbers of a shape, of which None is any length of one or more; an InputError that says what is wrong.
+
+    said : the shape, for messages.
+    """
+    try:
+        array = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: no array of numbers; expected shape {said}") from error
+    fits = array.ndim == len(shape) and all(
+        size > 0 if wanted is None else size == wanted
+        for size, wanted in zip(array.shape, shape, strict=False)
+    )
+    if not fits:
+        raise InputError(f"{name} of shape {array.shape}: expected {said}")
+    if finite and not np.isfinite(array).all():
+        raise InputError(f"{name}: holds a number that is not finite")
+    return array

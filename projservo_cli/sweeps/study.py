@@ -1,0 +1,120 @@
+"""A sweep as an object: its table as arrays, how often laws succeed, and laws against each other."""
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from projservo_cli.records import InputError
+from projservo_cli.results import RunTrace
+from projservo_cli.shown import Shown
+from projservo_cli.store.sweep_table import SweepTable
+from projservo_cli.sweeps.statistics import Rows, of_runs, paired
+
+
+class Study(Shown):
+    """The runs of a sweep that are done.
+
+    Parameters
+    ----------
+    table : the stored table.
+    names : of laws as their caller calls them, by the names in the table.
+    """
+
+    def __init__(self, table: SweepTable, names: Mapping[str, str] | None = None) -> None:
+        self._rows, self._names = Rows(table), dict(names or {})
+        # In memory what is stored is gone when the caller sees it.
+        self._columns = {name: self._rows[name] for name in (*table.names, "self_occluded", "left_image")}
+        self._columns["path_length_ratio"] = self._rows["path_length_ratio"]
+        self._traces = {run: RunTrace.of(table.trace(run)) for run in table.traces}
+        self.path: Path | None = table.path
+
+    @cached_property
+    def table(self) -> Mapping[str, npt.NDArray[Any]]:
+        """Columns (k,) of all runs, by name; laws as their caller calls them."""
+        found = {name: self._columns[name] for name in self._rows.table.names}
+        if "law" in found and self._names:
+            found["law"] = np.array([self._names.get(law, law) for law in found["law"].tolist()])
+        return found
+
+    @property
+    def traces(self) -> Mapping[int, RunTrace]:
+        """Traces that were kept, by the number of their run."""
+        return self._traces
+
+    def success(self) -> list[dict[str, Any]]:
+        """Return for each cell its values, ``runs``, ``successes``, ``success_rate`` and its interval.
+
+        ``success_interval`` is that of Wilson, of 95 %; ``quantiles`` are of runs that succeeded.
+        """
+        cells = ((self._rows.values(cell), of_runs(self._rows, these)) for cell, these in self._rows.cells())
+        return [self._named(values) | found for values, found in cells]
+
+    def paired(self, first: str | type, second: str | type) -> list[dict[str, Any]]:
+        """Return how two laws compare on the same tasks with the same noise, for each combination of values.
+
+        Parameters
+        ----------
+        first, second : laws of the sweep, by name or class.
+
+        Returns
+        -------
+        ``pairs``; ``both``, ``only`` (first, second) and ``neither`` succeeded; ``p_success`` of the exact
+        test of McNemar; ``median_difference`` first less second where both succeed, and ``p_difference`` of
+        the sign test, by measure.
+
+        Raises
+        ------
+        InputError
+            When the sweep has no such law.
+        """
+        known = {self._names.get(law, law): law for law in self._laws()}
+        asked = []
+        for law in (first, second):
+            name = law if isinstance(law, str) else law.__name__
+            if name not in known and name not in known.values():
+                raise InputError(f"paired: no law {name} in this sweep; laws: {', '.join(known)}")
+            asked.append(known.get(name, name))
+        found = paired(self._rows, asked)
+        return [one | {"laws": [self._names.get(law, law) for law in one["laws"]]} for one in found]
+
+    def to_frame(self) -> Any:
+        """Return the table as a pandas table; an InputError without pandas."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError("to_frame needs pandas: pip install '.[tables]'") from error
+        return pandas.DataFrame(dict(self.table))
+
+    def to_xarray(self) -> Any:
+        """Return the table as a Dataset over ``run``; an InputError without xarray."""
+        try:
+            import xarray
+        except ImportError as error:
+            raise InputError("to_xarray needs xarray: pip install '.[tables]'") from error
+        return xarray.Dataset(
+            {name: ("run", values) for name, values in self.table.items() if name != "run"},
+            {"run": self.table["run"]},
+        )
+
+    def summary(self) -> dict[str, str]:
+        """Return what there is to tell, in words, by name."""
+        cells = self.success()
+        told = {"runs": f"{len(self.table['run'])} in {len(cells)} cells"}
+        for cell in cells[:_SHOWN]:
+            low, high = cell["success_interval"]
+            values = ", ".join(f"{name} {cell[name]}" for name, _ in self._rows.axes)
+            told[values] = f"{cell['success_rate']:.1%} of {cell['runs']} succeed ({low:.1%} to {high:.1%})"
+        return told | ({"more": f"{len(cells) - _SHOWN} cells"} if len(cells) > _SHOWN else {})
+
+    def _laws(self) -> Sequence[str]:
+        return next((values for name, values in self._rows.axes if name == "law"), [])
+
+    def _named(self, values: dict[str, Any]) -> dict[str, Any]:
+        return values | ({"law": self._names.get(values["law"], values["law"])} if "law" in values else {})
+
+
+_SHOWN = 9  # cells that are printed
