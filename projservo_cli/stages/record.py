@@ -346,6 +346,8 @@ def observed(
             f"plant {config.plant.use} is calibrated from a table: record it, projservo record calibrate, or "
             "name one with --data"
         )
+    # A factor of commands to a robot that may do harm; what simulated trials show does not hang on it.
+    config = config.model_copy(update={"plant": config.plant.model_copy(update={"speed_scale": 1.0})})
     truth, sigma_px = truth_of(config), config.noise.calibration_px
     targets = trial_motions(config) if q is None else q
     drawn = seed_of_trials(config) if seed is None else seed, CALIBRATION_NOISE if q is None else POSE_NOISE

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
@@ -29,9 +29,25 @@ _PACE = (
     "control.joint_acceleration_limit_deg_s2",
     "control.prismatic_acceleration_limit_m_s2",
 )
-_RECORDING = (*(f"disturbance.{name}" for name in FAULTS), "plant.frames", "plant.settle_s")
+# Of trial motions that a simulated robot with faults, or before rendered cameras, is driven through.
+_DRIVEN = (
+    "control.period_s",
+    "control.joint_speed_limit_deg_s",
+    "control.prismatic_speed_limit_m_s",
+    *(
+        "plant.frames",
+        "plant.settle_s",
+        "plant.lag_s",
+        "plant.sag_deg",
+        "plant.lead_deg",
+        "plant.joint_limits",
+    ),
+)
 _DEPENDS_ON: dict[str, tuple[str, ...]] = {
-    "calibrate": ("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start", *_RECORDING),
+    "calibrate": (
+        *("seed", *_WORLD, "noise.calibration_px", "calibration", "data", "task.start"),
+        *(f"disturbance.{name}" for name in FAULTS),
+    ),
     "plan": (*_TASK, "trajectory", "control.observation", "plant.use", *_PACE),
     "servo": (*_TASK, "trajectory.delta", "control", "plant", "disturbance", "stop"),
     "report": ("report", "control.must_converge"),
@@ -61,7 +77,7 @@ class Step:
     key: str  # what the key of the result will be
     inputs: Mapping[str, str]  # files read and their hashes, and the hash of the source of a law of one's own
     why: str = ""  # why it has to be made; empty where the stored one is up to date
-    gone: bool = False  # whether the source of its law is not there any more
+    note: str = ""  # what changed that does not outdate it, in words
 
     @property
     def name(self) -> str:
@@ -71,7 +87,7 @@ class Step:
     @property
     def standing(self) -> str:
         """How a result stands that need not be made."""
-        return "up to date, though the source of its law is gone" if self.gone else "up to date"
+        return f"up to date, though {self.note}" if self.note else "up to date"
 
 
 def steps_for(
@@ -121,7 +137,9 @@ def key_of(config: Config, stage: str, **before: Any) -> str:
     """Hash of what a stage depends on: of the configuration, and of JSON values on what it is made from."""
     if config.plant.rendered is not None and stage in ("calibrate", "plan"):
         before["options"] = config.plant.rendered.model_dump()  # by which images look
-    return digest(config, _DEPENDS_ON[stage], without=_NOT_HASHED[stage], extra=before)
+    driven = stage == "calibrate" and not config.recorded and config.plant.simulated and not config.is_ideal
+    parts = (*_DEPENDS_ON[stage], *(_DRIVEN if driven else ()))
+    return digest(config, parts, without=_NOT_HASHED[stage], extra=before)
 
 
 def affects(key: str, stage: str) -> bool:
@@ -130,38 +148,54 @@ def affects(key: str, stage: str) -> bool:
     return any(part.startswith(f"{key}.") or f"{key}.".startswith(part) for part in parts)
 
 
-def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, tuple[Mapping[str, str], bool]]:
-    """What is read for the run of each law, by its name: the hash of its source, if it is one's own.
+class _Read(NamedTuple):
+    """What is read for a result beside the configuration and what it is made from."""
 
-    Beside it, whether that source is gone since; the stored hash stands then.
+    inputs: Mapping[str, str]  # files and their hashes, and hashes of sources of laws and robots of one's own
+    hashed: Mapping[str, str] = {}  # those of them that the key is of
+    note: str = ""  # what of it changed that does not outdate the result, in words
+
+
+def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
+    """What is read for the run of each law, by its name: sources of the law and the robot that are one's own.
+
+    Where the source of a law is gone since, the stored hash stands. Another source of a robot outdates
+    nothing: what it did cannot be done again.
     """
-    found: dict[str, tuple[Mapping[str, str], bool]] = {}
+    plant = "" if config.plant.simulated else config.plant.use or ""
+    robot = f"source of {plant}"
+    found: dict[str, _Read] = {}
     for law in names_of(laws, config.control.mode):
         name, stored = law_and_mode(law)[0], run.results.get(f"{SERVO}{law}")
-        source = source_hash(name) if ":" in name else ""
-        if ":" in name and not source and stored is not None:
-            found[law] = (stored.inputs, True)
-        else:
-            found[law] = ({f"source of {name}": source} if source else {}, False)
+        before = {} if stored is None else stored.inputs
+        own, note = source_hash(name) if ":" in name else "", ""
+        hashed = {f"source of {name}": own} if own else {}
+        if ":" in name and not own and stored is not None:
+            hashed = {key: value for key, value in before.items() if key != robot}
+            note = "the source of its law is gone"
+        inputs = dict(hashed)
+        if plant and (now := source_hash(plant)):
+            inputs[robot] = now
+        if robot in before and before[robot] != inputs.get(robot):
+            note = f"the source of {plant} {'changed' if robot in inputs else 'is gone'}"
+            inputs[robot] = before[robot]
+        found[law] = _Read(inputs, hashed, note)
     return found
 
 
 def _needed(
-    config: Config,
-    inputs: dict[str, str],
-    laws: Mapping[str, tuple[Mapping[str, str], bool]],
-    stages: Sequence[str],
+    config: Config, inputs: dict[str, str], laws: Mapping[str, _Read], stages: Sequence[str]
 ) -> Iterator[Step]:
     """Every result of the stages with its key, each made from those before."""
     before: list[str | None] = [inputs.get(f"{name}_sha256") for name in ("table", "init")]
     before += [inputs["mjcf_sha256"]] if "mjcf" in inputs else []
     for stage in stages:
         keys = []
-        of_none: Mapping[str, str] = inputs if stage == "calibrate" else {}
-        for law, (read, gone) in (laws if stage == "servo" else {"": (of_none, False)}).items():
-            own = {"source": read} if law and read else {}
+        of_files = {"": _Read(inputs if stage == "calibrate" else {})}
+        for law, read in (laws if stage == "servo" else of_files).items():
+            own = {"source": read.hashed} if read.hashed else {}
             keys.append(key_of(config, stage, before=before, law=law, **own))
-            yield Step(stage, law, keys[-1], read, gone=gone)
+            yield Step(stage, law, keys[-1], read.inputs, note=read.note)
         before = [*keys]
 
 
@@ -191,10 +225,10 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
     stored = run.results.get(step.name)
     if stored is None:
         return "none yet"
-    if step.law and stored.inputs != step.inputs:
-        return "the source of its law changed"
     if stored.key != step.key:
-        return "outdated"
+        law = f"source of {law_and_mode(step.law)[0]}"
+        other = step.law and stored.inputs.get(law) != step.inputs.get(law)
+        return "the source of its law changed" if other else "outdated"
     if step.law and stored.records[""].verdict == "failed":
         return "failed before"
     if remade:

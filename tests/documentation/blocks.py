@@ -95,8 +95,8 @@ def _near(a, b):
 def run_page(page, read):
     """Write the files of a page, run its commands and its Python, and compare the outputs it shows.
 
-    An output stands in a block of text right after the commands, and is part of what they print; ``read``
-    returns what was printed since it was last called. Returns the names that the Python of the page defines.
+    An output stands in a block of text right after commands or Python, and is part of what they print;
+    ``read`` returns what was printed since it was last called. Returns the names that the Python defines.
     """
     names = {}
     printed = ""
@@ -110,7 +110,9 @@ def run_page(page, read):
             run_commands(block.text)
             printed = read()
         elif block.language == "python":
+            read()
             exec(compile(block.text, page.name, "exec"), names)
+            printed = read()
         elif block.language == "text" and block.follows:
             assert matches(block.text, printed), printed
     return names

@@ -1,0 +1,390 @@
+"""The library: the same numbers as the command line, and the same sentences where something is wrong."""
+
+import dataclasses
+import importlib
+import json
+import os
+import pkgutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import projservo_cli as ps
+from projservo_cli import cli
+from projservo_cli.calibration import prediction_variance
+from projservo_cli.records import Calibration, Observation, Trace
+from projservo_cli.stages import calibrate
+from projservo_cli.stages.steps import key_of
+from projservo_cli.tables import read_table, write_table
+from tests.conftest import ROOT
+
+CONFIGS = ("apart", "coupled", "hobby", "paper", "seven", "stanford", "ur5")
+LATE = {"disturbance.delay_s": 0.1, "disturbance.lag_s": 0.05}
+FEW = {"calibration.frames_per_joint": 3, "calibration.random_poses": 6}
+
+
+class Resolved:
+    """A law of one's own: the stacked interaction matrix at the predicted images."""
+
+    gain = 2.0
+
+    def __init__(self, setup):
+        self.setup = setup
+
+    def __call__(self, s, q):
+        J = self.setup.calibration.jacobian(q)[:, self.setup.face].reshape(-1, len(q))
+        error = (s - self.setup.s_star).ravel()
+        return -self.gain * np.linalg.lstsq(J, error, rcond=None)[0]
+
+
+@pytest.fixture(scope="module")
+def config():
+    return ps.Config.load("ur5").replace({"control": {"laws": ["exact"]}})
+
+
+@pytest.fixture(scope="module")
+def made(config):
+    """Observations, calibration and plan of a configuration."""
+    observations = ps.simulate(config)
+    calibration = ps.calibrate(observations)
+    return observations, calibration, ps.plan(config, calibration)
+
+
+def alike(first, second, kind):
+    """Whether records are equal to the bit but for the time they took."""
+    for one in dataclasses.fields(kind):
+        a, b = getattr(first, one.name), getattr(second, one.name)
+        if one.name != "seconds":
+            np.testing.assert_array_equal(np.array(a), np.array(b), err_msg=one.name)
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_calibration_from_python_is_that_of_the_chain(name):
+    config = ps.Config.load(name).replace(FEW)
+    seen, chained, _ = calibrate.run(config)
+    observations = ps.simulate(config)
+    alike(observations, seen, Observation)
+    alike(ps.calibrate(observations, lens=config.calibration.lens), chained, Calibration)
+
+
+def test_joint_noise_is_estimated_where_the_chain_estimates_it():
+    config = ps.Config.load("ur5").replace({"disturbance.play_deg": 0.1})
+    seen = ps.simulate(config)
+    assert seen.joint_noise is None
+    assert not seen.exact
+    # half of the play, evenly spread: 0.05/√3 deg rms at most, and never none
+    assert 0.005 < np.degrees(ps.calibrate(seen).sigma_q) < 0.05
+
+
+def test_poses_have_noise_of_their_own_and_may_have_none(config, made):
+    q = made[0].q
+    first, second = ps.simulate(config, q), ps.simulate(config, q, seed=7)
+    exact = ps.simulate(config, q, noise_px=0.0)
+    assert not np.array_equal(first.images, made[0].images)
+    for seen in (first, second):
+        noise = (seen.images - exact.images)[np.isfinite(seen.images)]
+        assert noise.std() == pytest.approx(0.5, rel=0.1)  # 1,960 of them: 1.6 %
+    np.testing.assert_array_equal(ps.simulate(config, q, seed=7).images, second.images)
+    noises = [(seen.images - exact.images).ravel() for seen in (first, second)]
+    assert abs(np.corrcoef(noises)[0, 1]) < 0.1
+
+
+def test_a_score_is_that_of_validate(config, made, tmp_path, capsys):
+    observations, calibration, _ = made
+    held_out = ps.simulate(config, observations.q[:9] + 0.05)
+    write_table(held_out, tmp_path / "held.csv")
+    run = ps.Experiment(config, tmp_path / "run").make("calibrate")
+    assert cli.run(["validate", str(tmp_path / "run"), "--data", str(tmp_path / "held.csv"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert calibration.score(held_out) == {key: value for key, value in told.items() if key != "run"}
+    table = ps.Observations.from_frame(str(tmp_path / "held.csv"))
+    assert calibration.score(table) == run.calibration.score(held_out)
+
+
+def test_deviations_are_those_of_the_covariance(made):
+    observations, calibration, _ = made
+    pixels, sigma = calibration.predict(observations.q[:3], return_std=True)
+    np.testing.assert_array_equal(pixels, calibration.predict(observations.q[:3]))
+    np.testing.assert_allclose(sigma**2, prediction_variance(calibration, observations.q[:3]), rtol=1e-12)
+    C = calibration.covariance()
+    size = calibration.P.size + calibration.H_hat_0.size + calibration.M.size
+    assert C.shape == (size, size)
+    # Differences of the prediction by each parameter, at steps whose square is below what is compared.
+    rng, q = np.random.default_rng(0), calibration.q_reference
+    way = rng.standard_normal(size) * 1e-7 * np.sqrt(np.diag(C)).max()
+    parts = np.split(way, np.cumsum([calibration.P.size, calibration.H_hat_0.size]))
+    moved = dataclasses.replace(
+        calibration,
+        P=calibration.P + parts[0].reshape(calibration.P.shape),
+        H_hat_0=calibration.H_hat_0 + parts[1].reshape(calibration.H_hat_0.shape),
+        M=calibration.M + parts[2].reshape(calibration.M.shape),
+    )
+    assert np.isfinite(moved.predict(q)).all()
+
+
+def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):
+    _, calibration, plan = made
+    same = ps.plan(config, calibration, q_start=plan.q_start)
+    np.testing.assert_array_equal(same.s, plan.s)
+    by_images = ps.plan(config, calibration, goal=plan.s_star)
+    # By the four points of the face alone, from images of 0.5 px, not by the body of ten.
+    np.testing.assert_allclose(by_images.theta_s, plan.theta_s, atol=5e-3)
+    taught = {"images": {side: plan.s_star[i].tolist() for i, side in enumerate(("left", "right"))}}
+    (tmp_path / "goal.yaml").write_text(json.dumps(taught), encoding="utf-8")
+    for goal in (taught, str(tmp_path / "goal.yaml")):
+        np.testing.assert_array_equal(ps.plan(config, calibration, goal=goal).s, by_images.s)
+    joints = calibration.q_reference + 0.05
+    assert ps.plan(config, calibration, goal=joints).feasible
+
+
+def test_a_trace_is_that_of_the_chain_and_of_a_class_like_that_of_its_name(config, made):
+    _, calibration, plan = made
+    run = ps.Experiment(config).make("servo")
+    alike(ps.servo(config, calibration, plan), run.traces["exact"], Trace)
+    own = ps.servo(config, calibration, plan, law=Resolved)
+    named = ps.servo(config, calibration, plan, law=f"{__name__}:Resolved")
+    alike(own, named, Trace)
+    assert own.law == f"{__name__}:Resolved"
+    assert own.verdict == "converged"
+    lazy = ps.servo(config, calibration, plan, law=lambda setup: lambda s, q: 0.0 * q)
+    assert lazy.verdict == "plateau"
+
+
+def test_a_robot_at_hand_is_recorded_and_driven(made):
+    from tests.foreign.robots import Sound
+
+    config = ps.Config.load("ur5").replace({"plant.settle_s": 0.3, "noise.servo_px": 0.5, **FEW})
+    path = ROOT / "configs" / "ur5.yaml"
+    observations = ps.record(config, robot=Sound(path))
+    assert observations.source == "recorded"
+    assert len(observations.at_rest.pose) == 1 + 6 * 3 + 6
+    calibration = ps.calibrate(observations, noise_px=0.5)
+    assert calibration.usable
+    trace = ps.servo(config, calibration, ps.plan(config, calibration), robot=Sound(path))
+    assert trace.verdict == "converged"
+    with pytest.raises(ps.InputError, match=r"lacks open\(\), read\(\)"):
+        ps.record(config, robot=object())
+
+
+def test_a_sweep_in_memory_compares_classes_and_laws(config):
+    class Slow(Resolved):
+        gain = 0.5
+
+    studies = [ps.sweep(config, laws=[Slow, Resolved, "exact"], tasks=4, seed=3) for _ in range(2)]
+    for name, values in studies[0].table.items():
+        np.testing.assert_array_equal(values, studies[1].table[name])
+    study = studies[0]
+    assert study.path is None
+    assert [cell["law"] for cell in study.success()] == ["Slow", "Resolved", "exact"]
+    low, high = study.success()[2]["success_interval"]
+    assert 0.0 <= low <= study.success()[2]["success_rate"] <= high <= 1.0
+    (pair,) = study.paired(Slow, "exact")
+    assert pair["laws"] == ["Slow", "exact"]
+    assert pair["both"] + sum(pair["only"]) + pair["neither"] == pair["pairs"] == 4
+    with pytest.raises(ps.InputError, match="no law direct_two in this sweep; laws: Slow, Resolved, exact"):
+        study.paired("direct_two", "exact")
+    with pytest.raises(ps.InputError, match=r"other processes cannot import .*Slow: put it into a module"):
+        ps.sweep(config, laws=[Slow], tasks=4, workers=2)
+    assert set(study.to_frame().columns) == set(study.table)
+
+
+def test_a_sweep_in_a_folder_is_continued_but_never_that_of_a_class_without_source(config, tmp_path):
+    first = ps.sweep(config, laws=["exact"], runs=3, path=tmp_path / "sweep")
+    done = (tmp_path / "sweep" / "sweep.h5").stat().st_mtime_ns
+    again = ps.load(tmp_path / "sweep")
+    np.testing.assert_array_equal(first.table["steps"], again.table["steps"])
+    ps.sweep(config, laws=["exact"], runs=3, path=tmp_path / "sweep")
+    assert (tmp_path / "sweep" / "sweep.h5").stat().st_mtime_ns == done
+    with pytest.raises(ps.InputError, match="of another configuration"):
+        ps.sweep(config, laws=["exact"], runs=4, path=tmp_path / "sweep")
+
+
+SCRIPT = """
+import numpy as np
+import projservo_cli as ps
+
+class Law:
+    def __init__(self, setup):
+        self.setup = setup
+
+    def __call__(self, s, q):
+        return 0.0 * q
+
+{guard}
+    study = ps.sweep(ps.Config.load("ur5"), laws=[Law], runs=2, tasks=2, workers=2)
+    print(study.table["verdict"].tolist())
+"""
+
+
+def test_a_script_is_told_of_the_guard_it_lacks_and_its_classes_work_with_one(tmp_path):
+    def answer(guard):
+        (tmp_path / "study.py").write_text(SCRIPT.format(guard=guard), encoding="utf-8")
+        command = [sys.executable, "study.py"]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        return subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
+
+    lacking = answer("if True:")
+    assert 'put its calls under if __name__ == "__main__":' in lacking.stderr.splitlines()[-1]
+    assert answer('if __name__ == "__main__":').stdout == "['plateau', 'plateau']\n"
+
+
+def test_an_experiment_is_made_once_resumed_and_opened_again(config, tmp_path):
+    run = ps.Experiment(config, tmp_path / "run").make("plan")
+    keys = {name: result.key for name, result in run.results.items()}
+    again = ps.Experiment(config, tmp_path / "run").make("servo")
+    assert {name: again.results[name].key for name in keys} == keys
+    np.testing.assert_array_equal(again.calibration.P, run.calibration.P)
+    assert ps.load(tmp_path / "run").traces["exact"].verdict == "converged"
+    with pytest.raises(ps.InputError, match="give Experiment a path"):
+        ps.Experiment(config).make("report")
+    with pytest.raises(ps.InputError, match="no such stage; stages: calibrate, plan, servo, report"):
+        run.make("prepare")
+
+
+def test_what_was_finished_is_kept_where_a_stage_fails(config, tmp_path):
+    goal = {"turn_deg": None, "perturbation": None, "joints": {"joints": [9] * 6}}
+    far = config.replace({"task": {"goal": goal}})
+    run = ps.Experiment(far, tmp_path / "run")
+    with pytest.raises(ps.WorkFailed, match=r"plan: task.goal: joint 1 would be at 9 rad, beyond its limits"):
+        run.make("servo")
+    assert list(run.results) == ["calibrate"]
+    assert list(ps.load(tmp_path / "run").results) == ["calibrate"]
+
+
+def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
+    named = config.replace({"control.laws": [f"{__name__}:Resolved"]})
+    ps.Experiment(named, tmp_path / "run").make("plan")
+    with pytest.raises(ps.InputError, match="is named by the stored run alone, which starts no code"):
+        ps.load(tmp_path / "run").make("servo")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda c: ps.Config.load("ur6"), r"ur6: no file, and no shipped configuration; did you mean ur5\?"),
+        (lambda c: c.replace({"control": {"gian_t": 1}}), "control.gian_t: unknown key; did you mean gain_t"),
+        (
+            lambda c: c.replace({"control.gain_t": -1.0}),
+            "control.gain_t=-1.0: control.gain_t: must be",
+        ),
+        (lambda c: ps.simulate(c, np.zeros((2, 5))), r"q of shape \(2, 5\): expected \(K, 6\), rad or m"),
+        (lambda c: ps.simulate(c, np.full((1, 6), np.nan)), "q: holds a number that is not finite"),
+        (lambda c: ps.simulate(c, np.full((1, 6), 90.0)), "q: pose 0: joint 1 would be at 90 rad, beyond"),
+        (lambda c: ps.calibrate(np.zeros(3)), "observations of type ndarray; make them with"),
+        (
+            lambda c: ps.calibrate(ps.simulate(c), method="best"),
+            "method: 'best' is not one of them",
+        ),
+        (
+            lambda c: ps.calibrate(ps.simulate(c), lens="yes"),
+            "calibration.lens='yes': calibration.lens: ",
+        ),
+        (lambda c: ps.load("configs/ur5.yaml"), "a configuration, which Config.load reads"),
+        (lambda c: ps.sweep(c, laws=[]), "sweep: name one law or more"),
+        (lambda c: ps.sweep(c, laws=["best"]), "law best: no such law; laws: direct_three"),
+        (lambda c: ps.sweep(c, laws=["exact"], grid={"noise.servo": [0]}), "noise.servo: unknown key"),
+    ],
+)
+def test_what_makes_no_sense_is_said_in_a_sentence(config, call, message):
+    with pytest.raises(ps.InputError, match=message):
+        call(config)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"q": np.zeros((3, 6))}, r"q of shape \(3, 6\): expected \(4, n\)"),
+        ({"pixels": np.zeros((4, 3, 2))}, r"pixels of shape \(4, 3, 2\): expected \(K, 2, m, 2\)"),
+        ({"pixels": "here"}, "pixels: no array of numbers"),
+        ({"q": np.full((4, 6), 90.0)}, "they look like degrees; give joint_unit='deg'"),
+        ({"joint_types": "RRR"}, "joint_types: 'RRR': expected 6 letters R or P"),
+        ({"marker": [1, 1, 2]}, "marker: expected 3 different whole numbers"),
+        ({"sigma": np.zeros((4, 2, 3))}, "sigma: must be positive wherever a marker is seen"),
+    ],
+)
+def test_arrays_that_make_no_sense_are_refused(change, message):
+    given = {"q": np.zeros((4, 6)), "pixels": np.ones((4, 2, 3, 2))} | change
+    with pytest.raises(ps.InputError, match=message):
+        ps.Observations.from_arrays(given.pop("q"), given.pop("pixels"), **given)
+
+
+def test_arrays_tables_and_frames_hold_the_same(made, tmp_path):
+    observations = made[0]
+    order = np.random.default_rng(0).permutation(len(observations.marker))
+    shuffled = ps.Observations.from_arrays(
+        observations.q, observations.images[:, :, order], marker=observations.marker[order]
+    )
+    write_table(observations, tmp_path / "table.csv")
+    table = read_table(tmp_path / "table.csv")
+    tables = tmp_path / "table.csv", observations.to_frame(), dict(observations.to_frame())
+    for one in (shuffled, *map(ps.Observations.from_frame, tables)):
+        alike(one, table, Observation)
+    q, pixels = np.degrees(observations.q), observations.images
+    degrees = ps.Observations.from_arrays(q, pixels, joint_unit="deg")
+    np.testing.assert_allclose(degrees.q, observations.q, atol=1e-12)
+    with pytest.raises(ps.InputError, match=r"table:1: the header lacks the column\(s\) marker"):
+        ps.Observations.from_frame(observations.to_frame().drop(columns="marker"))
+
+
+def test_results_print_themselves_in_few_lines(config, made):
+    _, calibration, plan = made
+    study = ps.sweep(config, laws=["exact"], runs=2, grid={"noise.servo_px": [k / 10 for k in range(15)]})
+    trace = ps.servo(config, calibration, plan)
+    for one in (*made, trace, study, config, ps.Experiment(config)):
+        assert len(repr(one).splitlines()) <= 12
+        assert max(map(len, repr(one).splitlines())) <= 200
+    for one in (*made, trace, study):
+        assert one._repr_html_().startswith("<table>")
+
+
+def test_labelled_arrays_are_the_group_of_the_run_file(config, made, tmp_path):
+    xarray = pytest.importorskip("xarray")
+    run = ps.Experiment(config, tmp_path / "run").make("servo")
+    stored = xarray.load_dataset(tmp_path / "run" / "run.h5", engine="h5netcdf", group="servo/exact")
+    labelled = run.traces["exact"].to_xarray()
+    coordinates = {"time", "joint", "view", "xy"}
+    xarray.testing.assert_equal(labelled.drop_vars(coordinates), stored)
+    assert labelled.attrs.items() <= stored.attrs.items()
+    assert labelled["time"].values[:2].tolist() == [0.0, config.control.period_s]
+    np.testing.assert_array_equal(labelled["s"].sel(view="right", xy="v"), labelled["s"][:, 1, :, 1])
+    assert run.calibration.to_xarray()["M"].sel(marker=3).shape == (4,)
+    assert made[0].to_xarray()["q"].sel(joint="q2").shape == (49,)
+
+
+def test_no_public_name_is_hidden_by_a_module():
+    names = [name for name in ps.__all__ if name != "__version__"]
+    before = {name: getattr(ps, name) for name in names}
+    for module in pkgutil.iter_modules(ps.__path__):
+        importlib.import_module(f"projservo_cli.{module.name}")
+    assert {name: getattr(ps, name) for name in names} == before
+    assert set(dir(ps)) >= set(names)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "same"),
+    [
+        ("hobby", {"control.period_s": 0.1}, False),
+        ("hobby", {"control.joint_speed_limit_deg_s": 30.0}, False),
+        ("hobby", {"plant.speed_scale": 0.5}, True),
+        ("hobby", {"plant.timeout_s": 3.0}, True),
+        ("ur5", {"control.period_s": 0.02}, True),
+        ("ur5", {"plant.settle_s": 1.0}, True),
+        ("ur5", {"noise.calibration_px": 0.4}, False),
+    ],
+)
+def test_a_calibration_stands_where_nothing_changed_that_it_is_made_from(name, change, same):
+    before = ps.Config.load(name).replace(LATE if name == "hobby" else {})
+    after = before.replace(change)
+    assert (key_of(before, "calibrate") == key_of(after, "calibrate")) is same
+
+
+@pytest.mark.parametrize("change", [{"control.period_s": 0.08}, {"plant.speed_scale": 0.5}])
+def test_what_is_in_no_key_changes_nothing_and_what_changes_something_is_in_one(change):
+    before = ps.Config.load("hobby").replace(FEW | LATE)
+    after = before.replace(change)
+    same = np.array_equal(ps.simulate(before).images, ps.simulate(after).images, equal_nan=True)
+    assert (key_of(before, "calibrate") == key_of(after, "calibrate")) is same
