@@ -21,6 +21,7 @@ from projservo_cli.records import (
 )
 from projservo_cli.shown import Shown
 
+_AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
 
 
@@ -96,7 +97,9 @@ class ImageModel(Shown, Calibration):
             If the readings have another number of joints or are not finite.
         """
         rows, single = self._rows(q)
-        J = joint_derivative(self, rows)
+        parts = range(0, len(rows), _AT_ONCE)
+        J = np.concatenate([joint_derivative(self, rows[k : k + _AT_ONCE]) for k in parts])
+        J[np.isnan(predict(self, rows)[..., 0])] = np.nan
         return J[0] if single else J
 
     def score(self, observation: Observation) -> dict[str, Any]:

@@ -61,7 +61,7 @@ def test_commands_that_run_laws_and_what_is_read_from_python(folder, first_chain
         exec(compile(block, "README.md", "exec"), names)
     assert "converged" in capsys.readouterr().out
     assert names["pixels"].shape == (2, 10, 2)
-    assert np.isfinite(names["rates"]).all()
+    assert np.isfinite(names["sigma"]).all()
 
 
 @pytest.mark.volume

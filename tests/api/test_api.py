@@ -111,17 +111,32 @@ def test_deviations_are_those_of_the_covariance(made):
     C = calibration.covariance()
     size = calibration.P.size + calibration.H_hat_0.size + calibration.M.size
     assert C.shape == (size, size)
-    # Differences of the prediction by each parameter, at steps whose square is below what is compared.
-    rng, q = np.random.default_rng(0), calibration.q_reference
-    way = rng.standard_normal(size) * 1e-7 * np.sqrt(np.diag(C)).max()
-    parts = np.split(way, np.cumsum([calibration.P.size, calibration.H_hat_0.size]))
-    moved = dataclasses.replace(
-        calibration,
-        P=calibration.P + parts[0].reshape(calibration.P.shape),
-        H_hat_0=calibration.H_hat_0 + parts[1].reshape(calibration.H_hat_0.shape),
-        M=calibration.M + parts[2].reshape(calibration.M.shape),
-    )
-    assert np.isfinite(moved.predict(q)).all()
+    # To first order, sigma² = J C Jᵀ: differences of predictions by each parameter, central, at a step of
+    # 1e-6 of its deviation, of which rounding takes 1e-13 / 1e-6 of a deviation.
+    kinds = {"P": calibration.P, "H_hat_0": calibration.H_hat_0, "M": calibration.M}
+    q, step = observations.q[7], 1e-4 * np.sqrt(np.diag(C).max())
+    columns = []
+    for name, values in kinds.items():
+        for k in range(values.size):
+            ends = []
+            for sign in (1.0, -1.0):
+                changed = values.copy()
+                changed.flat[k] += sign * step
+                ends.append(dataclasses.replace(calibration, **{name: changed}).predict(q).ravel())
+            columns.append((ends[0] - ends[1]) / (2.0 * step))
+    J = np.array(columns).T
+    sigma = calibration.predict(q, return_std=True)[1].ravel()
+    np.testing.assert_allclose(np.sqrt(((J @ C) * J).sum(axis=1)), sigma, rtol=1e-3)
+
+
+def test_what_is_behind_a_camera_has_no_pixels_and_no_derivative(made):
+    calibration = made[1]
+    turned = dataclasses.replace(calibration, P=calibration.P * np.array([1.0, -1.0])[:, None, None])
+    q = made[0].q[:3]
+    np.testing.assert_array_equal(turned.predict(q)[:, 0], calibration.predict(q)[:, 0])
+    np.testing.assert_array_equal(turned.jacobian(q)[:, 0], calibration.jacobian(q)[:, 0])
+    assert np.isnan(turned.predict(q)[:, 1]).all()
+    assert np.isnan(turned.jacobian(q)[:, 1]).all()
 
 
 def test_a_plan_takes_joints_pixels_and_what_was_taught(config, made, tmp_path):

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
+import projservo_cli as ps
 from projservo_cli.loop.compiled import run_compiled
 from projservo_cli.records import LAWS
 from projservo_cli.stages import bench
@@ -51,6 +52,21 @@ def test_a_whole_run(benchmark, case):
     least = min(timeit(lambda: run_compiled(*job), number=1) for _ in range(20))
     benchmark.extra_info["run_150_ms"] = 1e3 * least
     assert least < 0.01
+
+
+def test_derivatives_of_many_poses_cost_a_few_times_their_predictions(benchmark):
+    config = ps.Config.load("ur5")
+    calibration = ps.calibrate(ps.simulate(config))
+    turns = np.random.default_rng(0).uniform(-0.3, 0.3, (10_000, 6))
+    q = calibration.q_reference + turns
+    benchmark.pedantic(calibration.jacobian, args=(q,), rounds=3)
+    rounds = [
+        (timeit(lambda: calibration.jacobian(q), number=1), timeit(lambda: calibration.predict(q), number=1))
+        for _ in range(5)
+    ]
+    jacobian, predict = np.min(rounds, axis=0)
+    benchmark.extra_info["jacobian_over_predict"] = jacobian / predict
+    assert jacobian < 30.0 * predict
 
 
 def test_the_table_holds_every_law_and_ratios_to_the_svd(case):

@@ -156,11 +156,6 @@ def check_law(folder, names, read):
     assert projservo_cli.load("results/law").traces["my_laws:Damped"].verdict == "converged"
 
 
-def check_api(folder, names, read):
-    assert names["rates"].shape == (2, 10, 2, 6)
-    np.testing.assert_allclose(names["same"], names["pixels"], atol=1e-9)  # px, of a thousand
-
-
 def check_guidance(folder, names, read):
     """The points keep the limits, and lead from the start to the goal as the true cameras see it."""
     config = load_config(folder / "configs" / "paper.yaml")
@@ -207,7 +202,6 @@ CHECK = {
     "commands": check_commands,
     "law": check_law,
     "report": check_report,
-    "api": check_api,
     "guidance": check_guidance,
     "rendered": check_rendered,
     "robot": check_robot,

@@ -13,9 +13,11 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import yaml
 
@@ -89,9 +91,23 @@ def numbers_of(name: str, folder: Path) -> dict[str, Any]:
             print(f"{name}: {done.stderr.strip()[-300:]}", file=sys.stderr)
             continue
         found |= of_json(json.loads(done.stdout), f"command{i}")
-    for path in sorted((folder / name).rglob("*.h5")):
-        found |= of_file(path, path.relative_to(folder / name).as_posix())
+    for place, path in files_of(folder / name):
+        found |= of_file(path, place)
     return {key: plain(value, folder) for key, value in found.items()}
+
+
+def files_of(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Run files of a chain and their names; calibrations of sweeps, whose files keys name, are counted."""
+    kept = sorted((folder / "calibrations").glob("*.h5"), key=calibrated)
+    for path in sorted(folder.rglob("*.h5")):
+        place = path.relative_to(folder).as_posix()
+        yield f"calibrations/{kept.index(path)}" if path in kept else place, path
+
+
+def calibrated(path: Path) -> str:
+    """The configuration that a calibration was made with, less what hangs on the folder."""
+    with h5py.File(path) as file:
+        return str(file["calibrate"].attrs["configuration"]).replace(str(ROOT), "")
 
 
 def make(folder: Path, names: list[str], keep: bool) -> int:
