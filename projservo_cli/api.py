@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.control import CODES
-from projservo_cli.experiment import Experiment, compilation, law_target, listening
+from projservo_cli.experiment import Experiment, compilation, law_target, listening, scene_of
 from projservo_cli.files import working_in
 from projservo_cli.observations import Observations, rows_of
 from projservo_cli.records import REPLAN, Calibration, InputError, Plan, law_and_mode, name_of
@@ -212,7 +212,8 @@ def calibrate(
         seen = replace(seen, seed=settings.seed)
     asked = calibrating.Estimation(settings.method, settings.lens, settings.init, settings.cross_validate)
     with listening(progress) as listener:
-        return ImageModel.of(*calibrating.estimate(seen, asked, progress=listener.progress))
+        made = calibrating.estimate(seen, asked, progress=listener.progress)
+        return ImageModel.of(*made, seen.record)
 
 
 def plan(
@@ -254,7 +255,7 @@ def plan(
     joints = None
     if asked.plant.simulated and not described:
         joints = joints_of(asked, calibration.joint_types, calibration)
-    return MotionPlan.of(planning.run(asked, calibration, joints))
+    return MotionPlan.of(planning.run(asked, calibration, joints), scene_of(asked, calibration))
 
 
 def servo(
@@ -301,7 +302,8 @@ def servo(
     _say_compilation()
     assert isinstance(name, str)
     given = driving.Given(factory, robot)
-    return RunTrace.of(driving.run(asked, calibration, plan, name_of(name, mode), given))
+    trace = driving.run(asked, calibration, plan, name_of(name, mode), given)
+    return RunTrace.of(trace, asked.face_numbers)
 
 
 def sweep(

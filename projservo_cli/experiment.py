@@ -10,12 +10,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from projservo_cli.config import Config, load_config, shipped, to_yaml
 from projservo_cli.control import CODES
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
 from projservo_cli.progress import Bar
 from projservo_cli.records import (
+    Calibration,
     CrossValidation,
     InputError,
     Observation,
@@ -23,10 +26,11 @@ from projservo_cli.records import (
     WorkFailed,
     law_and_mode,
 )
-from projservo_cli.results import ImageModel, MotionPlan, RunTrace
+from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress
 from projservo_cli.stages.steps import STAGES, Step, result_of, steps_for
+from projservo_cli.stages.world import joints_of
 from projservo_cli.store import SERVO, Result, Run, load, run_path, save
 
 FIGURES = "figures"  # folder of a run in which a killed report may have left something
@@ -337,7 +341,8 @@ class Experiment:
     @property
     def calibration(self) -> ImageModel:
         """The calibration, with functions that predict images."""
-        return ImageModel.of(self._run.calibration, self._run.cross_validation)
+        run = self._run
+        return ImageModel.of(run.calibration, run.cross_validation, run.observation)
 
     @property
     def cross_validation(self) -> CrossValidation | None:
@@ -347,12 +352,13 @@ class Experiment:
     @property
     def plan(self) -> MotionPlan:
         """The plan."""
-        return MotionPlan.of(self._run.plan)
+        return MotionPlan.of(self._run.plan, scene_of(self.config, self._run.calibration))
 
     @property
     def traces(self) -> dict[str, RunTrace]:
         """Traces of the runs of laws, by name."""
-        return {name: RunTrace.of(trace) for name, trace in self._run.traces.items()}
+        face = self.config.face_numbers
+        return {name: RunTrace.of(trace, face) for name, trace in self._run.traces.items()}
 
     @property
     def report(self) -> Report:
@@ -366,6 +372,19 @@ class Experiment:
         place = "in memory" if self._in_memory else str(self._run.path)
         made = ", ".join(self._run.results) or "nothing made yet"
         return f"Experiment ({place}): {made}"
+
+
+def scene_of(config: Config, calibration: Calibration) -> Scene:
+    """What plans of a configuration are drawn in."""
+    joints = joints_of(config, calibration.joint_types, calibration)
+    size = config.image_size_px
+    return Scene(
+        calibration.model(),
+        joints.lower,
+        joints.upper,
+        None if size is None else np.array(size, dtype=np.float64),
+        config.trajectory,
+    )
 
 
 def _stored(path: "str | Path | None") -> Run:

@@ -2,19 +2,21 @@
 
 import dataclasses
 import math
-from typing import Any, Literal, Self, overload
+from typing import Any, Literal, NamedTuple, Self, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.calibration import predict, prediction_variance, residual_statistics
 from projservo_cli.calibration.prediction import error_factor, joint_derivative
+from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.kinematics import project as pixels_of
 from projservo_cli.records import (
     Calibration,
     CrossValidation,
     FloatArray,
     InputError,
+    Model,
     Observation,
     Plan,
     Trace,
@@ -38,13 +40,39 @@ class ImageModel(Shown, Calibration):
     """
 
     cross_validation: CrossValidation | None = None  # held-out errors, where they were asked for
+    observation: Observation | None = None  # what it was made from, where that is at hand
 
     @classmethod
-    def of(cls, calibration: Calibration, cross_validation: CrossValidation | None = None) -> "ImageModel":
+    def of(
+        cls,
+        calibration: Calibration,
+        cross_validation: CrossValidation | None = None,
+        observation: Observation | None = None,
+    ) -> "ImageModel":
         """Return a record with its functions."""
         if isinstance(calibration, cls):
             return calibration
-        return cls(**_fields_of(calibration, Calibration), cross_validation=cross_validation)
+        return cls(
+            **_fields_of(calibration, Calibration), cross_validation=cross_validation, observation=observation
+        )
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw what the calibration leaves of the images, and what the data determine, as the report does.
+
+        Parameters
+        ----------
+        ax : axes in whose place the figure is shown; by default a figure of its own is returned.
+
+        Raises
+        ------
+        InputError
+            When the observations that it was made from are not at hand.
+        """
+        if self.observation is None:
+            raise InputError("plot: the observations that the calibration was made from are not at hand")
+        from projservo_cli.report import plots  # so that those who draw nothing need not import all figures
+
+        return plots.placed(plots.of_calibration(self, self.observation, self.cross_validation), ax)
 
     @overload
     def predict(self, q: npt.ArrayLike, *, return_std: Literal[False] = False) -> FloatArray: ...
@@ -188,14 +216,44 @@ class ImageModel(Shown, Calibration):
         return np.atleast_2d(readings), readings.ndim == 1
 
 
+class Scene(NamedTuple):
+    """What a plan is drawn in."""
+
+    model: Model  # as calibrated
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: (n,) limits, rad or m, infinite where none is set
+    image_size: FloatArray | None  # (2,) px; None where unknown
+    trajectory: Trajectory  # what was asked for
+
+
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class MotionPlan(Shown, Plan):
     """A plan that shows itself."""
 
+    scene: Scene | None = None  # what it is drawn in, where that is at hand
+
     @classmethod
-    def of(cls, plan: Plan) -> Self:
+    def of(cls, plan: Plan, scene: Scene | None = None) -> Self:
         """Return a record with its functions."""
-        return plan if isinstance(plan, cls) else cls(**_fields_of(plan, Plan))
+        return plan if isinstance(plan, cls) else cls(**_fields_of(plan, Plan), scene=scene)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the motion in both images, its joints and its margins over time, as the report does.
+
+        Parameters
+        ----------
+        ax : axes in whose place the figure is shown; by default a figure of its own is returned.
+
+        Raises
+        ------
+        InputError
+            When the calibration that it was made with is not at hand.
+        """
+        if self.scene is None:
+            raise InputError("plot: the calibration that the plan was made with is not at hand")
+        from projservo_cli.report import plots
+
+        return plots.placed(plots.of_plan(self, self.scene), ax)
 
     def summary(self) -> dict[str, str]:
         """Return what there is to tell, in words, by name."""
@@ -214,15 +272,29 @@ class MotionPlan(Shown, Plan):
 class RunTrace(Shown, Trace):
     """A trace that shows itself."""
 
+    face: tuple[int, ...] = ()  # numbers of the markers of the face, where they are known
+
     @classmethod
-    def of(cls, trace: Trace) -> Self:
+    def of(cls, trace: Trace, face: tuple[int, ...] = ()) -> Self:
         """Return a record with its functions."""
-        return trace if isinstance(trace, cls) else cls(**_fields_of(trace, Trace))
+        return trace if isinstance(trace, cls) else cls(**_fields_of(trace, Trace), face=face)
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw the image errors of the markers over time, as the report does.
+
+        Parameters
+        ----------
+        ax : axes in whose place the figure is shown; by default a figure of its own is returned.
+        """
+        from projservo_cli.report import plots
+
+        return plots.placed(plots.of_trace(self, self.face), ax)
 
     def coordinates(self) -> dict[str, Any]:
         """Return coordinates of dimensions, by their names; ``time`` in s of every instant."""
         time = ("instant", self.period * np.arange(len(self.q)), {"units": "s"})
-        return super().coordinates() | {"time": time}
+        face = {"marker": list(self.face)} if self.face else {}
+        return super().coordinates() | {"time": time} | face
 
     def summary(self) -> dict[str, str]:
         """Return what there is to tell, in words, by name."""

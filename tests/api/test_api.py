@@ -361,13 +361,30 @@ def test_labelled_arrays_are_the_group_of_the_run_file(config, made, tmp_path):
     run = ps.Experiment(config, tmp_path / "run").make("servo")
     stored = xarray.load_dataset(tmp_path / "run" / "run.h5", engine="h5netcdf", group="servo/exact")
     labelled = run.traces["exact"].to_xarray()
-    coordinates = {"time", "joint", "view", "xy"}
+    coordinates = {"time", "joint", "marker", "view", "xy"}
     xarray.testing.assert_equal(labelled.drop_vars(coordinates), stored)
     assert labelled.attrs.items() <= stored.attrs.items()
     assert labelled["time"].values[:2].tolist() == [0.0, config.control.period_s]
     np.testing.assert_array_equal(labelled["s"].sel(view="right", xy="v"), labelled["s"][:, 1, :, 1])
     assert run.calibration.to_xarray()["M"].sel(marker=3).shape == (4,)
     assert made[0].to_xarray()["q"].sel(joint="q2").shape == (49,)
+
+
+def test_results_draw_the_figures_of_the_report(config, made):
+    from matplotlib.figure import Figure
+
+    _, calibration, plan = made
+    trace = ps.servo(config, calibration, plan)
+    for one, panels in ((calibration, 6), (plan, 4), (trace, 2)):
+        figure = one.plot()
+        assert len(figure.axes) >= panels
+        axes = Figure().subplots()
+        assert one.plot(axes) is axes
+        assert len(axes.images) == 1
+    labels = [text.get_text() for text in trace.plot().legends[0].get_texts()]
+    assert labels == [*(f"marker {number}" for number in config.face_numbers), "u", "v"]
+    with pytest.raises(ps.InputError, match=r"the observations .* are not at hand"):
+        dataclasses.replace(calibration, observation=None).plot()
 
 
 def test_no_public_name_is_hidden_by_a_module():

@@ -161,8 +161,8 @@ def _data_errors(material: Material) -> Data:
     goal=True,
     alt="For each camera: the errors of u and v of every marker and of the centre over time.",
 )
-def _draw_errors(data: Data, figure: "style.Figure") -> None:
-    """One panel a camera; u solid, v dashed, the centre thick."""
+def draw_image_errors(data: Data, figure: "style.Figure") -> None:
+    """One panel a camera; u solid, v dashed, the centre thick, if it is known."""
     axes = figure.subplots(1, 2, sharey=True)
     t = data["t_s"]
     thick: style.Look = {"color": style.GREY, "linewidth": 3.0, "alpha": 0.6}
@@ -174,13 +174,15 @@ def _draw_errors(data: Data, figure: "style.Figure") -> None:
             every = {"markevery": (k * len(t) // 60, max(1, len(t) // 12))}
             panel.plot(t, u, **look, **every)
             panel.plot(t, v, **look | every | {"linestyle": (0, (3, 1.2))})
-        u, v = data["center_e"][:, view].T
-        panel.plot(t, u, **thick)
-        panel.plot(t, v, linestyle=(0, (2, 1)), **thick)
+        if "center_e" in data:
+            u, v = data["center_e"][:, view].T
+            panel.plot(t, u, **thick)
+            panel.plot(t, v, linestyle=(0, (2, 1)), **thick)
         panel.set(title=f"{name} camera, {data['law']}", xlabel="time (s)")
     axes[0].set_ylabel("image error $s - s_*$ (px)")
     looks = {f"marker {number}": look for number, look in zip(data["marker"], markers, strict=True)}
-    looks |= {"centre": thick, "u": thin, "v": thin | {"linestyle": (0, (3, 1.2))}}
+    looks |= {"centre": thick} if "center_e" in data else {}
+    looks |= {"u": thin, "v": thin | {"linestyle": (0, (3, 1.2))}}
     style.legend_below(figure, looks, min(len(looks), 8))
 
 

@@ -1,0 +1,72 @@
+"""Figures of the report for a single result, whoever made it."""
+
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace
+from projservo_cli.report import figures, style
+from projservo_cli.report.figures.images import draw_image_errors
+from projservo_cli.report.material import Fit, title
+from projservo_cli.task.face import cyclic_order
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_CALIBRATION, _PLAN, _TRACE = "fig13_calibration", "fig16_way", "fig11_image_errors"
+
+
+def of_calibration(
+    calibration: Calibration, observation: Observation, held_out: CrossValidation | None
+) -> "Figure":
+    """Draw figure 13: residuals, errors by pose, excitation and information."""
+    spec = _spec(_CALIBRATION)
+    data = spec.data(Fit(calibration, observation.at_rest, held_out=held_out))
+    return style.drawn(spec.draw, data, spec.height)
+
+
+def of_plan(plan: Plan, scene: Any) -> "Figure":
+    """Draw figure 16: the motion in both images, its joints and its margins over time.
+
+    scene : has ``model``, ``lower``, ``upper``, ``image_size`` and ``trajectory``.
+    """
+    spec = _spec(_PLAN)
+    extent = np.nanmax(plan.s, axis=(0, 1, 2)) if scene.image_size is None else scene.image_size
+    lowest, highest = plan.q.min(axis=0), plan.q.max(axis=0)
+    robot = SimpleNamespace(
+        joint_types=scene.model.joint_types,
+        lower=np.where(np.isfinite(scene.lower), scene.lower, lowest),
+        upper=np.where(np.isfinite(scene.upper), scene.upper, highest),
+    )
+    plant = SimpleNamespace(order=cyclic_order(plan.A), image_size=extent)
+    shown = {"plan": plan, "calibrated": scene.model, "trajectory": scene.trajectory}
+    data = spec.data(SimpleNamespace(robot=robot, plant=plant, **shown))
+    return style.drawn(spec.draw, data, spec.height)
+
+
+def of_trace(trace: Trace, markers: tuple[int, ...]) -> "Figure":
+    """Draw figure 11, without the centre of the face: errors of its markers in both images over time."""
+    data = {
+        "t_s": trace.period * np.arange(len(trace.s)),
+        "e": trace.s - trace.s_star,
+        "law": np.array(title(trace.law)),
+        "marker": np.array(markers or range(trace.s.shape[2])),
+    }
+    return style.drawn(draw_image_errors, data, _spec(_TRACE).height)
+
+
+def placed(figure: "Figure", axes: Any) -> Any:
+    """Return a figure, or the axes in whose place it is shown as a picture."""
+    if axes is None:
+        return figure
+    figure.set_dpi(2.0 * axes.figure.dpi)
+    figure.canvas.draw()
+    canvas: Any = figure.canvas
+    axes.imshow(np.asarray(canvas.buffer_rgba()))
+    axes.set_axis_off()
+    return axes
+
+
+def _spec(name: str) -> Any:
+    return next(spec for spec in figures.FIGURES if spec.name == name)
