@@ -341,8 +341,8 @@ class Experiment:
     @property
     def calibration(self) -> ImageModel:
         """The calibration, with functions that predict images."""
-        run = self._run
-        return ImageModel.of(run.calibration, run.cross_validation, run.observation)
+        calibration = self._run.calibration
+        return ImageModel.of(calibration, self._run.cross_validation, self._run.observation)
 
     @property
     def cross_validation(self) -> CrossValidation | None:
@@ -352,12 +352,14 @@ class Experiment:
     @property
     def plan(self) -> MotionPlan:
         """The plan."""
-        return MotionPlan.of(self._run.plan, scene_of(self.config, self._run.calibration))
+        plan, config = self._run.plan, self._readable()
+        return MotionPlan.of(plan, None if config is None else scene_of(config, self._run.calibration))
 
     @property
     def traces(self) -> dict[str, RunTrace]:
         """Traces of the runs of laws, by name."""
-        face = self.config.face_numbers
+        config = self._readable()
+        face = config.face_numbers if self._run.traces and config is not None else ()
         return {name: RunTrace.of(trace, face) for name, trace in self._run.traces.items()}
 
     @property
@@ -367,6 +369,13 @@ class Experiment:
             raise InputError(f"{self._run.path}: holds no report; make it first: make('report')")
         found: Report = self._run.results["report"].records[""]
         return found
+
+    def _readable(self) -> Config | None:
+        """The configuration; None for a stored one that is not read any more, whose results still are."""
+        try:
+            return self.config
+        except InputError:
+            return None
 
     def __repr__(self) -> str:
         place = "in memory" if self._in_memory else str(self._run.path)

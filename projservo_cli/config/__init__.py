@@ -1,6 +1,7 @@
 """The configuration of a run: YAML into frozen models, with errors that say where."""
 
 from projservo_cli.config.loading import (
+    Config,
     Override,
     digest,
     load_config,
@@ -11,7 +12,6 @@ from projservo_cli.config.loading import (
     sweep_of,
     to_yaml,
 )
-from projservo_cli.config.models import Config
 
 __all__ = [
     "Config",

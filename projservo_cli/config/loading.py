@@ -20,7 +20,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from projservo_cli.config.models import RENDERED, Config, RenderedOptions
+from projservo_cli.config.models import RENDERED, RenderedOptions, Settings
 from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.files import text_of
@@ -252,6 +252,43 @@ class Override:
         if steps == ["law"]:
             return cls(flag, "control.laws", [document.values])
         return cls(flag, ".".join(steps), document.values)
+
+
+class Config(Settings):
+    """Everything a run depends on.
+
+    ``robot``, ``rig``, ``markers`` and ``task`` may be absent in a recorded run (``data`` set) as
+    far as the stages asked for do without them.
+    """
+
+    @classmethod
+    def load(cls, path: pathlib.Path | str) -> "Config":
+        """Read and check a configuration.
+
+        Parameters
+        ----------
+        path : the YAML file, or the name of a shipped configuration, such as ``ur5``.
+
+        Raises
+        ------
+        InputError
+            With a line ``file:line:column: key: what`` for each thing that is wrong.
+        """
+        return load_config(shipped(path))
+
+    def replace(self, values: Mapping[str, Any]) -> "Config":
+        """Return the configuration with other values, checked as a whole.
+
+        Parameters
+        ----------
+        values : by key; nested mappings merge, keys with dots such as ``noise.servo_px`` set one value.
+
+        Raises
+        ------
+        InputError
+            With a line for each value that does not fit, as for ``--set``.
+        """
+        return load_config(self.name, overrides_of("replace", values), text=to_yaml(self))
 
 
 def load_config(

@@ -4,8 +4,7 @@ import inspect
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -651,12 +650,8 @@ def _missing(sections: Mapping[str, Any]) -> Iterator[Finding]:
         yield ("task",), f"{reason}, or calibration.reference"
 
 
-class Config(Root):
-    """Everything a run depends on.
-
-    ``robot``, ``rig``, ``markers`` and ``task`` may be absent in a recorded run (``data`` set) as
-    far as the stages asked for do without them.
-    """
+class Settings(Root):
+    """Values of all sections, and what follows from them."""
 
     name: FolderName = Field(description="of the run and its folder; by default that of the file")
     seed: Whole = Field(0, description="of all random numbers; the same seed gives the same run")
@@ -681,39 +676,6 @@ class Config(Root):
         for rule, wanted in _RULES.items():
             if wanted <= sound.keys():
                 yield from rule(**{name: sound[name] for name in wanted})
-
-    @classmethod
-    def load(cls, path: Path | str) -> "Config":
-        """Read and check a configuration.
-
-        Parameters
-        ----------
-        path : the YAML file, or the name of a shipped configuration, such as ``ur5``.
-
-        Raises
-        ------
-        InputError
-            With a line ``file:line:column: key: what`` for each thing that is wrong.
-        """
-        from projservo_cli.config.loading import load_config, shipped
-
-        return load_config(shipped(path))
-
-    def replace(self, values: Mapping[str, Any]) -> "Config":
-        """Return the configuration with other values, checked as a whole.
-
-        Parameters
-        ----------
-        values : by key; nested mappings merge, keys with dots such as ``noise.servo_px`` set one value.
-
-        Raises
-        ------
-        InputError
-            With a line for each value that does not fit, as for ``--set``.
-        """
-        from projservo_cli.config.loading import load_config, overrides_of, to_yaml
-
-        return load_config(self.name, overrides_of("replace", values), text=to_yaml(self))
 
     def __repr__(self) -> str:
         parts = [
@@ -743,7 +705,7 @@ class Config(Root):
         return self.calibration.reference or (self.task.start if self.task is not None else None)
 
     @property
-    def idealized(self) -> "Config":
+    def idealized(self) -> Self:
         """That of the simulated robot without noise and disturbances in the loop."""
         noise = self.noise.model_copy(update={"servo_px": 0.0})
         plant = self.plant.model_copy(update={"use": None, "options": {}})

@@ -10,7 +10,7 @@ import yaml
 from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema
 
-from projservo_cli.config.models import Config
+from projservo_cli.config.loading import Config
 from projservo_cli.config.sweep import SweepConfig
 
 _EXAMPLE = Path(__file__).with_name("starter.yaml")
