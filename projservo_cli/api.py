@@ -21,7 +21,7 @@ from projservo_cli.observations import Observations, rows_of
 from projservo_cli.records import REPLAN, Calibration, InputError, Plan, law_and_mode, name_of
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.robots import plugins
-from projservo_cli.shown import checked_array
+from projservo_cli.shown import checked_array, require_radians
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
@@ -73,17 +73,20 @@ def simulate(
     WorkFailed
         When a robot with faults does not come to rest at a pose.
     """
+    _require_config("simulate", config)
     if noise_px is not None:
         if config.plant.rendered is not None:
             raise InputError("noise_px: rendered images have plant.options.grey_noise instead")
         config = config.replace({"noise.calibration_px": noise_px})
-    if seed is not None and q is None:
-        config, seed = config.replace({"calibration.seed": seed}), None
+    if seed is not None:
+        seeded = config.replace({"calibration.seed": seed})
+        config, seed = (seeded, None) if q is None else (config, seed)
     with listening(progress) as listener:
         if q is None:
             return calibrating.simulated(config, progress=listener.progress)
         joints = joints_of(config)
         poses = rows_of(q, len(joints.types))
+        require_radians("q", poses, joints.types)
         for k, pose in enumerate(poses):
             if wrong := joints.limit_passed(pose):
                 raise InputError(f"q: pose {k}: {wrong}: choose another")
@@ -122,6 +125,7 @@ def record(
     WorkFailed
         When the robot fails, or its images show too little; what was recorded stands in the table.
     """
+    _require_config("record", config)
     asked = config if robot is None else _with_robot(config, robot)
     further = None
     if motions is not None:
@@ -242,13 +246,8 @@ def plan(
     WorkFailed
         When the task cannot be measured or split: which marker, and why.
     """
-    n = len(calibration.joint_types)
-    asked = _with_task(config, n, q_start, goal)
-    if (asked.joint_types or calibration.joint_types) != calibration.joint_types:
-        raise InputError(
-            f"plan: the calibration is of joints {calibration.joint_types}, the configuration of "
-            f"{asked.joint_types}: take one of the same robot"
-        )
+    _require_config("plan", config, calibration)
+    asked = _with_task(config, calibration.joint_types, q_start, goal)
     _say_compilation()
     described = asked.arm is not None and asked.rig is not None
     described = described and asked.markers is not None and asked.markers.points is not None
@@ -290,6 +289,9 @@ def servo(
         When the run could not begin: the goal is out of reach, or what a robot sees disagrees with the
         calibration.
     """
+    _require_config("servo", config, calibration)
+    if not (isinstance(law, str) or callable(law)):
+        raise InputError(f"law {law!r:.40}: expected a name, or a class or function that makes a law")
     factory, name = None, law
     if not isinstance(law, str):
         factory, name = law, plugins.name_of(law)
@@ -350,6 +352,9 @@ def sweep(
     WorkFailed
         When there are not enough tasks within sight, or workers were lost.
     """
+    _require_config("sweep", config)
+    if not (isinstance(workers, int) and workers > 0):
+        raise InputError(f"workers={workers!r}: give a whole number of one or more")
     named = [(one if isinstance(one, str) else one.__name__, _law_of_sweep(one, workers)) for one in laws]
     if not named:
         raise InputError("sweep: name one law or more")
@@ -407,6 +412,21 @@ def load(path: str | Path) -> Experiment | Study:
     return Experiment.of(stored_run(target))
 
 
+def _require_config(what: str, config: Any, calibration: Calibration | None = None) -> None:
+    """Refuse what is no configuration, or one of another robot than a calibration, with an InputError."""
+    if not isinstance(config, Config):
+        raise InputError(f"{what}: config of type {type(config).__name__}: read one with Config.load")
+    if calibration is None:
+        return
+    if not isinstance(calibration, Calibration):
+        raise InputError(f"{what}: calibration of type {type(calibration).__name__}: make one with calibrate")
+    if (config.joint_types or calibration.joint_types) != calibration.joint_types:
+        raise InputError(
+            f"{what}: the calibration is of joints {calibration.joint_types}, the configuration of "
+            f"{config.joint_types}: take one of the same robot"
+        )
+
+
 def _say_compilation() -> None:
     """Say once that what follows takes as long as the compiler does."""
     if told := compilation():
@@ -421,27 +441,30 @@ def _with_robot(config: Config, robot: Any) -> Config:
     return config.model_copy(update={"plant": plant})
 
 
-def _with_task(config: Config, n: int, q_start: npt.ArrayLike | None, goal: Any) -> Config:
+def _with_task(config: Config, joint_types: str, q_start: npt.ArrayLike | None, goal: Any) -> Config:
     """The configuration with another start (n,) or goal."""
-    changes = []
+    changes, n = [], len(joint_types)
     if q_start is not None:
         start = checked_array("q_start", q_start, (n,), f"({n},), rad or m", finite=True)
+        require_radians("q_start", start, joint_types)
         of_joints = {"joints": start.tolist(), "unit": "rad"}
         changes += [Override("plan: q_start", "task.start", of_joints)]
         changes += [Override("plan: q_start", "task.start_offset", None)]
     if goal is not None:
-        changes += [Override("plan: goal", "task.goal", _goal(config, n, goal))]
+        changes += [Override("plan: goal", "task.goal", _goal(config, joint_types, goal))]
     return load_config(config.name, changes, text=to_yaml(config)) if changes else config
 
 
-def _goal(config: Config, n: int, goal: Any) -> Any:
+def _goal(config: Config, joint_types: str, goal: Any) -> Any:
     """A goal as a configuration has it."""
+    n = len(joint_types)
     if isinstance(goal, (str, Path)):
         return str(Path(goal).resolve())
     if isinstance(goal, Mapping):
         return dict(goal)
     if np.ndim(goal) == 1:
         joints = checked_array("goal", goal, (n,), f"({n},) joint readings, rad or m", finite=True)
+        require_radians("goal", joints, joint_types)
         return {"joints": {"joints": joints.tolist(), "unit": "rad"}}
     m = len(config.face_numbers)
     shape = f"({n},) joint readings, or (2, {m}, 2) pixels of markers.face"

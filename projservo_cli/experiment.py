@@ -336,11 +336,13 @@ class Experiment:
     @property
     def observation(self) -> Observation:
         """What the calibration was made from."""
+        self._require("calibrate")
         return self._run.observation
 
     @property
     def calibration(self) -> ImageModel:
         """The calibration, with functions that predict images."""
+        self._require("calibrate")
         calibration = self._run.calibration
         return ImageModel.of(calibration, self._run.cross_validation, self._run.observation)
 
@@ -352,6 +354,7 @@ class Experiment:
     @property
     def plan(self) -> MotionPlan:
         """The plan."""
+        self._require("plan")
         plan, config = self._run.plan, self._readable()
         return MotionPlan.of(plan, None if config is None else scene_of(config, self._run.calibration))
 
@@ -365,10 +368,15 @@ class Experiment:
     @property
     def report(self) -> Report:
         """Claims and figures of the report."""
-        if "report" not in self._run.results:
-            raise InputError(f"{self._run.path}: holds no report; make it first: make('report')")
+        self._require("report")
         found: Report = self._run.results["report"].records[""]
         return found
+
+    def _require(self, stage: str) -> None:
+        """Refuse to give what is not made yet."""
+        if stage not in self._run.results:
+            place = "the experiment" if self._in_memory else self._run.path
+            raise InputError(f"{place}: holds no result of {stage}; make it first: make({stage!r})")
 
     def _readable(self) -> Config | None:
         """The configuration; None for a stored one that is not read any more, whose results still are."""

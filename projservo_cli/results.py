@@ -21,7 +21,7 @@ from projservo_cli.records import (
     Plan,
     Trace,
 )
-from projservo_cli.shown import Shown
+from projservo_cli.shown import Shown, require_radians
 
 _AT_ONCE = 100  # poses whose derivatives are worked out together: more of them leave the cache
 _AT_INFINITY = 1e-12  # of the norms: what rounding leaves of a_inf @ A there
@@ -96,8 +96,8 @@ class ImageModel(Shown, Calibration):
         Raises
         ------
         InputError
-            If the readings have another number of joints or are not finite, or deviations are asked for of
-            a calibration without a covariance.
+            If the readings have another number of joints, are not finite or look like degrees, or deviations
+            are asked for of a calibration without a covariance.
         """
         rows, single = self._rows(q)
         pixels = predict(self, rows)
@@ -122,7 +122,7 @@ class ImageModel(Shown, Calibration):
         Raises
         ------
         InputError
-            If the readings have another number of joints or are not finite.
+            If the readings have another number of joints, are not finite or look like degrees.
         """
         rows, single = self._rows(q)
         parts = range(0, len(rows), _AT_ONCE)
@@ -145,7 +145,7 @@ class ImageModel(Shown, Calibration):
         Raises
         ------
         InputError
-            If the readings have another number of joints or are not finite.
+            If the readings have another number of joints, are not finite or look like degrees.
         """
         return residual_statistics(self, observation)
 
@@ -213,6 +213,7 @@ class ImageModel(Shown, Calibration):
             raise InputError(
                 f"joint readings of shape {readings.shape}: expected {n} finite numbers, or rows of them"
             )
+        require_radians("joint readings", readings, self.joint_types)
         return np.atleast_2d(readings), readings.ndim == 1
 
 

@@ -64,6 +64,21 @@ class Shown:
         return found
 
 
+_TWO_TURNS = 4.0 * np.pi  # rad; no arm with stops turns a joint that far from its zero
+
+
+def require_radians(name: str, q: FloatArray, joint_types: str) -> None:
+    """Refuse joint readings (..., n) of which a revolute one can hardly be rad, with an InputError."""
+    turning = np.array([letter == "R" for letter in joint_types])
+    beyond = np.argwhere((np.abs(q) > _TWO_TURNS) & turning)
+    if beyond.size:
+        value = q[tuple(beyond[0])]
+        raise InputError(
+            f"{name}: joint {beyond[0][-1] + 1} at {value:g} is more than two turns in rad: degrees? convert "
+            "with numpy.radians"
+        )
+
+
 def checked_array(
     name: str, given: npt.ArrayLike, shape: Sequence[int | None], said: str, *, finite: bool = False
 ) -> FloatArray:

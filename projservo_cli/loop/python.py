@@ -97,7 +97,7 @@ class _LoopPlant(Protocol):
     q: FloatArray  # (n,) joints as they are, or as they were read
     H: FloatArray  # (4, 4) displacement of the face from the reference
     hidden: FloatArray
-    in_front: bool  # hidden, in_front: as of ``plants.plant.observe``, when last observed
+    in_front: bool  # hidden, in_front: as of ``robots.simulated.observe``, when last observed
     markers: int  # how many are observed, those of the face first
     # why the run cannot go on, the images no longer agree with the calibration or something failed; empty
     # where it can

@@ -30,7 +30,6 @@ from projservo_cli.stages.world import Truth
 # Joints are worked out this often at least, s, and taken as straight lines between.
 _GRID_S = 0.005
 _EXPOSED = 5  # instants of an exposure that are averaged
-# What a prismatic joint moves where a revolute one turns by a radian, m.
 _POSTURES = 500  # that are drawn to see how far an arm reaches
 _BEFORE = 2**20  # frames before the opening are numbered too
 _CLOCKS_S = 100.0  # how far clocks of cameras are off at most

@@ -288,7 +288,12 @@ def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
         ),
         (lambda c: ps.simulate(c, np.zeros((2, 5))), r"q of shape \(2, 5\): expected \(K, 6\), rad or m"),
         (lambda c: ps.simulate(c, np.full((1, 6), np.nan)), "q: holds a number that is not finite"),
-        (lambda c: ps.simulate(c, np.full((1, 6), 90.0)), "q: pose 0: joint 1 would be at 90 rad, beyond"),
+        (lambda c: ps.simulate(c, np.full((1, 6), 7.0)), "q: pose 0: joint 1 would be at 7 rad, beyond"),
+        (lambda c: ps.simulate(c, np.full((1, 6), 90.0)), "q: joint 1 at 90 is more than two turns in rad"),
+        (lambda c: ps.simulate(c, np.zeros((1, 6)), seed=-1), "calibration.seed: must be at least 0"),
+        (lambda c: ps.simulate("ur5"), "simulate: config of type str: read one with Config.load"),
+        (lambda c: ps.sweep(c, laws=["exact"], workers=0), "workers=0: give a whole number of one or more"),
+        (lambda c: ps.Experiment(c).plan, r"holds no result of plan; make it first: make\('plan'\)"),
         (lambda c: ps.calibrate(np.zeros(3)), "observations of type ndarray; make them with"),
         (
             lambda c: ps.calibrate(ps.simulate(c), method="best"),
@@ -307,6 +312,34 @@ def test_a_stored_run_starts_no_code_that_it_names(config, tmp_path):
 def test_what_makes_no_sense_is_said_in_a_sentence(config, call, message):
     with pytest.raises(ps.InputError, match=message):
         call(config)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda c, k, p: ps.plan(c, k, q_start=np.degrees(p.q_start)),
+            "q_start: .* two turns in rad",
+        ),
+        (lambda c, k, p: ps.plan(c, k, q_start=[1, 2]), r"q_start of shape \(2,\): expected \(6,\)"),
+        (
+            lambda c, k, p: ps.plan(c, k, goal=np.zeros((2, 3, 2))),
+            r"\(6,\) joint readings, or \(2, 4, 2\)",
+        ),
+        (
+            lambda c, k, p: ps.plan(ps.Config.load("stanford"), k),
+            "the configuration of RRPRRR: take one",
+        ),
+        (lambda c, k, p: ps.servo(ps.Config.load("stanford"), k, p), "the calibration is of joints RRRRRR"),
+        (lambda c, k, p: ps.servo(c, k, p, law="exakt"), "law exakt: no such law; laws: direct_three"),
+        (lambda c, k, p: ps.servo(c, k, p, law=3), "law 3: expected a name, or a class or function"),
+        (lambda c, k, p: ps.servo(c, k, p, mode="follow"), "'follow' is not one of them; valid: replan"),
+        (lambda c, k, p: k.predict(np.full(6, 90.0)), "joint readings: joint 1 at 90 is more than two turns"),
+    ],
+)
+def test_what_does_not_fit_a_calibration_is_said_in_a_sentence(config, made, call, message):
+    with pytest.raises(ps.InputError, match=message):
+        call(config, *made[1:])
 
 
 @pytest.mark.parametrize(

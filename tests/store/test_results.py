@@ -89,7 +89,7 @@ def test_other_numbers_of_joints_or_coordinates_are_refused(run):
 def test_a_run_says_what_it_lacks_and_how_to_make_it(run, tmp_path):
     assert run.observation.images.shape == (49, 2, 10, 2)
     assert run.traces == {}
-    with pytest.raises(InputError, match="projservo plan -o"):
+    with pytest.raises(InputError, match=r"make it first: make\('plan'\)"):
         _ = run.plan
     full = dataclasses.replace(sound_run(tmp_path / "run.h5"), configuration="name: x")
     save(full)
