@@ -292,18 +292,16 @@ def servo(
     _require_config("servo", config, calibration)
     if not (isinstance(law, str) or callable(law)):
         raise InputError(f"law {law!r:.40}: expected a name, or a class or function that makes a law")
-    factory, name = None, law
-    if not isinstance(law, str):
-        factory, name = law, plugins.name_of(law)
+    if isinstance(law, str):
+        name, of_name = law_and_mode(law)
+        given, name = driving.Given(None, robot), law_target(name)
+        mode = mode if of_name == REPLAN else of_name
     else:
-        name, own_mode = law_and_mode(law_target(law_and_mode(law)[0]))[0], law_and_mode(law)[1]
-        mode = own_mode if own_mode != REPLAN else mode
+        given, name = driving.Given(law, robot), plugins.name_of(law)
     asked = config.replace({"control.mode": mode})
     if robot is not None:
         asked = _with_robot(asked, robot)
     _say_compilation()
-    assert isinstance(name, str)
-    given = driving.Given(factory, robot)
     trace = driving.run(asked, calibration, plan, name_of(name, mode), given)
     return RunTrace.of(trace, asked.face_numbers)
 

@@ -78,6 +78,7 @@ class Step:
     inputs: Mapping[str, str]  # files read and their hashes, and the hash of the source of a law of one's own
     why: str = ""  # why it has to be made; empty where the stored one is up to date
     note: str = ""  # what changed that does not outdate it, in words
+    unkeyed: bool = False  # whether nothing tells what its law is, so that it is never up to date
 
     @property
     def name(self) -> str:
@@ -154,6 +155,7 @@ class _Read(NamedTuple):
     inputs: Mapping[str, str]  # files and their hashes, and hashes of sources of laws and robots of one's own
     hashed: Mapping[str, str] = {}  # those of them that the key is of
     note: str = ""  # what of it changed that does not outdate the result, in words
+    unkeyed: bool = False  # whether the law is of a notebook or a script, whose source is in no module
 
 
 def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
@@ -179,7 +181,7 @@ def _sources(laws: Sequence[str], config: Config, run: Run) -> dict[str, _Read]:
         if robot in before and before[robot] != inputs.get(robot):
             note = f"the source of {plant} {'changed' if robot in inputs else 'is gone'}"
             inputs[robot] = before[robot]
-        found[law] = _Read(inputs, hashed, note)
+        found[law] = _Read(inputs, hashed, note, name.startswith("__main__:"))
     return found
 
 
@@ -195,7 +197,7 @@ def _needed(
         for law, read in (laws if stage == "servo" else of_files).items():
             own = {"source": read.hashed} if read.hashed else {}
             keys.append(key_of(config, stage, before=before, law=law, **own))
-            yield Step(stage, law, keys[-1], read.inputs, note=read.note)
+            yield Step(stage, law, keys[-1], read.inputs, note=read.note, unkeyed=read.unkeyed)
         before = [*keys]
 
 
@@ -233,6 +235,8 @@ def _reason(step: Step, run: Run, forced: bool, remade: bool) -> str:
         return "failed before"
     if remade:
         return "what it is made from is made anew"
+    if step.unkeyed:
+        return "nothing tells whether its law is the same"
     if step.stage == "report" and missing(run):
         return "a file of it is missing"
     return "asked for by --force" if forced else ""

@@ -260,6 +260,14 @@ def test_an_experiment_is_made_once_resumed_and_opened_again(config, tmp_path):
         run.make("prepare")
 
 
+def test_a_law_of_a_notebook_is_never_up_to_date(config, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules["__main__"], "Resolved", Resolved, raising=False)
+    run = ps.Experiment(config, tmp_path / "run").make("servo", laws=["__main__:Resolved"])
+    monkeypatch.setattr(Resolved, "gain", 1.0)
+    steps = run.traces["__main__:Resolved"].steps
+    assert run.make("servo", laws=["__main__:Resolved"]).traces["__main__:Resolved"].steps > 1.5 * steps
+
+
 def test_what_was_finished_is_kept_where_a_stage_fails(config, tmp_path):
     goal = {"turn_deg": None, "perturbation": None, "joints": {"joints": [9] * 6}}
     far = config.replace({"task": {"goal": goal}})
