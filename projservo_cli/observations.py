@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.records import FloatArray, InputError, Observation
-from projservo_cli.shown import Shown, checked_array
+from projservo_cli.shown import Shown, checked_array, pandas
 from projservo_cli.tables import in_radians, read_table, to_csv, write_table
 
 _TABLE = "table"  # what messages call one that is no file
@@ -149,14 +149,11 @@ class Observations(Shown, Observation):
 
     def to_frame(self) -> Any:
         """Return the observation table as a pandas table; an InputError without pandas."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise InputError("to_frame needs pandas: pip install '.[tables]'") from error
+        of_pandas = pandas()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder, _TABLE)
             write_table(self, path)
-            return pandas.read_csv(path)
+            return of_pandas.read_csv(path)
 
     def summary(self) -> dict[str, str]:
         """Return what there is to tell, in words, by name."""

@@ -64,6 +64,15 @@ class Shown:
         return found
 
 
+def pandas() -> Any:
+    """Return the package; an InputError where it is not installed."""
+    try:
+        import pandas as found
+    except ImportError as error:
+        raise InputError("to_frame needs pandas: pip install '.[tables]'") from error
+    return found
+
+
 _TWO_TURNS = 4.0 * np.pi  # rad; no arm with stops turns a joint that far from its zero
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from projservo_cli.records import InputError
 from projservo_cli.results import RunTrace
-from projservo_cli.shown import Shown
+from projservo_cli.shown import Shown, pandas
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps.statistics import Rows, of_runs, paired
 
@@ -83,11 +83,7 @@ class Study(Shown):
 
     def to_frame(self) -> Any:
         """Return the table as a pandas table; an InputError without pandas."""
-        try:
-            import pandas
-        except ImportError as error:
-            raise InputError("to_frame needs pandas: pip install '.[tables]'") from error
-        return pandas.DataFrame(dict(self.table))
+        return pandas().DataFrame(dict(self.table))
 
     def to_xarray(self) -> Any:
         """Return the table as a Dataset over ``run``; an InputError without xarray."""

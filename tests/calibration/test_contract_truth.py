@@ -55,7 +55,7 @@ def test_a_simulated_run_with_garbage_for_truth_is_the_same(monkeypatch, method,
     # The garbage is garbage: its images have nothing to do with those observed.
     images = wrong.images(observation.q[0], wrong.M)
     assert np.nanmedian(np.abs(images - observation.images[0])) > 100.0
-    monkeypatch.setattr(stage, "observed", lambda config, progress: (observation, noise))
+    monkeypatch.setattr(stage, "observed", lambda *asked, progress: (observation, noise))
     same(stage.run(config)[1], calibration)
 
 
