@@ -15,19 +15,19 @@ import numpy.typing as npt
 
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
 from projservo_cli.control import CODES
+from projservo_cli.display import checked_array, require_radians
 from projservo_cli.experiment import Experiment, compilation, law_target, listening, scene_of
 from projservo_cli.files import working_in
 from projservo_cli.observations import Observations, rows_of
 from projservo_cli.records import REPLAN, Calibration, InputError, Plan, law_and_mode, name_of
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.robots import plugins
-from projservo_cli.shown import checked_array, require_radians
 from projservo_cli.stages import Progress
 from projservo_cli.stages import calibrate as calibrating
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages import record as recording
 from projservo_cli.stages import servo as driving
-from projservo_cli.stages.own_robot import foreign_robot
+from projservo_cli.stages.external_robot import foreign_robot
 from projservo_cli.stages.world import joints_of
 from projservo_cli.store import load as stored_run
 from projservo_cli.store import run_path

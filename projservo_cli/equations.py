@@ -208,7 +208,7 @@ REGISTER = (
     _entry(
         "§4.2",
         "Visibility and the motions that do not change it",
-        "guidance.margins._visibility task.visibility.visibility_translation "
+        "planning.margins._visibility task.visibility.visibility_translation "
         "task.visibility.visibility_angles task.visibility.choose_sense "
         "task.visibility.limited_translation",
         "task/test_visibility.py::test_neutral_along_the_ray_of_a_point_of_the_face "
@@ -223,8 +223,8 @@ REGISTER = (
     _entry(
         "§4.3",
         "Profiles of the trajectory, and the coupled constraint on translation and rotation",
-        "task.trajectory.profile_shares guidance.lattice.plan_path",
-        "planning/test_planning.py::test_the_shipped_task_needs_coupled_parts "
+        "task.trajectory.profile_shares planning.product_space.plan_path",
+        "planning/test_product_space.py::test_the_shipped_task_needs_coupled_parts "
         "task/test_trajectory.py::test_linear_and_exponential "
         "task/test_trajectory.py::test_what_comes_first_is_done_before_the_rest_begins",
         "1 − exp(−σ/t_*) reaches 0.632 at σ = t_* and is normalised to reach 1. H_r(θ_P(σ)) is "

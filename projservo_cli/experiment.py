@@ -204,7 +204,7 @@ class Chain:
         made = [step.stage for step in self.steps if step.why]
         if "calibrate" not in made or "servo" not in made:
             return nullcontext()
-        from projservo_cli.loop.beside import compiling_beside
+        from projservo_cli.loop.jit_warmup import compiling_beside
 
         return compiling_beside()
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.display import Shown, checked_array, pandas
 from projservo_cli.records import FloatArray, InputError, Observation
-from projservo_cli.shown import Shown, checked_array, pandas
 from projservo_cli.tables import in_radians, read_table, to_csv, write_table
 
 _TABLE = "table"  # what messages call one that is no file

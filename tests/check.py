@@ -15,7 +15,7 @@ PYTEST = [
     "--cov=projservo_cli",
 ]
 # What is compiled, run once more without the compiler: the same bits, and lines that coverage can count.
-MATHEMATICS = [f"tests/{folder}" for folder in ("geometry", "task", "control", "loop", "plants")]
+MATHEMATICS = [f"tests/{folder}" for folder in ("geometry", "task", "control", "loop", "simulation")]
 WITHOUT_COMPILER = {"NUMBA_DISABLE_JIT": "1"}
 
 CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
@@ -49,7 +49,7 @@ CHECKS: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
 }
 # Forty minutes: only where it is asked for by name.
 STUDIES: dict[str, tuple[Sequence[str | Path], dict[str, str]]] = {
-    "rendered": ([PYTHON, "-m", "tests.rendered.study"], {}),
+    "rendered": ([PYTHON, "-m", "tests.studies.rendered"], {}),
 }
 
 

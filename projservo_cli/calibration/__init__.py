@@ -8,13 +8,13 @@ through it, and ``prediction`` is what the result is for, with how far it errs.
 
 from projservo_cli.calibration.estimate import calibrate
 from projservo_cli.calibration.fit import Solution, chi2_band
+from projservo_cli.calibration.initialization import Nominal
 from projservo_cli.calibration.prediction import (
     predict,
     prediction_variance,
     residual_statistics,
 )
 from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate
-from projservo_cli.calibration.start import Nominal
 
 __all__ = [
     "WEAK_NOISE",

@@ -15,8 +15,8 @@ from projservo_cli.calibration.adjustment import LeastSquares, cross_matrix, min
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar, ImageFrame
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution, fit_from, median_px
 from projservo_cli.calibration.forward import CAMERA, LENS, Scene
+from projservo_cli.calibration.initialization import Search, carrying, starts, still
 from projservo_cli.calibration.readings import MOST_JUDGED, RAYLEIGH, Readings
-from projservo_cli.calibration.start import Search, carrying, starts, still
 from projservo_cli.geometry.lens import straight_views, within
 from projservo_cli.records import BoolArray, FloatArray, IntArray, WorkFailed
 

@@ -10,7 +10,6 @@ from scipy.special import chdtri
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.calibration.adjustment import LeastSquares
-from projservo_cli.calibration.delay import with_delay
 from projservo_cli.calibration.diagnosis import (
     Outliers,
     blamed_joint,
@@ -24,10 +23,11 @@ from projservo_cli.calibration.diagnosis import (
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve, with_joint_noise
+from projservo_cli.calibration.initialization import Nominal, Search, Tell
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate, judged
 from projservo_cli.calibration.readings import Readings, require_images, require_motion
-from projservo_cli.calibration.start import Nominal, Search, Tell
+from projservo_cli.calibration.time_offset import with_delay
 from projservo_cli.geometry.lens import FIRST
 from projservo_cli.records import Calibration, Errors, InputError, Observation
 

@@ -259,7 +259,7 @@ def _of_suggestions(value: dict[str, Any]) -> Iterator[str]:
 
 
 def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
-    from projservo_cli.report.material import NEAREST
+    from projservo_cli.report.report_data import NEAREST
 
     feasible = "feasible" if value["feasible"] else "NOT feasible"
     yield wrapped(f"plan: {value['profile']}, {feasible}: {value['reason']}")

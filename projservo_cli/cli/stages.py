@@ -370,7 +370,7 @@ def _work(call: _Call) -> int:
         call.beside["calibrate"] = _suggestions(chain, count)
     if (wanted := _extras(call.options)) and not chain.lacks("report"):
         call.beside["report"] = _made_extras(console, chain, wanted)
-    from projservo_cli.report.material import failed_object, stage_object
+    from projservo_cli.report.report_data import failed_object, stage_object
 
     values = {}
     for name in chain.names:

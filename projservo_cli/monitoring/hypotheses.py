@@ -7,8 +7,8 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from projservo_cli.calibration.forward import Scene
-from projservo_cli.monitoring.detector import ErrorModel, Residual, Sums
-from projservo_cli.monitoring.looks import Look
+from projservo_cli.monitoring.frame_pairs import Look
+from projservo_cli.monitoring.statistics import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray
 
 # Images are expected to be changed by so much by any cause, px rms: the prior of its parameters.

@@ -5,7 +5,17 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.calibration.readings import even_choice
-from projservo_cli.monitoring.detector import (
+from projservo_cli.monitoring.frame_pairs import Frame, Look, Pairing
+from projservo_cli.monitoring.hypotheses import (
+    Evidence,
+    Explanation,
+    causes_of,
+    contains,
+    is_possible,
+    together,
+)
+from projservo_cli.monitoring.messages import group_of, sentence
+from projservo_cli.monitoring.statistics import (
     LEAST_ERROR,
     WINDOW,
     Detector,
@@ -15,16 +25,6 @@ from projservo_cli.monitoring.detector import (
     columns_of_marker,
     is_same_view,
 )
-from projservo_cli.monitoring.hypotheses import (
-    Evidence,
-    Explanation,
-    causes_of,
-    contains,
-    is_possible,
-    together,
-)
-from projservo_cli.monitoring.looks import Frame, Look, Pairing
-from projservo_cli.monitoring.messages import group_of, sentence
 from projservo_cli.records import VIEWS, BoolArray, Calibration, FloatArray, IntArray
 
 # Markers that are tested, at most.

@@ -21,8 +21,8 @@ from projservo_cli.config import Config, load_config
 from projservo_cli.files import lies_inside, write_whole
 from projservo_cli.records import Plan, Report, name_of
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.figures.drift import drift_rows
-from projservo_cli.report.material import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, VIEWS, stage_object, title
+from projservo_cli.report.figures.path_deviation import drift_rows
+from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, VIEWS, stage_object, title
 from projservo_cli.report.style import FORMATS, power_of_ten
 from projservo_cli.store import Run
 

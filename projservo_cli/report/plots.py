@@ -8,7 +8,7 @@ import numpy as np
 from projservo_cli.records import Calibration, CrossValidation, Observation, Plan, Trace
 from projservo_cli.report import figures, style
 from projservo_cli.report.figures.images import draw_image_errors
-from projservo_cli.report.material import Fit, title
+from projservo_cli.report.report_data import Fit, title
 from projservo_cli.task.face import cyclic_order
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from projservo_cli.calibration.delay import comes_again
+from projservo_cli.calibration.time_offset import comes_again
 from projservo_cli.records import ByteArray, FloatArray, InputError, WorkFailed, in_unit
 from projservo_cli.robots.plugins import what_failed
 

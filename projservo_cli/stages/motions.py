@@ -11,14 +11,14 @@ from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.guidance.goals import Aim
-from projservo_cli.guidance.keep_out import keep_out_of
-from projservo_cli.guidance.lattice import duration, evenly, plan_path
-from projservo_cli.guidance.margins import Demands, Motion, Reaching, along_joints, along_shares
-from projservo_cli.guidance.spread import spread_of
-from projservo_cli.guidance.timing import Pace, joints_at, least_time
-from projservo_cli.guidance.validity import BORDER, CLEAR, Constraints, constraints_of
-from projservo_cli.guidance.way import Budget, Way, find_way, first_within, margins_at, within_region
+from projservo_cli.planning.constraints import BORDER, CLEAR, Constraints, constraints_of
+from projservo_cli.planning.goal_configurations import Aim
+from projservo_cli.planning.keep_out import keep_out_of
+from projservo_cli.planning.margins import Demands, Motion, Reaching, along_joints, along_shares
+from projservo_cli.planning.prediction_covariance import spread_of
+from projservo_cli.planning.product_space import duration, evenly, plan_path
+from projservo_cli.planning.rrt_connect import Budget, Way, find_way, first_within, margins_at, within_region
+from projservo_cli.planning.time_parameterization import Pace, joints_at, least_time
 from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Plan, Spread, WorkFailed
 from projservo_cli.stages.scenario import Scenario
 from projservo_cli.stages.verdicts import sight_words, verdict_of

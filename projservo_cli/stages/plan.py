@@ -13,9 +13,9 @@ from projservo_cli.geometry.algebra import as_array, composed_angle, vec
 from projservo_cli.geometry.kernels import COORDINATES, RANK_TOLERANCE
 from projservo_cli.geometry.kinematics import forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.guidance.margins import Demands, Reaching
-from projservo_cli.loop.trial import begin
+from projservo_cli.loop.batch import begin
 from projservo_cli.monitoring.monitor import fault_shown
+from projservo_cli.planning.margins import Demands, Reaching
 from projservo_cli.records import (
     NO_SPREAD,
     Calibration,
@@ -37,8 +37,8 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
+from projservo_cli.stages.plan_summary import reason_of, told_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.told import reason_of, told_of
 from projservo_cli.stages.verdicts import least_of, verdict_of
 from projservo_cli.stages.world import Joints
 from projservo_cli.task.face import Task, center_of, face_plane

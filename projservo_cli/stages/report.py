@@ -14,10 +14,12 @@ from projservo_cli.config import load_config
 from projservo_cli.files import replacing, require_inside, write_whole
 from projservo_cli.records import InputError, Report, Trace, WorkFailed
 from projservo_cli.report import style
+from projservo_cli.report.animation import motion_of, plotly, write_animation, write_view
 from projservo_cli.report.claims import claims_of
 from projservo_cli.report.figures import FIGURES
-from projservo_cli.report.figures.drift import drift_rows, study_numbers
-from projservo_cli.report.material import (
+from projservo_cli.report.figures.path_deviation import drift_rows, study_numbers
+from projservo_cli.report.page import write_page
+from projservo_cli.report.report_data import (
     ANIMATION_FILE,
     CLAIMS_FILE,
     VIEW_FILE,
@@ -26,8 +28,6 @@ from projservo_cli.report.material import (
     Material,
     Studies,
 )
-from projservo_cli.report.motion import motion_of, plotly, write_animation, write_view
-from projservo_cli.report.page import write_page
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.scenario import plant_of
 from projservo_cli.stages.studies import (

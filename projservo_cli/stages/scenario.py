@@ -16,8 +16,8 @@ from projservo_cli.config import Config
 from projservo_cli.config.task import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.guidance.margins import Demands
 from projservo_cli.loop.step import Limits
+from projservo_cli.planning.margins import Demands
 from projservo_cli.records import (
     BODY_LAWS,
     CORNERS,
@@ -30,7 +30,7 @@ from projservo_cli.records import (
     Model,
     WorkFailed,
 )
-from projservo_cli.robots.driven import weights
+from projservo_cli.robots.client import weights
 from projservo_cli.robots.simulated import METRIC_A_INF, NO_PINS, Ends, Plant
 from projservo_cli.stages.simulation import shown_in_frames
 from projservo_cli.stages.world import (

@@ -17,11 +17,11 @@ from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
 from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.metrics import MM, Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
-from projservo_cli.loop.standing import Standing
+from projservo_cli.loop.replanning import Watch
+from projservo_cli.loop.settling import Standing
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.loop.summary import MM, Ended, Summary, angle_between, path_deviation, summarize
-from projservo_cli.loop.watch import Watch
 from projservo_cli.records import (
     REPLAN,
     Calibration,
@@ -35,11 +35,11 @@ from projservo_cli.records import (
 )
 from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
+from projservo_cli.robots.client import DrivenRobot
 from projservo_cli.robots.contract import at_rest_after
-from projservo_cli.robots.driven import DrivenRobot
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
-from projservo_cli.stages import own_robot
+from projservo_cli.stages import external_robot
 from projservo_cli.stages.motions import Ways, search_of, why_closed
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.simulation import hindrance_of
@@ -376,7 +376,10 @@ class _Asked:
         own = scenario.truth is None
         if own and (scenario.calibration is None or not scenario.calibration.usable):
             raise WorkFailed("no robot is driven with a calibration that is not usable: calibrate anew")
-        controller, driven = self._controller(), own_robot.connected(scenario, self.law, self.given.robot)
+        controller, driven = (
+            self._controller(),
+            external_robot.connected(scenario, self.law, self.given.robot),
+        )
         # The matrices of a look are small: a second thread costs more than it gives.
         with threadpool_limits(limits=1), at_rest_after(driven.robot):
             if own:
@@ -384,7 +387,7 @@ class _Asked:
                 if wrong:
                     raise WorkFailed(f"nothing was moved, since where the robot stands {wrong}")
                 start, settle_s = scenario.ends.q_start, scenario.config.plant.settle_s
-                for _ in own_robot.way_to(driven.steered, start, settle_s, "servo"):
+                for _ in external_robot.way_to(driven.steered, start, settle_s, "servo"):
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the way to the start, since {wrong}")
             driven.begin()

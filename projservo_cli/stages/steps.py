@@ -15,7 +15,7 @@ from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.config.models import FAULTS
 from projservo_cli.records import InputError, law_and_mode, names_of
-from projservo_cli.report.material import CLAIMS_FILE, PAGE_FILE
+from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.robots.source import source_hash
 from projservo_cli.store import SERVO, Result, Run
 

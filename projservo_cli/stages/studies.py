@@ -18,9 +18,9 @@ from projservo_cli.geometry.algebra import (
     mat,
     twist_exponential,
 )
-from projservo_cli.guidance.margins import limits_alone
+from projservo_cli.planning.margins import limits_alone
 from projservo_cli.records import PRISMATIC, Calibration, FloatArray, Model, Plan, Trace, WorkFailed
-from projservo_cli.report.material import DIRECT, Studies
+from projservo_cli.report.report_data import DIRECT, Studies
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.stages.scenario import Scenario, scenario_of

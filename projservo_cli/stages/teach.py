@@ -14,7 +14,7 @@ from projservo_cli.config.task import TaskSettings
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.contract import Bounds, Reading, at_rest_after
 from projservo_cli.stages import plan as planning
-from projservo_cli.stages.own_robot import at_rest, averaged, foreign_robot, simulated_robot
+from projservo_cli.stages.external_robot import at_rest, averaged, foreign_robot, simulated_robot
 from projservo_cli.stages.scenario import TAUGHT_NOISE, generator
 from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself
 from projservo_cli.stages.world import joints_of, truth_of

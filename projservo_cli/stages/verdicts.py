@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from projservo_cli.guidance.margins import (
+from projservo_cli.planning.margins import (
     BEHIND,
     CONSTRAINTS,
     IMAGE,

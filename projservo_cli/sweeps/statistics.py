@@ -15,7 +15,7 @@ from projservo_cli.config.sweep import LAW
 from projservo_cli.files import write_whole
 from projservo_cli.records import BoolArray
 from projservo_cli.report import style
-from projservo_cli.report.material import Data
+from projservo_cli.report.report_data import Data
 from projservo_cli.stages import Progress
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.tables import to_csv

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from projservo_cli.display import Shown, pandas
 from projservo_cli.records import InputError
 from projservo_cli.results import RunTrace
-from projservo_cli.shown import Shown, pandas
 from projservo_cli.store.sweep_table import SweepTable
 from projservo_cli.sweeps.statistics import Rows, of_runs, paired
 

@@ -168,7 +168,7 @@ def test_a_trace_is_that_of_the_chain_and_of_a_class_like_that_of_its_name(confi
 
 
 def test_a_robot_at_hand_is_recorded_and_driven(made):
-    from tests.foreign.robots import Sound
+    from tests.robots.robots import Sound
 
     config = ps.Config.load("ur5").replace({"plant.settle_s": 0.3, "noise.servo_px": 0.5, **FEW})
     path = ROOT / "configs" / "ur5.yaml"

@@ -8,10 +8,10 @@ from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate
 from projservo_cli.records import WorkFailed
-from projservo_cli.report.material import findings
+from projservo_cli.report.report_data import findings
 from tests.calibration.bound import errors_of_the_best
 from tests.calibration.mistakes import KINDS, MISTAKES, table
-from tests.calibration.mistakes_study import median_error, shares_left_out
+from tests.studies.calibration_mistakes import median_error, shares_left_out
 
 
 def calibrated(mistaken, **given):

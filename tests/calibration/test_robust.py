@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.calibration import calibrate, predict
-from projservo_cli.report.material import findings
+from projservo_cli.report.report_data import findings
 from tests.calibration.damage import exchanged, listed, misread, shifted
 from tests.calibration.simulated_robot import around, random_robot, trials
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from projservo_cli.guidance.margins import limits_alone
+from projservo_cli.planning.margins import limits_alone
 from projservo_cli.records import NO_LENS
 from projservo_cli.stages.plan import plan_task
 from projservo_cli.task.target import Shown, followed

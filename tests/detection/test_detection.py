@@ -14,7 +14,7 @@ from projservo_cli.stages.record import trial_motions
 from projservo_cli.stages.world import truth_of
 from projservo_cli.tables import read_table
 from tests.detection.rendering import render, square
-from tests.detection.sigma_study import errors
+from tests.studies.detection_sigma import errors
 
 cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed: pip install '.[detect]'")
 

@@ -8,8 +8,8 @@ import pytest
 from projservo_cli.control import CODES
 from projservo_cli.control.law import Law, reset
 from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.metrics import SUBSAMPLES, Ended, path_deviation, summarize
 from projservo_cli.loop.step import CONVERGED, MAX_STEPS, RUNNING
-from projservo_cli.loop.summary import SUBSAMPLES, Ended, path_deviation, summarize
 from projservo_cli.records import LAWS
 from projservo_cli.robots.simulated import Ends
 from tests.samples import displacement, pixels, poe

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from tests.guidance.studies import in_two_processes
+from tests.studies.planning_tables import in_two_processes
 
 TABLE = Path(__file__).with_name("corners.npz")
 FINDERS = ("finder", "subpix", "jpeg")

@@ -12,10 +12,10 @@ from projservo_cli.calibration import calibrate as calibrated
 from projservo_cli.calibration import predict
 from projservo_cli.calibration.forward import Scene, displacements, image_points, moved_points
 from projservo_cli.calibration.prediction import all_changed, scene_of
-from projservo_cli.monitoring import detector
-from projservo_cli.monitoring.detector import WINDOW, ErrorModel, Memory
-from projservo_cli.monitoring.looks import Look
+from projservo_cli.monitoring import statistics
+from projservo_cli.monitoring.frame_pairs import Look
 from projservo_cli.monitoring.monitor import ImageMonitor
+from projservo_cli.monitoring.statistics import WINDOW, ErrorModel, Memory
 from projservo_cli.stages import calibrate
 from projservo_cli.stages.world import truth_of
 from tests.calibration.simulated_robot import random_robot, trials
@@ -96,7 +96,7 @@ def test_residuals_of_the_model_itself_set_nothing_off(arm, monkeypatch):
     """Errors of calibration, joints and instants of the first order, at a chance of one run in five."""
     arm = arm.with_joint_noise(1e-3)
     calibration, runs, alarms = arm.calibration, 30, 0
-    monkeypatch.setattr(detector, "_FALSE_ALARM", 0.2)
+    monkeypatch.setattr(statistics, "_FALSE_ALARM", 0.2)
     for seed in range(runs):
         rng = np.random.default_rng(seed)
         q, q_dot = arm.way(seed % 3)
@@ -182,7 +182,7 @@ def test_instants_that_are_uncertain_are_not_taken_for_a_disturbance(arm):
 
 
 def test_a_frame_that_comes_twice_is_no_second_measurement(arm):
-    """A slip of the detector, shown again and again, stays one; a camera that shows it anew was moved."""
+    """A slip of the statistics, shown again and again, stays one; a camera that shows it anew was moved."""
     q, _ = arm.way(4)
     s = noisy(arm.images(at_once(q)), 4)
     s[20:32, 0] += 30.0
@@ -337,10 +337,10 @@ def test_a_view_of_which_many_sightings_stay_aside_is_off_where_chance_does_not_
         """As play in the joints lets them: some sightings are off, and the view is not."""
         aside = np.zeros_like(residual.seen)
         aside[1, : aside.shape[1] // 3] = True
-        return detector.Tested(False, aside)
+        return statistics.Tested(False, aside)
 
-    monkeypatch.setattr(detector.Detector, "tested", some_aside)
-    monkeypatch.setattr(detector.Detector, "significant", lambda *_: None)
+    monkeypatch.setattr(statistics.Detector, "tested", some_aside)
+    monkeypatch.setattr(statistics.Detector, "significant", lambda *_: None)
     _, said = first_alarm(arm, read, s)
     assert ("right camera" in said) == bool(shift)
     assert bool(said) == bool(shift)

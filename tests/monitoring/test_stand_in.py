@@ -18,7 +18,7 @@ from tests.monitoring.stand_in import (
     seen,
     tool_pose,
 )
-from tests.monitoring.study import LAST, Rig, judged, moved_so_far, named_in, off_mm, run_of, tasks
+from tests.studies.monitoring import LAST, Rig, judged, moved_so_far, named_in, off_mm, run_of, tasks
 
 HOME = {name: np.radians(arm.home) for name, arm in ARMS.items()}
 

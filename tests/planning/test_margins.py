@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.guidance.lattice import shortest, widest
-from projservo_cli.guidance.margins import (
+from projservo_cli.planning.margins import (
     BEHIND,
     along_shares,
     image_margin,
@@ -15,7 +14,8 @@ from projservo_cli.guidance.margins import (
     limit_margin,
     limits_alone,
 )
-from projservo_cli.guidance.timing import least_time
+from projservo_cli.planning.product_space import shortest, widest
+from projservo_cli.planning.time_parameterization import least_time
 from tests.planning.cases import reaching_of
 from tests.samples import frame, in_frame, pixels, poe
 from tests.stages.cases import case

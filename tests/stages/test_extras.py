@@ -10,14 +10,14 @@ import pytest
 from PIL import Image
 
 from projservo_cli.records import InputError, WorkFailed
-from projservo_cli.report import motion as film
-from projservo_cli.report.material import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
+from projservo_cli.report import animation as film
 from projservo_cli.report.page import write_page
+from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE
 from projservo_cli.stages import report
 from projservo_cli.store import Result
-from tests.figures.cases import case
 from tests.known import configured
-from tests.page.conftest import MADE, read, stored
+from tests.report.cases import case
+from tests.report.conftest import MADE, read, stored
 
 MOST_BYTES = {VIEW_FILE: 8_000_000, ANIMATION_FILE: 3_000_000}
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.guidance.margins import limits_alone
+from projservo_cli.planning.margins import limits_alone
 from projservo_cli.stages import calibrate
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import plan_task, rotation_sense

@@ -6,13 +6,13 @@ import pytest
 
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.report.claims import claims_of
-from projservo_cli.report.figures.drift import study_numbers
-from projservo_cli.report.material import DIRECT
+from projservo_cli.report.figures.path_deviation import study_numbers
+from projservo_cli.report.report_data import DIRECT
 from projservo_cli.stages import report, steps, studies
 from projservo_cli.store import Result, Run, load, save
-from tests.figures.cases import GAINS, PERIODS_S, SPECS, case
 from tests.known import configured
-from tests.page.conftest import stored
+from tests.report.cases import GAINS, PERIODS_S, SPECS, case
+from tests.report.conftest import stored
 
 NONE = np.zeros(0)
 

@@ -7,7 +7,7 @@ from projservo_cli.config import load_config
 from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.robots.contract import Reading
 from projservo_cli.stages import calibrate, plan, servo
-from projservo_cli.stages.own_robot import averaged
+from projservo_cli.stages.external_robot import averaged
 from projservo_cli.stages.teach import checked, require_face, teach
 from projservo_cli.stages.world import truth_of
 from tests.conftest import ROOT

@@ -10,7 +10,7 @@ from projservo_cli.calibration.prediction import changed, error_factor, joint_de
 from projservo_cli.calibration.readings import MOST_JUDGED, even_choice, per_rad
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray, Observation
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Fit, registered
+from projservo_cli.report.report_data import VIEWS, Data, Fit, registered
 
 _BOTH = 2
 _ARROW = 0.04  # length of an arrow of the rms residual, as a share of the extent of what was seen

@@ -4,7 +4,7 @@ import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.material import Data, Material, curve_difference, percent, registered
+from projservo_cli.report.report_data import Data, Material, curve_difference, percent, registered
 
 _DECADES = 1e-5  # of its start, down to which an error is drawn on a logarithmic scale
 _FAINT: style.Look = {"linewidth": 0.8, "alpha": 0.55}

@@ -6,7 +6,7 @@ import numpy as np
 
 from projservo_cli.records import BODY_LAWS, ByteArray, IntArray, Trace
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Driven, Material, registered, title
+from projservo_cli.report.report_data import VIEWS, Data, Driven, Material, registered, title
 from projservo_cli.task.face import cyclic_order
 
 _MOMENTS = ("start", "on the way", "end")

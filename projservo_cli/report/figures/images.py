@@ -6,7 +6,7 @@ from projservo_cli.geometry.kinematics import project
 from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import POINT_LAWS, FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import (
+from projservo_cli.report.report_data import (
     DIRECT,
     TITLES,
     VIEWS,

@@ -6,7 +6,7 @@ from projservo_cli.geometry.algebra import exp_rotation
 from projservo_cli.geometry.kinematics import project
 from projservo_cli.records import FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import VIEWS, Data, Material, registered
+from projservo_cli.report.report_data import VIEWS, Data, Material, registered
 from projservo_cli.task.face import cyclic_order
 
 _ARC_POINTS, _SENSE_POINTS = 61, 181

@@ -7,7 +7,7 @@ import numpy as np
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import PRISMATIC, FloatArray
 from projservo_cli.report import style
-from projservo_cli.report.material import Data, Material, registered
+from projservo_cli.report.report_data import Data, Material, registered
 from projservo_cli.robots.simulated import Plant, camera_center
 from projservo_cli.task.face import center_of
 

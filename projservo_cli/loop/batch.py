@@ -1,0 +1,287 @@
+"""Whole runs from their images to their numbers, in arrays that one run leaves to the next."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import literal_unroll
+
+from projservo_cli.control import CODES
+from projservo_cli.control.law import (
+    ERRORS,
+    MOST_PARTS,
+    Gains,
+    Law,
+    State,
+    measure,
+    new_state,
+    reset,
+    split_of,
+)
+from projservo_cli.geometry.algebra import as_array
+from projservo_cli.geometry.jit import composed, merged, njit
+from projservo_cli.geometry.kinematics import backward
+from projservo_cli.geometry.lens import straight
+from projservo_cli.geometry.mechanisms import OWN, Span, span_of
+from projservo_cli.loop.compiled import Course, run_compiled
+from projservo_cli.loop.metrics import Ended, Summary, summarize
+from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log
+from projservo_cli.records import FloatArray, Model
+from projservo_cli.robots.simulated import Ends, Plant
+from projservo_cli.task.body import NO_BODY, Body
+from projservo_cli.task.face import (
+    FOUND,
+    MIDPOINT,
+    NOT_MEASURED,
+    NOT_UNIQUE,
+    Task,
+    center_of,
+    new_task,
+    put_task,
+    require_found,
+)
+from projservo_cli.task.partition import NO_PARTS, Parts, partition
+from projservo_cli.task.target import put_body_task
+
+# Closer than this to half a turn, rad, calibration noise alone decides the sign of the angle.
+_HALF_TURN_BAND = math.radians(2.0)
+_REHEARSAL_STEPS = 300
+_REHEARSAL_PX = 1.0
+_REHEARSAL_STEP = math.radians(5.0)
+_REHEARSAL = Gains(0.1, 0.1, 0.1, 0.1, 1.0, 0.1, 1.0, 0.9)
+_DIRECT_TWO = CODES["direct_two"]
+_Bounds = tuple[FloatArray, FloatArray]
+
+
+class _Rehearsal:
+    """Both senses of a half turn, tried on a robot that is as the model says, without noise.
+
+    Either sense reaches the goal, but they take the joints elsewhere. Both are rehearsed at a tenth of the
+    error and at most 5° a step; the sense that arrives without passing a joint limit is taken, between equals
+    the one that arrives in fewer steps.
+
+    model : calibrated; q_start : (n,) first joints, rad or m; m : markers of the face; bounds : lower and
+        upper limits (n,) of the joints; span : of an arm of n ≠ 6 joints.
+    """
+
+    def __init__(self, model: Model, q_start: FloatArray, m: int, bounds: _Bounds, span: Span = OWN) -> None:
+        self.model, self.q_start, self.bounds, n = model, q_start, bounds, len(q_start)
+        self.noise, self.state = np.zeros((_REHEARSAL_STEPS + 1, 2, m, 2)), new_state(n, m, span=span)
+        self.log = new_log(n, m, _REHEARSAL_STEPS, len(ERRORS))
+
+    def better(self, task: Task, state: State) -> tuple[int, Parts, bool]:
+        """A partitioned task in the better sense: what is wrong, its parts, and whether it arrives."""
+        model = self.model
+        # Cameras have no sign of their own; the plant tells front from back by positive depths.
+        depth = model.P[:, 2] @ np.array(center_of(state.A, MIDPOINT))
+        seen = model._replace(P=model.P * np.sign(depth)[:, None, None])
+        M = np.ascontiguousarray(state.A @ as_array(backward(model, self.q_start)).T)
+        endless = np.full(2, np.inf)
+        plant = Plant(seen, M, task.order, task.center, task.O, task.visible, endless, *self.bounds, False)
+        law = Law(_DIRECT_TWO, seen, task._replace(body=NO_BODY), _REHEARSAL)
+        step = np.full(len(self.q_start), _REHEARSAL_STEP)
+        q_hat_p = state.q_hat[2].copy()
+
+        def rehearsed(sense: float, most: int) -> tuple[bool, bool, int]:
+            """Whether a sense fails to arrive, whether it passes a joint limit, and in how many steps."""
+            reset(self.state)
+            self.state.driven[1] = sense * q_hat_p
+            limits = Limits(step, _REHEARSAL_PX, math.inf, 20, most, False, False)
+            course = Course(plant, limits, self.q_start)
+            verdict, steps = run_compiled(law, course, self.noise, self.state, self.log)
+            return verdict != CONVERGED, bool(self.log.events[1] >= 0.0), steps
+
+        first = rehearsed(1.0, _REHEARSAL_STEPS)
+        # Where the first sense does well, the other one is better only if it arrives before.
+        other = rehearsed(-1.0, _REHEARSAL_STEPS if any(first[:2]) else max(0, first[2] - 1))
+        state.driven[1] = (-1.0 if other < first else 1.0) * q_hat_p
+        parts = partition(task, split_of(state))
+        return FOUND if parts.found else NOT_UNIQUE, parts, not (first[0] and other[0])
+
+
+def begin(
+    model: Model, task: Task, s: FloatArray, q_start: FloatArray, bounds: _Bounds | None
+) -> tuple[State, Parts, bool]:
+    """Measure and partition the task at its start.
+
+    model : calibrated; task : in its frame.
+    s : (2, b, 2) straight pixels at the start; q_start : (n,) joints there, rad or m.
+    bounds : lower and upper limits (n,) of the joints, rad or m, where a half turn is to be made in the sense
+        that is better when rehearsed.
+    Returns the state with the face and the joint motions; the parts; False where neither sense of a half turn
+    arrived. Raises WorkFailed if the face is not seen, or a motion not unique.
+    """
+    m, span, arrives = len(task.A_star), span_of(model, task.A_star), True
+    state = new_state(len(q_start), m, span=span)
+    status, parts = _first_parts(model, task, s, q_start, state)
+    if status == FOUND and bounds is not None and _is_half_turn(parts.theta_p):
+        status, parts, arrives = _Rehearsal(model, q_start, m, bounds, span).better(task, state)
+    require_found(status, 0)
+    return state, parts, arrives
+
+
+@composed
+def _first_parts(
+    model: Model, task: Task, s: FloatArray, q_start: FloatArray, state: State
+) -> tuple[int, Parts]:
+    """Measure and partition the task in the sense that the angles have; what is wrong, and the parts."""
+    if not measure(model, task, s, q_start, state):
+        return NOT_MEASURED, NO_PARTS
+    parts = partition(task, split_of(state))
+    return FOUND if parts.found else NOT_UNIQUE, parts
+
+
+@composed
+def _is_half_turn(theta_p: float) -> bool:
+    """Whether the rotation within the plane is so near to half a turn that its sense must be chosen."""
+    return math.pi - abs(theta_p) < _HALF_TURN_BAND
+
+
+# A run that could not be begun; other verdicts as of ``step``.
+NOT_STARTED = -2
+# Columns of the numbers of a run: verdict, steps, then those of its summary.
+VERDICT, STEPS = range(2)
+NUMBERS = ("verdict", "steps", *Summary._fields)
+_NOT_OPENED = -1
+
+
+class Setting(NamedTuple):
+    """All that runs share which differ in their images alone; of a robot with six joints."""
+
+    code: int  # of the law
+    model: Model  # calibrated, by which the task is partitioned
+    believed: Model  # what the law believes, the same or the metric one
+    body: Body  # with which the task is measured; none for point by point
+    shares_task: bool  # whether the law measures the task in the same way; it else does point by point
+    rehearse: bool  # whether half turns are rehearsed
+    gains: Gains  # of the law
+    course: Course  # true robot as the law observes it, from its first joints
+    ends: Ends  # true poses of the tool
+
+
+class _Desk(NamedTuple):
+    """Workspace in which the task of a run is measured, and the run driven."""
+
+    shown: FloatArray  # (2, 2, b, 2) straight pixels of the images at the start and at the goal
+    task: Task
+    own_task: Task  # task, own_task: as it is partitioned, and as a law sees it that measures in another way
+    state: State
+    own_state: State  # state, own_state: of the partition and of the law
+    log: Log  # of the run
+
+
+class Trials:
+    """Runs of a setting, one after the other, in arrays that one run leaves to the next.
+
+    shown : how many markers are shown at the start and at the goal.
+    Raises WorkFailed if the face has fewer than three markers.
+    """
+
+    def __init__(self, setting: Setting, shown: int) -> None:
+        plant, limits, q_start = setting.course
+        n, m = len(q_start), len(plant.M)
+        observed, s_star = m + len(plant.pins), np.zeros((2, m, 2))
+        body = setting.body._replace(shown=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
+        self.setting = setting
+        self.desk = _Desk(
+            np.zeros((2, 2, shown, 2)),
+            new_task(setting.model, s_star, plant.center)._replace(body=body),
+            new_task(setting.believed, s_star, plant.center),
+            new_state(n, m, shown),
+            new_state(n, m, observed),
+            new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if setting.gains.substeps else 0),
+        )
+        self.rehearsal = _Rehearsal(setting.model, q_start, m, (plant.lower, plant.upper))
+
+    def numbers(self, shown: FloatArray, noise: FloatArray) -> FloatArray:
+        """Measure the task, partition it, drive the law to its verdict and sum up: (r, ``NUMBERS``).
+
+        shown : (r, 2, 2, b, 2) images of each run at the start and at the goal, the face first, px.
+        noise : (r, k, 2, m + p, 2) of the images of the loop, px; ``RUNNING`` is the verdict where it is too
+            short.
+        """
+        numbers = np.full((len(shown), len(NUMBERS)), math.nan)
+        at, made, opened = self.desk, 0, _NOT_OPENED
+        while made < len(shown):
+            made += _until_rehearsal(self.setting, shown[made:], noise[made:], at, opened, numbers[made:])
+            if made < len(shown):
+                opened, _, _ = self.rehearsal.better(at.task, at.state)
+        return numbers
+
+
+@njit
+def _until_rehearsal(
+    setting: Setting, shown: FloatArray, noise: FloatArray, desk: _Desk, opened: int, numbers: FloatArray
+) -> int:
+    """Runs up to one whose half turn is to be rehearsed, and how many; that one is opened.
+
+    A call takes as long as a tenth of a run to hand its arguments over, and all of it with the lock of the
+    interpreter held: hence many runs a call.
+
+    opened : what is wrong with the first run, which was opened; else ``_NOT_OPENED``.
+    """
+    for made in range(len(shown)):
+        status = opened
+        if made > 0 or opened == _NOT_OPENED:
+            status, theta_p = _open(setting, shown[made], desk)
+            if status == FOUND and setting.rehearse and _is_half_turn(theta_p):
+                return made
+        _drive(setting, status, noise[made], desk, numbers[made])
+    return len(shown)
+
+
+@merged
+def _open(setting: Setting, shown: FloatArray, desk: _Desk) -> tuple[int, float]:
+    """Measure and partition a task, and measure it as the law will; what is wrong, and the angle θ_p, rad."""
+    reset(desk.own_state)
+    if not setting.shares_task:
+        status = _put_measured(setting, setting.believed, shown, desk, desk.own_task)
+        if status != FOUND:
+            return status, 0.0
+    status = _put_measured(setting, setting.model, shown, desk, desk.task)
+    if status != FOUND:
+        return status, 0.0
+    reset(desk.state)
+    status, parts = _first_parts(setting.model, desk.task, desk.shown[0], setting.course.q_start, desk.state)
+    return status, parts.theta_p
+
+
+@composed
+def _put_measured(setting: Setting, model: Model, shown: FloatArray, desk: _Desk, task: Task) -> int:
+    """Measure a task from images (2, 2, b, 2) at its start and goal, px; what is wrong."""
+    for view in range(2):
+        for k in range(task.s_star.shape[1]):
+            for i in range(2):
+                task.s_star[view, k, i] = shown[1, view, k, i]
+    straight(model.lens, shown[0], desk.shown[0])
+    straight(model.lens, shown[1], desk.shown[1])
+    state = desk.state
+    status, _ = put_task(model, desk.shown, task, state.A, state.work.system.rhs)
+    if status == FOUND and task.body.M.shape[0] > 0:
+        q_start = setting.course.q_start
+        status, _ = put_body_task(model, q_start, desk.shown, task, split_of(state), state.normal)
+    return status
+
+
+@merged
+def _drive(setting: Setting, status: int, noise: FloatArray, desk: _Desk, numbers: FloatArray) -> None:
+    """Drive the law of a run that was opened; its numbers."""
+    numbers[VERDICT] = NOT_STARTED
+    if status != FOUND:
+        return
+    state = desk.own_state
+    for part in range(2):
+        for i in range(state.driven.shape[1]):
+            state.driven[part, i] = desk.state.driven[part, i]
+    task = desk.task if setting.shares_task else desk.own_task
+    law = Law(setting.code, setting.believed, task, setting.gains)
+    verdict, steps = run_compiled(law, setting.course, noise, state, desk.log)
+    numbers[VERDICT] = verdict
+    numbers[STEPS] = steps
+    if verdict != RUNNING:
+        ended, period = Ended(verdict, steps, state.limited[0]), setting.gains.period
+        found = summarize(setting.course.plant, desk.log, ended, period, setting.ends)
+        column = 2
+        for value in literal_unroll(found):
+            numbers[column] = value
+            column += 1

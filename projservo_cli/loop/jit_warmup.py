@@ -1,0 +1,66 @@
+"""Compiling what a first run needs later, in a process beside the one that calibrates: 10 s of 50."""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from subprocess import DEVNULL, Popen
+from typing import Any
+
+import numpy as np
+from numba import typeof
+
+from projservo_cli.control.law import ERRORS, new_state, pseudo_inverse, put_view, single_rotation
+from projservo_cli.geometry.algebra import IDENTITY
+from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.geometry.mechanisms import Seen, reach
+from projservo_cli.loop.metrics import Ended, path_deviation, summarize
+from projservo_cli.loop.step import new_log
+from projservo_cli.planning.margins import (
+    Reaching,
+    carrier_of,
+    limits_alone,
+    put_carried,
+    room_along,
+)
+from projservo_cli.records import Model
+from projservo_cli.robots.simulated import Ends, Plant
+from projservo_cli.task.face import Task
+from projservo_cli.task.partition import NO_PARTS
+
+
+@contextmanager
+def compiling_beside() -> Iterator[None]:
+    """Let another process compile meanwhile, where no kernel of the loop is in the cache."""
+    if CACHE_FOLDER is None or any(CACHE_FOLDER.rglob("compiled.run_compiled-*.nbi")):
+        yield
+        return
+    command = [sys.executable, "-c", f"from {__name__} import _compile_now; _compile_now()"]
+    with Popen(command, stdin=DEVNULL, stdout=DEVNULL, stderr=DEVNULL) as other:
+        try:
+            yield
+        finally:
+            other.kill()
+
+
+def _compile_now() -> None:
+    """Compile all calls."""
+    for kernel, arguments in calls():
+        kernel.compile(tuple(map(typeof, arguments)))
+
+
+def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
+    """Kernels and arguments of the types that all runs have; their values mean nothing."""
+    q, O, matrices, order = np.zeros(4), np.zeros((2, 4)), np.zeros((4, 4, 4)), np.zeros(4, np.int64)
+    model = Model(np.zeros((2, 3, 4)), matrices, order, q, q)
+    task = Task(np.zeros((2, 4, 2)), matrices[0], order, 0, np.zeros((3, 3)), O, q)
+    plant = Plant(model, matrices[0], order, 0, O, q, q, q, q, True)
+    state, log = new_state(4, 4), new_log(4, 4, 1, len(ERRORS))
+    reaching = Reaching(model, limits_alone(q, q), matrices, q, matrices[0], q, O, q)
+    along = room_along(reaching, 1)
+    yield reach, (model, Seen(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
+    yield pseudo_inverse, (state, 8, q)
+    yield put_view, (model, task, task.s_star, state, 0, 0)
+    yield single_rotation, (model, NO_PARTS, 1.0, state)
+    yield put_carried, (carrier_of(reaching), O, along)
+    yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))
+    yield path_deviation, (plant, log, 1, 0.04, q, q)

@@ -1,0 +1,145 @@
+"""Whether a robot has arrived, or stands still away from its goal, judged while it runs.
+
+A robot that need not follow what it is sent has arrived once it stands. Joints that lag or sag, and images
+that are late, show at the goal what they have not shown on the way.
+"""
+
+import math
+
+import numpy as np
+
+from projservo_cli.loop.step import (
+    CONVERGED,
+    NOT_FOLLOWING,
+    PLATEAU,
+    RUNNING,
+    WAITING,
+    Limits,
+    Log,
+    tolerance,
+)
+from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.robots.client import DrivenRobot
+
+# Share of the tolerance that a robot which stands may still move.
+_SETTLED = 0.5
+# At the goal, which one noisy look may show too soon, the law goes on for so many periods; then the robot is
+# held until it stands. It is moved again where the error is beyond so many tolerances, or beyond one at so
+# many looks in a row.
+_MORE, _GROWN, _LOOKS = 15, 3.0, 5
+# Progress is an image error that falls by this share below its least so far.
+_FALL = 0.01
+# Joints stand that move by less than so many deviations of their readings, or than this, rad or m; set-points
+# do by the latter.
+_DEVIATIONS, _LEAST = 4.0, 3e-4
+# A joint does not follow that stays while its set-point moves by so many times its sag.
+_STAYS = 2.0
+# Windows without progress after which a robot that moves to and fro is given up.
+_PATIENCE = 8
+# A window lasts so many times as long as images and servos are late.
+_TIMES_LATE = 4.0
+
+
+class Standing:
+    """Judge of a run of a robot that need not follow what it is sent.
+
+    robot : what is driven; limits : of the run.
+    ``why``: what holds the robot, once that was found. ``minimum``: whether that is the law alone.
+    """
+
+    def __init__(self, robot: DrivenRobot, limits: Limits) -> None:
+        self._robot, self._limits = robot, limits
+        known, bounds = robot.known, robot.robot.bounds
+        late = bounds.lag_s + max(0.0, float((known.delays.mean + known.delays.sigma).max()))
+        self._window = max(limits.plateau_steps, math.ceil(_TIMES_LATE * late / bounds.period))
+        self._still = np.maximum(_DEVIATIONS * known.sigma_q, _LEAST)
+        self._best, self._since = math.inf, 0
+        self._read: list[FloatArray] = []
+        self._sent: list[FloatArray] = []
+        self._short: list[BoolArray] = []
+        self._more = self._looks = 0  # periods and looks that are left at the goal
+        self.why, self.minimum = "", False
+
+    def ruled(self, log: Log, k: int, verdict: int) -> int:
+        """What becomes of the verdict of an instant; none while the arm is held."""
+        steered, now = self._robot.steered, len(self._read)
+        self._read.append(steered.reading.q)
+        self._sent.append(steered.target)
+        self._short.append(steered.set_point.short)
+        error = float(log.judged[k])
+        # What the law has left, and what is still to come: the sag that is not yet learnt, too.
+        left = error + self._robot.carried_px
+        if left < (1.0 - _FALL) * self._best:
+            self._best, self._since = left, now
+        ends = verdict not in (RUNNING, WAITING, CONVERGED)
+        if ends or k == self._limits.max_steps or math.isnan(error):
+            return verdict
+        within = tolerance(self._limits, log.fit[k, 2])
+        verdict = self._arrived(verdict, error, within)
+        return verdict if verdict == CONVERGED else self._stuck(now, verdict, error <= _GROWN * within)
+
+    def _arrived(self, verdict: int, error: float, within: float) -> int:
+        """``CONVERGED`` where the robot stands at the goal; until then the law goes on, then waits."""
+        if verdict == CONVERGED and not self._looks:
+            self._looks, self._more = _LOOKS, _MORE if self._limits.noise_px > 0.0 else 0
+        if not self._looks or error > _GROWN * within:
+            self._looks = 0
+            return verdict
+        if self._more:
+            self._more -= 1
+            return RUNNING
+        if not self._robot.settled(_SETTLED * within):
+            return WAITING
+        self._looks -= 1
+        return verdict if verdict == CONVERGED or not self._looks else WAITING
+
+    def _stuck(self, now: int, verdict: int, near: bool) -> int:
+        """``PLATEAU`` or ``NOT_FOLLOWING`` where the robot makes no progress; else the verdict as it is.
+
+        ``near``: whether it is so near the goal that what the law asks for may be lost in its joints.
+        """
+        idle, window = now - self._since, self._window
+        if idle < window:
+            return verdict
+        moved, sent = (np.ptp(rows[-window:], axis=0) for rows in (self._read, self._sent))
+        moved_since, sent_since = (np.ptp(rows[self._since :], axis=0) for rows in (self._read, self._sent))
+        stands, sag = bool((moved <= self._still).all()), self._robot.robot.bounds.sag
+        short: BoolArray = np.all(self._short[-window:], axis=0) & (moved <= self._still)
+        stays = (moved_since <= self._still) & (sent_since > _STAYS * np.maximum(sag, self._still)) | short
+        if stays.any():
+            self._say_who_stays(stays)
+            return NOT_FOLLOWING
+        if stands and (sent <= _LEAST).all():
+            self.minimum = True
+            most = self._robot.robot.bounds.told(int(np.argmax(sent)), float(sent.max()), 2)
+            self.why = (
+                f"set-points moved by no more than {most}: play in the joints, coarse set-points or coarse "
+                "readings hide what is left"
+                if near
+                else "the law asks for no motion there, a local minimum"
+            )
+            return PLATEAU
+        if (moved <= np.maximum(sag, self._still)).all() and idle >= _PATIENCE * window:
+            self._say_what_holds(moved_since, sent_since)
+            return PLATEAU
+        return verdict
+
+    def _say_who_stays(self, stays: BoolArray) -> None:
+        """A joint stays where it is however far its set-point goes."""
+        gap = np.abs(self._sent[-1] - self._read[-1]) * stays
+        i, told = int(np.argmax(gap)), self._robot.robot.bounds.told
+        self.why = (
+            f"joint {i + 1} stands at {told(i, self._read[-1][i])}, {told(i, gap[i], 3)} off its set-point: "
+            "look whether it is blocked, braked or in a protective stop, or raise plant.sag_deg or "
+            "plant.lead_deg"
+        )
+
+    def _say_what_holds(self, moved: FloatArray, sent: FloatArray) -> None:
+        """What a robot that moves to and fro without coming nearer is held by."""
+        i, told = int(np.argmax(sent / self._still)), self._robot.robot.bounds.told
+        amounts = f"{told(i, sent[i], 3)}, its readings by {told(i, moved[i], 3)}"
+        what = f"set-points of joint {i + 1} moved by {amounts}"
+        if moved[i] <= 0.5 * sent[i]:
+            self.why = f"{what}: it does not follow such small steps; coarse set-points, or friction"
+        else:
+            self.why = f"{what}, and images show no gain: play in the joints, or coarse set-points"

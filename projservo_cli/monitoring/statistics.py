@@ -1,0 +1,567 @@
+"""How images may differ from their prediction while nothing is wrong, and tests of that."""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_solve, solve_triangular
+from scipy.special import chdtri
+
+from projservo_cli.calibration.forward import CAMERA, Scene
+from projservo_cli.calibration.prediction import all_changed, scene_of
+from projservo_cli.calibration.readings import LEAST_SIGMA, per_rad
+from projservo_cli.monitoring.frame_pairs import Look
+from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray
+
+# Looks in a row that must agree: one may be blurred, or a marker taken for another.
+WINDOW = 3
+# Chance that a run of sound looks is called faulty, if all windows were independent. They overlap: it comes
+# to a twentieth of that. More of it is spent on the first looks.
+_FALSE_ALARM, _SOON = 1e-2, 10.0
+# Windows in which an onset is looked for, one longer than the other by this factor.
+_LONGER = 1.5
+# Error of the first order of a prediction, at most, as a share of the calibration's own noise.
+_BEYOND_FIRST_ORDER = 0.02
+# Lasting errors of a joint, by backlash and counts, differ between two times by √2 of their deviation.
+_LASTING = np.sqrt(2.0)
+# The part of a corner's error that is not new in each frame may last beyond a view: of many corners some are
+# off by so many deviations all along.
+_LASTING_CORNER = 2.0
+# Sightings of the calibration tell how a corner errs that is seen from within about this angle, rad; beside
+# them count so many of typical ones.
+_SLANT, _PRIOR_SIGHTINGS = 0.25, 4.0
+# In a view that the calibration has not seen all of them are, by so many.
+_UNUSUAL = 1.0
+# Joints (rad or m) and instants (s) are known no better than this, whatever is stated.
+LEAST_ERROR = 1e-6
+# A direction counts where it keeps this share of its size beside the others; what is added for solving.
+_RANK, RIDGE = 1e-6, 1e-9
+# Frames that are so near show joints of one reading, s.
+_AT_ONCE_S = 1e-4
+# A view lasts while markers move by no more than this, px rms; its looks are forgotten at this rate.
+_SAME_VIEW_PX, _FORGET = 20.0, 1.0 - 1.0 / 30.0
+# Markers that move by no more, px rms, show the same pixels; coordinates of such looks that tell enough.
+_AT_REST_PX, _ENOUGH = 0.2, 100.0
+# Differences between so many frames at rest tell how a sighting trembles: the median of χ² with two degrees
+# of freedom, which is beyond the second number once in ten thousand.
+_DIFFERENCES, _MEDIAN, _MEDIAN_AT_MOST = 9, 1.386, 5.6
+# χ² of a sighting that may be off by itself: once in ten thousand by chance.
+_OFF_ALONE = 18.4
+# Share of the markers of a view that may be off one by one before the view itself is.
+_MOST_ASIDE = 0.5
+
+
+class Residual(NamedTuple):
+    """Residuals of one look: rows by view, marker and coordinate, zero where unseen."""
+
+    seen: BoolArray  # (2, m)
+    noise: FloatArray  # (2, m) px
+    predicted: FloatArray  # (2, m, 2) px
+    r: FloatArray  # (4 m,) seen less predicted, px
+    B: FloatArray  # (4 m, e) derivatives by the errors of the calibration, in units of their deviations
+    F: FloatArray  # (4 m, f) derivatives by what may be wrong
+    R: FloatArray  # (4 m, 4 m) covariance of one look but for the errors of the calibration, px²
+
+    def without(self, aside: BoolArray) -> "Residual":
+        """The same without some sightings (2, m)."""
+        rows = np.repeat(~aside.ravel(), 2)
+        r, B, F = (part * (rows if part.ndim == 1 else rows[:, None]) for part in (self.r, self.B, self.F))
+        return self._replace(seen=self.seen & ~aside, r=r, B=B, F=F)
+
+
+class Sums(NamedTuple):
+    """Normal equations of looks, those of one view together as so many as they are worth."""
+
+    looks: int  # views that they come from
+    t: float  # when the last was taken, s from the first look
+    normal: FloatArray  # (c, c) of errors of the calibration, of what may be wrong, and of the residual
+    seen: FloatArray  # (2, m) coordinates seen of each marker
+    bias: FloatArray  # (2, m) squared errors of the model that they may have, over the noise
+
+    def plus(self, other: "Sums", factor: float = 1.0) -> "Sums":
+        """Sums and so many times others, which are later."""
+        return Sums(
+            self.looks + other.looks,
+            other.t,
+            self.normal + factor * other.normal,
+            self.seen + factor * other.seen,
+            self.bias + factor * other.bias,
+        )
+
+    def times(self, factor: float) -> "Sums":
+        """The same with another weight."""
+        return self._replace(normal=factor * self.normal, seen=factor * self.seen, bias=factor * self.bias)
+
+
+class ErrorModel:
+    """What a calibration allows images to be off, and directions in which faults would change them.
+
+    At given joint readings the calibration predicts the pixels of every marker. What is seen differs by
+
+        r = J δ + J_q δq + J_q q̇ δd + c + ε
+
+    to first order: δ ~ N(0, Σ), errors of the calibration, the same all along; δq of the joint readings, the
+    same in both views of one instant; δd of the instant of each frame; c, errors of corners that last while
+    the view does, and ε, what is new in each frame, of the variance σ² together.
+    """
+
+    def __init__(self, calibration: Calibration, sigma_px: float) -> None:
+        m, n = len(calibration.M), len(calibration.H_hat_0)
+        self.calibration, self.scene = calibration, scene_of(calibration)
+        self.errors, self.e = calibration.errors, calibration.shared_error.shape[1] + 3 * m
+        bent = _BEYOND_FIRST_ORDER * calibration.sigma_px
+        self._least = max(bent, LEAST_SIGMA)
+        self._sigma = max(sigma_px, self._least)
+        self._stated = self._sigma / max(calibration.sigma_px, LEAST_SIGMA) * (calibration.sigma_scale or 1.0)
+        self.bias_px = max(calibration.model_px, bent)
+        sigma_q = calibration.sigma_q or 0.0
+        if calibration.sigma_q_interval is not None:
+            sigma_q = max(sigma_q, float(calibration.sigma_q_interval[1]))
+        self.sigma_q = np.maximum(sigma_q * per_rad(calibration.prismatic), LEAST_ERROR)
+        # Directions of points at infinity, of rigid motions, and of changes of a camera but for its scale.
+        self.directions = np.linalg.svd(calibration.a_inf[None])[2][1:]
+        self.twists = _rigid_motions(calibration.H_hat_0, self.directions, calibration.a_inf)
+        self.cameras = [np.linalg.svd(P.reshape(1, CAMERA))[2][1:].T for P in calibration.P]
+        self.parts, self.touches, self.f = _directions_of(n, m, len(self.twists))
+        # Squares (K, 2, m) by which corners erred while it was recorded, and where they were seen from.
+        self._squares = calibration.corner_squares
+        if self._squares is not None and calibration.corner_q is not None:
+            self._counts: BoolArray = np.isfinite(self._squares)
+            self._typical = float(self._squares[self._counts].mean()) if self._counts.any() else 1.0
+            q = calibration.corner_q - calibration.q_reference
+            self._rays = _rays(self.scene, self.directions, q)
+
+    def noise(self, seen: BoolArray, stated: FloatArray | None) -> FloatArray:
+        """Standard deviation (2, m) of pixels, px: those stated, as the calibration found them, if any."""
+        common = np.full(seen.shape, self._sigma)
+        if stated is None:
+            return common
+        return np.where(stated > 0.0, np.maximum(self._stated * stated, self._least), common)
+
+    def residual(self, look: Look) -> Residual:
+        """Residuals of a look and their derivatives, each view at its own joints."""
+        scene, away, views = self.scene, look.q - self.calibration.q_reference, np.arange(2)
+        m, n, rows = len(scene.M), len(scene.H_hat), 4 * len(scene.M)
+        predicted = scene.seen(away)[views, views]
+        r = look.images - predicted
+        seen = np.isfinite(r[..., 0])
+        noise = look.noise * np.sqrt(self._excess(away))
+        at = scene.everywhere(away)
+        B = all_changed(scene, self.errors, away, at)[views, views]
+        D = at.by_point.reshape(n + 1, 2, 2, m, 2, 4)[:, views, views]
+        Y = at.points.reshape(n + 1, 2, m, 4)
+        by_camera = at.by_camera.reshape(2, 2, m, 2, CAMERA)[views, views]
+        F = self._fault_derivative(D, Y, by_camera, look)
+        for part in (r, B, F):
+            part[~seen] = 0.0
+        F = F.reshape(rows, -1)
+        J_q, late = F[:, :n], F[:, 2 * n : 2 * n + 2] * look.late
+        # Errors of joints are the same in both views of a look, but for what they move between both frames.
+        new = np.concatenate([J_q * self.sigma_q, late], axis=1)
+        if abs(look.t[0] - look.t[1]) > _AT_ONCE_S:
+            left = np.arange(rows)[:, None] < rows // 2
+            between = J_q * look.curved
+            new = np.concatenate([new, between * left, between * ~left], axis=1)
+        # An instant so uncertain that the arm moves on a curve: half the square of the angle.
+        bend = 0.5 * np.abs(look.q_dot).sum(axis=1).max() * (late @ look.late)
+        R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
+        return Residual(seen, noise, predicted, r.ravel(), B.reshape(rows, -1), F, R)
+
+    def _excess(self, away: FloatArray) -> FloatArray:
+        """Variance of corners (2, m) over their noise, as sightings of the calibration from near them err.
+
+        A corner that is seen from another side, or under another slant, errs otherwise.
+        away : (2, n) joints of both views from the reference.
+        """
+        if self._squares is None:
+            return np.ones((2, len(self.scene.M)))
+        rays = np.stack([_rays(self.scene, self.directions, away[v : v + 1])[0, v] for v in (0, 1)])
+        apart = 2.0 * (1.0 - np.abs(np.einsum("vmx,kwmx->vmkw", rays, self._rays)))
+        near = np.exp(-0.5 * apart / _SLANT**2) * self._counts.transpose(2, 0, 1)
+        squares = np.where(self._counts, self._squares, 0.0).transpose(2, 0, 1)
+        found = (near * squares).sum(axis=(2, 3)) + _PRIOR_SIGHTINGS * self._typical
+        return np.asarray(np.maximum(found / (near.sum(axis=(2, 3)) + _PRIOR_SIGHTINGS), 1.0))
+
+    def _fault_derivative(
+        self, D: FloatArray, Y: FloatArray, by_camera: FloatArray, look: Look
+    ) -> FloatArray:
+        """Derivatives (2, m, 2, f) of pixels by what may be wrong, in the order of ``_directions_of``.
+
+        D : (n + 1, 2, m, 2, 4) by the points Y (n + 1, 2, m, 4) behind each joint; by_camera : (2, m, 2, 12).
+        """
+        n, _, m = Y[1:, ..., 0].shape
+        F, d = np.zeros((2, m, 2, self.f)), len(self.twists)
+        velocity = Y[:n] @ self.scene.H_hat[:, None].swapaxes(2, 3)
+        J_q = np.moveaxis((D[:n] @ velocity[..., None])[..., 0], 0, -1)
+        F[..., :n], F[..., n : 2 * n] = J_q, J_q * look.t[:, None, None, None]
+        by_marker, first = D[n] @ self.directions.T, 2 * n + 2
+        for v in (0, 1):
+            F[v, ..., 2 * n + v] = -J_q[v] @ look.q_dot[v]
+            F[v, ..., first : first + CAMERA - 1] = by_camera[v] @ self.cameras[v]
+            first += CAMERA - 1
+        for j in range(m):
+            F[:, j, :, first : first + 3] = by_marker[:, j]
+            first += 3
+        F[..., first : first + d] = D[n] @ np.moveaxis(self.scene.M @ self.twists.swapaxes(1, 2), 0, -1)
+        F[..., first + d :] = D[0] @ np.moveaxis(Y[0] @ self.twists[:, None].swapaxes(2, 3), 0, -1)
+        return F
+
+    def sums(self, residual: Residual, t: float) -> Sums:
+        """What one look adds to the normal equations."""
+        rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
+        rows = solve_triangular(np.linalg.cholesky(residual.R), rows, lower=True, check_finite=False)
+        bias = 2.0 * residual.seen * (self.bias_px / residual.noise) ** 2
+        return Sums(1, t, rows.T @ rows, np.where(residual.seen, 2.0, 0.0), bias)
+
+    def nothing(self) -> Sums:
+        """Sums of no look."""
+        c = self.e + self.f + 1
+        none = np.zeros((2, len(self.calibration.M)))
+        return Sums(0, 0.0, np.zeros((c, c)), none, none)
+
+    def root(self, sums: Sums) -> FloatArray:
+        """Root (e, e) of the information on the errors of the calibration."""
+        return np.asarray(np.linalg.cholesky(np.eye(self.e) + sums.normal[: self.e, : self.e]))
+
+    def strays(self, sums: Sums) -> bool:
+        """Whether sums put the calibration where it is not by chance, once in ten thousand."""
+        root = self.root(sums)
+        off = cho_solve((root, True), sums.normal[: self.e, -1], check_finite=False)
+        return bool(off @ off > chdtri(self.e, 1e-4))
+
+    def lasting(self, seconds: float, late: FloatArray) -> FloatArray:
+        """Information (2 n + 2, 2 n + 2) on errors of joints, their drift with time, and of instants.
+
+        Over that time joints are off by a straight line, its middle and its slope by what lasts.
+        """
+        n = len(self.sigma_q)
+        weight = np.diag((_LASTING * np.concatenate([self.sigma_q, self.sigma_q, late])) ** -2.0)
+        line = np.eye(2 * n + 2)
+        line[:n, n : 2 * n] = 0.5 * seconds * np.eye(n)
+        line[n : 2 * n, n : 2 * n] = max(seconds, LEAST_ERROR) / np.sqrt(12.0) * np.eye(n)
+        return np.asarray(line.T @ weight @ line)
+
+
+class Memory:
+    """Looks that agreed, view by view: looks of one view share the errors of their corners."""
+
+    def __init__(self, errors: ErrorModel) -> None:
+        self._errors = errors
+        self._closed = [errors.nothing()]
+        self._total: Sums | None = None  # as last asked for
+        self._view = errors.nothing()  # looks of the view that lasts, fading
+        self._count = 0.0
+        self._first: FloatArray | None = None  # (2, m, 2) px predicted at its beginning
+        # The last look, as ``learn`` is given it.
+        self._before: tuple[Residual, BoolArray, bool] | None = None
+        # Of differences from look to look, over σ²: in motion, and at rest.
+        self._squares, self._freedom = np.zeros(2), np.zeros(2)
+        # Of each sighting (2, m) from look to look at rest, px².
+        self._steps: deque[FloatArray] = deque(maxlen=_DIFFERENCES)
+
+    def noise(self, stated: FloatArray) -> FloatArray:
+        """Standard deviations (2, m) of pixels, px: those stated, or as sightings tremble where that is more.
+
+        The median of differences at rest tells it, which a step does not move, such as a fault makes.
+        """
+        if len(self._steps) < _DIFFERENCES:
+            return stated
+        square = np.median(np.array(self._steps), axis=0)
+        more = square > _MEDIAN_AT_MOST * stated**2
+        return np.sqrt(square / _MEDIAN, where=more, out=stated.copy())
+
+    @property
+    def fresh(self) -> float:
+        """Share of the variance of a corner that is new in each frame, as differences in a view tell.
+
+        No more than is sure; a finder that makes the same error in each frame has none.
+        """
+        i = int(self._freedom[1] >= _ENOUGH)
+        if not self._freedom[i]:
+            return 0.0
+        sure = 1.0 - 2.0 * np.sqrt(2.0 / self._freedom[i])
+        return float(np.clip(self._squares[i] / self._freedom[i], 0.0, 1.0) * max(0.0, sure))
+
+    def worth(self, looks: float) -> float:
+        """How many single looks so many looks of one view are worth."""
+        return looks / (self.fresh + looks * (1.0 - self.fresh)) if looks else 0.0
+
+    @property
+    def views(self) -> int:
+        """Number of views that agreed."""
+        return self._closed[-1].looks + (self._count > 0.0)
+
+    @property
+    def total(self) -> Sums:
+        """Sums of all looks."""
+        if self._total is None:
+            self._total = self._closed[-1]
+            if self._count:
+                self._total = self._total.plus(self._view.times(self.worth(self._count) / self._count))
+        return self._total
+
+    def onsets(self) -> list[Sums]:
+        """Sums before each time that something may have begun, the earliest first."""
+        seen = self.total.seen.sum()
+        return [sums for sums in self._closed if sums.seen.sum() < seen]
+
+    def keep(self, residual: Residual, t: float, whole: bool) -> None:
+        """Add a look; of earlier views those are kept that tell an onset to a quarter of its age.
+
+        whole : whether no sighting of it is aside. What else is left is perhaps of the same hand or blur, and
+        is no look that agrees where the calibration would have to be off beyond chance.
+        """
+        new = self._errors.sums(residual, t)
+        if not whole and self._errors.strays(self.total.plus(new)):
+            return
+        if self._first is None or not is_same_view(self._first, residual.predicted):
+            if self._count:
+                self._closed.append(self.total)
+                age = [max(1, (self._closed[-1].looks - sums.looks) // 4) for sums in self._closed]
+                self._closed = [
+                    sums
+                    for sums, a in zip(self._closed, age, strict=True)
+                    if sums.looks % (1 << (a.bit_length() - 1)) == 0
+                ]
+            self._view, self._count, self._first = self._errors.nothing(), 0.0, residual.predicted
+        self._total = None
+        self._view = self._view.times(_FORGET).plus(new)._replace(looks=1)
+        self._count = _FORGET * self._count + 1.0
+
+    def learn(self, now: Residual, aside: BoolArray, disagrees: bool) -> None:
+        """Learn what is new in each frame from two in a row, beside errors of joints and instants.
+
+        Those at rest tell it, once there are enough: a corner that moves by part of a pixel errs otherwise.
+        aside : (2, m) sightings that are off by themselves, which tell how they tremble alone.
+        disagrees : whether this look does; one that does and one that does not tell nothing.
+        """
+        last, self._before = self._before, (now, aside, disagrees)
+        i = int(last is not None and _alike(last[0].predicted, now.predicted, _AT_REST_PX))
+        if not i:
+            self._steps.clear()
+        if last is None or last[2] != disagrees or not is_same_view(last[0].predicted, now.predicted):
+            return
+        before, n = last[0], len(self._errors.sigma_q)
+        seen = before.seen & now.seen
+        rows = np.repeat((seen & ~aside & ~last[1]).ravel(), 2)
+        weight = 1.0 / np.repeat(now.noise.ravel(), 2)
+        off, moved = (now.r - before.r) * weight, now.F[:, [*range(n), 2 * n, 2 * n + 1]] * weight[:, None]
+        basis, R = np.linalg.qr(moved[rows])
+        along = basis.T @ off[rows]
+        freedom = len(basis) - basis.shape[1]
+        if freedom > 0:
+            square = float(off[rows] @ off[rows] - along @ along)
+            off -= moved @ np.linalg.lstsq(R, along)[0]
+            if i:
+                step = 0.5 * np.square(off / weight).reshape(*seen.shape, 2).sum(axis=2)
+                self._steps.append(np.where(seen, step, np.nan))
+            # Fading, so that what a finder does in one light does not count for ever.
+            self._squares[i] *= 0.99
+            self._squares[i] += 0.5 * square
+            self._freedom[i] = 0.99 * self._freedom[i] + freedom
+            self._total = None
+
+
+def is_same_view(before: FloatArray, now: FloatArray) -> bool:
+    """Whether predicted pixels (2, m, 2) are of one view, of which corners err alike."""
+    return _alike(before, now, _SAME_VIEW_PX)
+
+
+def _alike(before: FloatArray, now: FloatArray, within_px: float) -> bool:
+    """Whether predicted pixels (2, m, 2) are the same within so many px rms."""
+    moved = np.square(now - before).sum(axis=-1)
+    return bool(np.nanmean(np.append(moved, 0.0)) <= within_px**2)
+
+
+class Tested(NamedTuple):
+    """Tests of one look."""
+
+    disagrees: bool  # whether the whole of it does
+    aside: BoolArray  # (2, m) sightings that are off by themselves
+
+
+class Detector:
+    """Tests of looks against a calibration.
+
+    Each look is tested by itself, each view and each marker; the looks of each window since an onset by the
+    likelihood ratio of each direction that a fault may take, beside the errors of the calibration and the
+    lasting ones with their priors.
+
+    Source: A. S. Willsky, H. L. Jones, "A Generalized Likelihood Ratio Approach to the Detection and
+    Estimation of Jumps in Linear Systems", IEEE Trans. Automatic Control 21 (1976) 108–112.
+
+    errors : what images may be off; observations : most looks of one sequence, which sets the thresholds.
+    """
+
+    def __init__(self, errors: ErrorModel, observations: int) -> None:
+        self._errors, self.memory = errors, Memory(errors)
+        m = len(errors.calibration.M)
+        tail = _FALSE_ALARM / observations
+        self._chance = _FALSE_ALARM / np.log1p(observations / _SOON)
+        self._most_once = np.sqrt(chdtri(np.maximum(np.arange(4 * m + 1), 1), tail / (3 + m)))
+        self._sizes = np.array([len(columns) for columns in errors.parts])
+        self._by_size = [
+            (which, np.array([errors.parts[i] for i in which]))
+            for which in (np.flatnonzero(self._sizes == size) for size in np.unique(self._sizes))
+        ]
+
+    def tested(self, residual: Residual) -> Tested:
+        """Test χ² of each view and each marker in one look, sightings that are off by themselves aside."""
+        errors, (_, m) = self._errors, residual.seen.shape
+        total = self.memory.total
+        both = np.concatenate([residual.B.T, total.normal[: errors.e, -1:]], axis=1)
+        both = solve_triangular(errors.root(total), both, lower=True, check_finite=False)
+        W = both[:, :-1]
+        S, r = W.T @ W + residual.R, residual.r - W.T @ both[:, -1]
+        rows = np.arange(4 * m).reshape(2, m, 2)
+        sightings = self._beyond(S, r, rows.reshape(2 * m, 2), residual).reshape(2, m)
+        markers = self._beyond(S, r, rows.swapaxes(0, 1).reshape(m, 4), residual)
+        aside = (sightings | (markers & ~sightings.any(axis=0))) & residual.seen
+        parts = (np.arange(2 * m) < m, np.arange(2 * m) >= m, np.ones(2 * m, dtype=np.bool_))
+        off = [self._is_off(S, r, residual, aside, part) for part in parts]
+        if any(off):
+            aside[:] = False
+        return Tested(any(off), aside)
+
+    def _is_off(
+        self, S: FloatArray, r: FloatArray, residual: Residual, aside: BoolArray, part: BoolArray
+    ) -> bool:
+        """Whether a view, or both, disagree even without their worst sightings, up to half, which go aside.
+
+        part : (2 m,) its sightings.
+        """
+        shown, out = residual.seen & part.reshape(aside.shape), aside.reshape(-1)
+        allowed = _MOST_ASIDE * shown.sum(axis=1)
+        while ((aside & shown).sum(axis=1) <= allowed).all():
+            left = np.flatnonzero(shown.ravel() & ~out)
+            rows = (2 * left[:, None] + np.arange(2)).ravel()
+            if not self._beyond(S, r, rows[None], residual)[0]:
+                return False
+            square = beside_others(S[np.ix_(rows, rows)], r[rows])
+            if square.max() <= _OFF_ALONE:
+                return True
+            out[left[np.argmax(square)]] = True
+        return True
+
+    def _beyond(self, S: FloatArray, r: FloatArray, parts: IntArray, residual: Residual) -> BoolArray:
+        """Which parts (h,) of residuals, by their rows (h, p), are beyond chance and errors of the model."""
+        seen = np.repeat(residual.seen.ravel(), 2)[parts]
+        bias = np.repeat((self._errors.bias_px / residual.noise.ravel()) ** 2, 2)[parts]
+        bias = bias + _UNUSUAL**2 * (1.0 - self.memory.fresh)
+        most = self._most_once[seen.sum(axis=1)] + np.sqrt((seen * bias).sum(axis=1))
+        gain = gains(S, np.where(np.repeat(residual.seen.ravel(), 2), r, 0.0), parts, 0.0)[0]
+        return np.asarray(gain > most**2)
+
+    def significant(self, looks: int, late: FloatArray, free: list[IntArray], thorough: bool) -> Sums | None:
+        """Sums before an onset since when something is beyond chance, if so.
+
+        looks : number of this one; late : (2,) deviation of instants, s; free : columns of markers that are
+        known to be off; thorough : test windows of all lengths, not of another one at each look.
+        """
+        total, onsets = self.memory.total, self.memory.onsets()
+        if not onsets or not total.looks:
+            return None
+        lengths = _LONGER ** np.arange(1 + int(np.log(total.looks) / np.log(_LONGER)))
+        tail = self._chance / (looks + _SOON) / len(self._sizes)
+        by_chance = np.sqrt(chdtri(self._sizes, tail))
+        found: Sums | None = None
+        most = 0.0
+        for length in lengths if thorough else lengths[[looks % len(lengths)]]:
+            since = min(onsets, key=lambda sums: abs(total.looks - length - sums.looks))
+            gain, bias = self._gain(since, total, late, free)
+            excess = float((np.sqrt(gain) - by_chance - np.sqrt(bias)).max())
+            if excess > most:
+                found, most = since, excess
+        return found
+
+    def _gain(
+        self, since: Sums, total: Sums, late: FloatArray, free: list[IntArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """What each direction gains since an onset (h,), and what errors of the model may."""
+        e, n = self._errors.e, len(self._errors.sigma_q)
+        across = (total.normal - since.normal)[:, e:]
+        for part in (across.T, across[e:]):  # time is from the onset
+            part[n : 2 * n] -= since.t * part[:n]
+        least = RIDGE * across[e:].diagonal()
+        across[:e, -1] = total.normal[:e, -1]
+        W = solve_triangular(self._errors.root(total), across[:e], lower=True, check_finite=False)
+        normal = across[e:] - W.T @ W
+        beside = np.concatenate([np.arange(2 * n + 2), *free]).astype(np.int64)
+        weight = np.diag(np.maximum(least[beside], RIDGE))
+        weight[: 2 * n + 2, : 2 * n + 2] = self._errors.lasting(total.t - since.t, late)
+        solved = np.linalg.solve(normal[np.ix_(beside, beside)] + weight, normal[beside])
+        normal -= normal[:, beside] @ solved
+        gain = np.zeros(len(self._sizes))
+        for which, columns in self._by_size:
+            gain[which] = gains(normal, normal[:, -1], columns, least)[0]
+        lasting = _LASTING_CORNER**2 * (1.0 - self.memory.fresh)
+        bias = total.bias - since.bias + lasting * (total.seen - since.seen)
+        return gain, self._errors.touches @ bias.ravel()
+
+
+def gains(
+    normal: FloatArray, right: FloatArray, parts: IntArray, least: FloatArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """bᵀ A⁻¹ b (h,) and A⁻¹ b (h, p) for parts (h, p) of A x = b, its diagonal not below a least."""
+    size = np.sqrt(np.maximum(np.maximum(normal.diagonal(), least), 1e-300))[parts]
+    blocks = normal[parts[:, :, None], parts[:, None, :]] / (size[:, :, None] * size[:, None, :])
+    b = right[parts] / size
+    x = np.linalg.solve(blocks + RIDGE * np.eye(parts.shape[1]), b[..., None])[..., 0]
+    return np.maximum((b * x).sum(axis=1), 0.0), x / size
+
+
+def beside_others(S: FloatArray, r: FloatArray) -> FloatArray:
+    """Return χ² (k,) of each sighting given all others, of residuals r (2 k,) with covariance S.
+
+    Errors of joints move all of them: one by itself hardly shows what it is off.
+    """
+    P, k = np.linalg.inv(S), np.arange(len(r) // 2)
+    u, blocks = (P @ r).reshape(-1, 2, 1), P.reshape(len(k), 2, len(k), 2)[k, :, k]
+    return np.asarray((u * np.linalg.solve(blocks, u)).sum(axis=(1, 2)))
+
+
+def _rays(scene: Scene, directions: FloatArray, q: FloatArray) -> FloatArray:
+    """Lines of sight (K, 2, m, 3) of all markers in the frame of the tool, unit vectors but for their sign.
+
+    directions : (3, 4) of points at infinity; q : (K, n) joints from the reference.
+    """
+    by_marker = scene.everywhere(q).by_point[-1].reshape(2, len(q), len(scene.M), 2, 4) @ directions.T
+    ray = np.cross(by_marker[..., 0, :], by_marker[..., 1, :])
+    return np.asarray((ray / np.linalg.norm(ray, axis=-1, keepdims=True)).swapaxes(0, 1))
+
+
+def _rigid_motions(H_hat: FloatArray, directions: FloatArray, a_inf: FloatArray) -> FloatArray:
+    """Basis (d, 4, 4) of rigid motions: translations, and what the joints generate together."""
+    brackets = [A @ B - B @ A for A in H_hat for B in H_hat]
+    known = np.concatenate([H_hat, np.array(brackets), directions[:, :, None] * a_inf])
+    sizes, rows = np.linalg.svd(known.reshape(-1, 16))[1:]
+    return np.asarray(rows[:6][sizes[:6] > _RANK * sizes[0]].reshape(-1, 4, 4))
+
+
+def _directions_of(n: int, m: int, d: int) -> tuple[list[IntArray], FloatArray, int]:
+    """Columns of each direction of a fault, sightings (h, 2 m) that each touches, and how many columns.
+
+    The columns are: joints, joints that go on, instants, cameras, markers, rigid motions of the tool and of
+    the rig.
+    """
+    everything = np.ones((2, m))
+    views = [everything * (np.arange(2)[:, None] == v) for v in (0, 1)]
+    at_camera, free = 2 * n + 2, CAMERA - 1
+    at_marker = at_camera + 2 * free
+    at_tool = at_marker + 3 * m
+    found = [*((np.array([i]), everything) for i in range(2 * n))]
+    found += [(n + np.arange(n), everything), (np.arange(n), everything)]
+    for v in (0, 1):
+        found += [(np.array([2 * n + v]), views[v]), (at_camera + v * free + np.arange(free), views[v])]
+    found += [(2 * n + np.arange(2), everything)]
+    for j in range(m):
+        found += [(at_marker + 3 * j + np.arange(3), everything * (np.arange(m) == j))]
+    found += [(at_tool + np.arange(d), everything), (at_tool + d + np.arange(d), everything)]
+    columns, touches = zip(*found, strict=True)
+    return list(columns), np.array([part.ravel() for part in touches]), at_tool + 2 * d
+
+
+def columns_of_marker(errors: ErrorModel, marker: int) -> IntArray:
+    """Columns of the displacement of a marker among the directions of faults."""
+    n = len(errors.sigma_q)
+    return np.asarray(2 * n + 2 + 2 * (CAMERA - 1) + 3 * marker + np.arange(3))

@@ -1,0 +1,408 @@
+"""Whether joints keep what must hold, as numbers with a sign, from the calibrated model alone.
+
+Each margin is positive where its constraint holds:
+
+- limits: the least distance of a joint from its limits over the margin asked for;
+- front: the least third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
+  the sign, which nothing else fixes in projective space;
+- side: a·O of the face and a camera over its value at the start, carried by the dual motion H⁻ᵀ;
+- width: the least width of the image of the face, px, for an angle means nothing in projective space;
+- border: the least distance of a marker of the face from the border of an image, px, less what its prediction
+  may be off;
+- clear: the least distance from a region that is kept out of, px, less what a prediction may be off: of all
+  markers, and of all points between those of the face.
+
+Of a tool with several tags side, width and border are those of the tag that keeps them best.
+
+Joints are valid where each margin is above what is asked for, and that is no more than a share of what start
+and goal have themselves, rising to its full value within ``RISE`` of them.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, axpy, dot, sub, vec
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kernels import put_row
+from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
+from projservo_cli.planning.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
+from projservo_cli.planning.margins import Demands, from_border, pixel, straight_pixel, tag_planes
+from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, Model, Spread
+from projservo_cli.task.face import Task, center_of, face_plane
+
+LIMITS, FRONT, SIDE, WIDTH, BORDER, CLEAR = 0, 1, 3, 5, 7, 9
+MARGINS = 10  # all but the limits and clear by view
+# Of what start and goal have themselves, so much is asked for there.
+SHARE = 0.5
+# Motion, s at the speed limits, from start or goal within which demands rise to their full value.
+RISE = 0.5
+# Between two checks no marker moves more than this in an image, px, and no joint more than that, rad or m.
+FINE_PX = 4.0
+FINE_STEP = 0.2
+# So many standard deviations a prediction may be off.
+DEVIATIONS = 3.0
+# No marker of the body is off by so many times as much as the face was at most.
+FAR_OFF = 5.0
+# Half the length, px, of the shortest pieces of a segment that are told apart at a region.
+PIECE = 0.5
+
+
+class Constraints(NamedTuple):
+    """What joints are held against, in the frame of the calibrated model."""
+
+    model: Model  # its cameras scaled so that markers in front have a positive third coordinate
+    M: FloatArray  # (b, 4) markers of the body at the reference, those of the face first
+    face: int  # how many are of the face
+    tags: IntArray  # (t, k) markers of the face, or of tags, of which one is to be in sight
+    a: FloatArray  # (t, 4) their planes at the reference
+    O: FloatArray  # (2, 4) optical centres, a·O = 1 of the face at the start
+    depth: FloatArray  # (2,) least third coordinate of a marker at the start
+    lower: FloatArray
+    upper: FloatArray  # lower, upper: (n,) joint limits, rad or m
+    speed: FloatArray  # (n,) most motion per second, rad/s or m/s
+    image_size: FloatArray  # (2,) px; infinite where an image has no border
+    keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
+    full: FloatArray  # (10,) margins asked for
+    ends: FloatArray  # (k, n) start and goals, near which less is asked for
+    had: FloatArray  # (k, 10) what is asked for there
+    spread: Spread = NO_SPREAD
+    keep_out: KeepOut = NO_KEEP_OUT
+
+
+def constraints_of(
+    model: Model,
+    A: FloatArray,
+    task: Task,
+    q_start: FloatArray,
+    demands: Demands,
+    keep_out: KeepOut = NO_KEEP_OUT,
+) -> Constraints:
+    """What joints are held against, of a task whose points (b, 4) are given at the start, face first.
+
+    Signs are those at the start: [RH00] section 4.2 carries them along.
+    """
+    m, n, tags = len(task.order), len(q_start), demands.tags
+    face = np.array(face_plane(A[:m], task.order, center_of(A[:m], task.center)))
+    H = forward_kinematics(model, q_start)
+    sides = np.sign((A @ model.P[:, 2].T)[0])
+    model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
+    steep, border = demands.least_face_px, demands.border_px
+    return Constraints(
+        model,
+        np.ascontiguousarray(A @ np.linalg.inv(H).T),
+        m,
+        tags if len(tags) else np.arange(m)[None],
+        np.ascontiguousarray((tag_planes(tags, A, m, face) if len(tags) else face[None]) @ H),
+        np.ascontiguousarray(task.O / (task.O @ face)[:, None]),
+        (A @ model.P[:, 2].T).min(axis=0),
+        demands.lower,
+        demands.upper,
+        demands.speed,
+        demands.image_size,
+        np.maximum(demands.keep, 1e-9),
+        np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
+        np.zeros((0, n)),
+        np.zeros((0, MARGINS)),
+        keep_out=keep_out,
+    )
+
+
+@merged
+def _put_limits(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
+    least = math.inf
+    for i in range(q.shape[0]):
+        least = min(least, min(q[i] - c.lower[i], c.upper[i] - q[i]) / c.keep[i])
+    margins[LIMITS] = least
+
+
+@merged
+def _put_images(c: Constraints, H: Mat4, s: FloatArray, margins: FloatArray) -> bool:
+    """Write the images (2, b, 2) of the displaced body; False where a marker is behind a camera."""
+    for view in range(2):
+        nearest = math.inf
+        for k in range(c.M.shape[0]):
+            A = apply(H, vec(c.M[k]))
+            depth = row(c.model.P[view], 2, A)
+            nearest = min(nearest, depth)
+            if depth > 0.0:
+                s[view, k, 0], s[view, k, 1] = pixel(c.model, view, A)
+        margins[FRONT + view] = nearest / c.depth[view]
+    return bool(margins[FRONT] > 0.0 and margins[FRONT + 1] > 0.0)
+
+
+@internal
+def width(s: FloatArray, which: IntArray) -> float:
+    """Least width of some (k,) image points of (b, 2), px: between the nearest parallel lines that hold them.
+
+    One of them goes through two of the points.
+    """
+    least = math.inf
+    for i in which:
+        for j in which:
+            dx, dy = s[i, 0] - s[j, 0], s[i, 1] - s[j, 1]
+            length = math.sqrt(dx * dx + dy * dy)
+            if j < i and length > 0.0:
+                low, high = 0.0, 0.0
+                for k in which:
+                    off = (dx * (s[k, 1] - s[j, 1]) - dy * (s[k, 0] - s[j, 0])) / length
+                    low, high = min(low, off), max(high, off)
+                least = min(least, high - low)
+    return least if math.isfinite(least) else 0.0
+
+
+@internal
+def _put_sight(c: Constraints, tag: int, back: Mat4, shown: bool, s: FloatArray, sight: FloatArray) -> None:
+    """Write side, width and border (6,) of a tag; the latter by images (2, b, 2), if they are shown.
+
+    back : inverse of the forward kinematics.
+    """
+    for view in range(2):
+        sight[view] = dot(vec(c.a[tag]), apply(back, vec(c.O[view])))
+        sight[2 + view] = width(s[view], c.tags[tag]) if shown else -math.inf
+        sight[4 + view] = math.inf if shown else -math.inf
+        for k in c.tags[tag]:
+            border = from_border(c.image_size, s[view, k, 0], s[view, k, 1])
+            sight[4 + view] = min(sight[4 + view], border)
+
+
+@internal
+def _put_best_sight(c: Constraints, q: FloatArray, shown: bool, trial: "Trial") -> None:
+    """Write side, width and border of the tag whose least excess over what is asked for is largest."""
+    best, back = -math.inf, backward(c.model, q)
+    for tag in range(c.tags.shape[0]):
+        _put_sight(c, tag, back, shown, trial.s, trial.sight)
+        least = math.inf
+        for i in range(6):
+            unit = 1.0 if i < 2 else FINE_PX
+            least = min(least, (trial.sight[i] - trial.demands[SIDE + i]) / unit)
+        if tag == 0 or least > best:
+            best = least
+            put_row(trial.margins[SIDE:CLEAR], trial.sight)
+
+
+@merged
+def twin_of(c: Constraints, j: int) -> Model:
+    """The calibrated model, off by the deviation j."""
+    m = c.model
+    return Model(c.spread.P[j], c.spread.H_hat[j], m.joint_types, m.q_reference, m.a_inf, m.lens)
+
+
+@internal
+def most_off(c: Constraints, q: FloatArray, H: Mat4) -> tuple[float, float]:
+    """Standard deviation of a coordinate in each image, px, no less than that of any marker of the body."""
+    left = right = c.spread.rest * c.spread.rest
+    for j in range(1, c.spread.P.shape[0]):
+        twin = twin_of(c, j)
+        H_j = forward(twin, q)
+        worst_left, worst_right = 0.0, 0.0
+        for k in range(c.M.shape[0]):
+            A, A_j = apply(H, vec(c.M[k])), apply(H_j, vec(c.spread.M[j, k]))
+            s_left, s_right = straight_pixel(c.model.P[0], A), straight_pixel(c.model.P[1], A)
+            worst_left = max(worst_left, squared(s_left, straight_pixel(twin.P[0], A_j)))
+            worst_right = max(worst_right, squared(s_right, straight_pixel(twin.P[1], A_j)))
+        left, right = left + 0.5 * worst_left, right + 0.5 * worst_right
+    return math.sqrt(left), math.sqrt(right)
+
+
+@internal
+def clear_by(c: Constraints, H: Mat4, s: FloatArray) -> float:
+    """Least distance, px, of the displaced body with images s (2, b, 2) from regions that are kept out of.
+
+    A point is clear where one camera sees it beside a region. Markers of a face that the obstacle may hide
+    are so in both images, and all markers in the only image in which a region is drawn.
+    """
+    keep, least = c.keep_out, math.inf
+    for region in range(keep.hides.shape[0]):
+        both = keep.views[region] == BOTH
+        for k in range(c.M.shape[0]):
+            left, right = (s[0, k, 0], s[0, k, 1]), (s[1, k, 0], s[1, k, 1])
+            first, second = clearance(keep, region, 0, left), clearance(keep, region, 1, right)
+            if not both or (keep.hides[region] == 1 and k < c.face):
+                least = min(least, first, second)
+            else:
+                first = min(first, from_border(c.image_size, left[0], left[1]))
+                second = min(second, from_border(c.image_size, right[0], right[1]))
+                least = min(least, max(first, second))
+        for k in range(c.face if both else 0):
+            A = apply(H, vec(c.M[k]))
+            for l in range(k):
+                least = min(least, _clear_between(c, region, A, apply(H, vec(c.M[l]))))
+    return least
+
+
+@internal
+def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
+    """Least distance, px, of a segment from a region of both images, as above; never too large.
+
+    Pieces of it, of the segment in space and so the same in both images, are halved until their images are
+    short, or short beside the distance of their middles and on the same side of what is asked for: a distance
+    changes by no more than the way.
+    """
+    least, done, step = math.inf, 0.0, 1.0
+    while done < 1.0:
+        step = min(step, 1.0 - done)
+        first, middle, last = (
+            combined(done, A, B),
+            combined(done + 0.5 * step, A, B),
+            combined(done + step, A, B),
+        )
+        here, along, half = -math.inf, -math.inf, 0.0
+        for view in range(2):
+            s, at, t = pixel(c.model, view, first), pixel(c.model, view, middle), pixel(c.model, view, last)
+            radius = math.sqrt(max(squared(at, s), squared(at, t)))
+            clear = min(clearance(c.keep_out, region, view, at), from_border(c.image_size, at[0], at[1]))
+            here, along, half = max(here, clear), max(along, clear - radius), max(half, radius)
+        told = along >= c.full[CLEAR] or here < c.full[CLEAR]
+        if half > PIECE and not (told and half <= 0.5 * abs(here)):
+            step *= 0.5
+            continue
+        least = min(least, along)
+        done += step
+        step *= 2.0
+    return least
+
+
+@merged
+def combined(x: float, A: Vec4, B: Vec4) -> Vec4:
+    """Point (1 − x) A + x B."""
+    return axpy(x, sub(B, A), A)
+
+
+@njit
+def put_margins(c: Constraints, q: FloatArray, trial: "Trial") -> None:
+    """Write margins, what is asked of them, and images at joints (n,), rad or m."""
+    margins, s = trial.margins, trial.s
+    put_demands(c, q, trial.demands)
+    _put_limits(c, q, margins)
+    H = forward(c.model, q)
+    shown = _put_images(c, H, s, margins)
+    _put_best_sight(c, q, shown, trial)
+    margins[CLEAR] = clear_by(c, H, s) if shown else -math.inf
+    # What a prediction is off, at most or, where that may tell, there.
+    left = right = most = c.spread.most
+    anywhere = FAR_OFF * most
+    room = min(margins[BORDER] - c.full[BORDER], margins[BORDER + 1] - c.full[BORDER + 1])
+    near = room < DEVIATIONS * most or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
+    if shown and most > 0.0 and near:
+        left, right = most_off(c, q, H)
+        anywhere = max(left, right)
+    margins[BORDER] -= DEVIATIONS * left
+    margins[BORDER + 1] -= DEVIATIONS * right
+    margins[CLEAR] -= DEVIATIONS * anywhere
+
+
+@njit
+def put_along(c: Constraints, q: FloatArray, trial: "Trial", found: FloatArray) -> None:
+    """Write margins and what is asked of them (2, k, 10) along joints (k, n)."""
+    for i in range(q.shape[0]):
+        put_margins(c, q[i], trial)
+        put_row(found[0, i], trial.margins)
+        put_row(found[1, i], trial.demands)
+
+
+@njit
+def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
+    """Write what is asked for (10,) at joints (n,): the full margins, or less near start and goals."""
+    for i in range(MARGINS):
+        demands[i] = c.full[i]
+    for e in range(c.ends.shape[0]):
+        rise = time_between(c.speed, q, c.ends[e]) / RISE
+        if rise < 1.0:
+            for i in range(MARGINS):
+                demands[i] = min(demands[i], c.had[e, i] + rise * (c.full[i] - c.had[e, i]))
+
+
+@merged
+def time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
+    """Time, s, of the straight way between joints at the speed limits (n,)."""
+    most = 0.0
+    for i in range(q.shape[0]):
+        most = max(most, abs(q[i] - r[i]) / speed[i])
+    return most
+
+
+@merged
+def _moved(s: FloatArray, before: FloatArray) -> float:
+    """Longest way of an image point between two views (2, b, 2), px."""
+    most = 0.0
+    for view in range(2):
+        for k in range(s.shape[1]):
+            du, dv = s[view, k, 0] - before[view, k, 0], s[view, k, 1] - before[view, k, 1]
+            most = max(most, du * du + dv * dv)
+    return math.sqrt(most)
+
+
+@merged
+def _keep_images(trial: "Trial") -> None:
+    for view in range(2):
+        for k in range(trial.s.shape[1]):
+            put_row(trial.s_before[view, k], trial.s[view, k])
+
+
+class Trial(NamedTuple):
+    """Workspace of one test of joints, or of the way between two."""
+
+    margins: FloatArray
+    demands: FloatArray  # margins, demands: (10,)
+    sight: FloatArray  # (6,) side, width and border of one tag
+    s: FloatArray
+    s_before: FloatArray  # s, s_before: (2, b, 2) px
+    q: FloatArray  # (n,)
+    failures: IntArray  # (10 + n,) how often each margin failed; of the limits, how often each joint
+
+
+def new_trial(n: int, b: int) -> Trial:
+    """Workspace for n joints and b markers."""
+    one, s = np.zeros(MARGINS), np.zeros((2, b, 2))
+    return Trial(one, one.copy(), np.zeros(6), s, s.copy(), np.zeros(n), np.zeros(MARGINS + n, np.int64))
+
+
+@internal
+def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
+    """Whether joints keep all that is asked for; what fails is counted, the images are written."""
+    put_margins(c, q, trial)
+    for i in range(MARGINS):
+        if not trial.margins[i] > trial.demands[i]:
+            trial.failures[i] += 1
+            for j in range(q.shape[0] if i == LIMITS else 0):
+                room = min(q[j] - c.lower[j], c.upper[j] - q[j]) / c.keep[j]
+                trial.failures[MARGINS + j] += not room > trial.demands[LIMITS]
+            return False
+    return True
+
+
+@njit
+def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) -> float:
+    """Share of the straight way from valid joints that is valid: 1 for all of it.
+
+    Checks are so dense that between two of them no marker moves more than ``FINE_PX`` and no joint more
+    than ``FINE_STEP``: a step that did is halved, and the next one made to do so by its speed.
+    """
+    n = start.shape[0]
+    stride = 0.0
+    for i in range(n):
+        stride = max(stride, abs(end[i] - start[i]))
+    if stride == 0.0:
+        return 1.0
+    least = min(1.0, 1e-6 / stride)
+    most = FINE_STEP / stride
+    valid(c, start, trial)
+    _keep_images(trial)
+    done, step = 0.0, 0.25 * most
+    while done < 1.0:
+        step = min(step, most, 1.0 - done)
+        share = 1.0 if done + step >= 1.0 - 1e-12 else done + step
+        for i in range(n):
+            trial.q[i] = end[i] if share == 1.0 else start[i] + share * (end[i] - start[i])
+        if not valid(c, trial.q, trial):
+            return done
+        moved = _moved(trial.s, trial.s_before)
+        if moved > FINE_PX and step > least:
+            step *= max(0.25, 0.9 * FINE_PX / moved)
+            continue
+        _keep_images(trial)
+        done = share
+        step *= min(2.0, 0.9 * FINE_PX / moved) if moved > 0.0 else 2.0
+    return 1.0

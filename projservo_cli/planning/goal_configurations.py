@@ -1,0 +1,335 @@
+"""All joint vectors that show the goal: Newton's method from random joints, and whole turns of what it finds.
+
+The points of the face are first brought to where they are at the goal, in the coordinates of the calibrated
+frame scaled to a_inf·A = 1, which is well behaved from everywhere; then its images, which have the last word.
+For an arm of more joints than the face has freedoms what is found is a sample of a continuum.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.algebra import Mat4, Vec4, apply, dot, mat, put_vec, sub, vec
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.geometry.kernels import put_row, solve_normal
+from projservo_cli.geometry.kinematics import forward, image_motion, operators_at
+from projservo_cli.planning.constraints import (
+    BORDER,
+    DEVIATIONS,
+    FINE_PX,
+    Constraints,
+    Trial,
+    clear_by,
+    most_off,
+    new_trial,
+    put_margins,
+    twin_of,
+)
+from projservo_cli.planning.margins import straight_pixel
+from projservo_cli.records import PRISMATIC, FloatArray
+
+# Newton steps from one start; one that is not near after half of them is given up.
+STEPS = 400
+# Share of the first squares that is left to one that is given up.
+GIVEN_UP = 0.25
+DAMPED = 1e6
+# A Newton step below this, rad or m, is the last: of points, which are near then, and of images.
+NEAR, SETTLED = 1e-3, 1e-7
+# Longest Newton step of a joint, rad or m.
+STRIDE = 0.7
+# Noise that is allowed for where none is known, px.
+LEAST_SIGMA = 0.2
+# What a solution may leave of the images, px, as a multiple of the least.
+MUCH = 2.0
+DISTINCT = math.radians(1.0)
+# A joint of a solution that deviates more than this, rad or m, is near a singularity: what the model reaches
+# there the robot may not. No solution is taken to be nearer to a limit than that by its deviation alone.
+DEFINITE = 0.05
+REDUNDANT = 0.01
+# Variance of joints that the images do not tell, rad² or m².
+UNTOLD = 1e6
+# Rank, s, from which on goals are unsure.
+UNSURE = 1e3
+ROUND_OFF = 1e-9
+# Starts; the search for further goals ends early once so many times the starts until the last new one, and
+# ``AT_LEAST``, have found none.
+STARTS, PATIENCE, AT_LEAST = 400, 3, 40
+# So many whole turns to both sides of the nearest are goals of their own.
+TURNS = 2
+# Solutions of an arm of more joints than six.
+SAMPLED = 96
+# Where the body is at a solution: in sight, or not, or within a region that is kept out of.
+SHOWN, HIDDEN, BARRED = range(3)
+
+
+class Aim(NamedTuple):
+    """What the goal shows."""
+
+    A_star: FloatArray  # (m, 4) face at the goal, a_inf·A = 1
+    s_star: FloatArray  # (2, m, 2) its images as projective cameras see them, px
+    sigma: float  # standard deviation of a coordinate of them, px
+
+
+class Solutions(NamedTuple):
+    """Joints that show the goal, none of them whole turns of others."""
+
+    q: FloatArray  # (k, n) rad or m
+    left: FloatArray  # (k,) their sums of squares, px²; 0 of those known, which are certain
+    deviation: FloatArray  # (k, n) standard deviations of their joints, rad or m
+
+
+class Bench(NamedTuple):
+    """Workspace of the solver."""
+
+    H_hat: FloatArray  # (n, 4, 4) operators at the joints
+    N: FloatArray  # (n, n + 1) normal equations, right-hand side in the last column
+    J: FloatArray  # (m, n + 1, 4) derivatives of points, or their images, by the joints; last what is left
+    L: FloatArray  # (n, n + 1) damped and solved
+    q: FloatArray  # (n,) trial
+
+
+@internal
+def _put_equations(c: Constraints, aim: Aim, q: FloatArray, images: bool, bench: Bench) -> float:
+    """Write the normal equations of points, or images, at joints; returns the sum of squares left.
+
+    [RH00] eq. (19) for points; eq. (7), second row corrected, for images.
+    """
+    n = q.shape[0]
+    N = bench.N
+    H = operators_at(c.model, q, bench.H_hat)
+    N[:] = 0.0
+    total = 0.0
+    for k in range(c.face):
+        A, J = apply(H, vec(c.M[k])), bench.J[k]
+        s, aimed = A, vec(aim.A_star[k])
+        if images:
+            left, right = aim.s_star[0, k], aim.s_star[1, k]
+            aimed = (left[0], left[1], right[0], right[1])
+        for i in range(n):
+            D = apply(mat(bench.H_hat[i]), A)
+            if images:
+                s, D = image_motion(c.model.P, A, D)
+            put_vec(J[i], D)
+        put_vec(J[n], sub(aimed, s))
+        for i in range(n):
+            for j in range(i, n + 1):
+                N[i, j] += dot(vec(J[i]), vec(J[j]))
+        total += dot(vec(J[n]), vec(J[n]))
+    return total
+
+
+@internal
+def _put_step(N: FloatArray, damping: float, L: FloatArray) -> bool:
+    """Solve (N + damping diag N) x = b; x is left in the last column of L."""
+    n = L.shape[0]
+    most = 0.0
+    for i in range(n):
+        most = max(most, N[i, i])
+    for i in range(n):
+        put_row(L[i], N[i])
+        L[i, i] = N[i, i] * (1.0 + damping) + 1e-14 * most
+    return solve_normal(L, n, 1e-16)
+
+
+@internal
+def _settled(c: Constraints, aim: Aim, images: bool, settled: float, q: FloatArray, bench: Bench) -> float:
+    """Bring the joints to the least squares of points or images by damped Newton steps; what is left.
+
+    K. Levenberg, Quarterly of Applied Mathematics 2, 1944; scaled as by D. Marquardt, SIAM Journal 11, 1963.
+    """
+    n = q.shape[0]
+    damping = 1e-3
+    left = first = _put_equations(c, aim, q, images, bench)
+    for step in range(STEPS):
+        if (step == 20 and left > GIVEN_UP * first and not images) or not _put_step(
+            bench.N, damping, bench.L
+        ):
+            break
+        longest = 0.0
+        for i in range(n):
+            longest = max(longest, abs(bench.L[i, n]))
+        share = min(1.0, STRIDE / longest) if longest > 0.0 else 1.0
+        for i in range(n):
+            bench.q[i] = q[i] + share * bench.L[i, n]
+        trial = _put_equations(c, aim, bench.q, images, bench)
+        if trial < left:
+            left = trial
+            put_row(q, bench.q)
+            damping *= 0.1
+        elif longest >= settled and damping <= DAMPED:
+            damping *= 10.0
+            _put_equations(c, aim, q, images, bench)
+            continue
+        if longest < settled:
+            break
+    return left
+
+
+@merged
+def _seen(P: FloatArray, H: Mat4, M: FloatArray) -> Vec4:
+    """Pixels u, v of a displaced point in both views (2, 3, 4), left and right."""
+    A = apply(H, vec(M))
+    return straight_pixel(P[0], A) + straight_pixel(P[1], A)
+
+
+@internal
+def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench, deviation: FloatArray) -> float:
+    """Sum of squares, px², that noise and calibration explain of what is left at joints that show the goal.
+
+    Of each way in which the calibration may be off, what no motion of the joints makes up for. The motion
+    that makes up for the rest, and for noise, is what the joints may be off: its standard deviation (n,), rad
+    or m, is written; ``REDUNDANT`` of an arm of more joints than six, which can move them at will.
+    """
+    n = q.shape[0]
+    noise = aim.sigma * aim.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
+    total: float = (4.0 * c.face - min(n, 6)) * noise
+    _put_equations(c, aim, q, True, bench)
+    for i in range(n):
+        for j in range(n):
+            bench.N[j, n] = 1.0 if i == j else 0.0
+        deviation[i] = REDUNDANT * REDUNDANT
+        if n <= 6:
+            deviation[i] = noise * bench.L[i, n] if _put_step(bench.N, 0.0, bench.L) else UNTOLD
+    H = operators_at(c.model, q, bench.H_hat)
+    for j in range(1, c.spread.P.shape[0]):
+        twin = twin_of(c, j)
+        H_j = forward(twin, q)
+        away = 0.0
+        bench.N[:, n] = 0.0
+        for k in range(c.face):
+            off = sub(_seen(twin.P, H_j, c.spread.M[j, k]), _seen(c.model.P, H, c.M[k]))
+            away += dot(off, off)
+            for i in range(n):
+                bench.N[i, n] += dot(vec(bench.J[k, i]), off)
+        if _put_step(bench.N, 0.0, bench.L):
+            for i in range(n):
+                away -= bench.L[i, n] * bench.N[i, n]
+                deviation[i] += bench.L[i, n] * bench.L[i, n] if n <= 6 else 0.0
+        total += max(away, 0.0)
+    for i in range(n):
+        deviation[i] = math.sqrt(deviation[i])
+    return DEVIATIONS * DEVIATIONS * total
+
+
+@merged
+def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bool:
+    """Whether joints are a solution that was found before, or whole turns of it."""
+    for g in range(count):
+        most = 0.0
+        for i in range(q.shape[0]):
+            off = q[i] - base[g, i]
+            if c.model.joint_types[i] != PRISMATIC:
+                off -= 2.0 * math.pi * math.floor(off / (2.0 * math.pi) + 0.5)
+            most = max(most, abs(off))
+        if most <= DISTINCT:
+            return True
+    return False
+
+
+@njit
+def _put_solutions(
+    c: Constraints, aim: Aim, known: FloatArray, starts: FloatArray, found: Solutions, bench: Bench
+) -> int:
+    """Write solutions; how many. First those known, which need no proof: the goal was seen there."""
+    count, last, most = len(known), 0, found.q.shape[0]
+    for k in range(count):
+        put_row(found.q[k], known[k])
+        _explained(c, aim, known[k], bench, found.deviation[k])
+    for k in range(starts.shape[0]):
+        if count == most or k > AT_LEAST + PATIENCE * last:
+            break
+        q = starts[k]
+        _settled(c, aim, False, NEAR, q, bench)
+        if _is_known(c, q, found.q, count):
+            continue
+        left = _settled(c, aim, True, SETTLED, q, bench)
+        explained = _explained(c, aim, q, bench, found.deviation[count])
+        if left <= explained and not _is_known(c, q, found.q, count):
+            put_row(found.q[count], q)
+            found.left[count] = left
+            count += 1
+            last = k
+    return count
+
+
+@njit
+def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
+    """Whether the goal is shown at joints (n,), but for their limits: ``SHOWN``, ``HIDDEN`` or ``BARRED``."""
+    put_margins(c, q, trial)
+    for j in range(1, BORDER):
+        if not trial.margins[j] > 0.0:
+            return HIDDEN
+    # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.
+    H = forward(c.model, q)
+    left, right = most_off(c, q, H)
+    doubt = min(DEVIATIONS * max(left, right), FINE_PX)
+    return SHOWN if clear_by(c, H, trial.s) > -doubt else BARRED
+
+
+def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) -> FloatArray:
+    """Whole turns (t, n) of joints (n,) within the limits and some slack (n,); else nearest to the start.
+
+    No more than ``TURNS`` to both sides of the nearest: of many joints that turn often there is no end.
+    """
+    turn, slides = 2.0 * math.pi, c.model.joint_types == PRISMATIC
+    half = np.where(slides, math.inf, 0.5 * turn)
+    low = np.where(np.isfinite(c.lower), c.lower, start - half) - slack - q
+    high = np.where(np.isfinite(c.upper), c.upper, start + half) + slack - q
+    nearest = np.round((start - q) / turn)
+    first = np.where(slides, 0.0, np.maximum(np.ceil(low / turn), nearest - TURNS))
+    last = np.minimum(np.floor(high / turn), nearest + TURNS) + 1.0
+    last = np.where(slides, (low <= 0.0) & (high >= 0.0), last)
+    counts = np.maximum(last - first, 0.0).astype(int)
+    whole = first + np.indices(tuple(counts.tolist())).reshape(len(q), -1, order="F").T
+    return np.asarray(q + turn * whole)
+
+
+def _rank(
+    c: Constraints, start: FloatArray, q: FloatArray, deviation: FloatArray, certain: bool
+) -> FloatArray:
+    """Time from the start (t,), s, to turns (t, n) of a solution of such deviations (n,).
+
+    ``UNSURE`` and more where it may be near a singularity, or beyond a limit if it is not certain: the less
+    within in standard deviations, the more.
+    """
+    sure = np.full(len(q), min(1.0, DEFINITE / deviation.max()))
+    if not certain:
+        room = np.minimum(q - c.lower, c.upper - q) / (DEVIATIONS * deviation)
+        sure = np.minimum(sure, room.min(axis=1))
+    time = (np.abs(q - start) / c.speed).max(axis=1)
+    return np.where(sure >= 1.0, time, UNSURE * (1.0 if certain else 2.0 - np.maximum(sure, -1.0)))
+
+
+def goals_of(
+    c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, starts: FloatArray
+) -> tuple[FloatArray, FloatArray, tuple[int, int, int]]:
+    """Joints (g, n) that show the goal, and their rank (g,), the least first.
+
+    Rank is the time from the start, s, or ``UNSURE`` and more. A solution that leaves much more than the best
+    is a local minimum beside it.
+
+    start : (n,) joints at the start; known : (l, n) joints at which the goal was shown.
+    starts : (k, n) from which solutions are sought, those known first; overwritten.
+    Also returns how many solutions there are, apart from whole turns; how many of those do not show the face
+    or lie beyond the limits; how many lie within a region kept out of.
+    """
+    n, most = len(start), STARTS if len(start) <= 6 else SAMPLED
+    found = Solutions(np.zeros((most, n)), np.zeros(most), np.zeros((most, n)))
+    shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, 4), (n, n + 1), (n,)
+    count = _put_solutions(c, aim, known, starts, found, Bench(*(np.zeros(shape) for shape in shapes)))
+    least = max(found.left[len(known) : count].min(initial=math.inf), 4.0 * c.face * LEAST_SIGMA**2)
+    good = np.flatnonzero(found.left[:count] <= MUCH**2 * least)
+    goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(n, len(c.M))
+    for k in good:
+        solution, deviation, certain = found.q[k], found.deviation[k], found.left[k] == 0.0
+        slack = ROUND_OFF + (0.0 if certain else 1.0) * np.minimum(DEVIATIONS * deviation, DEFINITE)
+        turns = _turns(c, start, solution, slack)
+        where = _where(c, solution, trial) if len(turns) > 0 else HIDDEN
+        met[where] += 1
+        if where == SHOWN:
+            goals.append(np.clip(turns, c.lower, c.upper))
+            ranks.append(_rank(c, start, turns, deviation, certain))
+    rank = np.concatenate(ranks)
+    order = np.argsort(rank, kind="stable")
+    return np.vstack(goals)[order], rank[order], (len(good), met[HIDDEN], met[BARRED])

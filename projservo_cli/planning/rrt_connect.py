@@ -1,0 +1,328 @@
+"""A way to the goal through joint space: straight, or by two trees that grow towards each other; or why none.
+
+J. Kuffner, S. LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA 2000. What is
+found is shortened, rounded and timed. Random numbers are those of a seed and drawn before the trees grow: a
+way is the same to the bit whoever searches beside.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.jit import internal, njit
+from projservo_cli.planning.constraints import (
+    BORDER,
+    CLEAR,
+    DEVIATIONS,
+    FRONT,
+    LIMITS,
+    SHARE,
+    Constraints,
+    Trial,
+    new_trial,
+    put_margins,
+    reached,
+    time_between,
+)
+from projservo_cli.planning.goal_configurations import STARTS, UNSURE, Aim, goals_of
+from projservo_cli.planning.keep_out import only
+from projservo_cli.planning.time_parameterization import Pace, least_time, timed
+from projservo_cli.records import NO_SPREAD, FloatArray, IntArray
+
+# Longest edge of a tree, s at the speed limits.
+REACH = 0.8
+# A way shorter than this, s, is none.
+LEAST = 1e-9
+# Draws that the trees are given at a time.
+CHUNK = 250
+# Ways that are looked for by trees, and draws after which no further one is begun.
+WAYS, FURTHER = 2, 300
+# A straight line that takes so much longer than to the nearest goal is held against what trees find.
+LONGER = 1.2
+SHORTENINGS = 60
+ROUND_OFF = 1e-9
+# Goals within so much of shunned joints, rad or m, are shunned too.
+NEARBY = 0.1
+
+
+class Tree(NamedTuple):
+    """Joints that a start or the goals are joined to by valid straight ways."""
+
+    q: FloatArray  # (k, n)
+    parent: IntArray  # (k,) −1 at a root
+    size: IntArray  # (1,) how many nodes there are
+
+
+class Budget(NamedTuple):
+    """How long is searched, and with which random numbers."""
+
+    samples: int = 20_000
+    seed: int = 0
+    goals: int = 64
+    shunned: FloatArray = np.zeros((0, 1))  # (k, n) joints near which no goal is taken, rad or m
+
+
+class Way(NamedTuple):
+    """What a search came to."""
+
+    goals: FloatArray  # (g, n) joints that show the goal, nearest in time first
+    shown: int  # how many there are, kept or not
+    solutions: int  # how many apart from whole turns
+    hidden: int  # how many of those lie beyond the limits or do not show the face
+    barred: int  # how many of those lie within a region that is kept out of
+    failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
+    had: FloatArray  # (10,) margins of the start
+    region: int  # the one that the start is within, counted from 1; 0 for none
+    held: Constraints  # what was held against: with less asked for at start and goals
+    corners: FloatArray  # (k, n) of the way; none where none was found
+    pace: Pace | None = None  # in time; None where there is no way or nothing limits its speed
+    draws: int = 0  # by the trees
+    trees: tuple[Tree, Tree] | None = None  # from the start and from the goals, where they were grown
+
+
+def may_start(had: FloatArray) -> bool:
+    """Whether a way may begin at joints of such margins (10,): at a limit, but not at the edge of a view."""
+    return bool(had[LIMITS] >= 0.0 and (had[FRONT:] > 0.0).all())
+
+
+def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
+    """Constraints that ask of joints (k, n), and near them, for no more than a share of what those have.
+
+    What they show was seen there, so that a deviation of the prediction takes nothing from it.
+    """
+    had = np.array([margins_at(c, q)[0] for q in ends])
+    seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
+    seen = np.where(np.isfinite(seen), seen, 0.0)
+    had = np.minimum(c.full, np.where(seen > 0.0, had - (1.0 - SHARE) * seen, had - ROUND_OFF))
+    poor = (had < c.full).any(axis=1)
+    return c._replace(ends=np.ascontiguousarray(ends[poor]), had=np.ascontiguousarray(had[poor]))
+
+
+def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Margins (10,) and images (2, b, 2), px, at joints (n,)."""
+    trial = new_trial(len(q), len(c.M))
+    put_margins(c, q, trial)
+    return trial.margins, trial.s
+
+
+def within_region(c: Constraints, q: FloatArray) -> int:
+    """Number, counted from 1, of the region that the body is in at joints (n,); 0 for none."""
+    c = c._replace(spread=NO_SPREAD)
+    return _nearest_region(c, q) if -math.inf < margins_at(c, q)[0][CLEAR] <= 0.0 else 0
+
+
+def _nearest_region(c: Constraints, q: FloatArray) -> int:
+    """Number, counted from 1, of the region that the body is deepest in, or nearest to, at joints (n,)."""
+    regions = [only(c.keep_out, r) for r in range(len(c.keep_out.hides))]
+    return 1 + int(np.argmin([margins_at(c._replace(keep_out=region), q)[0][CLEAR] for region in regions]))
+
+
+def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
+    """The last of joints (s, n) up to which a path keeps out of regions, and the number of the one it enters.
+
+    All but the regions is left aside. The last of all and 0 where it enters none.
+    """
+    n = q.shape[1]
+    endless = np.full(n, math.inf)
+    full = np.r_[np.full(CLEAR, -1e12), c.full[CLEAR]]  # finite, as demands are interpolated
+    speed = np.where(np.isfinite(c.speed), c.speed, 1.0)
+    c = with_ends(c._replace(lower=-endless, upper=endless, full=full, speed=speed), q[[0, -1]])
+    trial = new_trial(n, len(c.M))
+    for i in range(len(q) - 1):
+        if reached(c, q[i], q[i + 1], trial) < 1.0:
+            return i, _nearest_region(c, trial.q)
+    return len(q) - 1, 0
+
+
+def find_way(
+    c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, search: Budget, acceleration: FloatArray
+) -> Way:
+    """Find a way from the start to joints that show the goal.
+
+    start : (n,) joints, rad or m.
+    known : (k, n) joints known to show the goal, k ≥ 0.
+    acceleration : (n,) rad/s² or m/s².
+    """
+    n, rng = len(start), np.random.default_rng(search.seed)
+    starts = np.vstack([known, start[None], _drawn(c, start, STARTS, rng)])
+    every, rank, counts = goals_of(c, aim, start, known, starts)
+    goals, rank = every[: search.goals], rank[: search.goals]
+    off = np.abs(goals[:, None] - search.shunned)
+    far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
+    goals, rank = goals[far], rank[far]
+    had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
+    had[BORDER:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
+    trial = new_trial(n, len(c.M))
+    region, nowhere = within_region(c, start), np.empty((0, n))
+    way = Way(goals, len(every), *counts, trial.failures, had, region, c, nowhere)
+    if len(goals) == 0 or not may_start(had):
+        return way
+    c = with_ends(c, np.vstack([start[None], goals]))
+    way = way._replace(held=c)
+    sure = goals[rank < UNSURE]
+    for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
+        most = search.samples - way.draws if asked is goals else min(search.samples // 2, FURTHER)
+        best, draws, trees = _shortest(c, start, asked, most, rng, trial)
+        way = way._replace(draws=way.draws + draws, trees=trees)
+        if len(best) > 0:
+            return way._replace(corners=best, pace=timed(c, best, acceleration, trial))
+    return way
+
+
+def _drawn(c: Constraints, start: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """Random joints (count, n) within the limits; within half a turn of the start where there are none."""
+    low = np.where(np.isfinite(c.lower), c.lower, start - np.pi)
+    high = np.where(np.isfinite(c.upper), c.upper, start + np.pi)
+    return np.asarray(low + (high - low) * rng.random((count, len(start))))
+
+
+def _shortest(
+    c: Constraints, start: FloatArray, goals: FloatArray, most: int, rng: np.random.Generator, trial: Trial
+) -> tuple[FloatArray, int, tuple[Tree, Tree] | None]:
+    """The shortest way (k, n) that was met with to any of the goals (g, n), in so many draws of joints.
+
+    A straight one, if it takes little longer than to the nearest goal; else the best of some that trees find.
+    Returns the way, empty where there is none; how many draws it took; the trees that found it, or the first.
+    """
+    best, shortest, draws = np.empty((0, len(start))), math.inf, 0
+    straight = next((goal for goal in goals if reached(c, start, goal, trial) == 1.0), None)
+    if straight is not None:
+        best = np.stack([start, straight])
+        shortest = least_time(c.speed, best)[-1]
+    trees: tuple[Tree, Tree] | None = None
+    if not shortest <= LONGER * (np.abs(goals - start) / c.speed).max(axis=1).min():
+        for _ in range(WAYS):
+            left = (most if math.isinf(shortest) else FURTHER) - draws
+            if left <= 0:
+                break
+            found, used, grown = _by_trees(c, start, goals, left, rng, trial)
+            draws, trees = draws + used, trees or grown
+            if found is not None:
+                found = _shortened(c, found, rng, trial)
+                if (time := least_time(c.speed, found)[-1]) < shortest:
+                    best, shortest, trees = found, time, grown
+    return best, draws, trees
+
+
+def _by_trees(
+    c: Constraints, start: FloatArray, goals: FloatArray, most: int, rng: np.random.Generator, trial: Trial
+) -> tuple[FloatArray | None, int, tuple[Tree, Tree]]:
+    """A path of corners (k, n), None where none was found; how many draws it took; the trees."""
+    nodes = min(most, 100_000) * 4 + len(goals)
+    trees = _new_tree(nodes, start[None]), _new_tree(nodes, goals)
+    draws = 0
+    while draws < most:
+        chunk = _drawn(c, start, min(CHUNK, most - draws), rng)
+        first, last, used = _grow(c, trees, chunk, trial)
+        draws += used
+        if first >= 0:
+            return np.vstack([_branch(trees[0], first)[::-1], _branch(trees[1], last)[1:]]), draws, trees
+        if used < len(chunk):
+            break
+    return None, draws, trees
+
+
+def _new_tree(most: int, roots: FloatArray) -> Tree:
+    """A tree of roots (r, n) with room for so many nodes."""
+    q = np.empty((max(most, len(roots)), roots.shape[1]))
+    q[: len(roots)] = roots
+    return Tree(q, np.full(len(q), -1), np.array([len(roots)]))
+
+
+@internal
+def _nearest(c: Constraints, tree: Tree, q: FloatArray) -> int:
+    best, nearest = math.inf, 0
+    n = q.shape[0]
+    for k in range(tree.size[0]):
+        most = 0.0
+        for i in range(n):
+            most = max(most, abs(tree.q[k, i] - q[i]) / c.speed[i])
+            if most >= best:
+                break
+        if most < best:
+            best, nearest = most, k
+    return nearest
+
+
+@internal
+def _extended(c: Constraints, tree: Tree, q: FloatArray, trial: Trial) -> tuple[int, bool]:
+    """Grow the tree from its nearest node towards joints q; the last node, and whether it is there."""
+    node = _nearest(c, tree, q)
+    n = q.shape[0]
+    while True:
+        time = time_between(c.speed, tree.q[node], q)
+        if time <= LEAST:
+            return node, True
+        if tree.size[0] == tree.q.shape[0]:
+            return node, False
+        share = min(1.0, REACH / time)
+        new = tree.size[0]
+        here, there = tree.q[node], tree.q[new]
+        for i in range(n):
+            there[i] = q[i] if share == 1.0 else here[i] + share * (q[i] - here[i])
+        got = reached(c, here, there, trial)
+        if got < 1.0:
+            # What was reached before a check failed is valid, but too near a border to grow from.
+            got *= 0.5
+            if got * share * time <= 0.05:
+                return node, False
+            for i in range(n):
+                there[i] = here[i] + got * (there[i] - here[i])
+        tree.parent[new] = node
+        tree.size[0] += 1
+        node = new
+        if got < 1.0:
+            return node, False
+
+
+@njit
+def _grow(c: Constraints, trees: tuple[Tree, Tree], draws: FloatArray, trial: Trial) -> tuple[int, int, int]:
+    """Grow two trees towards drawn joints (k, n) and each other until they meet.
+
+    Returns the nodes of both at which they met, −1 where they did not; how many draws it took.
+    """
+    for k in range(draws.shape[0]):
+        first = trees[0] if k % 2 == 0 else trees[1]
+        second = trees[1] if k % 2 == 0 else trees[0]
+        if first.size[0] == first.q.shape[0] or second.size[0] == second.q.shape[0]:
+            return -1, -1, k
+        before = first.size[0]
+        node, _ = _extended(c, first, draws[k], trial)
+        if first.size[0] == before:
+            continue
+        other, there = _extended(c, second, first.q[node], trial)
+        if there:
+            return (node, other, k + 1) if k % 2 == 0 else (other, node, k + 1)
+    return -1, -1, draws.shape[0]
+
+
+def _branch(tree: Tree, node: int) -> FloatArray:
+    """Joints (k, n) from a node to its root."""
+    nodes = [node]
+    while tree.parent[nodes[-1]] >= 0:
+        nodes.append(int(tree.parent[nodes[-1]]))
+    return tree.q[nodes]
+
+
+def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
+    """What is left of a path (k, n) when straight ways cut it short: first between drawn places on it."""
+    time = least_time(c.speed, path)
+    for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
+        if len(path) <= 2:
+            return path
+        low, high = ends * time[-1]
+        i, j = np.clip(np.searchsorted(time, (low, high)) - 1, 0, None)
+        if i == j:  # on one straight piece
+            continue
+        new = np.stack([np.interp((low, high), time, column) for column in path.T], axis=1)
+        if least_time(c.speed, new)[-1] < high - low and reached(c, new[0], new[1], trial) == 1.0:
+            path = np.vstack([path[: i + 1], new, path[j + 1 :]])
+            time = least_time(c.speed, path)
+    k = 1
+    while k < len(path) - 1:
+        if reached(c, path[k - 1], path[k + 1], trial) == 1.0:
+            path, k = np.delete(path, k, axis=0), max(1, k - 1)
+        else:
+            k += 1
+    return path

@@ -1,0 +1,172 @@
+"""From corners to joints over time: a path without stops, at the speeds and accelerations that joints have.
+
+Corners are rounded by parabolas as large as validity lets them be, so that the path is C¹. Its pace is the
+quickest on a grid: Q.-C. Pham, "A general, fast, and robust implementation of the time-optimal path
+parameterization algorithm", IEEE T-RO 30, 2014; H. Pham, Q.-C. Pham, "A new approach to time-optimal path
+parameterization based on reachability analysis", IEEE T-RO 34, 2018. Between the points of the grid the path
+parameter is accelerated evenly and q'' is constant, so that joint accelerations are linear: bounds at both
+ends of an interval hold all along it.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.geometry.jit import internal, merged, njit
+from projservo_cli.planning.constraints import Constraints, Trial, reached
+from projservo_cli.records import FloatArray
+
+# Share of the limits of speed and acceleration that is planned with, so that feedback has room.
+ROOM = 0.9
+# Straight chords by which the validity of a rounded corner is checked.
+CHORDS = 8
+# Most halvings of a rounded corner.
+HALVINGS = 12
+# Intervals of the grid on each straight piece and on each rounded corner.
+STRAIGHT, ROUNDED = 64, 24
+BISECTIONS = 48
+# Motion between two corners, rad or m, or s, below which it is none.
+LEAST = 1e-12
+
+
+class Pace(NamedTuple):
+    """A path on a grid of its parameter, the time along straight pieces at the speed limits, and its pace."""
+
+    s: FloatArray  # (k,) s
+    q: FloatArray  # (k, n) joints, rad or m
+    dq: FloatArray  # (k, n) dq/ds
+    ddq: FloatArray  # (k − 1, n) d²q/ds² of each interval
+    x: FloatArray  # (k,) (ds/dt)²
+    time: FloatArray  # (k,) s
+
+
+def least_time(speed: FloatArray, q: FloatArray) -> FloatArray:
+    """Time (s,) at which joints q (s, n) are reached where one is always at its speed limit (n,), s.
+
+    Where nothing limits, the motion of the joint that moves most.
+    """
+    speed = speed if np.isfinite(speed).any() else np.ones_like(speed)
+    return np.concatenate([[0.0], np.cumsum((np.abs(np.diff(q, axis=0)) / speed).max(axis=1))])
+
+
+def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
+    """The pace of a path of corners (k, n), from rest to rest at ``ROOM`` of the limits."""
+    path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > LEAST]]
+    if len(path) == 1:
+        still = np.zeros((2, path.shape[1]))
+        return Pace(np.array([0.0, 1.0]), path + still, still, still[:1], np.zeros(2), np.zeros(2))
+    times = np.diff(least_time(c.speed, path))
+    slopes = np.diff(path, axis=0) / times[:, None]
+    sizes = np.zeros(len(path))
+    for k in range(1, len(path) - 1):
+        sizes[k] = _rounding(c, path[k], slopes[k - 1 : k + 1], 0.5 * times[k - 1 : k + 1].min(), trial)
+    pace = _on_grid(path, times, slopes, sizes)
+    with np.errstate(divide="ignore", over="ignore"):
+        pace.x[:] = ((ROOM * c.speed / np.abs(pace.dq)) ** 2).min(axis=1)
+    _put_pace(pace, ROOM * acceleration)
+    return pace
+
+
+def _parabola(corner: FloatArray, slopes: FloatArray, size: float, x: FloatArray) -> FloatArray:
+    """Joints (k, n) at shares x (k, 1) of the parabola that rounds a corner from ``size`` s before it."""
+    return np.asarray(corner + size * (x**2 * slopes[1] - (1.0 - x) ** 2 * slopes[0]))
+
+
+def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: float, trial: Trial) -> float:
+    """How far from a corner (n,), s, its largest valid rounding begins and ends: ``size`` at most.
+
+    The least that is tried leaves the corner by less than what lies between two checks.
+    """
+    x = np.linspace(0.0, 1.0, CHORDS + 1)[:, None]
+    for _ in range(HALVINGS):
+        path = _parabola(corner, slopes, size, x)
+        if all(reached(c, path[k], path[k + 1], trial) == 1.0 for k in range(CHORDS)):
+            break
+        size *= 0.5
+    return size
+
+
+def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: FloatArray) -> Pace:
+    """The rounded path on its grid, its pace still to be found."""
+    steps, q, dq, ddq = [np.zeros(1)], [path[:1]], [slopes[:1]], []
+    even = np.ones((STRAIGHT, 1))
+    x = np.arange(1, ROUNDED + 1)[:, None] / ROUNDED
+    for k, slope in enumerate(slopes):
+        straight = times[k] - sizes[k] - sizes[k + 1]
+        if straight > LEAST:
+            step = straight / STRAIGHT * even
+            steps.append(step[:, 0])
+            q.append(path[k] + (sizes[k] + np.cumsum(step, axis=0)) * slope)
+            dq.append(even * slope)
+            ddq.append(0.0 * even * slope)
+        size = sizes[k + 1]
+        if size > 0.0:
+            change = slopes[k + 1] - slope
+            steps.append(np.full(ROUNDED, 2.0 * size / ROUNDED))
+            q.append(_parabola(path[k + 1], slopes[k : k + 2], size, x))
+            dq.append(slope + x * change)
+            ddq.append(np.tile(change / (2.0 * size), (ROUNDED, 1)))
+    s = np.cumsum(np.concatenate(steps))
+    return Pace(s, np.vstack(q), np.vstack(dq), np.vstack(ddq), np.zeros(len(s)), np.zeros(len(s)))
+
+
+@merged
+def _narrowed(slope: float, offset: float, bound: float, low: float, high: float) -> tuple[float, float]:
+    """Those u of an interval for which |slope u + offset| ≤ bound."""
+    if abs(slope) < 1e-300:
+        return (low, high) if abs(offset) <= bound else (1.0, -1.0)
+    first, second = (-bound - offset) / slope, (bound - offset) / slope
+    return max(low, min(first, second)), min(high, max(first, second))
+
+
+@internal
+def _accelerations(pace: Pace, i: int, x: float, ahead: float, most: FloatArray) -> tuple[float, float]:
+    """Accelerations d²s/dt² that interval i allows at a pace x, to end at no more than that ahead."""
+    step = pace.s[i + 1] - pace.s[i]
+    low, high = -x / (2.0 * step), (ahead - x) / (2.0 * step)
+    for j in range(most.shape[0]):
+        curve = pace.ddq[i, j]
+        low, high = _narrowed(pace.dq[i, j], curve * x, most[j], low, high)
+        low, high = _narrowed(pace.dq[i + 1, j] + 2.0 * step * curve, curve * x, most[j], low, high)
+    return low, high
+
+
+@njit
+def _put_pace(pace: Pace, acceleration: FloatArray) -> None:
+    """Write the quickest pace from rest to rest within accelerations (n,), and its times.
+
+    The pace is as quick as speeds allow yet.
+    """
+    count = pace.s.shape[0]
+    pace.x[count - 1] = 0.0
+    for i in range(count - 2, -1, -1):
+        low, high = 0.0, pace.x[i]
+        a, b = _accelerations(pace, i, high, pace.x[i + 1], acceleration)
+        if a <= b:
+            continue
+        for _ in range(BISECTIONS):
+            middle = 0.5 * (low + high)
+            a, b = _accelerations(pace, i, middle, pace.x[i + 1], acceleration)
+            if a <= b:
+                low = middle
+            else:
+                high = middle
+        pace.x[i] = low
+    pace.x[0] = 0.0
+    pace.time[0] = 0.0
+    for i in range(count - 1):
+        _, u = _accelerations(pace, i, pace.x[i], pace.x[i + 1], acceleration)
+        step = pace.s[i + 1] - pace.s[i]
+        pace.x[i + 1] = max(0.0, pace.x[i] + 2.0 * step * u)
+        pace.time[i + 1] = pace.time[i] + 2.0 * step / (math.sqrt(pace.x[i]) + math.sqrt(pace.x[i + 1]))
+
+
+def joints_at(pace: Pace, times: FloatArray) -> FloatArray:
+    """Joints (k, n) at times (k,), s: at rest before the first and after the last."""
+    t = np.clip(times, 0.0, pace.time[-1])
+    i = np.clip(np.searchsorted(pace.time, t, side="right") - 1, 0, len(pace.time) - 2)
+    since, step = t - pace.time[i], pace.s[i + 1] - pace.s[i]
+    rate, u = np.sqrt(pace.x[i]), (pace.x[i + 1] - pace.x[i]) / (2.0 * step)
+    done = np.clip(rate * since + 0.5 * u * since**2, 0.0, step)[:, None]
+    return np.asarray(pace.q[i] + done * pace.dq[i] + 0.5 * done**2 * pace.ddq[i])

@@ -1,0 +1,424 @@
+"""Runs that move: the 3D view, one page of HTML that needs no network, and the animation of both images.
+
+The view is drawn by plotly and has a time slider; the animation has a column a law.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from markupsafe import Markup
+
+from projservo_cli.files import replacing, write_whole
+from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
+from projservo_cli.records import (
+    BODY_LAWS,
+    POINT_LAWS,
+    BoolArray,
+    ByteArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    Plan,
+    Trace,
+)
+from projservo_cli.report import style
+from projservo_cli.report.figures.frames import frames_of, with_halo
+from projservo_cli.report.figures.images import near_pixels
+from projservo_cli.report.figures.joint_space import tree_edges, with_gaps
+from projservo_cli.report.figures.scene import pyramids, skeleton
+from projservo_cli.report.page import template
+from projservo_cli.report.report_data import PAGE_FILE, VIEWS, title
+from projservo_cli.robots.simulated import Arm, Plant
+from projservo_cli.task.face import center_of
+
+MOST_INSTANTS = 60
+_DOTS = 9  # on the planned path
+_DIGITS = 4  # of coordinates in m: a tenth of a millimetre
+_HEIGHT = 640  # px of the scene
+_EYE = 1.75  # distance of the eye, in sizes of the scene
+_LOWER = 0.15  # that it looks below the middle, where the names of the axes are
+_PAD = 0.03  # around all that is shown, as a share of it
+FRAME_MS, LAST_MS = 80, 2000  # what each frame of view and animation lasts, and the last of the animation
+_TOOLS = ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]  # none leaves the page
+# What is wider than high needs more distance where the page is narrow.
+_NEARER = """
+const plot = document.getElementById("{plot_id}");
+const far = Math.min(3, Math.max(1, 1050 / plot.clientWidth));
+const {x, y, z} = plot.layout.scene.camera.eye;
+Plotly.relayout(plot, {"scene.camera.eye": {x: far * x, y: far * y, z: far * z}});
+"""
+_CAMERAS = (style.BLUE, style.ORANGE)
+_SEEN, _HIDDEN = style.SKY, style.VERMILION
+_KEY = (
+    ("robot, face at the start", style.BLACK),
+    ("face", _SEEN),
+    ("face, hidden from a camera", _HIDDEN),
+    ("markers", style.GREY),
+    ("left camera", _CAMERAS[0]),
+    ("right camera", _CAMERAS[1]),
+    ("goal, planned path of the centre", style.PURPLE),
+    ("driven path of the centre", style.GREEN),
+)
+_TREES = (("search tree from the start", "#9cc9e8"), ("search tree from the goals", "#dcb4cd"))
+_AT_ONCE = {"mode": "immediate", "frame": {"duration": 0, "redraw": True}, "transition": {"duration": 0}}
+_PLAYING = _AT_ONCE | {"frame": {"duration": FRAME_MS, "redraw": True}, "fromcurrent": True}
+
+
+class _Driven(NamedTuple):
+    """One run at the k instants shown, in m."""
+
+    verdict: str
+    seconds: FloatArray  # (k,)
+    hidden: BoolArray  # (k, 2) whether the face is hidden from each camera
+    path: FloatArray  # (t, 3) centre of the face at every instant of the run
+    robot: FloatArray  # (k, j, 3) from its base to the tool
+    face: FloatArray  # (k, m, 3) in cyclic order
+    markers: FloatArray  # (k, p, 3)
+
+
+class _Motion(NamedTuple):
+    """What stands still in the view, in m in the frame of the robot's base, and the runs by name."""
+
+    cameras: FloatArray  # (2, 5, 3) optical centre and image corners of both viewing pyramids
+    start: FloatArray  # (m, 3) corners of the face
+    goal: FloatArray | None  # the same, None where only images of the goal are known
+    planned: FloatArray  # (s, 3) centre of the face along the joints of the plan, as far as they follow it
+    trees: tuple[
+        FloatArray, ...
+    ]  # (e, 3) centre of the face along the edges of each search tree, NaN between
+    runs: Mapping[str, _Driven]
+
+
+def motion_of(
+    robot: Arm, plant: Plant, markers: FloatArray, plan: Plan, traces: Mapping[str, Trace]
+) -> _Motion:
+    """What the view shows of runs with a step at least; ``markers`` (p, 4) at the robot's reference, m."""
+    face = plant.M[plant.order]
+    start = (face @ forward_kinematics(plant.model, plan.q_start).T)[:, :3]
+    goals = [trace.goal_pose for trace in traces.values() if np.isfinite(trace.goal_pose).all()]
+    goal = (face @ np.linalg.solve(robot.base_tool.T, goals[0].T))[:, :3] if goals else None
+    planned = _centers(plant, plan.q[np.isfinite(plan.q).all(axis=1)])
+    runs = {name: _driven(robot, plant, markers, trace) for name, trace in traces.items()}
+    edges = () if plan.tree_q is None else tree_edges(plan)
+    trees = tuple(with_gaps(_centers(plant, q.reshape(-1, q.shape[-1]))) for q in edges)
+    return _Motion(pyramids(plant, start), start, goal, planned, trees, runs)
+
+
+def _instants(q: FloatArray) -> IntArray:
+    """At most ``MOST_INSTANTS`` instants of the joints q (t, n), the first and the last among them.
+
+    They are spread half over the time, half over the way of the joints: no end of a run is passed over.
+    """
+    if len(q) <= MOST_INSTANTS:
+        return np.arange(len(q))
+    even = np.linspace(0.0, 1.0, len(q))
+    way = np.append(0.0, np.cumsum(np.abs(np.diff(q, axis=0)).max(axis=1)))
+    done = 0.5 * (even + (way / way[-1] if way[-1] > 0.0 else even))
+    marks = np.linspace(0.0, 1.0, MOST_INSTANTS)
+    return np.unique(np.minimum(np.searchsorted(done, marks), len(q) - 1))
+
+
+def _driven(robot: Arm, plant: Plant, markers: FloatArray, trace: Trace) -> _Driven:
+    shown, places = _instants(trace.q), []
+    for q in trace.q[shown]:
+        H = forward_kinematics(plant.model, q)
+        polyline = skeleton(joint_operators(plant.model, q), robot.joint_types, (H @ robot.base_tool)[:3, 3])
+        places.append((polyline, (plant.M[plant.order] @ H.T)[:, :3], (markers @ H.T)[:, :3]))
+    moved = (np.stack(kind) for kind in zip(*places, strict=True))
+    verdict, path = f"{trace.verdict}, {trace.steps} steps", _centers(plant, trace.q)
+    return _Driven(verdict, trace.period * shown.astype(np.float64), trace.self_occluded[shown], path, *moved)
+
+
+def _centers(plant: Plant, q: FloatArray) -> FloatArray:
+    """Centre of the face (k, 3) at joints (k, n), m."""
+    H = (forward_kinematics(plant.model, joints) for joints in q)
+    return np.array([center_of(plant.M @ moved.T, plant.center)[:3] for moved in H]).reshape(-1, 3)
+
+
+def plotly() -> Any:
+    """The library that draws the view; an InputError says how to get it."""
+    try:
+        import plotly.graph_objects
+    except ImportError as error:
+        raise InputError("the 3D view needs plotly: pip install '.[view]'") from error
+    return plotly.graph_objects
+
+
+def write_view(path: Path, motion: _Motion, *, name: str, known: str) -> None:
+    """Write the view of a run of a name beside its report; ``known`` says where the picture comes from."""
+    scene = _figure(motion).to_html(
+        full_html=False,
+        include_plotlyjs=True,
+        auto_play=False,
+        config={"displaylogo": False, "responsive": True, "modeBarButtons": [_TOOLS]},
+        div_id="scene",
+        post_script=_NEARER,
+    )
+    key = _KEY + (_TREES if motion.trees else ())
+    text = template("view.html").render(name=name, known=known, page=PAGE_FILE, scene=Markup(scene), key=key)
+    write_whole(path, text)
+
+
+def _figure(motion: _Motion) -> Any:
+    """The view as a figure of plotly: what stands still, then four traces a run, and a frame an instant."""
+    go = plotly()
+    menu: list[dict[str, Any]] = []
+    traces, frames = [*_still(go, motion)], []
+    still = len(traces)
+    for number, (name, run) in enumerate(motion.runs.items()):
+        moving = [_moving(go, run, k) for k in range(len(run.seconds))]
+        own = [f"{name}/{k}" for k in range(len(moving))]
+        place = [len(traces) + k for k in range(3)]
+        frames += [go.Frame(name=n, data=data, traces=place) for n, data in zip(own, moving, strict=True)]
+        for trace in (*moving[0], _line(go, run.path, "driven path", style.GREEN, width=5)):
+            trace.visible = number == 0  # a list of all runs chooses another
+            traces.append(trace)
+        shown = [True] * still + [k // 4 == number for k in range(4 * len(motion.runs))]
+        buttons = [
+            {"label": "▶ play", "method": "animate", "args": [own, _PLAYING]},
+            {"label": "❚❚ pause", "method": "animate", "args": [[None], _AT_ONCE]},
+        ]
+        changed: dict[str, Any] = {"sliders": [_slider(run, own)], "updatemenus[1].buttons": buttons}
+        changed |= {f"scene.{axis}axis.range": limits for axis, limits in _extent(motion, run).items()}
+        menu.append({"label": title(name), "method": "update", "args": [{"visible": shown}, changed]})
+    first: dict[str, Any] = menu[0]["args"][1]
+    buttons = first["updatemenus[1].buttons"]
+    left = {"x": 0.0, "xanchor": "left"}
+    playing = {"type": "buttons", "direction": "left", "showactive": False, "buttons": buttons}
+    layout = {
+        "height": _HEIGHT,
+        "margin": {"l": 10, "r": 10, "t": 60, "b": 10},
+        "showlegend": False,  # the page has a key that leaves the scene its room
+        "font": {"family": "system-ui, DejaVu Sans, sans-serif", "size": 13, "color": style.BLACK},
+        "paper_bgcolor": "#ffffff",
+        "uirevision": "kept",  # the view stays as it was turned
+        "scene": _scene(motion, {axis: first[f"scene.{axis}axis.range"] for axis in "xyz"}),
+        "sliders": first["sliders"],
+        "updatemenus": [
+            left | {"y": 1.0, "yanchor": "bottom", "pad": {"b": 8}, "buttons": menu},
+            left | {"y": 0.0, "yanchor": "top", "pad": {"t": 8}} | playing,
+        ],
+    }
+    return go.Figure(traces, layout, frames)
+
+
+def _scene(motion: _Motion, reach: Mapping[str, list[float]]) -> dict[str, Any]:
+    """Axes of equal scales, seen from beside the way from the face to the cameras."""
+    axis = {"gridcolor": style.PALE, "showbackground": False}
+    towards = motion.cameras[:, 0].mean(axis=0) - motion.start.mean(axis=0)
+    azimuth = float(np.arctan2(towards[1], towards[0])) - np.radians(58.0)
+    eye = {"x": _EYE * np.cos(azimuth), "y": _EYE * np.sin(azimuth), "z": 0.5 * _EYE}
+    scene: dict[str, Any] = {"aspectmode": "data", "camera": {"eye": eye, "center": {"z": -_LOWER}}}
+    for name, limits in reach.items():
+        scene[f"{name}axis"] = axis | {"title": {"text": f"{name} (m)"}, "range": limits}
+    return scene
+
+
+def _extent(motion: _Motion, run: _Driven) -> dict[str, list[float]]:
+    """Range of each coordinate that a run keeps to, so that the scene stands still while the robot moves."""
+    points = [motion.cameras, motion.start, run.robot, run.markers, run.path, motion.planned]
+    points += [] if motion.goal is None else [motion.goal]
+    points += [tree[np.isfinite(tree[:, 0])] for tree in motion.trees]
+    shown = np.concatenate([some.reshape(-1, 3) for some in points])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    pad = _PAD * float((high - low).max())
+    ranges = np.round(np.stack([low - pad, high + pad], axis=1), _DIGITS)
+    return {name: reach.tolist() for name, reach in zip("xyz", ranges, strict=True)}
+
+
+def _slider(run: _Driven, own: list[str]) -> dict[str, Any]:
+    """A step for each instant; what it is labelled with stands above the slider."""
+    steps = []
+    for frame, seconds, hidden in zip(own, run.seconds, run.hidden, strict=True):
+        views = " and ".join(name for name, behind in zip(VIEWS, hidden, strict=True) if behind)
+        label = f"{seconds:.2f} s" + (f", hidden from {views}" if views else "")
+        label += f", {run.verdict}" if frame == own[-1] else ""
+        steps.append({"label": label, "method": "animate", "args": [[frame], _AT_ONCE], "value": frame})
+    return {
+        "steps": steps,
+        "active": 0,
+        "pad": {"t": 60, "b": 10},
+        "currentvalue": {"prefix": "time ", "font": {"size": 14, "color": style.BLACK}},
+        "font": {"color": "rgba(0,0,0,0)"},  # no labels below: they would lie over one another
+        "ticklen": 0,
+        "minorticklen": 0,
+    }
+
+
+def _still(go: Any, motion: _Motion) -> Iterator[Any]:
+    for pyramid, name, color in zip(motion.cameras, VIEWS, _CAMERAS, strict=True):
+        apex, corners = pyramid[:1], style.closed(pyramid[1:])
+        edges = np.concatenate([np.concatenate([corner[None], apex, corner[None]]) for corner in corners])
+        yield _line(go, edges, f"{name} camera", color, width=3)
+    yield _line(go, style.closed(motion.start), "face at the start", style.BLACK, width=3)
+    if motion.goal is not None:
+        yield _line(go, style.closed(motion.goal), "face at the goal", style.PURPLE, width=4)
+    for points, (name, color) in zip(motion.trees, _TREES, strict=False):
+        yield _line(go, points, name, color, width=1)
+    if len(motion.planned):
+        dots = np.linspace(0, len(motion.planned) - 1, min(_DOTS, len(motion.planned))).astype(int)
+        yield _line(go, motion.planned, "planned path", style.PURPLE, width=2)
+        yield _line(go, motion.planned[dots], "planned path", style.PURPLE)
+
+
+def _moving(go: Any, run: _Driven, k: int) -> tuple[Any, Any, Any]:
+    """Arm, face and markers at one of the instants."""
+    robot = _line(go, run.robot[k], "robot", style.BLACK, width=9)
+    robot.update(mode="lines+markers", marker={"size": 5, "color": style.BLACK})
+    fan = np.arange(1, run.face.shape[1] - 1)
+    triangles = {"i": (0 * fan).tolist(), "j": fan.tolist(), "k": (fan + 1).tolist()}
+    color = _HIDDEN if run.hidden[k].any() else _SEEN
+    look = {"color": color, "flatshading": True, "name": "face", "hoverinfo": "name"}
+    face = go.Mesh3d(**_places(run.face[k]), **triangles, **look)
+    return robot, face, _line(go, run.markers[k], "markers", style.GREY)
+
+
+def _line(go: Any, points: FloatArray, name: str, color: str, width: float | None = None) -> Any:
+    """A line of a width, or points where there is none."""
+    look = {"mode": "markers", "marker": {"size": 3, "color": color}}
+    if width is not None:
+        look = {"mode": "lines", "line": {"color": color, "width": width}}
+    return go.Scatter3d(**_places(points), **look, name=name, hoverinfo="name")
+
+
+def _places(points: FloatArray) -> dict[str, list[float]]:
+    return {name: np.round(points[:, i], _DIGITS).tolist() for i, name in enumerate("xyz")}
+
+
+FRAMES = 60
+_MOST_COLUMNS = 4
+SEEN, HIDDEN = style.GREEN, style.ORANGE
+_PATH: style.Look = {"color": SEEN, "linewidth": 0.9}
+_BEHIND: style.Look = {"color": HIDDEN, "linewidth": 4.0, "alpha": 0.6}
+_PANEL, _LEAST_WIDTH = 2.3, 4.0  # inches across one panel, and across the legend
+_COLORS, _NEAR_WHITE = 128, 240  # beside greys, which frames need
+_FILM_WIDTH = 320  # px, of which a panel shows most
+
+
+def write_animation(
+    path: Path,
+    traces: Mapping[str, Trace],
+    order: IntArray,
+    size: Sequence[float] | None,
+    progress: Callable[[str, int, int], None],
+) -> None:
+    """Write the animation of runs that moved as GIF: the first direct law beside the classical ones.
+
+    ``order`` are the markers around the face, ``size`` is that of the images in px; where it is not known,
+    the animation shows what reaches around all that was seen. Where the runs have frames, these are shown.
+    """
+    from PIL import Image
+
+    direct = [name for name in traces if name in BODY_LAWS]
+    beside = [*direct[:1], *(name for name in traces if name in POINT_LAWS)]
+    columns = {name: traces[name] for name in (beside if len(beside) > 1 else [*traces])[:_MOST_COLUMNS]}
+    if size is None:
+        size = np.nanmax(np.concatenate([run.s.reshape(-1, 2) for run in traces.values()]), axis=0) + 1.0
+    images = []
+    for pixels in _frames(columns, order, np.array(size, dtype=np.float64)):
+        images.append(Image.fromarray(pixels))
+        progress("animation", len(images), FRAMES)
+    # The last frame has all colours; one palette for all keeps what does not move the same.
+    palette = images[-1].quantize(_COLORS, method=Image.Quantize.MAXCOVERAGE)
+    colors = np.array((palette.getpalette() or [])[: 3 * _COLORS]).reshape(-1, 3)
+    greys = np.linspace(0, _NEAR_WHITE, 256 - len(colors)).round().astype(np.int64)[:, None].repeat(3, axis=1)
+    colors[colors.min(axis=1) >= _NEAR_WHITE] = 255  # else paper takes the nearest shade of them
+    palette.putpalette(np.concatenate([colors, greys]).ravel().tolist())
+    first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    with replacing(path) as temporary:
+        durations = [*[FRAME_MS] * len(others), LAST_MS]
+        first.save(temporary, "GIF", save_all=True, append_images=others, duration=durations, loop=0)
+
+
+def _frames(traces: Mapping[str, Trace], order: IntArray, size: FloatArray) -> Iterator[Any]:
+    """Draw one frame after another, a column a run; yields the pixels (height, width, 3) of each.
+
+    They go from the start to the end of the longest run that converged, if any did.
+    """
+    ends = [run.period * run.steps for run in traces.values() if run.verdict == "converged"]
+    end = max(ends or [run.period * run.steps for run in traces.values()])
+    every = [t[:, :, order].reshape(-1, 2) for run in traces.values() for t in (run.s, run.s_star[None])]
+    near = near_pixels(np.concatenate(every), size)
+    films = {name: frames_of(run, width=_FILM_WIDTH) for name, run in traces.items()}
+    margin = 0.06
+    if any(film is not None for film in films.values()):  # whole images
+        near, margin = np.array([[-0.5, -0.5], size - 0.5]), 0.0
+    width = max(_LEAST_WIDTH, _PANEL * len(traces) + 0.5)
+    columns: list[list[_Panel]] = []
+
+    def draw(runs: Mapping[str, Trace], figure: "style.Figure") -> None:
+        axes = figure.subplots(2, len(runs), squeeze=False, sharex=True, sharey=True)
+        for column, (name, run) in zip(axes.T, runs.items(), strict=True):
+            for view, (panel, camera) in enumerate(zip(column, VIEWS, strict=True)):
+                style.face(panel, run.s[0, view, order], style.START)
+                style.face(panel, run.s_star[view, order], style.GOAL)
+                style.image_axes(panel, "" if view else f"{title(name)}\nrunning", near, margin)
+                panel.set_ylabel("" if columns else f"{camera} camera\nv (px)")
+                panel.set_xlabel("u (px)" if view else "")
+            shown = zip(column, run.s[:, :, order].swapaxes(0, 1), run.self_occluded.T, strict=True)
+            columns.append([_Panel(*one) for one in shown])
+            if (film := films[name]) is not None and run.frame_instant is not None:
+                for panel, frames in zip(columns[-1], film.swapaxes(0, 1), strict=True):
+                    panel.over(frames, run.frame_instant, size)
+        looks = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
+        looks["face hidden from this camera"] = _BEHIND
+        style.legend_below(figure, looks, 4 if len(runs) > 2 else 2)
+        figure.suptitle("time 00.00 s", fontsize=9)
+
+    with style.styled():
+        figure = style.drawn(draw, traces, 2.0 * _PANEL * style.aspect(near) + 1.6, width)
+        for seconds in np.linspace(0.0, end, FRAMES):
+            figure.suptitle(f"time {seconds:.2f} s", fontsize=9)
+            for column, (name, run) in zip(columns, traces.items(), strict=True):
+                now = min(int((seconds + 1e-9) / run.period), run.steps)
+                told = f"{run.verdict}, {run.steps} steps"
+                if now < run.steps:
+                    told = f"later: {told}" if seconds == end else "running"
+                column[0].axes.set_title(f"{title(name)}\n{told}")
+                for panel in column:
+                    panel.show(now)
+            canvas: Any = figure.canvas
+            canvas.draw()
+            yield np.array(canvas.buffer_rgba(), dtype=np.uint8)[:, :, :3]
+
+
+class _Panel:
+    """What moves in the image of one camera under one law: paths (t, m, 2) and a face, hidden (t,) or not."""
+
+    def __init__(self, axes: Any, s: FloatArray, hidden: BoolArray) -> None:
+        self.axes, self.s, self.hidden = axes, s, hidden
+        self.behind, self.paths = ([axes.plot([], [], **look)[0] for _ in s[0]] for look in (_BEHIND, _PATH))
+        (self.face,) = axes.fill([0.0], [0.0], linewidth=1.2, edgecolor=style.BLACK, alpha=0.9, zorder=3)
+        place = {"transform": axes.transAxes, "ha": "center", "va": "bottom"}
+        self.word = axes.text(0.5, 0.03, "", fontweight="bold", fontsize=8, **place)
+        self.ground: Any = None
+        self.instant: IntArray = np.zeros(0, dtype=np.int64)
+
+    def over(self, frames: ByteArray, instant: IntArray, size: FloatArray) -> None:
+        """Lay frames (k, height, width) of instants (k,) of images of a size, px, beneath."""
+        extent = (-0.5, size[0] - 0.5, size[1] - 0.5, -0.5)
+        limits = self.axes.get_xlim(), self.axes.get_ylim()
+        self.ground = self.axes.imshow(frames[0], cmap="gray", vmin=0, vmax=255, extent=extent, aspect="auto")
+        self.axes.set(xlim=limits[0], ylim=limits[1])
+        self.axes.grid(visible=False)
+        with_halo(self.axes)
+        self.frames, self.instant = frames, instant
+        self.face.set_alpha(0.5)
+
+    def show(self, now: int) -> None:
+        """Show the paths up to an instant, and the face at it."""
+        past, hidden = self.s[: now + 1], self.hidden[: now + 1]
+        if self.ground is not None:  # the newest frame that is kept
+            self.ground.set_data(self.frames[np.searchsorted(self.instant, now, side="right") - 1])
+        for k, (line, behind) in enumerate(zip(self.paths, self.behind, strict=True)):
+            line.set_data(*past[:, k].T)
+            behind.set_data(*np.where(hidden[:, None], past[:, k], np.nan).T)
+        here = past[-1][np.isfinite(past[-1]).all(axis=1)]
+        self.face.set_visible(len(here) > 2)
+        if len(here) > 2:
+            self.face.set_xy(here)
+        self.face.set_facecolor(HIDDEN if hidden[-1] else SEEN)
+        unseen = "MARKERS NOT SEEN" if len(here) < self.s.shape[1] else ""
+        self.word.set_text("FACE HIDDEN" if hidden[-1] else unseen)

@@ -1,0 +1,254 @@
+"""Figure 16: the planned motion in both images, its joints and its margins over time, and search trees."""
+
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.geometry.kinematics import forward_kinematics, project
+from projservo_cli.planning.constraints import BORDER, CLEAR, WIDTH
+from projservo_cli.planning.margins import BEHIND
+from projservo_cli.records import PRISMATIC, FloatArray, IntArray, Plan
+from projservo_cli.report import style
+from projservo_cli.report.figures.images import near_pixels
+from projservo_cli.report.report_data import VIEWS, Data, Material, registered
+
+PIECES = 4  # of each edge of a tree, which is no straight line in an image
+_IMAGE_WIDTH, _ROW = 2.9, 1.5  # inches: of an image, and the height of a row of curves
+_HIGHEST = 0.8  # height of an image over its width, at most
+_NEAR_EDGE = 0.42  # distance from the middle of an image, as a share of it, from which its border shows
+_STRIP = 0.085  # of the time, that the range of a joint takes beside the curves
+_NEAR, _NEAR_PX = 1.0, 10.0  # margins and distances up to which a scale to ten times as much is linear
+_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")  # as text, which takes a tenth of formulas
+_SIDES: tuple[Any, Any] = ("-", (0, (4, 1.5)))  # of what both cameras have
+_PATH: style.Look = {"color": style.GREY, "linewidth": 0.8}
+_CENTER: style.Look = {"color": style.GREEN, "linewidth": 1.6}
+_CORNER: style.Look = {"color": style.VERMILION, "marker": "|", "markersize": 8.0, "linestyle": "none"}
+_EDGE: style.Look = {"color": style.GREY, "linewidth": 0.8, "linestyle": (0, (1, 1))}
+_TREES: dict[str, style.Look] = {
+    "start": {"color": style.SKY, "linewidth": 0.5, "alpha": 0.7},
+    "goals": {"color": style.PURPLE, "linewidth": 0.5, "alpha": 0.7},
+}
+_KEPT_OUT: style.Look = {"facecolor": "none", "edgecolor": style.VERMILION, "hatch": "////", "linewidth": 0.6}
+_ASKED: style.Look = {"linewidth": 0.8, "linestyle": (0, (1, 1))}
+_SHARES = {
+    "visibility": ("visibility a·O (start = 1)", style.BLUE),
+    "joints": ("nearest joint limit (middle = 1)", style.GREEN),
+    "conditioning": ("conditioning (start = 1)", style.PURPLE),
+}
+_DISTANCES = {
+    "border_px": ("face from the border", style.ORANGE),
+    "width_px": ("width of the face", style.BLACK),
+    "clear_px": ("body from kept-out regions", style.VERMILION),
+}
+
+
+def _data(material: Material) -> Data:
+    """Images, joints and margins along the plan; trees as lines with NaN between their edges."""
+    plan, order, model = material.plan, material.plant.order, material.calibrated
+    slides = material.robot.joint_types == PRISMATIC
+    unit = np.where(slides, 1e3, np.degrees(1.0))
+    timed = bool(np.isfinite(plan.time).all())
+    name = f"{plan.profile.replace('_', ' ')} profile"
+    if plan.profile == "joint" and not plan.feasible:
+        name = "no way found, linear motion"
+    result: Data = {
+        "name": np.array(name),
+        **({"t_s": plan.time} if timed else {"sigma": plan.sigma}),
+        "s": plan.s[:, :, order],
+        "s_star": plan.s_star[:, order],
+        "center": np.moveaxis(project(model.P, plan.H_d @ plan.A_c, model.lens), 0, 1),
+        "image_size": material.plant.image_size,
+        "prismatic": slides,
+        "q_deg_or_mm": plan.q * unit,
+        "q_start_deg_or_mm": plan.q_start * unit,
+        "limits_deg_or_mm": np.stack([material.robot.lower, material.robot.upper]) * unit,
+        "corner_s": np.zeros((0, 2)) if plan.corner is None else plan.corner,
+        "visibility": plan.margin,
+        "joints": plan.joint_margin[:, None],
+        "conditioning": (plan.condition / plan.condition[0])[:, None],
+        **_distances(plan, material.trajectory.border_px),
+    }
+    for i, region in enumerate(material.trajectory.keep_out):
+        for view, polygon in ((0, region.left), (1, region.right)):
+            if polygon is not None:
+                result[f"kept_out_{VIEWS[view]}_{i}"] = np.array(polygon)
+    if plan.tree_q is not None:
+        result["nodes"] = np.array([len(plan.tree_q), plan.tree_nodes])
+        M = np.linalg.solve(forward_kinematics(model, plan.q_start), plan.A_c)
+        for name, edges in zip(_TREES, tree_edges(plan), strict=True):
+            points = np.array([forward_kinematics(model, q) @ M for q in edges.reshape(-1, edges.shape[-1])])
+            result[f"tree_{name}"] = with_gaps(np.moveaxis(project(model.P, points, model.lens), 0, 1))
+    return result
+
+
+def _distances(plan: Plan, border_px: float) -> Data:
+    """Distances in px and what is asked of them; of a way through joint space those it was held against."""
+    if plan.validity is None or plan.validity_asked is None:
+        seen = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
+        return {"border_px": seen, "border_px_asked": np.full_like(seen, border_px)}
+    found: Data = {}
+    for name, i, count in (("border_px", BORDER, 2), ("width_px", WIDTH, 2), ("clear_px", CLEAR, 1)):
+        if np.isfinite(plan.validity[:, i]).all():
+            found[name], found[f"{name}_asked"] = (
+                x[:, i : i + count] for x in (plan.validity, plan.validity_asked)
+            )
+    return found
+
+
+def tree_edges(plan: Plan) -> tuple[FloatArray, FloatArray]:
+    """Joints (e, PIECES + 1, n) along the edges of the tree from the start, and of that from the goals."""
+    assert plan.tree_q is not None
+    assert plan.tree_parent is not None
+    share = np.linspace(0.0, 1.0, PIECES + 1)[:, None]
+    second = int(np.append(np.flatnonzero(plan.tree_parent < 0), len(plan.tree_q))[1])
+    edges = []
+    for nodes in (np.arange(second), np.arange(second, len(plan.tree_q))):
+        nodes = nodes[plan.tree_parent[nodes] >= 0]
+        start, end = plan.tree_q[plan.tree_parent[nodes], None], plan.tree_q[nodes, None]
+        edges.append(start + share * (end - start))
+    return edges[0], edges[1]
+
+
+def with_gaps(points: FloatArray) -> FloatArray:
+    """Points (k, …) of one edge after the other as one line, with NaN after each edge."""
+    parts = points.reshape(-1, PIECES + 1, *points.shape[1:])
+    gaps = np.full_like(parts[:, :1], np.nan)
+    return np.concatenate([parts, gaps], axis=1).reshape(-1, *points.shape[1:])
+
+
+@registered(
+    "fig16_way",
+    "The planned motion in both images, its joints and its margins over time",
+    "beside the paper's, after section 4",
+    _data,
+    alt="Above, for each camera, the paths of the markers and of the centre of the face, regions that are "
+    "kept out of, and the search trees where there are some. Below left the joints over time beside their "
+    "ranges, below right the margins and distances over time, with what is asked for.",
+)
+def _draw(data: Data, figure: "style.Figure") -> None:
+    """Above the images; below left the joints, by kind, right what is held against."""
+    slides = data["prismatic"]
+    kinds: list[tuple[IntArray, str]] = [
+        (np.flatnonzero(slides == kind), "mm" if kind else "deg") for kind in np.unique(slides)
+    ]
+    shown = [_shown(data, view) for view in range(2)]
+    image = _IMAGE_WIDTH * style.aspect(np.concatenate(shown), most=_HIGHEST)
+    figure.set_figheight(image + 2.0 * _ROW + 1.9)
+    grid = figure.add_gridspec(3, 2, height_ratios=[image, _ROW, _ROW])
+    for view in range(2):
+        _image(figure.add_subplot(grid[0, view]), data, view, shown[view])
+    places = (grid[1:, 0],) if len(kinds) == 1 else (grid[1, 0], grid[2, 0])
+    for place, (chosen, unit) in zip(places, kinds, strict=True):
+        _joints(figure.add_subplot(place), data, chosen.tolist(), unit)
+    shares, distances = figure.add_subplot(grid[1, 1]), figure.add_subplot(grid[2, 1])
+    _curves(shares, data, {name: color for name, (_, color) in _SHARES.items()})
+    _curves(distances, data, {name: color for name, (_, color) in _DISTANCES.items()})
+    shares.set(ylabel="margin (1)", xlabel="")
+    shares.tick_params(labelbottom=False)
+    distances.set_ylabel("distance (px)")
+    for axes, near in ((shares, _NEAR), (distances, _NEAR_PX)):
+        if np.abs(axes.dataLim.intervaly).max() > 10.0 * near:
+            axes.set_yscale("symlog", linthresh=near)
+            axes.yaxis.set_major_formatter("{x:g}")
+    style.legend_below(figure, _legend(data), 3)
+
+
+def _shown(data: Data, view: int) -> FloatArray:
+    """All pixels (k, 2) that are drawn of one image."""
+    names = ["s", "s_star", "center", *(f"tree_{name}" for name in _TREES if f"tree_{name}" in data)]
+    drawn = [data[name][..., view, :, :] if name[0] == "s" else data[name][:, view] for name in names]
+    drawn += [data[name] for name in data if name.startswith(f"kept_out_{VIEWS[view]}")]
+    return near_pixels(np.concatenate([pixels.reshape(-1, 2) for pixels in drawn]), data["image_size"])
+
+
+def _image(axes: "style.Axes", data: Data, view: int, shown: FloatArray) -> None:
+    for name in (name for name in data if name.startswith(f"kept_out_{VIEWS[view]}")):
+        axes.fill(*data[name].T, **_KEPT_OUT)
+    for name, look in _TREES.items():
+        if f"tree_{name}" in data:
+            axes.plot(*data[f"tree_{name}"][:, view].T, **look)
+    s, center = data["s"][:, view], data["center"][:, view]
+    style.paths(axes, s, _PATH)
+    axes.plot(*center.T, **_CENTER)
+    t = _time(data)[0]
+    at = data["corner_s"].ravel()
+    axes.plot(*(np.interp(at, t, column) for column in center.T), **_CORNER)
+    style.face(axes, s[0], style.START, fill=True)
+    style.face(axes, data["s_star"][view], style.GOAL)
+    style.image_axes(axes, f"{VIEWS[view]} camera, {data['name']}", shown)
+    border = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * data["image_size"] - 0.5
+    axes.plot(*style.closed(border).T, **_EDGE)
+
+
+def _time(data: Data) -> tuple[FloatArray, str]:
+    """What runs to the right, (k,), and its name."""
+    return (data["t_s"], "time (s)") if "t_s" in data else (data["sigma"], "path parameter σ (1)")
+
+
+def _joints(axes: "style.Axes", data: Data, chosen: list[int], unit: str) -> None:
+    """Joints over time; right of them a bar for the range of each."""
+    t, name = _time(data)
+    end = float(t[-1]) or 1.0
+    q, limits = data["q_deg_or_mm"], data["limits_deg_or_mm"]
+    values = np.concatenate([q[:, chosen].ravel(), limits[:, chosen].ravel()])
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if len(values) else (-1.0, 1.0)
+    pad = 0.06 * max(high - low, 1e-3)
+    for begin, until in data["corner_s"]:
+        axes.axvspan(begin, until, color=style.PALE, linewidth=0)
+    axes.axvline(end, color=style.GREY, linewidth=0.6)
+    for place, i in enumerate(chosen):
+        look = style.curve(i)
+        axes.plot(t, q[:, i], **look)
+        x = end * (1.0 + _STRIP * (place + 0.7))
+        axes.plot([x, x], np.clip(limits[:, i], low - pad, high + pad), color=look["color"], linewidth=3.0)
+        axes.text(
+            x,
+            high + 1.5 * pad,
+            "q" + str(i + 1).translate(_SUBSCRIPTS),
+            ha="center",
+            va="bottom",
+            fontsize=6.5,
+        )
+    colors = [style.curve(i)["color"] for i in chosen]
+    axes.scatter(np.zeros(len(chosen)), data["q_start_deg_or_mm"][chosen], 9.0, colors)
+    axes.set(xlabel=name, ylabel=f"joint ({unit})", ylim=(low - pad, high + 4.0 * pad))
+    axes.set_xlim(-0.03 * end, end * (1.0 + _STRIP * (len(chosen) + 0.4)))
+    axes.set_xticks([x for x in axes.get_xticks() if 0.0 <= x <= end])
+
+
+def _curves(axes: "style.Axes", data: Data, colors: dict[str, str]) -> None:
+    """What is held against over time, solid for the left camera or both, and what is asked for."""
+    t, name = _time(data)
+    axes.axhline(0.0, color=style.BLACK, linewidth=0.6)
+    for key, color in colors.items():
+        for suffix, looks in (("", _SIDES), ("_asked", (_ASKED["linestyle"],) * 2)):
+            width = 0.8 if suffix else 1.2
+            for column, look in zip(data.get(key + suffix, np.zeros((len(t), 0))).T, looks, strict=False):
+                axes.plot(t, column, color=color, linestyle=look, linewidth=width)
+    axes.set(xlabel=name)
+
+
+def _legend(data: Data) -> dict[str, style.Look]:
+    grey: style.Look = {"color": style.GREY}
+    looks: dict[str, style.Look] = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
+    looks["path of the centre"] = _CENTER
+    if len(data["corner_s"]):
+        looks["a rounded corner begins, ends"] = _CORNER
+    for name, look in _TREES.items():
+        if f"tree_{name}" in data:
+            looks[f"tree from the {name}"] = look | {"linewidth": 1.2}
+    if "nodes" in data and data["nodes"][0] < data["nodes"][1]:
+        looks["{} of {} joint vectors of trees".format(*data["nodes"])] = {"linewidth": 0}
+    if any(name.startswith("kept_out") for name in data):
+        looks["kept-out region"] = _KEPT_OUT
+    for key, (label, color) in (_SHARES | _DISTANCES).items():
+        if key in data:
+            looks[label] = {"color": color}
+    looks |= {
+        "left camera, or both": grey | {"linestyle": _SIDES[0]},
+        "right camera": grey | {"linestyle": _SIDES[1]},
+    }
+    looks["asked for"] = grey | _ASKED
+    shown = np.concatenate([_shown(data, view) for view in range(2)]) / data["image_size"]
+    return looks | ({"border of the image": _EDGE} if (np.abs(shown - 0.5) > _NEAR_EDGE).any() else {})

@@ -1,0 +1,195 @@
+"""How far the centre drifts from its straight line: for several gains, Fig. 8 of [RH00], and by mode."""
+
+from typing import Any
+
+import numpy as np
+
+from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.records import FloatArray, Report, Trace
+from projservo_cli.report import style
+from projservo_cli.report.report_data import (
+    DIRECT,
+    TITLES,
+    Data,
+    Material,
+    Studies,
+    along_line,
+    registered,
+    title,
+)
+
+_LEAST_SHARE = 0.05  # of the largest deviation of the best run, below which nothing is drawn
+_PATH_POINTS = 400
+_WHIRL = np.pi  # with a longer joint step, rad or m, the arm winds up: its path is drawn at the instants only
+_WIDE = 10.0  # modes that differ more have a logarithmic scale, down to a share of the least of them
+_LEAST_OF_MODES = 0.02
+_WAY, _OFF = "way along the straight line (mm)", "distance from it (mm)"
+_RESOLUTION = np.radians(1.0)  # longest joint motion, rad or m, between two points of a drawn path
+_OPERATORS = ("true", "calibrated")
+_LIMITED: style.Look = {"color": style.SKY, "linewidth": 2.4}
+# Largest deviations by operators and limit, both 0 or 1.
+_MAXIMA: dict[tuple[int, int], style.Look] = {
+    (0, 0): {"color": style.BLACK, "marker": "o"},
+    (0, 1): {"color": style.BLACK, "marker": "^", "linestyle": (0, (4, 1.5))},
+    (1, 0): {"color": style.VERMILION, "marker": "s", "fillstyle": "none"},
+    (1, 1): {"color": style.VERMILION, "marker": "v", "fillstyle": "none", "linestyle": (0, (4, 1.5))},
+}
+
+
+def study_numbers(studies: Studies | None) -> dict[str, Any]:
+    """What a ``Report`` holds of the extra runs, NaN where the goal pose is unknown.
+
+    Laws, operators, limits and gains are in the order of its tables.
+    """
+    gains, periods = (studies.gains, studies.periods) if studies is not None else ((), ())
+    shape = (len(DIRECT), len(_OPERATORS), 2, len(gains))
+    drift, at_samples, converged = np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape, np.bool_)
+    by_period = np.full((len(DIRECT), len(periods)), np.nan)
+    for (law, operators, limited, gain), trace in (studies.sweep if studies is not None else {}).items():
+        where = DIRECT.index(law), _OPERATORS.index(operators), int(limited), gains.index(gain)
+        converged[where] = trace.verdict == "converged"
+        drift[where] = trace.center_deviation_mm  # None becomes NaN
+        at_samples[where] = trace.center_deviation_at_samples_mm
+    for (law, period), trace in (studies.rate if studies is not None else {}).items():
+        by_period[DIRECT.index(law), periods.index(period)] = trace.center_deviation_mm
+    return {
+        "gain_per_step": np.array(gains),
+        "drift_mm": drift,
+        "drift_at_samples_mm": at_samples,
+        "drift_converged": converged,
+        "period": np.array(periods),
+        "period_drift_mm": by_period,
+    }
+
+
+def _data(material: Material) -> Data:
+    """Paths of the centre with calibrated operators, and the largest deviations of all runs."""
+    studies = material.extra
+    result: Data = {
+        "gain": np.array(studies.gains),
+        "drift_mm": study_numbers(studies)["drift_mm"],
+        "step_limit_deg": np.array(studies.step_limit_deg),
+    }
+    for law in DIRECT:
+        cases = [(gain, False) for gain in studies.gains] + [(max(studies.gains), True)]
+        for i, (gain, limited) in enumerate(cases):
+            trace = studies.sweep[law, "calibrated", limited, gain]
+            whirls = np.abs(np.diff(trace.q, axis=0)).max(initial=0.0) > _WHIRL
+            points = trace.center if whirls else _center_path(material, trace)
+            way, off = along_line(points, trace.center[0], material.goal_center(trace))
+            used = np.unique(np.linspace(0, len(points) - 1, _PATH_POINTS).round().astype(int))
+            result[f"whirls_{law}_{i}"] = np.array(whirls)
+            result[f"path_mm_{law}_{i}"] = 1e3 * np.stack([way, off], axis=1)[used]
+    return result
+
+
+def _center_path(material: Material, trace: Trace) -> FloatArray:
+    """True centre (k, 3) along a run, m, between the instants too, where the joints move linearly."""
+    amount = np.abs(np.diff(trace.q, axis=0)).max(axis=1, initial=0.0)
+    points = [trace.center[0]]
+    for k, most in enumerate(amount):
+        parts = max(1, int(np.ceil(most / _RESOLUTION)))
+        for share in np.arange(1, parts) / parts:
+            q = trace.q[k] + share * (trace.q[k + 1] - trace.q[k])
+            points.append((forward_kinematics(material.plant.model, q) @ material.middle)[:3])
+        points.append(trace.center[k + 1])
+    return np.array(points)
+
+
+@registered(
+    "fig08_drift",
+    "Drift of the centre from its straight line",
+    "Fig. 8, section 6",
+    _data,
+    height=5.2,
+    studies=True,
+    goal=True,
+    alt="For directTHREE and directTWO: distance of the centre from its straight line along the way "
+    "for several gains, and the largest distance over the gain, with true and calibrated "
+    "operators, with and without a limit.",
+)
+def _draw(data: Data, figure: "style.Figure") -> None:
+    """One row a law: left the paths, right the largest deviation over the gain."""
+    axes = figure.subplots(2, 2, width_ratios=[1.5, 1])
+    gains = data["gain"]
+    looks = [*(style.curve(i) for i in range(len(gains))), _LIMITED]
+    for (path_axes, most), deviation, law in zip(axes, data["drift_mm"], DIRECT, strict=True):
+        paths = [data[f"path_mm_{law}_{i}"] for i in range(len(gains) + 1)]
+        least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
+        for path, look in zip(paths, looks, strict=True):
+            path_axes.plot(path[:, 0], np.maximum(path[:, 1], least), **look)
+        path_axes.set(title=f"{TITLES[law]}: path of the centre, calibrated operators")
+        path_axes.set(xlabel=_WAY, ylabel=_OFF)
+        style.log_scale(path_axes)
+        path_axes.set_ylim(bottom=least)
+        for (operators, limited), look in _MAXIMA.items():
+            size = 4.5 if operators else 3.0  # an empty marker shows around a full one
+            most.plot(gains, deviation[operators, limited], markersize=size, **look)
+        most.set(title=f"{TITLES[law]}: largest distance", xscale="log")
+        most.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
+        most.set_xticks(gains, [f"{gain:g}" for gain in gains])
+        most.minorticks_off()
+        style.log_scale(most)
+    limit = f"{float(data['step_limit_deg']):g}° per step"
+    legend = {f"gain {gain:g} per step": look for gain, look in zip(gains, looks, strict=False)}
+    legend[f"{gains.max():g} and {limit}"] = _LIMITED
+    for (operators, limited), look in _MAXIMA.items():
+        legend[f"{_OPERATORS[operators]}, {limit if limited else 'no limit'}"] = look
+    if any(data[f"whirls_{law}_{i}"] for law in DIRECT for i in range(len(gains) + 1)):
+        legend["chords: steps over 180°"] = {"color": style.BLACK, "linewidth": 0}
+    style.legend_below(figure, legend, 4)
+
+
+def drift_rows(report: Report) -> list[dict[str, Any]]:
+    """The drift table as rows: law, operators, limit in deg per step or None, gain, mm, converged."""
+    rows = []
+    for index in np.ndindex(report.drift_mm.shape):
+        law, operators, limited, gain = index
+        drift, at_samples = float(report.drift_mm[index]), float(report.drift_at_samples_mm[index])
+        rows.append(
+            {
+                "law": DIRECT[law],
+                "operators": _OPERATORS[operators],
+                "limit_deg_per_step": report.step_limit_deg if limited else None,
+                "gain_per_step": float(report.gain_per_step[gain]),
+                "drift_mm": drift if np.isfinite(drift) else None,
+                "drift_at_samples_mm": at_samples if np.isfinite(at_samples) else None,
+                "converged": bool(report.drift_converged[index]),
+            }
+        )
+    return rows
+
+
+def _data_modes(material: Material) -> Data:
+    """Way along the line of the centre and distance from it at every instant, mm."""
+    names = material.compared()
+    result: Data = {"names": np.array(names)}
+    for name in names:
+        trace = material.traces[name]
+        way, off = along_line(trace.center, trace.center[0], material.goal_center(trace))
+        result[f"path_mm_{name}"] = 1e3 * np.stack([way, off], axis=1)
+    return result
+
+
+@registered(
+    "fig15_modes_path",
+    "Path of the centre: planning anew in each step, and following the plan",
+    "beside the paper's, after section 4",
+    _data_modes,
+    height=3.0,
+    modes=True,
+    goal=True,
+    alt="Distance of the centre from its straight line over the way along it, one curve a law and mode.",
+)
+def _draw_modes(data: Data, figure: "style.Figure") -> None:
+    """Distance of the centre from its line over the way along it, one curve a run."""
+    axes, names = figure.subplots(), [str(name) for name in data["names"]]
+    for i, name in enumerate(names):
+        way, off = data[f"path_mm_{name}"].T
+        axes.plot(way, off, **style.curve(i))
+    axes.set(title="path of the centre", xlabel=_WAY, ylabel=_OFF)
+    style.legend_below(figure, {title(name): style.curve(i) for i, name in enumerate(names)}, 2)
+    most = [float(data[f"path_mm_{name}"][:, 1].max()) for name in names]
+    if min(most) > 0.0 and max(most) > _WIDE * min(most):
+        style.log_scale(axes)
+        axes.set_ylim(bottom=_LEAST_OF_MODES * min(most))

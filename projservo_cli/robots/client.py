@@ -1,0 +1,384 @@
+"""A robot of the contract as the loop drives it: set-points at its pace, images as it will come to rest.
+
+A servo lags behind its set-point while that moves, and sags below it under gravity. What a law is given are
+the joints at which the arm would come to rest if nothing more were sent: lag has then no part in its loop,
+and sag is integrated away.
+"""
+
+import io
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.readings import LEAST_SIGMA
+from projservo_cli.geometry.algebra import as_array
+from projservo_cli.geometry.kinematics import forward
+from projservo_cli.monitoring.monitor import ImageMonitor
+from projservo_cli.monitoring.statistics import WINDOW
+from projservo_cli.records import BoolArray, ByteArray, FloatArray, IntArray
+from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
+from projservo_cli.robots.latency import DelayPrior, Delays, History, squares_by_joints
+from projservo_cli.robots.simulated import Plant, observe
+
+# Share of the sag allowed for that a servo may still be behind where sag is told from lag.
+_STILL = 0.2
+# Weight in the fit of a law that a sighting keeps which is off by itself.
+_REJECTED = 1e-3
+# A held arm that so long shows the same image to the bit, s, shows no other: a simulated one without noise.
+_STALE_S = 0.5
+# Looks before the first motion, until enough agree or a fault is named.
+_MOST_LOOKS = 120
+
+
+class SetPoint:
+    """The set-point of a robot.
+
+    bounds : of its commands, with what is taken of its servos.
+    q : (n,) first reading, rad or m: where it is sent at first.
+    ``target``: (n,) the set-point, rad or m. ``short``: (n,) joints whose last step was cut short because the
+    set-point was too far ahead of the reading.
+    """
+
+    def __init__(self, bounds: Bounds, q: FloatArray) -> None:
+        self._bounds, self.target = bounds, q.copy()
+        self.short: BoolArray = np.zeros(len(q), dtype=np.bool_)
+        self._q, self._sag = q.copy(), np.zeros(len(q))
+        self._behind = np.zeros(len(q))  # by how much a servo of that lag would be
+
+    @property
+    def at_rest(self) -> FloatArray:
+        """Joints (n,) at which the arm comes to rest if nothing more is sent, rad or m."""
+        return self.target - self._sag
+
+    def read(self, q: FloatArray, seconds: float) -> None:
+        """Learn the sag from a reading (n,), so long after the last one: only while hardly anything moves."""
+        self._q = q.copy()
+        weight = 1.0 / (1.0 + (self._behind / (_STILL * self._bounds.sag)) ** 2)
+        share = -math.expm1(-seconds / self._bounds.lag_s)
+        self._sag += share * weight * (self.target - q - self._sag)
+
+    def step(self, dq: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
+        """Go on by a joint step (n,), rad or m, in so many seconds: the set-point (n,) and its speed (n,)."""
+        bounds, lag, before, q = self._bounds, self._bounds.lag_s, self.target, self._q
+        target = np.clip(before + dq, *bounds.not_far_ahead(q))
+        self.short = target != before + dq
+        self.target = np.clip(target, *bounds.within_limits(q))
+        speed = np.clip((self.target - before) / seconds, -bounds.speed, bounds.speed)
+        fades = math.exp(-seconds / lag)
+        self._behind = fades * self._behind + (1.0 - fades) * lag * np.abs(speed)
+        return self.target.copy(), speed
+
+
+class Steered:
+    """A robot that is sent absolute set-points, the sum of the steps asked for, one a period.
+
+    The robot itself accumulates nothing.
+
+    robot : what is driven.
+    ``reading``: of the last look. ``history``: joint readings of all looks. ``set_point``: where it is sent,
+    at first where it is read to stand. ``overruns``: periods that reading and thinking did not fit into.
+    """
+
+    reading: Reading
+    set_point: SetPoint
+
+    def __init__(self, robot: ForeignRobot) -> None:
+        self.robot, self.history, self.overruns = robot, History(), 0
+        self._due: float | None = None
+
+    @property
+    def target(self) -> FloatArray:
+        """The set-point (n,), rad or m."""
+        return self.set_point.target
+
+    def look(self) -> Reading:
+        """Read joints and images."""
+        self.reading = self.robot.read()
+        t, q = self.reading.t_q, self.reading.q
+        if self.history:
+            self.set_point.read(q, t - self.history.last[0])
+        else:
+            self.set_point = SetPoint(self.robot.bounds, q)
+        self.history.add(t, q)
+        return self.reading
+
+    def command(self, step: FloatArray, period: float) -> None:
+        """Move the set-point by a step (n,), rad or m, and wait until the period, s, is over."""
+        now = self.robot.now()
+        due = (now if self._due is None else self._due) + period
+        if now > due:  # thinking took too long, and no set-point must be due in the past
+            due = now + period
+            self.overruns += 1
+        self.robot.command(*self.set_point.step(step, period), due)
+        self._due = due
+        if self.robot.wait_until(due):
+            self.overruns += 1
+
+    def hold(self) -> Reading:
+        """Hold the set-point for a period, and look."""
+        self.command(np.zeros_like(self.reading.q), self.robot.bounds.period)
+        return self.look()
+
+
+MOST_FRAMES = 60  # pairs of a run that are kept
+_QUALITY = 85  # of JPEG
+
+
+class _Shot(NamedTuple):
+    """A pair of frames that is kept."""
+
+    instant: int
+    s: FloatArray  # (2, m, 2) px, what was found in it
+    jpeg: tuple[bytes, bytes]
+
+
+class Film:
+    """Frames of a run, evenly thinned while it runs, the first and the last among them."""
+
+    def __init__(self) -> None:
+        self._kept: list[_Shot] = []
+        self._every = 1  # instants from one to the next
+        self._last: tuple[int, FloatArray, ByteArray] | None = None
+
+    def show(self, instant: int, s: FloatArray, frames: ByteArray) -> None:
+        """Take the frames (2, height, width) of an instant, and the pixels (2, m, 2) that were found."""
+        self._last = instant, s, frames
+        if instant % self._every == 0 and len(self._kept) == MOST_FRAMES - 1:
+            self._kept, self._every = self._kept[::2], 2 * self._every
+        if instant % self._every == 0:
+            self._kept.append(_Shot(instant, s, _as_jpeg(frames)))
+
+    def told(self) -> dict[str, Any]:
+        """What a ``Trace`` holds of it."""
+        if self._last is None:
+            return {}
+        instant, s, frames = self._last
+        shots = [*self._kept]
+        if not shots or shots[-1].instant != instant:
+            shots.append(_Shot(instant, s, _as_jpeg(frames)))
+        whole = b"".join(one for shot in shots for one in shot.jpeg)
+        return {
+            "frame_instant": np.array([shot.instant for shot in shots], dtype=np.int64),
+            "frame_s": np.array([shot.s for shot in shots]),
+            "frame_size": np.array([[len(one) for one in shot.jpeg] for shot in shots], dtype=np.int64),
+            "frame_jpeg": np.frombuffer(whole, dtype=np.uint8),
+        }
+
+
+def _as_jpeg(frames: ByteArray) -> tuple[bytes, bytes]:
+    """Both frames (2, height, width) as files."""
+    from PIL import Image
+
+    files = io.BytesIO(), io.BytesIO()
+    for file, frame in zip(files, frames, strict=True):
+        Image.fromarray(frame).save(file, "JPEG", quality=_QUALITY)
+    return files[0].getvalue(), files[1].getvalue()
+
+
+class Known(NamedTuple):
+    """What is known of a robot and its images before it is driven."""
+
+    # pixels (k, 2, m, 2) of the markers of the calibration at joints (k, n), rad or m
+    predicted: Callable[[FloatArray], FloatArray]
+    shown: IntArray  # (k,) markers that the loop is shown among those that the robot observes, the face first
+    order: IntArray  # (m,) index there of each marker of the calibration, −1 where it is not observed
+    sigma_px: float  # noise of the pixels
+    sigma_q: FloatArray  # (n,) deviation of joint readings, rad or m; 0 where none shows
+    delays: DelayPrior
+    timeout_s: float  # longest that an image may stand still while joints move, s
+
+
+class DrivenRobot:
+    """A robot with its cameras beside the plant that it is taken for.
+
+    A law is given the joints at which the arm comes to rest if nothing more is sent, and images as they will
+    be there: each pixel is carried by predict(q) − predict(q_then) from when it was taken. Lag and delay so
+    vanish from its loop.
+
+    robot : what is driven.
+    plant : face; image size and joint limits: of the calibration, or the true ones of a robot that tells its
+        true joints.
+    known : of robot and images.
+    monitor : of the raw images against the calibration; None tests nothing.
+    ``q``: (n,) joint readings when last asked for, or the true joints, rad or m. ``H, hidden``: displacement
+    of the face and self-occlusion there. ``in_front``: a camera sees nothing behind it. ``disturbance``: why
+    the images no longer agree with the calibration, or what failed; else empty. ``weight``: (2, k) of the
+    pixels shown in a fit, where the robot tells their deviations. Of each look since ``begin``:
+    ``delays`` of both views as followed, (2,) s, ``readings`` of the joints, (n,), and ``truths`` of a robot
+    that tells them, joints (n,) or the pose (4, 4) of its tool; ``film`` of its frames.
+    """
+
+    in_front = True
+    takes_parts = True
+
+    def __init__(self, robot: ForeignRobot, plant: Plant, known: Known, monitor: ImageMonitor | None) -> None:
+        self.robot, self.steered, self.plant = robot, Steered(robot), plant
+        self.known, self.monitor = known, monitor
+        self.markers = len(known.shown)
+        self._place = np.array([np.flatnonzero(known.order == i)[0] for i in known.shown])
+        self._instants = Delays(known.predicted, known.delays, known.sigma_px, known.timeout_s, known.sigma_q)
+        self._carried = np.zeros((2, self.markers, 2))
+        self.q = np.zeros(len(plant.lower))
+        self.H = np.eye(4)
+        self.hidden = np.zeros(2)
+        self.disturbance = ""
+        self.weight: FloatArray | None = None
+        self._stale = 0  # looks in a row without a new frame while the arm is held
+        self.begin()
+
+    def begin(self) -> None:
+        """Keep what is told of a run from here on."""
+        self.delays: list[FloatArray] = []
+        self.readings: list[FloatArray] = []
+        self.truths: list[FloatArray] = []
+        self.film = Film()
+        self.steered.overruns = 0
+
+    def joints(self) -> FloatArray:
+        """Joints (n,), rad or m, at which the arm comes to rest, after a new look at robot and images."""
+        read, truth = self.steered.look().q, self.robot.truth()
+        self.q = read if truth is None or truth.ndim > 1 else truth
+        H = forward(self.plant.model, self.q)
+        self.H = as_array(H)
+        M = np.zeros_like(self.plant.M)
+        observe(self.plant, H, M, np.zeros((2, len(M) + len(self.plant.pins), 2)), self.hidden)
+        if self.robot.frames is not None:
+            self.film.show(len(self.readings), self.steered.reading.s, self.robot.frames)
+        self.readings.append(read)
+        self.truths += [] if truth is None else [truth]
+        return self.steered.set_point.at_rest
+
+    def observe(self) -> FloatArray:
+        """Pixels (2, k, 2) of the markers shown as they will be at rest, NaN where unseen; all are tested."""
+        reading, history, order = self.steered.reading, self.steered.history, self.known.order
+        images = np.where((order < 0)[:, None], np.nan, reading.s[:, order])
+        shown, stated = self.known.shown, None
+        if reading.sigma_px is not None:
+            stated = reading.sigma_px[:, order]
+            self.weight = weights(reading.sigma_px[:, shown], reading.s[:, shown])
+        frames = self._instants.look(reading.t_view, images, history)
+        q_then = history.at(frames.t)
+        if self.monitor is not None:
+            q_dot = np.stack([history.speed_at(float(t)) for t in frames.t])
+            fault = self.monitor.look(
+                frames.t, q_then, q_dot, frames.sigma, images, frames.fresh, stated=stated
+            )
+            self.disturbance = fault or self.disturbance
+            self._stale = 0 if frames.fresh.any() or not self.holds else self._stale + 1
+            if self._stale * self.robot.bounds.period > _STALE_S:
+                self.give_up()
+            self._leave_out(self.monitor.rejected[:, self._place], stated is None)
+        q = self.steered.set_point.at_rest
+        there, *then = self.known.predicted(np.stack([q, *q_then]))[:, :, self._place]
+        for view in range(2):
+            carries = not np.array_equal(q, q_then[view])
+            self._carried[view] = there[view] - then[view][view] if carries else 0.0
+        self.delays.append(self._instants.mean)
+        return np.ascontiguousarray(reading.s[:, shown]) + self._carried
+
+    def _leave_out(self, rejected: BoolArray, alike: bool) -> None:
+        """Leave sightings (2, k) that are off by themselves out of the fit of the law.
+
+        alike : all others weigh the same.
+        """
+        if self.weight is not None and alike:
+            self.weight = np.ones(rejected.shape)
+        if rejected.any():
+            weight = np.ones(rejected.shape) if self.weight is None else self.weight
+            self.weight = np.where(rejected, _REJECTED * weight, weight)
+
+    @property
+    def holds(self) -> bool:
+        """Whether images disagree with the calibration so that nothing should move."""
+        return self.monitor is not None and self.monitor.holds
+
+    @property
+    def pending(self) -> bool:
+        """Whether images disagreed and nothing has cleared that yet."""
+        return self.monitor is not None and self.monitor.pending
+
+    def give_up(self) -> None:
+        """Say what is wrong as far as it is known, where there is no time for more looks."""
+        if self.monitor is not None:
+            self.disturbance = self.disturbance or self.monitor.give_up()
+
+    def fits(self) -> str:
+        """Return what is wrong with the images where the robot stands; empty where enough of them agree.
+
+        Nothing is moved meanwhile.
+        """
+        for look in range(1, _MOST_LOOKS):
+            tested = 0 if self.monitor is None else self.monitor.looks
+            self.joints()
+            self.observe()
+            if self.disturbance or self._agreed(look):
+                return self.disturbance
+            if self.monitor is None or self.monitor.looks > tested:
+                continue  # the next look shows another image
+            if not self.robot.waits(self.robot.bounds.period):  # time passes in commands alone
+                if look >= WINDOW and self.monitor.agreeing and not self.pending:
+                    return ""
+                if look >= WINDOW:
+                    self.steered.hold()
+        if self.pending:
+            self.give_up()
+        return self.disturbance
+
+    def _agreed(self, looks: int) -> bool:
+        """Whether enough of so many looks agree."""
+        agreeing = looks if self.monitor is None else self.monitor.agreeing
+        return agreeing >= WINDOW and not self.pending
+
+    def agrees(self) -> str:
+        """Test the images of the last look, held as long as they disagree; return what is wrong with them."""
+        self.observe()
+        for _ in range(_MOST_LOOKS):
+            if self.disturbance or not self.holds:
+                return self.disturbance
+            self.steered.hold()
+            self.observe()
+        self.give_up()
+        return self.disturbance
+
+    @property
+    def carried_px(self) -> float:
+        """How far the face is from where it comes to rest, px rms per marker and view."""
+        face = self._carried[:, : len(self.plant.M)]
+        return math.sqrt(2.0 * float(np.nanmean(face**2)))
+
+    def settled(self, within_px: float) -> bool:
+        """Whether the arm stands as far as images to so many px rms, or its readings, can tell.
+
+        Not before images of where it stands agree with the calibration.
+        """
+        if self.monitor is not None and (self.pending or self.monitor.agreeing < WINDOW):
+            return False
+        q, face = self.steered.set_point.at_rest, self._place[: len(self.plant.M)]
+        if self.known.sigma_q.any():
+            squares = squares_by_joints(self.known.predicted, q, self.known.sigma_q)[:, face]
+            within_px = max(within_px, math.sqrt(float(np.nansum(squares)) / (2 * len(face))))
+        return self.carried_px <= within_px
+
+    def distance(self) -> float:
+        """No distance is known without a metric: nothing ever recedes."""
+        return 0.0
+
+    def command(self, step: FloatArray, period: float) -> None:
+        """Move by the joint step (n,), rad or m, within one period, s."""
+        self.steered.command(step, period)
+
+    def stop(self) -> None:
+        """Come to rest."""
+        self.robot.stop()
+
+
+def weights(sigma: FloatArray, s: FloatArray) -> FloatArray:
+    """Weights (2, k) of pixels (2, k, 2) of deviations (2, k) in a fit: the rms of those seen over each."""
+    seen = np.isfinite(s[..., 0])
+    weight = np.ones(seen.shape)
+    if seen.any():
+        sigma = np.maximum(sigma, LEAST_SIGMA)
+        weight[seen] = np.sqrt(np.mean(sigma[seen] ** 2)) / sigma[seen]
+    return weight

@@ -1,0 +1,309 @@
+"""When the images of a robot were taken by the clock of its joint readings, and where the joints were then.
+
+The delay of a view is the instant of a joint reading less the middle of the exposure of the image that came
+with it. Only this difference can be seen, so a constant offset is always estimated: of the stamp of a frame
+where it has one, which may be of another clock or of its arrival, else of the reading itself.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.calibration.time_offset import comes_again
+from projservo_cli.records import VIEWS, BoolArray, FloatArray, WorkFailed
+
+# Deviation of a delay of which nothing is known, and of a single frame where no calibration tells it, s.
+UNKNOWN_S, _JITTER_S = 0.3, 0.012
+# Readings that are kept, and how far beyond the last one joints are taken to move on, s.
+_KEPT, _AHEAD_S = 256, 0.1
+# Delays that are reckoned with while little is known, s.
+_DELAYS = np.arange(-0.1, 1.0, 0.01)
+# An image is compared with those predicted so long before and after; a delay known as well is followed, s.
+_APART_S = 0.02
+# Markers err alike: they count as so many coordinates. What no image excludes.
+_COUNTED, _LEAST_CHANCE = 8.0, 1e-9
+# A frame farther from its instant than so many deviations is none of this delay, nor are so many in a row; it
+# fits so much better elsewhere, in squares.
+_GATE, _STRAYS, _CLEARLY = 4.0, 3, 9.0
+# How fast a delay may change, s for each frame that tells it; so many in a row err alike, by the model.
+_DRIFT_S, _ALIKE = 0.2e-3, 10.0
+# What the model is off at least where it tells the instant of a frame, px.
+_MODEL_PX = 0.3
+# Images should have moved so far, px, before one that stands still is a fault.
+_STILL_PX = 5.0
+
+
+class History:
+    """Joint readings of the past; before the first one the robot was at rest."""
+
+    def __init__(self) -> None:
+        self._t, self._q = np.zeros(0), np.zeros((0, 0))
+
+    def __bool__(self) -> bool:
+        return len(self._t) > 0
+
+    def add(self, t: float, q: FloatArray) -> None:
+        """Take in joints (n,), rad or m, of an instant, s; another reading of an instant replaces it."""
+        first = max(0, len(self._t) + 1 - _KEPT)
+        last = len(self._t) - int(len(self._t) > 0 and t == self._t[-1])
+        self._t = np.append(self._t[first:last], t)
+        self._q = np.concatenate([self._q[first:last].reshape(-1, len(q)), q[None]])
+
+    @property
+    def last(self) -> tuple[float, FloatArray]:
+        """The last instant, s, and its joints (n,), rad or m."""
+        return float(self._t[-1]), self._q[-1]
+
+    def at(self, t: FloatArray) -> FloatArray:
+        """Joints (k, n) at instants (k,), s; those of a reading to the bit, a little beyond the last one."""
+        times, q = self._t, self._q
+        if len(times) == 1:
+            return np.repeat(q, len(t), axis=0)
+        t = np.clip(t, times[0], times[-1] + _AHEAD_S)
+        i = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
+        x = ((t - times[i]) / (times[i + 1] - times[i]))[:, None]
+        return np.asarray((1.0 - x) * q[i] + x * q[i + 1])
+
+    def speed_at(self, t: float) -> FloatArray:
+        """Joint velocities (n,) about an instant, rad/s or m/s."""
+        q = self.at(np.array([t - _APART_S, t + _APART_S]))
+        return np.asarray((q[1] - q[0]) / (2.0 * _APART_S))
+
+
+class DelayPrior(NamedTuple):
+    """What is known of the delays of both views before the first image."""
+
+    mean: FloatArray  # (2,) s
+    sigma: FloatArray  # (2,) s, of the mean; 0 where it is given and not followed
+    jitter: FloatArray  # (2,) s, deviation of single frames
+
+
+NOTHING_KNOWN = DelayPrior(np.zeros(2), np.full(2, UNKNOWN_S), np.full(2, _JITTER_S))
+
+
+class _Frames(NamedTuple):
+    """When the images of a look were taken."""
+
+    t: FloatArray  # (2,) s, by the clock of the readings
+    sigma: FloatArray  # (2,) s, how well that was known before the images were looked at
+    fresh: BoolArray  # (2,) whether the image is another one than before
+
+
+def squares_by_joints(
+    predicted: Callable[[FloatArray], FloatArray], q: FloatArray, sigma_q: FloatArray
+) -> FloatArray:
+    """Variances (2, m, 2) of pixels, px², by deviations (n,) of the readings at joints (n,), rad or m."""
+    s = predicted(np.concatenate([q[None], q + np.diag(sigma_q)]))
+    return np.asarray(np.square(s[1:] - s[0]).sum(axis=0))
+
+
+class Delays:
+    """The delays of both views, and the instants of frames.
+
+    predicted : pixels (k, 2, m, 2) at joints (k, n).
+    prior : of the delays; sigma_px : pixel noise; timeout_s : longest that an image may stand still, s.
+    sigma_q : (n,) deviation of the joint readings, rad or m; 0 where none shows.
+    """
+
+    def __init__(
+        self,
+        predicted: Callable[[FloatArray], FloatArray],
+        prior: DelayPrior,
+        sigma_px: float,
+        timeout_s: float,
+        sigma_q: FloatArray,
+    ) -> None:
+        self._predicted, self._sigma_q, self._error_px = predicted, sigma_q, math.hypot(sigma_px, _MODEL_PX)
+        self._views = [_View(view, predicted, prior, self._error_px, timeout_s) for view in range(2)]
+
+    @property
+    def mean(self) -> FloatArray:
+        """Delays (2,) as followed, s: of images from their readings, or from their stamps."""
+        return np.array([view.mean for view in self._views])
+
+    def look(self, t_view: FloatArray, images: FloatArray, history: History) -> _Frames:
+        """Instants of both images of a look.
+
+        t_view : (2,) s, stamps, NaN where there are none; images : (2, m, 2) px, NaN where unseen.
+        history : of the readings, that of this look the last.
+        Raises WorkFailed if the clock of a camera jumped, or its image stands still while the joints move.
+        """
+        if self._sigma_q.any():
+            self._reckon_with_joints(history.last[1])
+        found = [
+            view.look(float(t), s, history) for view, t, s in zip(self._views, t_view, images, strict=True)
+        ]
+        t, sigma, fresh = zip(*found, strict=True)
+        return _Frames(np.array(t), np.array(sigma), np.array(fresh))
+
+    def _reckon_with_joints(self, q: FloatArray) -> None:
+        """Take what errors of the readings at joints (n,) do to images into what the model is off.
+
+        While a joint goes through its play, readings move and images do not: as they would if they were late.
+        """
+        squares = squares_by_joints(self._predicted, q, self._sigma_q)
+        for view, square in zip(self._views, squares, strict=True):
+            by_joints = square[np.isfinite(square)]
+            view.error_px = math.hypot(self._error_px, math.sqrt(by_joints.mean() if by_joints.size else 0.0))
+
+
+class _View:
+    """The delay of one view, and the instants of its frames.
+
+    While the joints move, an image tells when it was taken. Where little is known of the delay, the chance of
+    each is kept; else a Kalman filter follows the mean, from which single frames stray by jitter:
+    s − ŝ(t) = ṡ (t′ − t), to first order.
+
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and
+    Navigation", Wiley 2001, section 5.2.
+    """
+
+    def __init__(
+        self,
+        view: int,
+        predicted: Callable[[FloatArray], FloatArray],
+        prior: DelayPrior,
+        error_px: float,
+        timeout_s: float,
+    ) -> None:
+        self._view, self._predicted, self.error_px, self._timeout_s = view, predicted, error_px, timeout_s
+        mean, sigma, jitter = (float(both[view]) for both in prior)
+        self.mean, self._variance, self._jitter, self._follows = mean, sigma**2, jitter, sigma > 0.0
+        blur = np.exp(-0.5 * (np.subtract.outer(_DELAYS, _DELAYS) / jitter) ** 2)
+        self._blur = blur / blur.sum(axis=1, keepdims=True)
+        self._log_chance = self._open(mean, sigma)
+        self._strays = 0
+        self._stamp, self._offset = math.nan, 0.0  # of the last frame; of the clock that stamps it
+        self._image: FloatArray | None = None
+        self._t = -math.inf  # when the last image was taken
+        self._moved_at = math.nan  # when joints began to leave it
+
+    def look(self, stamp: float, image: FloatArray, history: History) -> tuple[float, float, bool]:
+        """Instant of an image (m, 2), s, how well it was known before, s, and whether the image is new."""
+        nominal = self._nominal(stamp, history.last[0])
+        expected, sigma = nominal - self.mean, math.sqrt(self._variance + self._jitter**2)
+        if not np.isfinite(image).any():
+            return expected, sigma, False
+        if not self._is_fresh(stamp, image):
+            self._require_motion(history)
+            return self._t, sigma, False
+        self._require_age(history.last[0] - expected, sigma)
+        self._moved_at = math.nan
+        self._t = (self._followed if self._log_chance is None else self._searched)(image, nominal, history)
+        return self._t, sigma, True
+
+    @staticmethod
+    def _open(mean: float, sigma: float) -> FloatArray | None:
+        """Logarithm of the chance of each delay where little is known; None where it need not be kept."""
+        return None if sigma <= _APART_S else -0.5 * ((_DELAYS - mean) / sigma) ** 2
+
+    def _nominal(self, stamp: float, t_q: float) -> float:
+        """The instant, s, that a delay is the offset of: of the stamp, else of the reading."""
+        if math.isnan(stamp) or not self._follows:
+            return t_q
+        if math.isnan(self._stamp) and not -_AHEAD_S <= t_q - stamp + self.mean <= self._timeout_s:
+            # Clocks that have nothing in common, or not as when it was calibrated, start together.
+            self._offset, self.mean, self._variance = stamp - t_q, 0.0, UNKNOWN_S**2
+            self._log_chance = self._open(0.0, UNKNOWN_S)
+        return stamp - self._offset
+
+    def _is_fresh(self, stamp: float, image: FloatArray) -> bool:
+        """Whether an image is another one than the last."""
+        if self._image is not None and comes_again(stamp, image, self._stamp, self._image):
+            return False
+        self._image, self._stamp = image.copy(), stamp
+        return True
+
+    def _require_age(self, age: float, sigma: float) -> None:
+        """Refuse a stamp that makes an image far too old, or one of the future."""
+        slack = _AHEAD_S + _GATE * sigma
+        if not -slack <= age <= self._timeout_s + slack:
+            raise WorkFailed(
+                f"the stamp of a {VIEWS[self._view]} image makes it {age:.3g} s old: the clock that stamps "
+                "it jumped, or images come that late"
+            )
+
+    def _require_motion(self, history: History) -> None:
+        """Refuse an image that has stood still for too long while the joints moved."""
+        now = history.last[0]
+        here, then = self._seen(history, np.array([now, self._t]))
+        if not float(np.nanmax(np.abs(here - then), initial=0.0)) > _STILL_PX:
+            self._moved_at = math.nan
+            return
+        if math.isnan(self._moved_at):
+            self._moved_at = now
+        if now - self._moved_at > self._timeout_s:
+            raise WorkFailed(
+                f"the {VIEWS[self._view]} image has stood still for {now - self._moved_at:.3g} s while the "
+                "joints moved: look whether its camera still runs"
+            )
+
+    def _seen(self, history: History, t: FloatArray) -> FloatArray:
+        """Predicted pixels (k, m, 2) of the view at instants (k,)."""
+        return np.asarray(self._predicted(history.at(t))[:, self._view])
+
+    def _misfit(self, image: FloatArray, t: FloatArray, history: History) -> FloatArray:
+        """Mean squares (k,) by which an image is off those predicted at instants (k,), px²."""
+        off = (image - self._seen(history, t)) ** 2
+        known = np.isfinite(off)
+        square = np.where(known, off, 0.0).sum(axis=(1, 2)) / np.maximum(known.sum(axis=(1, 2)), 1)
+        return np.where(known.any(axis=(1, 2)), square, math.inf)
+
+    def _searched(self, image: FloatArray, nominal: float, history: History) -> float:
+        """Instant of a fresh image, s, among all; each delay has its chance."""
+        assert self._log_chance is not None
+        misfit = self._misfit(image, nominal - _DELAYS, history)
+        least = max(float(misfit.min()), self.error_px**2)
+        chance = np.exp(-0.5 * _COUNTED * np.maximum(misfit / least - 1.0, 0.0))
+        before = self._blur @ np.exp(self._log_chance - self._log_chance.max())
+        t = nominal - float(_DELAYS[np.argmax(chance * before)])
+        self._log_chance += np.log(self._blur @ chance + _LEAST_CHANCE)
+        weight = np.exp(self._log_chance - self._log_chance.max())
+        self.mean = float(np.average(_DELAYS, weights=weight))
+        self._variance = float(np.average((_DELAYS - self.mean) ** 2, weights=weight))
+        if self._variance < _APART_S**2 / 4.0:
+            self._log_chance = None
+        shift, _ = self._shift(image, t, history)
+        return t + float(np.clip(shift, -_APART_S, _APART_S))
+
+    def _followed(self, image: FloatArray, nominal: float, history: History) -> float:
+        """Instant of a fresh image, s, by what was known and what it shows; the delay is followed."""
+        expected, variance = nominal - self.mean, self._variance + self._jitter**2
+        shift, sigma = self._shift(image, expected, history)
+        if not math.isfinite(sigma):
+            return expected
+        if abs(shift) > max(_APART_S, _GATE * math.sqrt(variance + sigma**2)):
+            self._stray(image, nominal, history)
+            return expected
+        self._strays = 0
+        if self._follows:
+            gain = self._variance / (variance + _ALIKE * sigma**2)
+            self.mean -= gain * shift
+            self._variance = (1.0 - gain) * self._variance + _DRIFT_S**2
+        return expected + variance / (variance + sigma**2) * shift
+
+    def _stray(self, image: FloatArray, nominal: float, history: History) -> None:
+        """A frame that is far from its instant is another delay's, where it clearly fits that."""
+        here, *others = self._misfit(image, nominal - np.append(self.mean, _DELAYS), history)
+        self._strays += here > _CLEARLY * max(min(others), self.error_px**2)
+        if self._follows and self._strays >= _STRAYS:
+            self._strays, self._variance = 0, UNKNOWN_S**2
+            self._log_chance = self._open(self.mean, UNKNOWN_S)
+
+    def _shift(self, image: FloatArray, t: float, history: History) -> tuple[float, float]:
+        """How much later than t an image was taken, to first order, and the deviation of that, s.
+
+        An image tells its instant only where it moved the same way before and after.
+        """
+        predicted = self._seen(history, t + _APART_S * np.array([-1.0, 0.0, 1.0]))
+        known = np.isfinite(image[:, 0]) & np.isfinite(predicted[..., 0]).all(axis=0)
+        before, after = np.diff(predicted[:, known], axis=0) / _APART_S
+        square = float(np.mean(before * after)) if known.any() else 0.0
+        if not square > 0.0:
+            return 0.0, math.inf
+        off, speed = image[known] - predicted[1, known], 0.5 * (before + after)
+        shift = float(np.sum(speed * off) / np.sum(speed**2))
+        left = float(np.sqrt(np.mean((off - shift * speed) ** 2)))
+        return shift, max(self.error_px, left) / math.sqrt(square)

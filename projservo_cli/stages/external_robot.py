@@ -1,0 +1,351 @@
+"""Robots of the contract: made, checked against the calibration, driven to given joints, waited for."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+
+from projservo_cli.calibration import predict
+from projservo_cli.config import Config
+from projservo_cli.geometry.algebra import mat
+from projservo_cli.monitoring.monitor import ImageMonitor
+from projservo_cli.monitoring.statistics import WINDOW
+from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
+from projservo_cli.robots import plugins
+from projservo_cli.robots.client import DrivenRobot, Known, Steered
+from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
+from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
+from projservo_cli.robots.simulated import Plant, observe
+from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
+from projservo_cli.stages.simulation import FaultyRobot, Points, hindrance_of, robot_of
+from projservo_cli.stages.world import Joints
+
+# What a joint may drift, rad or m, and an image, px rms, and be called still, where its noise is less.
+_STILL, _STILL_PX = 2e-5, 0.02
+_NEVER_LATE_S = 3600.0  # for what a simulated robot answers, which may be compiled first
+_LEAST = 6  # looks that tell noise from motion
+# Least deviation of a delay and of single frames, s; a 95 % interval is so many deviations wide.
+_LEAST_JITTER_S, _INTERVAL = 0.002, 3.92
+_PATIENCE_S = 20.0  # for a robot to come to rest where it was sent
+_WAITED = 5  # looks for each image that is wanted, where the same one comes again
+
+
+def bounds_of(config: Config, joints: Joints) -> Bounds:
+    """What no command to a robot may exceed, and what is taken of its servos."""
+    plant, period = config.plant, config.control.period_s
+    speed, sag = joints.speed * plant.speed_scale, joints.length_of(plant.sag_deg)
+    lead = speed * (plant.lag_s + period) + sag
+    if plant.lead_deg is not None:
+        lead = joints.length_of(plant.lead_deg)
+    return Bounds(joints.lower, joints.upper, speed, lead, period, plant.lag_s, sag, joints.units)
+
+
+def foreign_robot(config: Config, joints: Joints, markers: int, given: Robot | None = None) -> ForeignRobot:
+    """Make the robot of ``plant.use``, unless it is given; an InputError where a joint has no speed limit."""
+    plant, target = config.plant, config.plant.use
+    assert target is not None
+    for kind, key in (("R", "joint_speed_limit_deg_s"), ("P", "prismatic_speed_limit_m_s")):
+        if kind in joints.types and getattr(config.control, key) is None:
+            raise InputError(
+                f"plant {target}: a robot that is not simulated needs a limit: set control.{key}"
+            )
+    robot = _made(config, target) if given is None else given
+    bounds = bounds_of(config, joints)
+    name, size = f"plant {target}", config.image_size_px
+    return ForeignRobot(robot, name, markers, bounds, plant.timeout_s, plant.open_s, size)
+
+
+def _made(config: Config, target: str) -> Robot:
+    """Make an object of the class of a plant, with its options."""
+    options, dictionary = dict(config.plant.options), config.markers.dictionary if config.markers else None
+    if dictionary is not None:
+        if not plugins.takes("plant", target, "dictionary"):
+            raise InputError(
+                f"markers.dictionary: is without effect: plant.use {target} takes no argument dictionary; "
+                "leave it out, or let the class take it"
+            )
+        options["dictionary"] = dictionary
+    robot: Robot = plugins.make("plant", target, (), options)
+    return robot
+
+
+def _require_no_turn_off(bounds: Bounds, q: FloatArray) -> None:
+    """Refuse joints (n,) of which one reads a whole turn off: it would turn back by that, with its cables."""
+    beyond = ((q < bounds.lower) | (q > bounds.upper)) & np.isfinite(bounds.upper - bounds.lower)
+    for i in np.flatnonzero(beyond).tolist():
+        turns = np.round((q[i] - 0.5 * (bounds.lower[i] + bounds.upper[i])) / (2.0 * np.pi))
+        if bounds.units[i] == "m" or not bounds.lower[i] <= q[i] - 2.0 * np.pi * turns <= bounds.upper[i]:
+            continue
+        limits = f"{bounds.told(i, bounds.lower[i])} to {bounds.told(i, bounds.upper[i])}"
+        raise WorkFailed(
+            f"nothing was moved: joint {i + 1} reads {bounds.told(i, q[i])}, a whole turn beyond its limits "
+            f"{limits}: home it again where it stands"
+        )
+
+
+def way_to(
+    robot: Steered, q: FloatArray, settle_s: float, what: str, fit: Callable[[Reading], None] | None = None
+) -> Iterator[Reading]:
+    """Move to joints (n,) along a straight line at the speed limit and come to rest there.
+
+    what : the command it is for, in messages.
+    fit : is shown the first reading, before anything moves; it raises where nothing should.
+    Yields what is read after each command. The robot has then stood still for so many s, and so have the
+    images. Raises WorkFailed if a joint does not follow, goes the other way, or nothing comes to rest, or if
+    one reads a whole turn beyond its limits.
+    """
+    bounds, still = robot.robot.bounds, _Standstill(settle_s)
+    begun = robot.look().q
+    _require_no_turn_off(bounds, begun)
+    if fit is not None:
+        fit(robot.reading)
+    while (gap := q - robot.target).any():
+        robot.command(gap / np.max(np.abs(gap) / (bounds.speed * bounds.period), initial=1.0), bounds.period)
+        stands = still.joints(robot.look())
+        yield robot.reading
+        away = np.abs(q - robot.reading.q) - np.abs(q - begun)
+        held = np.abs(robot.target - robot.reading.q) >= bounds.lead * (1.0 - 1e-6)
+        if (away > bounds.lead).any() or (stands and held.any()):
+            break
+    else:
+        yield from at_rest(robot.reading, robot.hold, settle_s, what)
+    gap = np.abs(q - robot.reading.q)
+    i, sag = int(np.argmax(gap / np.maximum(bounds.sag, _STILL))), bounds.sag
+    if gap[i] > max(sag[i], _STILL) or (q != robot.target).any():
+        remedy = "look what holds the robot, or whether it sags or plays so far (plant.sag_deg)"
+        if gap[i] > abs(q[i] - begun[i]) + sag[i]:
+            remedy = (
+                f"it went away from there, from {bounds.told(i, begun[i])}: look at its sign and unit, and "
+                "whether it can hold what it carries"
+            )
+        if hindrance := hindrance_of(robot.robot.robot):
+            remedy = f"{hindrance}: take joints that it can reach and hold"
+        raise WorkFailed(
+            f"{what}: joint {i + 1} was sent to {bounds.told(i, q[i])} and stands at "
+            f"{bounds.told(i, robot.reading.q[i])}, {bounds.told(i, gap[i], 3)} short: {remedy}; then run "
+            "the command again" + (" to continue" if what == "record" else "")
+        )
+
+
+def at_rest(reading: Reading, look: Callable[[], Reading], settle_s: float, what: str) -> Iterator[Reading]:
+    """Look, a period after the other, until joints and images stand still, and yield what is read."""
+    still, first = _Standstill(settle_s), reading.t_q
+    while not still.all(reading):
+        if reading.t_q > first + settle_s + _PATIENCE_S:
+            raise WorkFailed(
+                f"{what}: {still.moving or 'the robot'} does not come to rest within {_PATIENCE_S:g} s: look "
+                "for what vibrates, creeps or flickers"
+            )
+        reading = look()
+        yield reading
+
+
+def averaged(
+    reading: Reading, look: Callable[[], Reading], wanted: int
+) -> tuple[Reading, FloatArray, FloatArray]:
+    """The mean of looks at a robot at rest, of which each view shows so many frames, each frame once.
+
+    Frames are weighed by the deviations they tell, if they do. Markers that most of the frames of a view do
+    not show are NaN. Returns the mean; sums (2, m) of the squares by which pixels are off it, px²; how many
+    frames (2, m) show a marker, 0 where it is NaN.
+    """
+    looks, frames = [reading], [[_frame(reading, view)] for view in (0, 1)]
+    for _ in range(_WAITED * wanted):
+        if min(map(len, frames)) >= wanted:
+            break
+        looks.append(look())
+        for view, new in enumerate(looks[-1].new_views(looks[-2])):
+            if new and len(frames[view]) < wanted:
+                frames[view].append(_frame(looks[-1], view))
+    s, sigma, squares, count = (np.stack(both) for both in zip(*map(_mean, frames), strict=True))
+    q = looks[0].q + np.mean([seen.q - looks[0].q for seen in looks], axis=0)
+    told = reading.sigma_px if reading.sigma_px is None or len(looks) == 1 else sigma
+    return looks[-1]._replace(q=q, s=s, sigma_px=told), squares, count
+
+
+def _frame(reading: Reading, view: int) -> FloatArray:
+    """What a view shows: u, v and their deviation (m, 3), px, a deviation of one where none is told."""
+    sigma = np.ones(len(reading.s[view])) if reading.sigma_px is None else reading.sigma_px[view]
+    return np.column_stack([reading.s[view], sigma])
+
+
+def _mean(frames: list[FloatArray]) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Mean (m, 2) of frames (m, 3) of one view, its deviation (m,), squares (m,) off it, their count (m,).
+
+    What does not scatter from frame to frame does not average away: the share of the variance told that
+    scatters, of all markers together, becomes less.
+    """
+    seen, sigma = np.split(np.array(frames), [2], axis=2)
+    count = np.isfinite(seen[..., 0]).sum(axis=0)
+    count[2 * count <= len(seen)] = 0
+    weight = np.where(np.isfinite(seen), sigma**-2.0, 0.0)
+    total = np.maximum(weight.sum(axis=0), 1e-300)
+    mean: FloatArray = np.nansum(seen * weight, axis=0) / total
+    mean[count == 0] = np.nan
+    off = (seen - mean) ** 2
+    freedom = 2 * np.maximum(count - 1, 0).sum()
+    scatter = min(1.0, float(np.nansum(off / sigma**2)) / freedom) if freedom else 1.0
+    typical = count / total[:, 0]  # variance of a frame
+    variance = np.where(count > 0, typical * (1.0 - scatter) + scatter / total[:, 0], np.nan)
+    return mean, np.sqrt(variance), np.nansum(off, axis=(0, 2)), count
+
+
+class _Standstill:
+    """Whether a robot has stood still for a time, s, as one look after the other shows.
+
+    Over that time, and no fewer than six looks, the means of its thirds differ by no more than noise
+    explains, which the differences of consecutive looks tell: motion adds up, noise does not.
+
+    Source: J. von Neumann, "Distribution of the ratio of the mean square successive difference to the
+    variance", Annals of Mathematical Statistics 12, 1941.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._since = math.inf
+        self._q: _Rows = deque()
+        self._s: tuple[_Rows, _Rows] = deque(), deque()
+        self._last: Reading | None = None
+        self.moving = ""  # what is not still, in words
+
+    def joints(self, reading: Reading) -> bool:
+        """Whether the joints have stood still up to the next reading."""
+        self._since = min(self._since, reading.t_q)
+        square, variance = _drift(self._kept(self._q, reading.t_q, reading.q))
+        moving = np.flatnonzero(square > np.maximum(_STILL**2, 9.0 * variance))
+        self.moving = f"joint {moving[0] + 1}" if len(moving) else ""
+        whole = reading.t_q - self._since >= self.seconds * (1.0 - 1e-9)
+        return whole and len(self._q) >= _LEAST and not self.moving
+
+    def all(self, reading: Reading) -> bool:
+        """Whether joints and images have stood still up to the next reading."""
+        still = self.joints(reading)
+        new = reading.new_views(self._last)
+        self._last = reading
+        for view, rows in enumerate(self._s):
+            frames = self._kept(rows, reading.t_q, reading.s[view].ravel() if new[view] else None)
+            if rows[-1][0] < reading.t_q - self.seconds:
+                continue  # the same image all the time
+            square, variance = _drift(frames[:, np.isfinite(frames).all(axis=0)])
+            if square.size and square.mean() > max(_STILL_PX**2, 2.0 * variance.mean()):
+                self.moving = self.moving or f"the {VIEWS[view]} image"
+            still = still and len(rows) >= _LEAST
+        return still and not self.moving
+
+    def _kept(self, rows: "_Rows", now: float, row: FloatArray | None) -> FloatArray:
+        """The rows of the time that counts, with one more unless it is None."""
+        if row is not None:
+            rows.append((now, row))
+        while len(rows) > _LEAST and rows[0][0] < now - self.seconds * (1.0 + 1e-9):
+            rows.popleft()
+        return np.array([values for _, values in rows])
+
+
+_Rows = deque[tuple[float, FloatArray]]
+
+
+def _drift(rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variance of the means of the thirds of rows (k, c), and what noise makes of it, (c,)."""
+    third = len(rows) // 3
+    if third == 0:
+        return np.zeros(rows.shape[1]), np.zeros(rows.shape[1])
+    means = [part.mean(axis=0) for part in (rows[:third], rows[third:-third], rows[-third:])]
+    noise = 0.5 * (np.diff(rows, axis=0) ** 2).mean(axis=0)
+    return np.var(means, axis=0, ddof=1), noise / third
+
+
+def simulated_robot(config: Config, joints: Joints, robot: FaultyRobot) -> ForeignRobot:
+    """A simulated robot of the contract, which is never late, and goes beyond its limits where it may."""
+    bounds = bounds_of(config, joints)
+    if config.plant.joint_limits == "report":
+        endless = np.full(len(joints.types), math.inf)
+        bounds = bounds._replace(lower=-endless, upper=endless)
+    markers = len(robot.world.truth.number)
+    return ForeignRobot(robot, "the simulated robot", markers, bounds, _NEVER_LATE_S, _NEVER_LATE_S)
+
+
+def _in_the_loop(scenario: Scenario) -> FaultyRobot:
+    """The simulated robot of a scenario at the start of the task, which observes all markers."""
+    config, truth, plant = scenario.config, scenario.truth, scenario.plant_of("exact")
+    assert truth is not None
+    face, others, workspace = list(truth.face), list(truth.pins), np.zeros_like(plant.M)
+
+    def see(q: FloatArray, M: FloatArray) -> FloatArray:
+        """What both cameras see of markers (m, 4) at joints (n,), as the loop has it."""
+        s, ordered = np.zeros((2, len(M), 2)), np.zeros((2, len(M), 2))
+        H = mat(truth.displacement(q))
+        observe(plant._replace(M=M[face], pins=M[others]), H, workspace, ordered, np.zeros(2))
+        s[:, face + others] = ordered
+        return s
+
+    points = Points(truth, see, False, config.noise.servo_px)
+    drawn = config.seed, SERVO_NOISE
+    return robot_of(config, truth, scenario.exact.q_start, points, drawn, config.disturbance)
+
+
+def connected(scenario: Scenario, law: str, given: Robot | None = None) -> DrivenRobot:
+    """The robot as the loop of a law sees it: beside its truth, or what the calibration takes it for.
+
+    given : an object of the contract instead of one of ``plant.use``.
+    """
+    config, joints, calibration = scenario.config, scenario.joints, scenario.calibration
+    assert calibration is not None
+    if scenario.truth is None:
+        plant = _believed_plant(scenario, calibration)
+        robot = foreign_robot(config, joints, len(scenario.observed), given)
+    else:
+        plant, robot = scenario.plant_of(law), simulated_robot(config, joints, _in_the_loop(scenario))
+    monitor = None
+    if not scenario.untested:
+        noise = config.stop.innovation_factor * scenario.noise_px
+        shown = np.flatnonzero(np.isin(calibration.marker, scenario.observed))
+        looks = scenario.limits.max_steps + 1 + WINDOW
+        monitor = ImageMonitor(calibration, noise, looks, shown, plant.image_size)
+    return DrivenRobot(robot, plant, _known_of(scenario, calibration, law), monitor)
+
+
+def _believed_plant(scenario: Scenario, calibration: Calibration) -> Plant:
+    """What the calibration takes the robot and its face for."""
+    task = scenario.ends.by_points().task(scenario.model)
+    return Plant(
+        scenario.model,
+        np.ascontiguousarray(calibration.M[calibration.places(scenario.numbers[: scenario.m])]),
+        task.order,
+        task.center,
+        task.O,
+        task.visible,
+        scenario.demands.image_size,
+        scenario.joints.lower,
+        scenario.joints.upper,
+        False,
+    )
+
+
+def _known_of(scenario: Scenario, calibration: Calibration, law: str) -> Known:
+    """What is known of a robot and its images before a law drives it."""
+    config, numbers = scenario.config, scenario.observed
+    return Known(
+        partial(predict, calibration),
+        np.array([numbers.index(number) for number in scenario.numbers_of(law)]),
+        np.array([numbers.index(k) if k in numbers else -1 for k in calibration.marker.tolist()]),
+        scenario.noise_px,
+        scenario.joints.length_of(math.degrees(calibration.sigma_q or 0.0)),
+        _delays_of(config, calibration),
+        config.plant.timeout_s,
+    )
+
+
+def _delays_of(config: Config, calibration: Calibration) -> DelayPrior:
+    """What is known of the delays of both views: given, calibrated, or nothing."""
+    given, known = config.plant.delay_s, NOTHING_KNOWN
+    if calibration.delay_s is not None:
+        interval, jitter = calibration.delay_interval_s, calibration.delay_jitter_s
+        assert interval is not None
+        assert jitter is not None
+        sigma = np.maximum(np.ptp(interval, axis=1) / _INTERVAL, 0.5 * _LEAST_JITTER_S)
+        known = DelayPrior(calibration.delay_s.copy(), sigma, np.maximum(jitter, _LEAST_JITTER_S))
+    if given is not None:
+        known = known._replace(mean=np.array([given.left, given.right]), sigma=np.zeros(2))
+    return known

@@ -1,0 +1,142 @@
+"""What becomes of a run that follows a way, with ways that are made up."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from projservo_cli.loop.replanning import Watch
+from projservo_cli.loop.step import (
+    BEHIND_CAMERA,
+    CONVERGED,
+    DIVERGED,
+    JOINT_LIMIT,
+    MARKERS_LOST,
+    RUNNING,
+    WAITING,
+    new_log,
+)
+from tests.scene import limits
+
+WAY = np.linspace([0.0, 0.0], [1.0, -2.0], 21)
+SEEN = np.arange(12.0).reshape(2, 3, 2)
+
+
+class Ways:
+    """Ways that lead on as often as they are asked to, and tell what they were asked."""
+
+    def __init__(self, count=1, leaves=False):
+        self.count, self.out, self.asked = count, leaves, []
+
+    def predicted(self, q):
+        return SEEN
+
+    def leaves(self, q, off):
+        self.ahead = q, off
+        return self.out
+
+    def anew(self, q, shunned, off):
+        self.asked.append((q, shunned, off))
+        self.count -= 1
+        return "another way" if self.count >= 0 else None
+
+
+def watched(ways, clock=0.0, searches=3, **bounds):
+    """A watch over a law on the way, that law's tasks and a log whose images are 1 px off."""
+    state = SimpleNamespace(
+        clock=np.array([clock]), parts=np.ones(1, int), share=np.zeros(1), blocked=np.zeros(1)
+    )
+    task = SimpleNamespace(reference=SimpleNamespace(q=WAY), s_star=SEEN)
+    followed = []
+    law = SimpleNamespace(
+        law=SimpleNamespace(task=task), state=state, gains=SimpleNamespace(period=0.5), follow=followed.append
+    )
+    log = new_log(2, 3, 100, 5)
+    log.s[:] = SEEN + 1.0
+    log.read[:] = 0.25
+    return Watch(law, lambda plan: plan, ways, searches, limits(max_steps=100, **bounds)), followed, log
+
+
+@pytest.mark.parametrize("verdict", [CONVERGED, BEHIND_CAMERA, WAITING, RUNNING])
+def test_most_verdicts_stay(verdict):
+    ways = Ways()
+    watch, followed, log = watched(ways, clock=3.0)
+    assert watch.ruled(log, 20, verdict, np.zeros(2)) == verdict
+    assert (followed, watch.told, ways.asked) == ([], [], [])
+
+
+def test_what_stops_the_law_at_the_goal_has_it_shunned():
+    ways = Ways(count=2)
+    watch, followed, log = watched(ways, clock=20.0)
+    assert watch.ruled(log, 30, JOINT_LIMIT, np.zeros(2)) == WAITING
+    q, shunned, off = ways.asked[0]
+    assert followed == ["another way"]
+    np.testing.assert_array_equal(q, log.read[30])
+    np.testing.assert_array_equal(shunned, [WAY[-1], log.read[30]])
+    np.testing.assert_allclose(off, np.ones((2, 2)))
+    assert watch.told == ["at step 30 (a joint limit at the goal)"]
+    # Another goal that fails is shunned beside it; where there is no other way, the verdict stays.
+    assert watch.ruled(log, 31, DIVERGED, np.zeros(2)) == WAITING
+    assert watch.ruled(log, 32, JOINT_LIMIT, np.zeros(2)) == JOINT_LIMIT
+    assert [len(shunned) for _, shunned, _ in ways.asked] == [2, 4, 6]
+    assert watch.told[-1] == "at step 32 (a joint limit at the goal) in vain"
+
+
+def test_no_more_ways_are_searched_than_asked_for():
+    ways = Ways(count=9)
+    watch, _, log = watched(ways, clock=20.0, searches=1)
+    assert watch.ruled(log, 5, JOINT_LIMIT, np.zeros(2)) == WAITING
+    assert watch.ruled(log, 6, JOINT_LIMIT, np.zeros(2)) == JOINT_LIMIT
+    assert len(ways.asked) == 1
+
+
+def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
+    ways = Ways()
+    watch, _, log = watched(ways, clock=20.0, plateau_steps=4)
+    log.judged[:] = 3.0
+    verdicts = [watch.ruled(log, k, RUNNING, np.zeros(2)) for k in range(40, 46)]
+    assert verdicts == [RUNNING] * 4 + [WAITING, RUNNING]
+    assert watch.told == ["at step 44 (no progress at the goal)"]
+
+
+def test_a_way_may_lead_away_from_the_goal():
+    watch, _, log = watched(Ways(), clock=4.0)
+    assert watch.ruled(log, 7, DIVERGED, np.zeros(2)) == RUNNING
+
+
+def test_a_command_that_is_no_number_is_never_let_through():
+    ways = Ways()
+    watch, _, log = watched(ways, clock=4.0)
+    assert watch.ruled(log, 7, DIVERGED, np.array([0.0, np.nan])) == WAITING
+    assert watch.told == ["at step 7 (growing errors on the way)"]
+    assert watch.ruled(log, 8, DIVERGED, np.array([np.inf, 0.0])) == DIVERGED
+
+
+def test_what_is_ahead_is_looked_at_with_what_images_are_off():
+    ways = Ways(leaves=True)
+    watch, _, log = watched(ways, clock=16.0)
+    assert watch.ruled(log, 9, RUNNING, np.zeros(2)) == RUNNING
+    assert watch.ruled(log, 10, RUNNING, np.zeros(2)) == WAITING
+    ahead, off = ways.ahead
+    np.testing.assert_array_equal(ahead, WAY[16:])
+    np.testing.assert_allclose(off[:, 0, 0], [1.0, 0.75, 0.5, 0.25, 0.0])  # at the goal they agree
+    assert ways.asked[0][1].shape == (0, 2)
+
+
+def test_a_lost_face_is_sought_back_along_the_path():
+    ways = Ways()
+    watch, followed, log = watched(ways, clock=3.0)
+    q_dot = np.zeros(2)
+    for k, place in enumerate((2, 1)):
+        assert watch.ruled(log, 50 + k, MARKERS_LOST if k == 0 else WAITING, q_dot) == RUNNING
+        np.testing.assert_allclose(q_dot, (WAY[place] - 0.25) / 0.5)
+        assert watch.law.state.parts[0] == 0  # what the law split its last step into is not sent
+    assert watch.ruled(log, 52, RUNNING, q_dot) == WAITING
+    assert followed == ["another way"]
+    assert "lost" in watch.told[0]
+
+
+def test_a_face_that_is_nowhere_on_the_way_back_is_lost():
+    watch, _, log = watched(Ways(), clock=1.5)
+    verdicts = [watch.ruled(log, k, MARKERS_LOST, np.zeros(2)) for k in range(3)]
+    assert verdicts == [RUNNING, MARKERS_LOST, MARKERS_LOST]

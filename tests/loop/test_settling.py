@@ -1,0 +1,128 @@
+"""A robot that stands still away from its goal is judged while it runs; one at its goal is waited for."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from projservo_cli.loop.settling import Standing
+from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
+from projservo_cli.robots.contract import Bounds
+from projservo_cli.robots.latency import NOTHING_KNOWN
+from tests.scene import limits
+
+PERIOD, TICK = 0.1, 1.5e-3
+BOUNDS = Bounds(*np.zeros((4, 2)), PERIOD, 0.15, np.full(2, 0.017), ("rad", "deg"))
+LIMITS = limits(2, image_px=1.0, max_steps=1000)
+
+
+class Robot:
+    """Readings, set-points and what is carried, as a test says."""
+
+    def __init__(self):
+        self.known = SimpleNamespace(delays=NOTHING_KNOWN, sigma_q=np.full(2, TICK / 12**0.5))
+        self.robot = SimpleNamespace(bounds=BOUNDS)
+        point = SimpleNamespace(short=np.zeros(2, dtype=bool))
+        self.steered = SimpleNamespace(reading=None, target=None, set_point=point)
+        self.carried_px = 0.0
+
+    def settled(self, within_px):
+        return self.carried_px <= within_px
+
+
+def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=lambda k: 0.0, most=900):
+    """Verdict of a run, why, and when; of what is a function of the instant."""
+    robot, log = Robot(), new_log(2, 4, 1000, 5)
+    standing = Standing(robot, LIMITS)
+    for k in range(most):
+        log.judged[k] = error(k)
+        robot.steered.reading = SimpleNamespace(q=np.array(read(k), dtype=float))
+        robot.steered.target = np.array(sent(k), dtype=float)
+        robot.steered.set_point.short = np.array(short)
+        robot.carried_px = carried(k)
+        told = CONVERGED if log.judged[k] <= LIMITS.image_px else verdict
+        ruled = standing.ruled(log, k, told)
+        if ruled not in (RUNNING, WAITING):
+            return ruled, standing, k
+    return RUNNING, standing, most
+
+
+def test_a_law_that_asks_for_nothing_is_at_a_local_minimum():
+    ruled, standing, k = judged(lambda k: 30.0 + 20.0 * 0.9**k, lambda k: (0.5, 0.1), lambda k: (0.5, 0.1))
+    assert (ruled, standing.minimum) == (PLATEAU, True)
+    assert "a local minimum" in standing.why
+    assert k < 100
+
+
+def test_beside_the_goal_the_joints_hide_what_is_left():
+    """An image error of up to three tolerances, that of joints within their ticks."""
+    ruled, standing, _ = judged(
+        lambda k: 1.5 + (k % 7) / 7, lambda k: (TICK * (k % 2), 0.0), lambda k: (1e-4 * (k % 3), 0.0)
+    )
+    assert ruled == PLATEAU
+    assert "set-points moved by no more than 0.0002" in standing.why
+    assert "coarse readings hide what is left" in standing.why
+
+
+def test_instants_at_which_the_arm_was_held_count_for_nothing():
+    robot, log = Robot(), new_log(2, 4, 1000, 5)
+    standing = Standing(robot, LIMITS)
+    robot.steered = SimpleNamespace(
+        reading=SimpleNamespace(q=np.zeros(2)),
+        target=np.zeros(2),
+        set_point=SimpleNamespace(short=np.zeros(2, bool)),
+    )
+    for k in [*range(5), *range(200, 205), *range(400, 405)]:
+        log.judged[k] = 50.0 * (0.9 if k > 200 else 1.0)
+        assert standing.ruled(log, k, RUNNING) == RUNNING
+
+
+def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
+    ruled, standing, k = judged(
+        lambda k: 50.0, lambda k: (0.5, 0.1), lambda k: (0.9, min(0.1 + 0.01 * k, 0.4)), short=(True, False)
+    )
+    assert ruled == NOT_FOLLOWING
+    assert standing.why.startswith("joint 1 stands at 0.5 rad, 0.4 rad off")
+    assert k < 60
+
+
+@pytest.mark.parametrize(
+    ("read", "what"),
+    [(lambda k: 0.2, "coarse set-points, or friction"), (lambda k: 0.2 + 0.004 * (k % 20 > 9), "play")],
+)
+def test_a_robot_that_gains_nothing_is_given_up_with_a_cause(read, what):
+    ruled, standing, k = judged(
+        lambda k: 5.0 + (k % 7) / 7, lambda k: (read(k), 0.0), lambda k: (0.2 + 0.005 * (k % 20 > 9), 0.0)
+    )
+    assert (ruled, standing.minimum) == (PLATEAU, False)
+    assert what in standing.why
+    assert k < 300
+
+
+def _still(k):
+    """Joints that stand, rad."""
+    return 0.1, 0.0
+
+
+def _far(k):
+    """A joint that moves on."""
+    return 0.01 * k, 0.0
+
+
+def test_a_robot_that_moves_or_comes_nearer_or_sees_nothing_goes_on():
+    assert judged(lambda k: 50.0, _far, _far)[0] == RUNNING
+    assert judged(lambda k: 5.0 + 900.0 * 0.995**k, _still, _still, most=800)[0] == RUNNING
+    assert judged(lambda k: np.nan, _still, _still, verdict=WAITING)[0] == RUNNING
+
+
+def test_arrival_is_believed_once_the_robot_stands():
+    ruled, _, k = judged(lambda k: 0.4, _still, _still, carried=lambda k: 8.0 * 0.8**k)
+    assert ruled == CONVERGED
+    assert k == 13  # 8 px fall below half a pixel
+    assert judged(lambda k: 0.4, _still, _still)[2] == 0
+    # An arm that is off once it stands is driven on.
+    ruled, _, k = judged(
+        lambda k: 0.9 if k < 20 else 1.5 * 0.9 ** (k - 20), _still, _still, carried=lambda k: 8.0 * (k < 20)
+    )
+    assert ruled == CONVERGED
+    assert k == 24

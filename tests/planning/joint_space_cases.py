@@ -1,0 +1,49 @@
+"""Random tasks of shipped robots, with the true model in place of a calibrated one."""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from projservo_cli.planning.constraints import Constraints, constraints_of
+from projservo_cli.planning.goal_configurations import Aim
+from projservo_cli.planning.margins import Demands
+from projservo_cli.stages.world import joints_of, truth_of
+from projservo_cli.sweeps.design import random_tasks
+from projservo_cli.task.target import Shown
+from tests.known import configured
+
+COUNT = 12
+
+
+class Case(NamedTuple):
+    """One task."""
+
+    truth: object
+    q_start: object
+    q_goal: object
+    c: Constraints
+    aim: Aim
+    acceleration: object
+
+
+@lru_cache(maxsize=8)
+def _drawn(name):
+    config = configured(name)
+    truth, joints = truth_of(config), joints_of(config)
+    front = np.array(config.task.start.values(config.joint_types))
+    return truth, joints, random_tasks(truth, front, COUNT, np.random.default_rng(3))
+
+
+def case(name, k):
+    """Random task k of a configuration."""
+    truth, joints, tasks = _drawn(name)
+    q_start, q_goal = tasks[0][k], tasks[1][k]
+    s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
+    task = Shown(q_start, s_start, s_star, truth.center).task(truth.model)
+    A = truth.M_face @ truth.displacement(q_start).T
+    speed = np.where(np.isfinite(joints.speed), joints.speed, 1.0)
+    keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])
+    demands = Demands(joints.lower, joints.upper, speed, truth.image_size, 5.0, 0.0, keep, 8.0)
+    c = constraints_of(truth.model, A, task, q_start, demands)
+    return Case(truth, q_start, q_goal, c, Aim(task.A_star, s_star, 0.0), joints.acceleration)

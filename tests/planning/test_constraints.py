@@ -1,0 +1,98 @@
+"""Margins against what the metric truth says, and edges against dense samples."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.planning.constraints import (
+    BORDER,
+    FRONT,
+    LIMITS,
+    SIDE,
+    WIDTH,
+    new_trial,
+    reached,
+    width,
+)
+from projservo_cli.planning.rrt_connect import margins_at, with_ends
+from tests.planning.joint_space_cases import case
+
+
+@pytest.mark.parametrize("name", ["paper", "stanford"])
+def test_signs_are_those_of_the_metric_truth(name):
+    found = case(name, 1)
+    truth, c = found.truth, found.c
+    centers = optical_centers(truth.P, np.array([0.0, 0.0, 0.0, 1.0]))[:, :3]
+    rng = np.random.default_rng(0)
+
+    def sides(q):
+        X = (truth.M_face @ truth.displacement(q).T)[:, :3]
+        normal = np.cross(X[1] - X[0], X[2] - X[0])
+        return (centers - X[0]) @ normal, (np.c_[X, np.ones(len(X))] @ truth.P[:, 2].T).min(axis=0)
+
+    start, _ = sides(found.q_start)
+    signs = set()
+    for q in rng.uniform(c.lower, c.upper, (200, len(c.lower))):
+        margins, s = margins_at(c, q)
+        side, depth = sides(q)
+        np.testing.assert_array_equal(margins[SIDE : SIDE + 2] > 0.0, side * start > 0.0)
+        if (depth > 0.0).all():
+            np.testing.assert_array_equal(margins[FRONT : FRONT + 2] > 0.0, True)
+            np.testing.assert_allclose(s, truth.images(q, truth.M_face), atol=1e-6)
+            inside = np.minimum(s + 0.5, truth.image_size - 0.5 - s).min(axis=(1, 2))
+            np.testing.assert_allclose(margins[BORDER : BORDER + 2], inside, atol=1e-6)
+        signs.add((*(margins[SIDE : SIDE + 2] > 0.0), *(depth > 0.0)))
+        nearest = np.minimum(q - c.lower, c.upper - q) / c.keep
+        assert margins[LIMITS] == pytest.approx(nearest.min())
+    assert len(signs) > 3
+
+
+@given(st.integers(3, 8), st.integers(0, 10_000))
+def test_width_is_the_least_over_all_directions(m, seed):
+    points = np.random.default_rng(seed).uniform(0.0, 100.0, (m, 2))
+    found = width(points, np.arange(m))
+    # Along each edge of the hull, by another library; no direction is narrower.
+    corners = points[ConvexHull(points).vertices]
+    edges = np.roll(corners, -1, axis=0) - corners
+    normals = np.c_[-edges[:, 1], edges[:, 0]] / np.linalg.norm(edges, axis=1)[:, None]
+    assert found == pytest.approx(np.ptp(corners @ normals.T, axis=0).min(), abs=1e-9)
+    angle = np.linspace(0.0, np.pi, 60)
+    assert found <= np.ptp(points @ np.array([np.cos(angle), np.sin(angle)]), axis=0).min() + 1e-9
+
+
+def test_the_width_of_a_line_is_nothing():
+    assert width(np.array([[0.0, 0.0], [1.0, 1.0], [3.0, 3.0]]), np.arange(3)) == pytest.approx(
+        0.0, abs=1e-12
+    )
+
+
+def test_edges_are_valid_where_dense_samples_are():
+    verdicts = set()
+    name = "stanford"
+    for k in range(10):
+        found = case(name, k)
+        c = with_ends(found.c, np.stack([found.q_start, found.q_goal]))
+        trial = new_trial(len(found.q_start), len(c.M))
+        share = reached(c, found.q_start, found.q_goal, trial)
+        # Without the demands, which rise in between: at every sample before it what must hold does.
+        x = np.linspace(0.0, share, 400)[:, None]
+        margins = np.array([margins_at(c, q)[0] for q in (1.0 - x) * found.q_start + x * found.q_goal])
+        assert margins[:, [LIMITS, SIDE, SIDE + 1, WIDTH, WIDTH + 1]].min() > 0.0
+        verdicts.add(share == 1.0)
+    assert verdicts == {True, False}
+
+
+def test_start_and_goal_are_asked_for_no_more_than_they_have():
+    # A distance from the border that no image has: the ends are valid all the same, what lies between is not.
+    found = case("paper", 3)
+    full = found.c.full.copy()
+    full[BORDER : BORDER + 2] = 1e4
+    asked = with_ends(found.c._replace(full=full), np.stack([found.q_start, found.q_goal]))
+    trial = new_trial(6, len(asked.M))
+    near = found.q_start + 1e-4 * (found.q_goal - found.q_start)
+    assert reached(asked, found.q_start, near, trial) == 1.0
+    assert reached(asked, found.q_start, found.q_goal, trial) < 1.0
+    assert trial.failures[BORDER : BORDER + 2].sum() == trial.failures.sum() == 1

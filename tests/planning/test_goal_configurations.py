@@ -1,0 +1,87 @@
+"""All joints that show a goal: each does, all that closed forms know of are found, nearest in time first."""
+
+import numpy as np
+import pytest
+
+from projservo_cli.planning.goal_configurations import UNSURE, goals_of
+from projservo_cli.planning.rrt_connect import Budget, find_way
+from tests.planning.joint_space_cases import case
+
+NONE = np.empty((0, 7))
+
+
+def goals_in(found, seed=0):
+    """Goals of a case, their rank, and what was counted."""
+    c, n = found.c, len(found.q_start)
+    draws = np.random.default_rng(seed).random((400, n))
+    starts = np.vstack([found.q_start, c.lower + (c.upper - c.lower) * draws])
+    return goals_of(c, found.aim, found.q_start, NONE[:, :n], starts)
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5", "stanford", "seven"])
+@pytest.mark.parametrize("k", [0, 5, 11])
+def test_every_goal_shows_the_goal_within_the_limits(name, k):
+    found = case(name, k)
+    goals, times, (solutions, hidden, _) = goals_in(found)
+    goals, times = goals[:64], times[:64]
+    assert len(goals) > 0
+    assert solutions > hidden
+    truth = found.truth
+    for q in goals[times < UNSURE]:  # others may have been brought to the limit they lie beyond
+        assert np.abs(truth.images(q, truth.M_face) - found.aim.s_star).max() < 1e-4
+    for q in goals:
+        assert ((q >= found.c.lower) & (q <= found.c.upper)).all()
+    assert (np.diff(times) >= 0.0).all()
+    wanted = (np.abs(goals - found.q_start) / found.c.speed).max(axis=1)
+    np.testing.assert_allclose(times[times < UNSURE], wanted[times < UNSURE])
+    apart = np.abs(goals[:, None] - goals[None]).max(axis=2) + 9.0 * np.eye(len(goals))
+    assert apart.min() > np.radians(1.0)
+
+
+@pytest.mark.parametrize("name", ["paper", "ur5", "stanford"])
+def test_the_joints_at_which_the_goal_was_drawn_are_among_them(name):
+    for k in range(6):
+        found = case(name, k)
+        goals, *_ = goals_in(found)
+        assert np.abs(goals - found.q_goal).max(axis=1).min() < 1e-6
+
+
+def test_an_arm_with_a_spherical_wrist_has_eight_solutions():
+    # D. Pieper, "The kinematics of manipulators under computer control", 1968: four places of the wrist, and
+    # two turns of it each, wherever limits let them.
+    counts = [goals_in(case("paper", k))[2][0] for k in range(6)]
+    assert max(counts) == 8
+    assert all(count % 2 == 0 for count in counts)
+
+
+def test_turns_are_goals_of_their_own():
+    # The UR5 turns five of its joints twice around: 2⁵ goals of each solution.
+    goals, _, (solutions, hidden, _) = goals_in(case("ur5", 1))
+    assert len(goals) == 32 * (solutions - hidden)
+
+
+def test_joints_that_turn_often_have_no_more_goals_than_are_near():
+    found = case("ur5", 1)
+    often = found.c._replace(lower=np.full(6, -1e4), upper=np.full(6, 1e4))
+    starts = np.vstack([found.q_start, found.q_goal])
+    goals, rank, (solutions, *_) = goals_of(often, found.aim, found.q_start, NONE[:, :6], starts)
+    assert len(goals) == 5**6 * solutions
+    assert np.abs(goals - found.q_start).max() < 5.0 * np.pi + 1e-6
+    assert (np.diff(rank) >= 0.0).all()
+
+
+def test_few_are_the_nearest_of_many():
+    found = case("ur5", 2)
+    many, times, _ = goals_in(found)
+    way = find_way(found.c, found.aim, found.q_start, NONE[:, :6], Budget(goals=5), found.acceleration)
+    assert way.shown == len(many)
+    np.testing.assert_allclose(times[:5], (np.abs(way.goals - found.q_start) / found.c.speed).max(axis=1))
+
+
+def test_a_goal_beyond_the_limits_is_told():
+    found = case("paper", 0)
+    # Limits around the start that none of the solutions lies within.
+    c = found.c._replace(lower=found.q_start - 1e-3, upper=found.q_start + 1e-3)
+    way = find_way(c, found.aim, found.q_start, NONE[:, :6], Budget(), found.acceleration)
+    assert len(way.goals) == len(way.corners) == way.shown == 0
+    assert way.solutions == way.hidden > 0

@@ -1,0 +1,101 @@
+"""Runs for the tests of figures and report: the shipped tasks, calibrated by a known projective frame."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from projservo_cli.calibration.forward import Scene
+from projservo_cli.records import LAWS, METRIC_LAWS, MODES_OF, PRISMATIC, Calibration, name_of
+from projservo_cli.report.figures import FIGURES
+from projservo_cli.report.report_data import Material
+from projservo_cli.robots.client import Film
+from projservo_cli.stages import record, studies
+from tests.fake_records import fake
+from tests.known import configured, driven, known_scenario, planned
+
+SHORT = 4
+GAINS = (0.5, 0.1)
+PERIODS_S = (0.08, 0.04)
+# Laws whose runs that follow the plan are shown beside those that plan anew.
+FOLLOWING = ("exact", "stacked")
+SPECS = {spec.name: spec for spec in FIGURES}
+
+
+@lru_cache
+def case(name="paper", steps=SHORT, whole=False):
+    """Configuration, extra runs and material of a task whose runs end after a few steps.
+
+    The model is the true one in a projective frame, so everything is known and nothing is fitted.
+    ``whole`` sweeps all gains and periods.
+    """
+    config = configured(name, f"stop.max_steps={steps}")
+    scenario = known_scenario(config)
+    true = scenario.truth
+    model = studies.projective_twin(true.model)
+    plan = planned(scenario, model, samples=21, duration=3.0)
+    sense = plan.rotation_sense()
+    traces = {law: driven(scenario, sense, law, true.model if law in METRIC_LAWS else model) for law in LAWS}
+    traces["direct_three"] = filmed(traces["direct_three"], *true.image_size.astype(int))
+    for law in FOLLOWING:
+        followed = name_of(law, MODES_OF[law][1])
+        traces[followed] = driven(scenario, plan, followed, model)
+    clean = replace(
+        known_scenario(config.idealized), limits=scenario.limits._replace(stop_at_joint_limit=False)
+    )
+    models = {"true": true.model, "twin": model, "calibrated": model}
+    bench = studies.Comparison(clean, models, sense)
+    extra = studies.run_studies(bench) if whole else studies.run_studies(bench, GAINS, PERIODS_S)
+    observation = record.simulate(config, true)
+    calibration = known(config, true, model, observation.q)
+    numbers = tuple(true.number[i] for i in true.face)
+    plant = scenario.plant_of("exact")
+    return (
+        config,
+        bench,
+        Material(calibration, observation, model, true.robot, plant, plan, numbers, traces, extra),
+    )
+
+
+def filmed(trace, width, height):
+    """A run of which there are frames: black, with a bright square where a marker is."""
+    film = Film()
+    for k, s in enumerate(trace.s):
+        frames = np.zeros((2, height, width), dtype=np.uint8)
+        for view, marker in np.ndindex(s.shape[:2]):
+            u, v = s[view, marker].round().astype(int)
+            frames[view, max(0, v - 8) : v + 9, max(0, u - 8) : u + 9] = 200
+        film.show(k, s, frames)
+    return replace(trace, **film.told())
+
+
+def known(config, true, model, q):
+    """The record of a model known in the frame of ``projective_twin``, as if it had been fitted freely."""
+    M = np.linalg.solve(studies.H_PE, true.M.T).T
+    scene = Scene(model.P, model.H_hat_0, model.joint_types == PRISMATIC, M)
+    J, own = scene.derivative(q - model.q_reference)
+    own = np.einsum("kvmia,mn->kvmina", own, np.eye(len(M))).reshape(*own.shape[:-1], -1)
+    J, first = np.concatenate([J, own], axis=-1), J.shape[-1]
+    s, Vt = np.linalg.svd(J.reshape(-1, J.shape[-1]), full_matrices=False)[1:]
+    factor = (Vt / s[:, None])[s > 1e-8 * s[0]].T
+    none = np.zeros((0, 3), dtype=np.int64)
+    sigma = config.noise.calibration_px or 0.5
+    return fake(
+        Calibration,
+        sizes={"joint": len(q[0])},
+        joint_types=config.robot.joint_types,
+        sigma_px=sigma,
+        chi2_per_dof=1.0,
+        **{name: getattr(model, name) for name in ("P", "H_hat_0", "q_reference", "a_inf")},
+        marker=np.array(true.number),
+        M=M,
+        shared_error=sigma * factor[:first],
+        marker_error=sigma * factor[first:].reshape(len(M), 4, -1),
+        own_error=np.zeros((len(M), 4, 3)),
+        excitation=np.ptp(q, axis=0),
+        lowest=q.min(axis=0),
+        weak=np.arange(len(q[0])) == 1,
+        outlier=none,
+        suspect=none[:, :2],
+        swapped=none,
+    )

@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+from matplotlib.text import Text
+
+from projservo_cli.report import style
+from tests.report.cases import SPECS, case
+
+NAMES = [*SPECS]
+
+
+def drawn(spec, material):
+    return style.drawn(spec.draw, spec.data(material), spec.height)
+
+
+@pytest.fixture(scope="module", params=["paper", "stanford"])
+def figures(request):
+    material = case(request.param)[2]
+    return {name: drawn(spec, material) for name, spec in SPECS.items()}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_text_is_clipped_by_the_figure_or_lies_on_another(figures, name, monkeypatch):
+    require_readable(figures[name], monkeypatch)
+
+
+def require_readable(figure, monkeypatch):
+    """Every text that is drawn lies within the figure and on no other."""
+    found, draw = [], Text.draw
+
+    def record(self, renderer, *args, **kwargs):
+        if self.get_visible() and self.get_text().strip():
+            found.append((self.get_text(), self.get_window_extent(renderer)))
+        return draw(self, renderer, *args, **kwargs)
+
+    monkeypatch.setattr(Text, "draw", record)  # what is really drawn: ticks beyond the limits are not
+    with style.styled():
+        figure.canvas.draw()
+    assert len(found) > 5
+    for i, (text, extent) in enumerate(found):
+        low, high = extent.get_points()
+        # half a pixel of anti-aliasing may stand over
+        assert (low >= -0.5).all(), f"{text!r} at {extent}"
+        assert (high <= figure.bbox.get_points()[1] + 0.5).all(), f"{text!r} at {extent}"
+        for other, place in found[:i]:
+            shared = extent.intersection(extent, place)
+            # boxes hold the leading of a line: a pixel or two in common is no touching ink
+            clash = shared is not None and min(shared.width, shared.height) > 2.5
+            assert not clash, f"{text!r} on {other!r}"
+
+
+def test_legend_covers_no_axes(figures):
+    for name, figure in figures.items():
+        legend = figure.legends[0].get_window_extent()
+        if name != "fig03_scene":
+            assert not any(axes.get_window_extent().overlaps(legend) for axes in figure.axes), name
+            continue
+        (axes,) = figure.axes  # fill the figure; what is drawn in them counts
+        extent = np.array([axes.get_xlim(), axes.get_ylim(), axes.get_zlim()])
+        m = axes.get_proj() @ [*np.array(np.meshgrid(*extent)).reshape(3, -1), np.ones(8)]
+        shown = axes.transData.transform((m[:2] / m[3]).T)
+        assert shown[:, 1].min() >= legend.y1
+        assert (shown >= 0).all()
+        assert (shown <= figure.bbox.get_points()[1]).all()
+
+
+def test_axes_have_units(figures):
+    for axes in (axes for figure in figures.values() for axes in figure.axes):
+        labels = [axes.get_xlabel(), axes.get_ylabel(), getattr(axes, "get_zlabel", str)()]
+        for label in labels:
+            assert not label or ("(" in label and ")" in label), label
+
+
+@pytest.mark.parametrize("name", ["fig00_overview", "fig04_classical", "fig07_three_two"])
+def test_pixels_are_square(figures, name):
+    images = [axes for axes in figures[name].axes if axes.get_label() == style.IMAGE]
+    assert len(images) >= 2
+    for axes in images:
+        box = axes.get_window_extent()
+        du, dv = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
+        assert du / box.width == pytest.approx(dv / box.height, rel=1e-9)
+        assert axes.get_ylim()[0] > axes.get_ylim()[1]  # v points down
+
+
+def test_same_input_gives_the_same_bytes():
+    first, second = (drawn(SPECS["fig13_calibration"], case()[2]) for _ in range(2))
+    assert style.contents(first, style.FORMATS) == style.contents(second, style.FORMATS)
+
+
+def test_names_follow_the_numbers_of_the_paper():
+    # 0 the overview, 13 the calibration, 14 the path, 15 the modes, 16 the way, 17 the frames
+    assert [int(name[3:5]) for name in NAMES] == list(range(18))
+
+
+def test_importing_figures_does_not_import_matplotlib():
+    import subprocess
+    import sys
+
+    code = "import sys, projservo_cli.report.figures; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

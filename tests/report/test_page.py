@@ -1,0 +1,270 @@
+"""The page of a run: whole, self-contained, safe, and in agreement with the run."""
+
+import base64
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from projservo_cli.config import load_config, to_yaml
+from projservo_cli.records import CrossValidation
+from projservo_cli.report.page import write_comparison, write_page
+from projservo_cli.report.report_data import PAGE_FILE
+from projservo_cli.stages import steps
+from projservo_cli.store import Result
+from projservo_cli.tables import to_csv
+from tests.fake_records import fake
+from tests.report.cases import SPECS, case
+from tests.report.conftest import SOME, read, words
+
+
+@pytest.fixture(scope="session")
+def page(run):
+    return read(run.path.parent / PAGE_FILE)
+
+
+def altered(run, folder, *, report=None, **results):
+    """The run in another folder, with other results, and some fields of its report replaced."""
+    record = dataclasses.replace(run.results["report"].records[""], **(report or {}))
+    made = {"report": Result("", "", {}, {}, {"": record})}
+    return dataclasses.replace(run, path=folder / "run.h5", results=run.results | made | results)
+
+
+def shown(run):
+    return read(write_page(run))
+
+
+def test_the_page_loads_nothing_and_runs_nothing(page, run):
+    assert not list(page.all("script", "link", "iframe", "object", "embed", "base"))
+    for element in page.all():
+        for name, value in element.attributes.items():
+            assert not name.startswith("on")
+            assert name not in ("src", "srcset", "action", "data") or value.startswith(
+                "data:image/svg+xml;base64,"
+            )
+            if name == "href":
+                assert element.tag == "a" or value.startswith("#")
+                assert ":" not in value
+                assert value.startswith("#") or (run.path.parent / value).is_file() or value == "run.h5"
+    (style,) = page.all("style")
+    assert "url(" not in style.text
+    assert "@import" not in style.text
+
+
+def test_names_are_unique_and_references_lead_somewhere(page):
+    found = [element.attributes for element in page.all()]
+    names = [attributes["id"] for attributes in found if "id" in attributes]
+    assert len(set(names)) == len(names)
+    wanted = {a["href"][1:] for a in found if a.get("href", "").startswith("#")}
+    wanted |= {a["aria-labelledby"] for a in found if "aria-labelledby" in a}
+    assert wanted
+    assert wanted <= set(names)
+
+
+def test_headings_sections_language_and_title(page):
+    (html,) = page.all("html")
+    assert html.attributes["lang"] == "en"
+    assert next(page.all("title")).text == "projservo: paper"
+    assert len(list(page.all("h1"))) == len(list(page.all("main"))) == 1
+    sections = ["run", "calibration", "plan", "control", "claims", "left-out"]
+    assert [h.attributes["id"] for h in page.all("h2")] == sections
+    assert all("scope" in th.attributes for th in page.all("th"))
+
+
+def test_every_figure_has_a_text_a_caption_and_its_numbers(page, run):
+    figures = list(page.all("figure"))
+    assert sorted(figure.attributes["id"] for figure in figures) == sorted(SOME)
+    for figure in figures:
+        spec = SPECS[figure.attributes["id"]]
+        (image,) = figure.all("img")
+        assert image.attributes["alt"] == spec.alt
+        drawn = run.path.parent / "figures" / f"{spec.name}.svg"
+        content = base64.b64encode(drawn.read_bytes()).decode()
+        assert image.attributes["src"] == f"data:image/svg+xml;base64,{content}"
+        (caption,) = figure.all("figcaption")
+        assert spec.title in words(caption.text)
+        assert not spec.paper.startswith("Fig") or spec.paper in words(caption.text)
+        links = {a.text: a.attributes["href"] for a in caption.all("a")}
+        assert set(links) == {"numbers (CSV)", "SVG"}
+        assert (run.path.parent / links["numbers (CSV)"]).stat().st_size > 100
+    texts = [spec.alt for spec in SPECS.values() if spec.alt]
+    assert len(set(texts)) == len(texts) >= 14
+
+
+def test_numbers_of_a_figure_are_those_that_are_drawn(run):
+    text = (run.path.parent / "figures" / "fig08_drift.csv").read_bytes().decode()
+    assert text == to_csv(SPECS["fig08_drift"].data(case()[2]))
+
+
+def test_columns_keep_every_bit_and_kind():
+    arrays = {"x": np.array([0.1, np.nan, -np.inf]), "on": np.array([True, False]), "n": np.array(3)}
+    arrays["m"] = np.array([[[1.0, 2.0]], [[3.0, 1 / 3]]])
+    lines = ['x,on,n,"m[:,0,0]","m[:,0,1]"', "0.1,1,3,1.0,2.0", f"nan,0,,3.0,{1 / 3!r}", "-inf,,,,", ""]
+    assert to_csv(arrays) == "\n".join(lines)
+
+
+def test_all_that_the_claims_say_is_on_the_page(page, run):
+    told = (run.path.parent / "claims.json").read_text(encoding="utf-8")
+    content, text = json.loads(told), words(page.text)
+    for claim in content["claims"]:
+        for key in ("claim", "source", "measured", "criterion"):
+            assert words(claim[key]) in text
+    shown = {element.attributes["value"] for element in page.all("data")}
+    numbers = (item for row in content["drift"] for item in row.items())
+    values = {value for key, value in numbers if "_mm" in key or "_per" in key}
+    assert len(values) > 15
+    assert {repr(value) for value in values - {None}} <= shown
+    holding = sum(claim["holds"] is True for claim in content["claims"])
+    assert f"{holding} of {len(content['claims'])} hold" in text
+
+
+def test_what_was_run_and_why_each_law_ended(page, run):
+    text = words(page.text)
+    for value in ("seed 1", "projservo servo", "here", "2026-01-02", "simulated"):
+        assert value in text
+    for trace in run.traces.values():
+        assert f"{trace.verdict} after {trace.steps} steps" in text
+        assert words(trace.reason) in text
+    assert run.calibration.reason in text
+    assert run.plan.reason in text
+    worst = int(np.argmax(run.calibration.prediction_noise)) + 1
+    assert f"Joint {worst} is known worst" in text
+    (configuration,) = page.all("pre")
+    assert configuration.text.strip() == run.configuration.strip()
+
+
+def test_the_same_run_gives_the_same_bytes(run):
+    path = run.path.parent / PAGE_FILE
+    texts = []
+    for _ in range(2):
+        write_page(run)
+        texts.append(path.read_bytes())
+    assert texts[0] == texts[1]
+
+
+def test_a_report_misses_a_file_that_was_deleted(run, tmp_path):
+    assert not steps.missing(run)
+    assert steps.missing(dataclasses.replace(run, path=tmp_path / "run.h5"))
+
+
+HOSTILE = "<script>alert(1)</script>\"'&{{ 7*7 }}"
+
+
+def test_hostile_texts_are_shown_and_not_run(run, tmp_path):
+    claims = ({"claim": HOSTILE, "source": "s", "measured": HOSTILE, "criterion": "c", "holds": None},)
+    left_out = ({"what": HOSTILE, "reason": HOSTILE},)
+    files = ("figures/../x.svg", "javascript:alert(1)//fig01_partition.svg", "figures/fig01_partition.svg")
+    trace = dataclasses.replace(run.traces["stacked"], verdict=HOSTILE, reason=HOSTILE)
+    made = {"argv": ["projservo", HOSTILE], "host": HOSTILE}
+    report = {"claims": claims, "left_out": left_out, "figures": files}
+    other = altered(run, tmp_path, report=report, **{"servo/stacked": Result("", "", made, {}, {"": trace})})
+    configuration = run.configuration.replace("PUMA 560", "</pre><script>")
+    other = dataclasses.replace(other, configuration=configuration)
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "fig01_partition.svg").write_text(f'"><svg>{HOSTILE}</svg>')
+    page = shown(other)
+    assert not list(page.all("script", "svg"))  # an image runs nothing and fetches nothing
+    assert words(page.text).count(HOSTILE) >= 6
+    assert not any("javascript" in a.attributes["href"] for a in page.all("a"))
+    assert "</pre><script>" in next(page.all("pre")).text
+
+
+def test_a_picture_stands_in_where_there_is_no_vector_image(run, tmp_path):
+    files = ("figures/fig01_partition.png", "figures/fig01_partition.pdf")
+    other = altered(run, tmp_path, report={"figures": files})
+    assert words(shown(other).text).count("cannot show the figure") == 1
+    (tmp_path / "figures").mkdir()
+    (tmp_path / files[0]).write_bytes(b"\x89PNG")
+    page = shown(other)
+    (image,) = page.all("img")
+    assert image.attributes["src"] == "data:image/png;base64,iVBORw=="
+    assert image.attributes["alt"].startswith("Three panels")
+    assert [a.text for a in next(page.all("figcaption")).all("a")] == ["PDF", "PNG"]
+
+
+def test_a_run_is_told_as_far_as_it_goes(run, tmp_path):
+    fit = {"calibrate": run.results["calibrate"]}
+    text = words(shown(dataclasses.replace(run, path=tmp_path / "run.h5", results=fit)).text)
+    missing = ("This run holds no plan.", "No law was run.", "No claim was measured.", "projservo report -o")
+    assert all(part in text for part in missing)
+    empty = np.zeros((2, 2, 2, 0))
+    drift = {"drift_mm": empty, "drift_at_samples_mm": empty, "drift_converged": empty.astype(bool)}
+    recording = altered(run, tmp_path, report={"claims": (), "figures": (), **drift})
+    text = words(shown(recording).text)
+    assert "No drift was measured." in text
+    assert "projservo report -o" not in text
+
+
+def test_runs_stand_side_by_side_and_a_figure_that_one_lacks_leaves_its_place_empty(run, tmp_path):
+    other = altered(run, run.path.parent, report={"figures": [f"figures/{name}.svg" for name in SOME[1:]]})
+    other = dataclasses.replace(other, configuration=run.configuration.replace("seed: 1", "seed: 22"))
+    path = tmp_path / "both.html"
+    write_comparison([run, other], path)
+    page = read(path)
+    names = [element.attributes["id"] for element in page.all() if "id" in element.attributes]
+    assert len(set(names)) == len(names)
+    assert words(page.text).count("lacks the figure") == 1
+    classes = (div for div in page.all("div") if div.attributes.get("class") == "runs")
+    rows = [list(div.all("figure")) for div in classes]
+    named = {tuple(figure.attributes["id"].partition("-")[2] for figure in row) for row in rows if row}
+    assert named == {(SOME[0],), *((name, name) for name in SOME[1:])}
+    *_, row = [tr for tr in page.all("tr") if "seed" in words(tr.text) and "22" in tr.text]
+    assert words(row.text) == "seed 1 22"
+    (table,) = [t for t in page.all("table") if "What the paper claims" in t.text]
+    assert len(list(table.all("tr"))) == 1 + len(run.results["report"].records[""].claims)
+    for link in page.all("a"):
+        target = link.attributes["href"]
+        assert target.startswith("#") or target.endswith("run.h5") or (tmp_path / target).is_file()
+
+
+def test_numbers_for_the_eye_carry_all_their_digits(run, tmp_path):
+    told = {0.0: "0", 116.0: "116", 1461.2: "1461", 12.345: "12.3", -0.5: "−0.5", 999.9: "1000", 99.99: "100"}
+    told |= {2.34e-12: "2.34 × 10⁻¹²", 1.5e9: "1.5 × 10⁹", 1 / 3: "0.333"}
+    values = [*told, *6 * [np.nan]]
+    page = shown(altered(run, tmp_path, report={"drift_mm": np.reshape(values, (2, 2, 2, 2))}))
+    (table,) = [table for table in page.all("table") if "in brackets at the sampling" in table.text]
+    cells = [cell for cell in table.all("td") if cell.attributes.get("class") == "count"]
+    for value, cell in zip(values, cells, strict=True):
+        assert words(cell.text).partition(" (")[0] == told.get(value, "–")
+        assert np.isnan(value) or next(cell.all("data")).attributes["value"] == repr(value)
+
+
+def test_what_is_known_of_a_calibration_is_told(run, tmp_path):
+    table = tmp_path / "table.csv"
+    table.write_text("pose,marker\n")
+    calibration = dataclasses.replace(
+        run.calibration,
+        usable=False,
+        prediction_noise=np.array([0.5, 7.25, 1.0, 1.0, 1.0, 1.0]),
+        outlier=np.zeros((2, 3), dtype=np.int64),
+        suspect=np.zeros((1, 2), dtype=np.int64),
+        advice=("move joint 2",),
+        lens=np.array([[640, 512, 800, -0.0625, 0.5], [640, 512, 800, 0.25, 0.0]]),
+    )
+    held_out = fake(CrossValidation, folds=5, unit="poses", rms_px=0.321, reason="as predicted")
+
+    configuration = to_yaml(load_config(None, [f"data.table={table}"]))
+
+    def told(calibration):
+        records = {"calibration": calibration, "cross_validation": held_out}
+        fit = run.results["calibrate"]
+        other = altered(run, tmp_path, calibrate=dataclasses.replace(fit, records=fit.records | records))
+        return words(shown(dataclasses.replace(other, configuration=configuration)).text)
+
+    text = told(calibration)
+    for part in (
+        "✗ not usable",
+        "Not usable: ",
+        "an estimate from these images",
+        "Joint 2 is known worst: 0.5 rad from the reference it adds 7.25 times",
+        "so this one is weak.",
+        "2 readings left out as outliers. 1 joint reading contradicts the images.",
+        "Held out, in 5 parts of poses: rms 0.321 px",
+        "As predicted.",
+        "What to do next: move joint 2",
+        "lens of the left camera, k1 −0.0625",
+    ):
+        assert part in text, part
+    unknown = dataclasses.replace(calibration, prediction_noise=np.full(6, np.nan))
+    assert "states no uncertainty" in told(unknown)

@@ -1,0 +1,39 @@
+"""The command line on a robot of others, with a calibration made once."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from projservo_cli import cli, files
+from tests.cli.conftest import projservo  # noqa: F401 - the command line as in its own tests
+from tests.robots.robots import CALLS
+
+UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
+
+
+@pytest.fixture(autouse=True)
+def no_disk(monkeypatch):
+    monkeypatch.setattr(files, "_synchronise", lambda path: None)  # the disk may take its time
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory):
+    """A run with a calibration and nothing else."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    assert cli.run(["calibrate", "-c", str(UR5), "-o", str(folder), "-q"]) == 0
+    return folder
+
+
+@pytest.fixture
+def servo(projservo, calibrated, monkeypatch, tmp_path):  # noqa: F811
+    """Servo with the calibration, the configuration given anew."""
+    monkeypatch.chdir(tmp_path)
+    CALLS.clear()
+    shutil.copytree(calibrated, "run")
+
+    def call(*arguments, law="direct_three"):
+        laws = ["--law", law] if law else []
+        return projservo("servo", "-c", UR5, "-o", "run", *laws, *arguments)
+
+    return call

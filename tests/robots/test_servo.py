@@ -1,0 +1,405 @@
+"""Servo and record with robots and laws of others, on the command line."""
+
+import io
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import click
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from projservo_cli.config import load_config
+from projservo_cli.records import Calibration
+from projservo_cli.stages.scenario import Scenario, scenario_of
+from projservo_cli.store import load
+from projservo_cli.tables import read_table
+from tests.fake_records import fake
+from tests.robots import robots
+from tests.robots.robots import CALLS
+
+pytestmark = pytest.mark.volume  # a calibration and many steps
+
+UR5 = Path(__file__).parents[2] / "configs" / "ur5.yaml"
+HERE = "tests.robots.robots"
+OPTIONS = f"options: {{config: {UR5}"
+NEAR = ["--set", "task.goal.joints.joints=[3, -1.7, -0.9, -2, 2, 1]"]
+SOUND = ["--set", f"plant={{use: '{HERE}:Sound', {OPTIONS}}}}}"]
+
+
+def faulty(fault, after=0, **more):
+    settings = "".join(f", {name}: {value}" for name, value in more.items())
+    return ["--set", f"plant={{use: '{HERE}:Faulty', {OPTIONS}, fault: {fault}, after: {after}}}{settings}}}"]
+
+
+def commands():
+    return [call for call in CALLS if isinstance(call, tuple)]
+
+
+def test_a_robot_of_others_reaches_the_goal_as_the_simulated_one_does(servo):
+    answer = servo(*SOUND, "--json")
+    assert answer.code == 0, answer.err
+    (told,) = answer.json["laws"]
+    assert told["verdict"] == "converged"
+    assert [told[name] for name in ("position_error_mm", "rotation_error_deg", "center_deviation_mm")] == [
+        None
+    ] * 3
+    trace = load("run").traces["direct_three"]
+    # True goal: that of the configuration, less what the calibration mispredicts there.
+    truth = robots.Sound(UR5).world.robot
+    goal = truth.pose(np.array([4.143219, -2.507909, -1.233571, 2.549498, 1.251226, 3.700267]))
+    reached = truth.pose(trace.q[-1])
+    assert 1e3 * np.linalg.norm(reached[:3, 3] - goal[:3, 3]) < 5.0
+    assert np.isnan(trace.pose).all()
+    assert servo("--set", "noise.servo_px=0.5", "--json", "--force").json["laws"][0][
+        "steps"
+    ] == pytest.approx(told["steps"], abs=25)
+
+
+@pytest.mark.parametrize("joints", ["true", "false"])
+def test_a_robot_that_tells_its_truth_is_told_how_far_off_it_is(servo, joints):
+    told = f"plant={{use: '{HERE}:Telling', {OPTIONS}, joints: {joints}}}}}"
+    answer = servo("--set", told, *NEAR, "--json")
+    (law,) = answer.json["laws"]
+    trace, arm = load("run").traces["direct_three"], robots.Sound(UR5).world.robot
+    pose, goal = arm.pose(trace.q[-1]), arm.pose(np.array([3, -1.7, -0.9, -2, 2, 1]))
+    np.testing.assert_allclose(trace.pose[-1], pose, atol=1e-12)
+    np.testing.assert_allclose(trace.goal_pose, goal, atol=1e-12)
+    assert 0.0 < law["position_error_mm"] < 5.0
+    assert law["position_error_mm"] == pytest.approx(1e3 * np.linalg.norm(pose[:3, 3] - goal[:3, 3]))
+    turn = Rotation.from_matrix(pose[:3, :3].T @ goal[:3, :3]).magnitude()
+    assert law["rotation_error_deg"] == pytest.approx(np.degrees(turn))
+    assert law["success"] is None
+
+
+@pytest.mark.parametrize("law", ["direct_three", "exact"])
+def test_every_command_keeps_the_limit_and_the_robot_is_stopped_last(servo, law):
+    assert servo(*SOUND, "-q", law=law).code == 0
+    speeds = np.array([np.abs(sent.step).max() / sent.period for sent in commands()])
+    assert speeds.max() == pytest.approx(np.radians(125.0))
+    assert [call for call in CALLS if call in ("open", "stop", "close")] == ["open", "stop", "close"]
+    assert CALLS[-2:] == ["stop", "close"]
+    moved = next(i for i, call in enumerate(CALLS) if isinstance(call, tuple))
+    assert CALLS[:moved].count("read") == 4  # nothing moves before the images were seen to fit
+
+
+def test_speed_scale_scales_every_command(servo):
+    assert servo(*SOUND, "-q").code == 0
+    whole, trace = commands(), load("run").traces["direct_three"]
+    assert servo(*SOUND, "--speed-scale", "0.25", "-q").code == 0
+    quarter, slow = commands(), load("run").traces["direct_three"]
+    assert load("run").configuration.count("speed_scale: 0.25") == 1
+    np.testing.assert_allclose(quarter[0].step, 0.25 * whole[0].step, rtol=1e-12)  # to the start of the task
+    assert slow.steps > 3 * trace.steps
+    limit = np.radians(125.0) * 0.04
+    assert max(np.abs(sent.step).max() for sent in quarter) <= 0.25 * limit * (1 + 1e-12)
+    assert servo("-q").code == 0  # the simulated robot too
+    simulated = load("run").traces["direct_three"]
+    assert servo("--speed-scale", "0.5", "-q").code == 0
+    np.testing.assert_array_equal(load("run").traces["direct_three"].q_dot[0], 0.5 * simulated.q_dot[0])
+
+
+@pytest.mark.parametrize(
+    ("fault", "after", "message"),
+    [
+        ("raises", 70, r"read() failed: OSError: camera 2 is unplugged (robots.py:"),
+        ("command raises", 70, "command() failed: RuntimeError: protective stop"),
+        ("hangs", 70, "read() did not return within 0.5 s"),
+    ],
+)
+def test_a_robot_that_fails_ends_the_run_in_one_line(servo, fault, after, message):
+    answer = servo(*faulty(fault, after, timeout_s=0.5))
+    assert answer.code == 1
+    assert answer.err.splitlines()[-1].startswith(
+        "projservo: servo/direct_three: plant tests.robots.robots:Faulty"
+    )
+    assert message in answer.err
+    assert CALLS.count("stop") == 1
+    assert "Traceback" not in answer.err
+    trace = load("run").traces["direct_three"]  # what was known until then
+    assert trace.verdict == "failed"
+    assert message in trace.reason
+    assert len(trace.q) == trace.steps + 1 == len(trace.q_dot) + 1
+    assert trace.steps > 10
+    assert np.isfinite(trace.q[:-1]).all()
+    assert np.isfinite(trace.s[:-1]).all()
+    # What was not measured any more is unknown; a command that fails comes after the images.
+    assert np.isfinite(trace.s[-1]).all() == fault.startswith("command")
+
+
+def test_a_joint_that_is_blocked_is_named_while_the_run_goes_on(servo):
+    answer = servo(*faulty("blocked", 80), "--json", law="exact")
+    (told,) = answer.json["laws"]
+    assert told["verdict"] == "not following"
+    assert told["overruns"] == 0
+    trace = load("run").traces["exact"]
+    assert trace.reason.startswith("joint 3 stands at ")
+    assert trace.steps < 300
+    assert np.ptp(trace.q[-40:, 2]) == 0.0
+
+
+def test_after_a_failure_no_other_law_drives_the_robot(servo):
+    answer = servo(*faulty("raises", 100), "--law", "exact", "--json")
+    assert answer.code == 1
+    assert [told["law"] for told in answer.json["laws"]] == ["direct_three"]
+    assert answer.json["laws"][0]["verdict"] == "failed"
+    assert answer.json["failed"] == "servo/direct_three"
+    assert CALLS.count("stop") == 1
+    again = servo(*SOUND, "--json")
+    assert again.json["laws"][0]["verdict"] == "converged"
+
+
+def test_ctrl_c_stops_the_robot(servo):
+    answer = servo(*faulty("interrupted", 70))
+    assert answer.code == 130
+    assert CALLS[-2:] == ["stop", "close"]
+
+
+@pytest.mark.parametrize(
+    ("fault", "culprit"),
+    [
+        ("bumped camera", "the left camera was moved"),
+        ("frozen readings", "the reading of all joints stands still"),
+    ],
+)
+def test_a_disturbance_ends_the_run_with_what_moved(servo, fault, culprit):
+    answer = servo(*faulty(fault, 100), "--json", law="exact")
+    assert answer.code == 1
+    (told,) = answer.json["laws"]
+    assert told["verdict"] == "disturbed"
+    assert culprit in told["reason"]
+    assert culprit in answer.err
+    started = sum(1 for call in CALLS if call == "read") - told["steps"] - 1
+    assert told["steps"] <= 100 - started + 8  # the third observation in a row, a few more for what is small
+    assert CALLS[-2:] == ["stop", "close"]
+
+
+def test_nothing_moves_where_the_images_do_not_fit_from_the_start(servo):
+    answer = servo(*faulty("bumped camera"))
+    assert answer.code == 1
+    assert "nothing was moved, since where the robot stands images are" in answer.err
+    assert commands() == []
+    assert CALLS[-2:] == ["stop", "close"]
+    answer = servo(*faulty("bumped camera"), "--set", "stop.innovation_factor=0", "--json")
+    assert answer.json["laws"][0]["untested"] == "stop.innovation_factor is 0"
+    assert answer.json["laws"][0]["success"] is None  # nobody knows the truth
+    assert commands()
+
+
+def test_a_calibration_without_covariance_tests_nothing_and_says_so():
+    config = load_config(UR5)
+    bare = fake(Calibration, shared_error=np.full((3, 3), np.nan))
+    assert "has no covariance" in Scenario.untested.fget(SimpleNamespace(config=config, calibration=bare))
+    sound = fake(Calibration, shared_error=np.eye(3))
+    assert Scenario.untested.fget(SimpleNamespace(config=config, calibration=sound)) == ""
+
+
+def test_lost_markers_are_waited_for(servo):
+    answer = servo(*faulty("lost for a while", 80), "--json")
+    assert answer.json["laws"][0]["verdict"] == "converged"
+    trace = load("run").traces["direct_three"]
+    unseen = np.isnan(trace.s).any(axis=(1, 2, 3))
+    assert unseen.sum() == 9
+    np.testing.assert_array_equal(trace.q_dot[unseen[:-1]], 0.0)
+    answer = servo(*faulty("lost", 80), "--set", "stop.lost_steps=7", "--json")
+    (told,) = answer.json["laws"]
+    assert (answer.code, told["verdict"]) == (1, "markers lost")
+    assert "7 periods after the last that was" in told["reason"]
+    assert np.isnan(load("run").traces["direct_three"].s).any(axis=(1, 2, 3)).sum() == 8
+
+
+def test_joint_limits_end_a_run_whatever_is_configured(calibrated):
+    use = f"plant={{use: '{HERE}:Sound', joint_limits: report}}"
+    config = load_config(UR5, [use, "noise.servo_px=0.1"])
+    calibration = load(calibrated).calibration
+    scenario = scenario_of(config, calibration)
+    gains, limits = scenario.gains, scenario.limits
+    assert limits.stop_at_joint_limit
+    assert limits.image_px == 0.01 + 2.0 * calibration.sigma_fitted_px
+    np.testing.assert_array_equal(gains.speed, np.full(6, np.radians(125.0)))
+
+
+def test_a_robot_without_speed_limit_is_refused(servo):
+    answer = servo(*SOUND, "--set", "control.joint_speed_limit_deg_s=null")
+    assert answer.code == 2
+    assert "set control.joint_speed_limit_deg_s" in answer.err
+    assert commands() == []
+
+
+def test_a_law_of_others_equals_the_built_in_one_it_calls(servo):
+    points = ["--set", "control.observation=points"]
+    assert servo("-q", *points).code == 0
+    built_in = load("run").traces["direct_three"]
+    assert servo("-q", *points, law=f"{HERE}:DirectThree").code == 0
+    theirs = load("run").traces[f"{HERE}:DirectThree"]
+    assert theirs.verdict == "converged"
+    for name in ("q", "s", "q_dot", "pose"):
+        np.testing.assert_array_equal(getattr(theirs, name), getattr(built_in, name), err_msg=name)
+    assert np.isnan(theirs.tau).all()
+
+
+TALKING = """
+import threading
+from tests.robots.robots import ByImage, Sound
+print("a module says")
+
+class Robot(Sound):
+    def __init__(self, config):
+        super().__init__(config)
+        print("a robot is made")
+    def read(self):
+        threading.Thread(target=print, args=("a camera says",)).start()
+        print("a robot sees")
+        return super().read()
+    def stop(self):
+        print("a robot stops")
+        super().stop()
+
+class Law(ByImage):
+    def __init__(self, setup):
+        super().__init__(setup)
+        print("a law is made")
+    def __call__(self, s, q):
+        print("a law is asked")
+        return super().__call__(s, q)
+"""
+SAID = ("a module says", "a robot is made", "a robot sees", "a camera says", "a robot stops", "a law is made")
+
+
+def test_a_law_and_a_robot_of_others_and_what_they_print(servo, monkeypatch):
+    """Standard output is for results: what others print, from whatever thread, goes to standard error."""
+    Path("mine_talks.py").write_text(TALKING)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    plant = ["--set", f"plant={{use: 'mine_talks:Robot', {OPTIONS}}}}}"]
+    answer = servo(*plant, "--set", "law=mine_talks:Law", *NEAR, "--json", law=None)
+    assert answer.code == 0, answer.err
+    assert answer.json["laws"][0]["verdict"] == "converged"
+    assert [text for text in (*SAID, "a law is asked") if text in answer.out] == []
+    assert [text for text in (*SAID, "a law is asked") if text not in answer.err] == []
+
+
+@pytest.mark.parametrize(
+    ("law", "code", "message"),
+    [
+        (
+            f"{HERE}:Wrong",
+            1,
+            "law tests.robots.robots:Wrong: gave (1.0, 2.0): expected 6 finite joint velocities",
+        ),
+        (f"{HERE}:Raising", 1, "failed: IndexError: list index out of range (robots.py:"),
+        (f"{HERE}:Nobody", 2, "tests.robots.robots has no Nobody"),
+        ("direct_thre", 2, "no such law; laws: direct_three"),
+    ],
+)
+def test_a_law_that_fails(servo, law, code, message):
+    answer = servo(*SOUND, law=law)
+    assert answer.code == code
+    assert message in answer.err
+    assert "Traceback" not in answer.err
+
+
+def test_a_law_that_waits_is_waited_for(servo):
+    answer = servo("--set", "stop.lost_steps=3", "--json", law=f"{HERE}:Silent")
+    assert answer.code == 1  # a law that is named must converge
+    assert "Silent must converge, but ended in markers lost: " in answer.err
+    assert (answer.json["laws"][0]["verdict"], answer.json["laws"][0]["steps"]) == ("markers lost", 3)
+
+
+def test_confirm_needs_a_terminal(servo, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))
+    answer = servo(*SOUND, "--confirm")
+    assert answer.code == 2
+    assert "--confirm: standard input is no terminal" in answer.err
+    assert commands() == []
+
+
+@pytest.mark.parametrize(("answered", "code"), [("y", 0), ("n", 130), ("", 130)])
+def test_confirm_asks_before_the_first_motion(servo, monkeypatch, answered, code):
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    asked = []
+
+    def answer_it(prompt):
+        asked.append((prompt, len(commands())))
+        return answered
+
+    CALLS.clear()
+    monkeypatch.setattr(click.termui, "visible_prompt_func", answer_it)
+    answer = servo(*SOUND, "--confirm", "--speed-scale", "0.5")
+    assert answer.code == code
+    ((_, moved),) = asked
+    assert moved == 0
+    assert ("servo will move tests.robots.robots:Sound, speeds times 0.5" in answer.err) or asked[0][0]
+    assert bool(commands()) == (code == 0)
+
+
+def test_a_stored_run_starts_no_code(servo, projservo, monkeypatch):
+    Path("mine_marks.py").write_text(
+        "import pathlib\npathlib.Path('imported').touch()\nfrom tests.robots.robots import *\n"
+    )
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    robot = ["--set", f"plant={{use: 'mine_marks:Sound', {OPTIONS}}}}}"]
+    law = ["--set", "control.laws=['mine_marks:ByImage', direct_three]"]
+    assert servo(*robot, *law, *NEAR, "-q", law=None).code == 0
+    Path("imported").unlink()
+    sys.modules.pop("mine_marks")
+    for words in (
+        ("show", "run"), ("servo", "-o", "run"), ("servo", "-o", "run", "-n", "--force"),
+        ("calibrate", "-o", "run", "--set", "seed=9", "-n"), ("validate", "run", "--data", "t.csv"),
+    ):  # fmt: skip
+        projservo(*words)
+    refused = projservo("servo", "-o", "run", "--force")
+    assert refused.code == 2
+    assert "law mine_marks:ByImage is named by the stored run alone, which starts no code" in refused.err
+    refused = projservo("servo", "-o", "run", "--force", "--law", "mine_marks:ByImage")
+    assert "plant mine_marks:Sound is named by the stored run alone" in refused.err
+    assert not Path("imported").exists()
+    assert "mine_marks" not in sys.modules
+    asked = projservo("servo", "-o", "run", "--force", "--law", "direct_three", *robot)
+    assert asked.code == 0, asked.err
+    assert Path("imported").exists()
+
+
+def test_a_report_never_moves_a_robot(servo, projservo):
+    CALLS.clear()
+    answer = projservo("report", "-c", UR5, "-o", "run", *SOUND)
+    assert answer.code == 2
+    assert "which moves tests.robots.robots:Sound: run projservo servo first" in answer.err
+    assert CALLS == []
+
+
+def test_a_robot_is_calibrated_from_what_it_showed(projservo, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    CALLS.clear()
+    alone = projservo("calibrate", "-c", UR5, *SOUND, "-o", "run")
+    assert (alone.code, CALLS) == (2, [])
+    assert "is calibrated from a table: record it" in alone.err
+    chain = ("record", "calibrate", "-o", "run", "--set", "calibration.frames_per_joint=4")
+    answer = projservo(*chain, "-c", UR5, *SOUND, "--json")
+    assert answer.code == 0, answer.err
+    assert (answer.json["record"]["recorded"], answer.json["calibrate"]["source"]) == (37, "recorded")
+    assert CALLS[-2:] == ["stop", "close"]
+    CALLS.clear()
+    refused = projservo(*chain, "--set", "seed=5")
+    assert (refused.code, CALLS) == (2, [])
+    assert "is named by the stored run alone, which starts no code" in refused.err
+    assert projservo("calibrate", "-o", "run", "--json").json["usable"] == answer.json["calibrate"]["usable"]
+
+
+def test_record_drives_the_same_robot(projservo, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    few = ["--set", "calibration.frames_per_joint=2"]
+    answer = projservo("record", "-c", UR5, *SOUND, *few, "-o", "t.csv", "--speed-scale", "0.5", "--json")
+    assert answer.code == 0, answer.err
+    assert (answer.json["recorded"], answer.json["markers"]) == (25, 10)
+    assert max(np.abs(sent.step).max() for sent in commands()) <= 0.5 * np.radians(125.0) * 0.04 * (1 + 1e-12)
+    assert CALLS[-2:] == ["stop", "close"]
+    answer = projservo("record", "-c", UR5, *few, "-o", "t.csv")
+    assert answer.code == 2  # those poses are of another robot
+    answer = projservo("record", "-c", UR5, *faulty("raises", 115), *few, "-o", "u.csv")
+    assert answer.code == 1
+    assert "camera 2 is unplugged" in answer.err
+    assert CALLS[-2:] == ["stop", "close"]
+    table = read_table("u.csv")  # what was seen until then is kept, on the way too
+    assert table.at_rest.pose.tolist() == [0, 1, 2, 3, 4]
+    assert table.moving.max() == 5

@@ -1,0 +1,171 @@
+"""What rendered cameras show, against the projection of the true corners."""
+
+import hashlib
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from projservo_cli.config import to_yaml
+from projservo_cli.records import InputError
+from tests.simulation.conftest import eyes_of
+
+POSTURES = np.array([[0.1 * a, 0.25 * b] for a in (-2, 0, 1, 3) for b in (-2, -1, 0, 1, 2)])
+
+
+def misses(truth, eyes, postures, seed=0):
+    """By how much corners (k, 2, m, 2) that are found are off the true ones, px; NaN where none is."""
+    found = []
+    for i, q in enumerate(postures):
+        rngs = [np.random.default_rng((seed, i, view)) for view in range(2)]
+        seen = np.array([eyes.look(view, q[None], None, rng)[0] for view, rng in enumerate(rngs)])
+        found.append(seen - truth.images(q, truth.M))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("k1", [0.0, -0.25, 0.15])
+def test_corners_are_where_the_cameras_project_them(small, drawn, k1):
+    """Both cameras; one has skew, and with a lens both bend."""
+    truth, eyes = drawn(small(f"plant.options.k1={k1}"))
+    off = misses(truth, eyes, POSTURES)
+    assert np.isfinite(off).mean() > 0.75
+    assert np.abs(np.nanmean(off, axis=(0, 2))).max() < 0.02
+    assert np.nanstd(off) < 0.06
+
+
+def test_noise_and_blur_are_as_they_were_asked_for(small, drawn):
+    truth, eyes = drawn(small("plant.options.grey_noise=3", "plant.options.blur_px=1.2"))
+    shots = []
+    for seed in range(2):
+        misses(truth, eyes, POSTURES[:1], seed)
+        shots.append(eyes.last.astype(float))
+    assert np.std(shots[1] - shots[0]) == pytest.approx(3.0 * np.sqrt(2.0), rel=0.03)
+    sharp_truth, sharp = drawn(small())
+    misses(sharp_truth, sharp, POSTURES[:1])
+    steepest = [np.abs(np.diff(image, axis=1)).max() for image in (sharp.last[1].astype(float), shots[0][1])]
+    assert steepest[1] < 0.6 * steepest[0]
+
+
+def test_an_exposure_is_the_mean_of_the_frames_in_it(small, drawn):
+    truth, eyes = drawn(small())
+    q, way = POSTURES[7], np.array([[0.0, 0.01 * k] for k in range(-2, 3)])
+    rng = np.random.default_rng(0)
+    single = []
+    for step in way:
+        eyes.look(1, (q + step)[None], None, rng)
+        single.append(eyes.last[1].astype(float))
+    seen, _ = eyes.look(1, q + way, None, rng)
+    assert np.abs(eyes.last[1] - np.mean(single, axis=0)).max() <= 1.0
+    assert np.nanmean(np.abs(seen - truth.images(q, truth.M)[1])) < 0.1
+
+
+def test_a_tag_that_is_moved_is_seen_to_be_moved(small, drawn):
+    truth, eyes = drawn(small())
+    q, by = POSTURES[7], np.array([0.01, 0.0, 0.005])
+    moved = truth.M.copy()
+    moved[4:8, :3] += truth.robot.base_tool[:3, :3] @ by
+    seen, _ = eyes.look(1, q[None], (6, by), np.random.default_rng(0))
+    assert seen == pytest.approx(truth.images(q, moved)[1], abs=0.15, nan_ok=True)
+    assert np.isfinite(seen[4:8]).all()
+
+
+def test_plates_lists_and_hard_light_are_seen(small, drawn):
+    turned = (
+        "{number: 7, size_m: 0.1, pose: [[0, -1, 0, 0.05], [1, 0, 0, 0.02], [0, 0, 1, 0.03], [0, 0, 0, 1]]}"
+    )
+    for markers in ("{tags: plate, tag_size_m: 0.07}", f"{{tags: [{turned}], dictionary: APRILTAG_36H11}}"):
+        for light in ("soft", "side"):
+            truth, eyes = drawn(small(f"markers={markers}", f"plant.options.light={light}"))
+            off = misses(truth, eyes, POSTURES[[6, 7, 8]])
+            assert np.isfinite(off).all()
+            assert np.abs(off).max() < 0.15
+
+
+HASHED = """
+import hashlib, sys
+import numpy as np
+from projservo_cli.config import load_config
+from projservo_cli.rendered.cameras import Frames
+from projservo_cli.rendered.model import rendered_model
+from projservo_cli.stages.world import truth_of
+config = load_config("small.yaml", ["plant.options={k1: -0.1}"], text=sys.stdin.read())
+truth = truth_of(config)
+given = config.arm, truth.robot, config.rig, truth.P, config.markers, config.plant.rendered
+eyes = Frames(rendered_model(*given))
+eyes.open()
+seen = [eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)]
+print(hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest())
+eyes.close()
+"""
+
+
+@pytest.mark.parametrize("gl", ["egl", "osmesa"])
+def test_processes_draw_the_same_to_the_bit(small, drawn, gl):
+    config = small("plant.options={k1: -0.1}")
+    _, eyes = drawn(config)
+    seen = [
+        eyes.look(view, np.array([[0.1, 0.2]]), None, np.random.default_rng(view))[0] for view in range(2)
+    ]
+    here = hashlib.sha256(eyes.last.tobytes() + np.array(seen).tobytes()).hexdigest()
+    there = subprocess.run(
+        [sys.executable, "-c", HASHED],
+        input=to_yaml(config),
+        env={**os.environ, "MUJOCO_GL": gl, "PYOPENGL_PLATFORM": gl},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if "finds no OpenGL" in there.stderr:
+        pytest.skip(f"no OpenGL of the kind {gl} here")
+    assert there.stdout.strip() == here
+
+
+@pytest.mark.usefixtures("needs_mujoco")
+def test_what_lacks_gl_is_told_what_to_install(small):
+    done = subprocess.run(
+        [sys.executable, "-c", HASHED],
+        input=to_yaml(small()),
+        env={**os.environ, "MUJOCO_GL": "disable"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "InputError: MuJoCo finds no OpenGL to draw with: apt-get install libegl1" in done.stderr
+
+
+@pytest.mark.usefixtures("needs_mujoco")
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["plant.options.k1=-0.9", "rig.right.focal_px=[150, 150]"],
+            "plant.options.k1: a lens that bends so much",
+        ),
+        (["markers={tags: roof, dictionary: 5X5_9}"], "dictionary 5X5_9: unknown; valid: "),
+        (["markers={tags: [TAG]}"], "there is no tag 50 in the dictionary, which has tags 0 to 49"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_said_in_a_line(small, overrides, message):
+    tag = "{number: 50, size_m: 0.1, pose: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}"
+    config = small(*(text.replace("TAG", tag) for text in overrides))
+    with pytest.raises(InputError, match=message):
+        eyes_of(config)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("plant.options.blur=1", "plant.options.blur: unknown key; did you mean blur_px"),
+        ("plant.options.light=dark", "plant.options.light: 'dark' is not one of them; valid: soft, side"),
+        ("noise.servo_px=0.5", "noise.servo_px: is that of projected points"),
+        ("markers={positions_m: [[0, 0, 0]]}", "markers: plant mujoco shows tags: set markers.tags"),
+        ("markers.numbers=[1, 2]", "markers.numbers: tags is set as well"),
+        ("markers.face=[0, 1, 99]", "markers.face.2: there is no marker 99"),
+    ],
+)
+def test_what_contradicts_a_rendered_plant_is_named(small, override, message):
+    with pytest.raises(InputError, match=message):
+        small(override)

@@ -1,0 +1,110 @@
+"""What studies of guidance share: tasks by seed, the true model as a judge, rates, two processes, tables."""
+
+import argparse
+import csv
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import binomtest
+from tqdm import tqdm
+
+from projservo_cli.config.robot import JointVector
+from projservo_cli.planning.constraints import constraints_of
+from projservo_cli.planning.goal_configurations import Aim
+from projservo_cli.planning.margins import limits_alone
+from projservo_cli.planning.rrt_connect import Budget, find_way
+from projservo_cli.stages.world import joints_of, truth_of
+from projservo_cli.sweeps.design import random_tasks
+from projservo_cli.task.target import Shown
+from tests.known import configured
+
+# Configurations with images of 0.5 px noise, each with a seed of its own for its tasks.
+ARMS = {"paper": 151, "ur5": 152, "stanford": 153, "seven": 154}
+# Ways that are looked for with the true model: joint vectors drawn by each search, and how many searches.
+SAMPLES, SEARCHES = 100_000, 20
+
+
+def task_configs(name, count, *overrides):
+    """Configurations of random tasks of an arm, images and trials at 0.5 px, run k with the seed k."""
+    config = configured(name, "noise.calibration_px=0.5", "noise.servo_px=0.5", *overrides)
+    front = np.array(config.task.start.values(config.joint_types))
+    for k, ends in enumerate(
+        zip(*random_tasks(truth_of(config), front, count, np.random.default_rng(ARMS[name])), strict=True)
+    ):
+        start, goal = (JointVector(joints=tuple(q.tolist()), unit="rad") for q in ends)
+        asked = {"start": start, "goal": type(config.task.goal)(joints=goal)}
+        task = config.task.model_copy(update=asked)
+        yield config.model_copy(update={"task": task, "seed": k})
+
+
+def true_search(config, *, margins=False):
+    """Constraints, aim, joints at both ends of a task and accelerations by the true model.
+
+    margins : whether it keeps those of the configuration; else none, and a border of 0.
+    """
+    truth, joints, asked = truth_of(config), joints_of(config), config.trajectory
+    start, goal = config.task.start, config.task.goal.joints
+    q_start, q_goal = (np.array(q.values(config.joint_types)) for q in (start, goal))
+    s_start, s_star = (truth.images(q, truth.M_face) for q in (q_start, q_goal))
+    task = Shown(q_start, s_start, s_star, truth.center).task(truth.model)
+    A = truth.M_face @ truth.displacement(q_start).T
+    demands = limits_alone(joints.lower, joints.upper)._replace(
+        speed=joints.speed, image_size=truth.image_size
+    )
+    if margins:
+        deg = np.radians(asked.joint_margin_deg)
+        keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])
+        demands = demands._replace(border_px=asked.border_px, least_face_px=asked.least_face_px, keep=keep)
+    c = constraints_of(truth.model, A, task, q_start, demands)
+    return c, Aim(task.A_star, s_star, 0.0), q_start, q_goal, joints.acceleration
+
+
+def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
+    """What the command line of a study asks for: tasks, arms and where its table goes."""
+    parser = argparse.ArgumentParser(description=about.splitlines()[0])
+    parser.add_argument("--tasks", type=int, default=tasks, help=counted)
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(arms))
+    parser.add_argument("-o", "--output", type=Path, default=Path(f"{study}.csv"), help="every row, as CSV")
+    return parser.parse_args()
+
+
+def has_no_way(config):
+    """Whether no search with the true model finds a way."""
+    c, aim, q_start, q_goal, acceleration = true_search(config)
+    return not any(
+        len(find_way(c, aim, q_start, q_goal[None], Budget(SAMPLES, seed), acceleration).corners)
+        for seed in range(SEARCHES)
+    )
+
+
+def rate(good, count):
+    """A share in percent with its interval of Wilson, 95 %."""
+    if not count:
+        return "-"
+    interval = binomtest(int(good), int(count)).proportion_ci(0.95, "wilson")
+    return f"{100 * good / count:.1f} ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+
+
+def quantiles(values, shares=(0.5, 0.95, 1.0)):
+    """Quantiles of what is a number, in words."""
+    values = np.asarray(values, dtype=float)
+    values = values[np.isfinite(values)]
+    return " / ".join(f"{q:.4g}" for q in np.quantile(values, shares)) if len(values) else "-"
+
+
+def in_two_processes(function, jobs, what):
+    """Results of jobs in their order, behind other work of the machine, with a progress bar."""
+    with ProcessPoolExecutor(2, get_context("spawn"), os.nice, (10,)) as pool:
+        yield from tqdm(pool.map(function, jobs), what, len(jobs), disable=not sys.stderr.isatty())
+
+
+def write_rows(path, rows):
+    """Rows of a table as CSV."""
+    with open(path, "w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(name for row in rows for name in row)))
+        writer.writeheader()
+        writer.writerows(rows)

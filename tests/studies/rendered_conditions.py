@@ -1,0 +1,126 @@
+"""Rendered robots in a study: the arm, its tasks by seed, and the conditions under which it is driven.
+
+    python -m tests.studies.rendered_conditions
+
+draws the tasks anew and writes rendered_tasks.csv beside this file, which the study reads.
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from projservo_cli.config.robot import JointVector
+from projservo_cli.records import FloatArray
+from projservo_cli.stages.simulation import hindrance_of, robot_by_itself, shown_in_frames
+from projservo_cli.stages.world import truth_of
+from projservo_cli.sweeps.design import STRATA, random_tasks
+from tests.conftest import SHARED
+from tests.known import configured
+from tests.studies.planning_tables import write_rows
+
+TASKS = Path(__file__).with_name("rendered_tasks.csv")
+SEEDS = range(1, 31)
+ARM = SHARED / "robots" / "ur5e" / "ur5e.xml"
+# Joints, rad, at which the tool stands upright before the cameras of rendered.yaml.
+FRONT = (-1.6568, -1.5713, 1.6684, -0.0971, 1.4848, 1.5708)
+LEAST_PX = 40.0  # width of the middle tag at start and goal
+SHOWN_FRAMES = 8
+FRAMES = 2  # of each pose of a recording
+
+CONDITIONS = {
+    "ideal": (),
+    "40 ms late": ("disturbance.delay_s=0.04",),
+    "120 ms late, ticks, lag, sag": (  # servos of their own sag
+        *("disturbance.delay_s=0.12", "disturbance.exposure_s=0.01", "disturbance.encoder_ticks=4096"),
+        "disturbance.lag_s=0.05",
+    ),
+    "play, taught images": ("disturbance.play_deg=0.5",),
+    "lens": ("plant.options.k1=-0.1", "calibration.lens=true"),
+    "side light": ("plant.options.light=side",),
+}
+TAUGHT = "play, taught images"
+LATEST = 300  # steps of classical laws
+
+
+def base_of(condition):
+    """Configuration of the arm with its meshes under a condition."""
+    front = f"{{joints: {list(FRONT)}, unit: rad}}"
+    return configured(
+        "rendered",
+        f"robot={{mjcf: {ARM}, tip: attachment_site}}",
+        *(f"calibration.reference={front}", f"task={{start: {front}, goal: {{joints: {front}}}}}"),
+        *(f"noise.shown_frames={SHOWN_FRAMES}", "trajectory.profile=auto", "plant.joint_limits=stop"),
+        *("control.laws=[exact]", "control.mode=track", f"plant.frames={FRAMES}", "plant.settle_s=0.3"),
+        *CONDITIONS[condition],
+    )
+
+
+def tasks_of():
+    """Start and goal joints, rad, by seed."""
+    with open(TASKS, encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return {
+        int(row["seed"]): tuple(
+            np.array([float(row[f"{end}_q{i}"]) for i in range(1, 7)]) for end in ("start", "goal")
+        )
+        for row in rows
+    }
+
+
+def task_config(config, seed, *, taught=False):
+    """A configuration with the task of a seed; its goal is taught by images, or joints."""
+    start, goal = tasks_of()[seed]
+    vectors = [JointVector(joints=tuple(q.tolist()), unit="rad") for q in (start, goal)]
+    kind = type(config.task.goal)
+    aim = kind(joints=vectors[1])
+    if taught:
+        aim = kind.model_validate({"images": taught_images(config, goal, seed)})
+    task = config.task.model_copy(update={"start": vectors[0], "goal": aim})
+    return config.model_copy(update={"task": task, "seed": seed})
+
+
+def taught_images(config, q: FloatArray, seed):
+    """What ``teach`` writes of images at joints (n,)."""
+    truth = truth_of(config)
+    s, sigma = shown_in_frames(config, truth, q, (seed, 7))
+    pixels = [[None if np.isnan(uv).any() else uv.tolist() for uv in view] for view in s]
+    told = [[None if np.isnan(x) else float(x) for x in view] for view in sigma]
+    sides = {"left": pixels[0], "right": pixels[1], "sigma_left_px": told[0], "sigma_right_px": told[1]}
+    return {"markers": list(truth.number)} | sides
+
+
+def drawn():
+    """Tasks of all seeds, those of each sixth of half a turn in turn.
+
+    Their ends show the middle tag well, and the arm touches nothing there, itself included.
+    """
+    config = base_of("ideal")
+    truth = truth_of(config)
+    for seed in SEEDS:
+        rng, found = np.random.default_rng(seed), None
+        while found is None:
+            starts, goals = random_tasks(truth, np.array(FRONT), STRATA, rng)
+            ends = starts[(seed - 1) % STRATA], goals[(seed - 1) % STRATA]
+            robots = [robot_by_itself(config, truth, q, 0.0, 0, 0) for q in ends]
+            free = not any("touches" in hindrance_of(robot) for robot in robots)
+            found = ends if free and all(_shows(config, truth, q) for q in ends) else None
+        yield {"seed": seed} | {
+            f"{end}_q{i}": repr(float(x))
+            for end, q in zip(("start", "goal"), found, strict=True)
+            for i, x in enumerate(q, 1)
+        }
+
+
+def _shows(config, truth, q):
+    """Whether both frames at joints (n,) show the middle tag, as wide as asked for."""
+    face = truth.images(q, truth.M_face)
+    sides = np.linalg.norm(face - np.roll(face, 1, axis=1), axis=2)
+    if sides.max(axis=1).min() < LEAST_PX:
+        return False
+    s, _ = shown_in_frames(config.model_copy(update={"noise": type(config.noise)()}), truth, q, (0, 0))
+    return bool(np.isfinite(s[:, list(truth.face)]).all())
+
+
+if __name__ == "__main__":
+    write_rows(TASKS, list(drawn()))

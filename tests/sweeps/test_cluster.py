@@ -1,0 +1,98 @@
+"""A sweep on a real Dask scheduler with two workers, processes of their own, which are then killed."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from projservo_cli.records import WorkFailed
+from projservo_cli.sweeps import engine
+from tests.sweeps import processes
+
+pytest.importorskip("distributed", reason="distributed is not installed: the extra cluster")
+pytestmark = pytest.mark.volume
+
+
+class Dask:
+    """Scheduler and two workers on this machine."""
+
+    def __init__(self, folder):
+        folder.mkdir()
+        self.folder, self.file = folder, folder / "scheduler.json"
+        self.processes = []
+        self._start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        for _ in range(2):
+            self._start("worker", "--nworkers", "1", "--nthreads", "1", "--no-nanny")
+        end = time.monotonic() + 60
+        while not (self.file.exists() and self.file.stat().st_size):
+            assert time.monotonic() < end, "the scheduler did not start"
+            time.sleep(0.1)
+        self.address = json.loads(self.file.read_text(encoding="utf-8"))["address"]
+
+    def _start(self, kind, *options):
+        command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--scheduler-file", str(self.file)]
+        self.processes.append(
+            subprocess.Popen(
+                [*command, "--no-dashboard", *options],
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env=processes.ENVIRONMENT,
+                cwd=self.folder,
+                start_new_session=True,
+            )
+        )
+
+    def kill(self):
+        """End the scheduler, then what is left of the workers."""
+        for process in self.processes:
+            processes.kill_group(process)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """What starts a cluster, which ends with the test."""
+    started = []
+
+    def begin():
+        started.append(Dask(tmp_path / f"cluster{len(started)}"))
+        return started[-1]
+
+    yield begin
+    for one in started:
+        one.kill()
+
+
+def test_a_killed_worker_is_made_up_for_and_a_killed_scheduler_gone_on_after(cluster, whole, tmp_path):
+    config, reference = whole
+    out, first = tmp_path / "out", cluster()
+    process = processes.start(config, out, "--scheduler", first.address)
+    processes.wait_for_parts(process, out, 2)
+    processes.kill_group(first.processes[1])
+    processes.wait_for_parts(process, out, 8)  # more than were under way
+    processes.kill_group(first.processes[0])
+    code, _, err = processes.finish(process)
+    assert code == 1
+    assert "2 workers of tcp://127.0.0.1" in err
+    assert "the connection to the scheduler is lost; what was stored until then is kept" in err
+    assert "Traceback" not in err, err
+    stored = len(processes.parts(out))
+    assert 8 <= stored < 2 * processes.RUNS / processes.CHUNK
+    code, _, err = processes.finish(processes.start(config, out, "--scheduler", cluster().address))
+    assert code == 0, err
+    assert f"{processes.CHUNK * stored} of {2 * processes.RUNS} runs are stored already" in err
+    assert not processes.differences(out, reference)
+
+
+def test_no_scheduler_at_the_address(monkeypatch):
+    monkeypatch.setattr(engine, "PATIENCE_S", 0.5)
+    with pytest.raises(WorkFailed, match=r"--scheduler tcp://127\.0\.0\.1:9: no answer within 0\.5 s"):
+        engine.Cluster("tcp://127.0.0.1:9")
+
+
+def test_a_cluster_of_other_versions_is_refused(cluster, monkeypatch):
+    address = cluster().address
+    monkeypatch.setattr(engine.provenance, "collect", lambda **_: dict.fromkeys(engine.DECISIVE, "0.1"))
+    with pytest.raises(engine.InputError, match=r"a worker has projservo [0-9.]+ instead of 0\.1"):
+        engine.Cluster(address)

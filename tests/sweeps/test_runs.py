@@ -1,0 +1,169 @@
+"""Rows of a sweep against the ordinary stages: every run redone by itself is its row, to the bit."""
+
+import math
+
+import numpy as np
+import pytest
+
+from projservo_cli.records import WorkFailed
+from projservo_cli.stages import calibrate, plan, servo
+from projservo_cli.stages.scenario import scenario_of
+from projservo_cli.stages.world import truth_of
+from projservo_cli.sweeps import runs
+from projservo_cli.sweeps.design import name_of_run
+from projservo_cli.sweeps.runs import Part, is_compiled, run_part
+from tests.known import configured
+from tests.sweeps.cases import design
+
+# Of each case every run is redone.
+CASES = {
+    "laws": {
+        "grid": {"law": ["direct_three", "exact", "exact_track", "euclidean_points"]},
+        "runs": 1,
+    },
+    "points": {
+        "set": {"control.observation": "points"},
+        "runs": 2,
+        "random": {"control.gain_s": {"uniform": [1, 3]}},
+    },
+    "late images": {"set": {"disturbance.delay_s": 0.08}, "runs": 2},
+    "constrained": {"set": {"trajectory.profile": "constrained"}, "runs": 1, "between_samples": True},
+    "python loop": {"set": {"plant.speed_scale": 0.5, "stop.max_steps": 10}, "runs": 1},
+    "half turn": {"base": "paper", "runs": 2, "set": {"noise.calibration_px": 0.5}},
+    "tasks": {"tasks": {"random": 4}, "grid": {"law": ["direct_two"]}, "runs": 4},
+}
+# Columns of the name of a field of the trace.
+SAME = (
+    "position_error_mm",
+    "rotation_error_deg",
+    "self_occluded_steps_left",
+    "self_occluded_steps_right",
+    "first_outside_image",
+    "first_beyond_limit",
+    "speed_limited_steps",
+    "visibility_limited_steps",
+    "path_length_mm",
+    "center_deviation_at_samples_mm",
+    "center_deviation_mm",
+    "effort",
+    "steps",
+    "success",
+)
+
+
+def part_of(found, first=0, last=None):
+    """A part with all it needs."""
+    calibrations = {}
+    for key, config in found.calibrations():
+        try:
+            calibrations[key] = calibrate.run(config)[1]
+        except WorkFailed:
+            calibrations[key] = None
+    return Part(found, first, found.total if last is None else last, calibrations)
+
+
+@pytest.mark.volume
+@pytest.mark.parametrize("name", CASES)
+def test_every_run_redone_by_the_stages_is_its_row(name):
+    found = design(**CASES[name])
+    part = part_of(found)
+    made = run_part(part)
+    for i in range(found.total):
+        config = found.config(i)
+        cell, _, number, _ = found.numbers(i)
+        calibration = part.calibrations[found.calibration_key(cell, number)]
+        trace = servo.run(config, calibration, plan.run(config, calibration), name_of_run(config))
+        row = {column: values[i] for column, values in made.columns.items()}
+        assert row["verdict"].decode() == trace.verdict
+        assert row["seed"] == config.seed
+        assert row["image_error_px"] == trace.image_error[-1]
+        for column in row.keys() & set(SAME):
+            assert row[column] == getattr(trace, column), column
+        truth = truth_of(config)
+        seen = np.array([truth.images(q, truth.M_face) for q in trace.q])
+        kept = (trace.q >= truth.robot.lower) & (trace.q <= truth.robot.upper)
+        inside = (seen >= -0.5) & (seen <= truth.image_size - 0.5)
+        good = kept.all() and inside.all() and not trace.self_occluded.any()
+        assert row["success"] == (trace.verdict == "converged" and good)
+        R = trace.pose[0, :3, :3].T @ trace.goal_pose[:3, :3]
+        angle = math.degrees(math.acos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+        assert row["rotation_deg"] == pytest.approx(angle, abs=1e-4)
+        centre = trace.center[-1] - trace.center[0]
+        assert abs(np.linalg.norm(centre) * 1e3 - row["distance_mm"]) <= row["position_error_mm"] + 1e-6
+        assert row["path_length_mm"] >= np.linalg.norm(centre) * 1e3 - 1e-9
+
+
+@pytest.mark.volume
+def test_parts_do_not_depend_on_how_runs_are_divided():
+    found = design(runs=3, traces=[1, 4], random={"control.gain_t": {"normal": [2.5, 0.2]}})
+    part = part_of(found)
+    whole = run_part(part)
+    pieces = [
+        run_part(Part(found, first, first + 1, part.calibrations)) for first in reversed(range(found.total))
+    ][::-1]
+    for column, values in whole.columns.items():
+        assert np.concatenate([piece.columns[column] for piece in pieces]).tobytes() == values.tobytes()
+    assert sorted(whole.traces) == [1, 4]
+    assert np.array_equal(whole.traces[4].q, pieces[4].traces[4].q)
+    assert whole.traces[4].law == "stacked"
+
+
+def test_runs_that_cannot_begin_have_a_verdict_and_no_numbers():
+    """Without trials there is no calibration; an offset beyond a joint limit is no start."""
+    made = run_part(part_of(design(runs=1, set={"calibration.frames_per_joint": 0})))
+    assert made.columns["verdict"].tolist() == [b"not calibrated"] * 2
+    assert made.columns["usable"].tolist() == [0, 0]
+    limits = {"task.start_offset": {"joints": [0, 0, 300, 0, 0, 0], "unit": "deg"}}
+    made = run_part(part_of(design(runs=1, set=limits)))
+    assert made.columns["verdict"].tolist() == [b"not started"] * 2
+    assert np.isnan(made.columns["position_error_mm"]).all()
+    assert made.columns["steps"].tolist() == [-1, -1]
+    assert made.columns["success"].tolist() == [0, 0]
+
+
+@pytest.mark.volume
+def test_the_deviation_is_unknown_where_images_alone_show_the_goal():
+    s_star = scenario_of(configured("ur5")).exact.s_star.tolist()
+    goal = {"images": dict(zip(("left", "right"), s_star, strict=True))}
+    made = run_part(part_of(design(runs=1, set={"task.goal": goal}, between_samples=True))).columns
+    assert (made["steps"] > 0).all()
+    assert np.isnan(made["center_deviation_mm"]).all()
+
+
+@pytest.mark.volume
+def test_laws_on_the_same_images_share_the_plan(monkeypatch):
+    planned, plan_of = [], plan.run
+    monkeypatch.setattr(plan, "run", lambda *given: planned.append(given) or plan_of(*given))
+    run_part(part_of(design(**CASES["constrained"] | {"runs": 2, "seed": 7})))
+    assert len(planned) == 2
+
+
+@pytest.mark.volume
+def test_noise_for_fewer_instants_changes_nothing(monkeypatch):
+    """A run that outlasts its noise is made anew with more of it."""
+    part = part_of(design(runs=2))
+    whole = run_part(part).columns
+    assert whole["steps"].min() > 8
+    monkeypatch.setattr(runs, "INSTANTS", 2)
+    for name, values in run_part(part).columns.items():
+        assert values.tobytes() == whole[name].tobytes(), name
+
+
+@pytest.mark.volume
+def test_a_run_whose_images_show_nothing_has_a_verdict_and_no_numbers():
+    """Images so noisy that markers have no place leave nothing to count."""
+    made = run_part(part_of(design(runs=3, set={"noise.servo_px": 3000.0}))).columns
+    lost = made["verdict"] == b"not started"
+    assert lost.any()
+    assert (made["steps"][lost] == -1).all()
+    assert np.isnan(made["effort"][lost]).all()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("plant.speed_scale", 0.5), ("trajectory.profile", "constrained"), ("control.mode", "track")],
+)
+def test_runs_that_need_more_than_their_images_are_made_elsewhere(key, value):
+    plain, other = (design(grid={"law": ["exact"]}, set=given) for given in ({}, {key: value}))
+    assert is_compiled(plain, plain.cell(0))
+    assert not is_compiled(other, other.cell(0))
