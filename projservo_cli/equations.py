@@ -49,7 +49,7 @@ REGISTER = (
         "4",
         "Projective rotation: algebra to group and group to algebra",
         "geometry.algebra.rotation calibration.projective.closed_form_operators "
-        "calibration.forward.displacements",
+        "calibration.prediction.displacements",
         "geometry/test_displacement.py::test_rotation_is_the_matrix_exponential "
         "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0 and ±π: such trial motions are refused.",
@@ -58,7 +58,7 @@ REGISTER = (
         "5",
         "Projective translation: algebra to group and group to algebra",
         "geometry.algebra.translation calibration.projective.closed_form_operators "
-        "calibration.forward.displacements",
+        "calibration.prediction.displacements",
         "geometry/test_displacement.py::test_translation_is_the_matrix_exponential "
         "calibration/test_contract_structure.py::test_the_closed_form_finds_the_same_operators_without_noise",
         "Group to algebra is undefined at 0: such trial motions are refused.",
@@ -66,13 +66,13 @@ REGISTER = (
     _entry(
         "6",
         "Forward kinematics as a product of exponentials",
-        "geometry.kinematics.forward geometry.kinematics.forward_between calibration.forward.moved_points",
+        "geometry.kinematics.forward geometry.kinematics.forward_between calibration.prediction.moved_points",
         "geometry/test_kinematics.py::test_forward_kinematics_is_the_product_of_exponentials",
     ),
     _entry(
         "7",
         "Velocity of a projective point and of its image",
-        "geometry.kinematics.image_velocity calibration.forward.projection_derivative",
+        "geometry.kinematics.image_velocity calibration.prediction.projection_derivative",
         "geometry/test_kinematics.py::test_image_jacobian_is_the_derivative_of_the_pixels",
         "The second row of J_G is printed as 1/m3, 0, …; it is 0, 1/m3, −m2/m3².",
     ),

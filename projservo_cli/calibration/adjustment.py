@@ -23,7 +23,7 @@ import numpy as np
 from scipy.linalg import expm, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
-from projservo_cli.calibration.forward import CAMERA, LENS, Scene, image_points
+from projservo_cli.calibration.prediction import CAMERA, LENS, Scene, image_points
 from projservo_cli.calibration.readings import RAYLEIGH, Readings, per_block
 from projservo_cli.geometry.lens import FIRST, bent
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray

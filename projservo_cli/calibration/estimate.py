@@ -16,14 +16,13 @@ from projservo_cli.calibration.diagnosis import (
     listed,
     noise_at_free_poses,
     other_motion,
-    share_explained,
     unexplained,
     why_lost,
-    with_lens,
 )
 from projservo_cli.calibration.epipolar import Epipolar, ImageFrame
 from projservo_cli.calibration.fit import REFUSE_RATIO, Expected, Misfit, Solution, solve, with_joint_noise
 from projservo_cli.calibration.initialization import Nominal, Search, Tell
+from projservo_cli.calibration.lens_estimation import share_explained, with_lens
 from projservo_cli.calibration.projective import Projective, closed_form_operators
 from projservo_cli.calibration.quality import WEAK_NOISE, cross_validate, judged
 from projservo_cli.calibration.readings import Readings, require_images, require_motion

@@ -11,9 +11,9 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares, minimize, settled
 from projservo_cli.calibration.epipolar import OUTLIER, Epipolar
-from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.initialization import Nominal, Search, carrying, starts
 from projservo_cli.calibration.joint_noise import NO_JOINT_NOISE, JointNoise
+from projservo_cli.calibration.prediction import Scene
 from projservo_cli.calibration.readings import RAYLEIGH, even_choice, medians, per_rad
 from projservo_cli.calibration.triangulation import Tracks
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed

@@ -17,7 +17,7 @@ from projservo_cli.calibration.epipolar import (
     marker_pairs,
     metric_guesses,
 )
-from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.prediction import Scene
 from projservo_cli.calibration.readings import MAD, Readings, per_block
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
 from projservo_cli.records import (

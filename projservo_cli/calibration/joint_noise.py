@@ -21,7 +21,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import JointErrors, LeastSquares
-from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.prediction import Scene
 from projservo_cli.calibration.readings import per_rad
 from projservo_cli.records import BoolArray, FloatArray
 

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from projservo_cli.calibration.adjustment import moved_operators
 from projservo_cli.calibration.epipolar import reconstruct
 from projservo_cli.calibration.fit import OPEN_DIRECTION, Solution
-from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.prediction import Scene
 from projservo_cli.calibration.readings import MOST_JUDGED, ON_A_LINE, Readings, even_choice
 from projservo_cli.geometry.algebra import normalize_displacement
 from projservo_cli.records import BoolArray, Errors, FloatArray, IntArray, WorkFailed

@@ -9,9 +9,8 @@ from scipy.sparse.csgraph import connected_components
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import WARN_RATIO, Expected, Solution, fit_inliers
-from projservo_cli.calibration.forward import Scene
 from projservo_cli.calibration.joint_noise import quantile
-from projservo_cli.calibration.prediction import distance_statistics
+from projservo_cli.calibration.prediction import Scene, distance_statistics
 from projservo_cli.calibration.readings import (
     MOST_JUDGED,
     MOST_REACHES,

@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.epipolar import homogeneous, triangulated
-from projservo_cli.calibration.forward import Scene, projection_derivative
+from projservo_cli.calibration.prediction import Scene, projection_derivative
 from projservo_cli.calibration.readings import per_block
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.records import BoolArray, FloatArray, IntArray

@@ -25,7 +25,8 @@ from projservo_cli.config.robot import CONTRADICTIONS, Finding, Root
 from projservo_cli.config.sweep import SweepConfig
 from projservo_cli.files import text_of
 from projservo_cli.records import InputError
-from projservo_cli.robots import urdf
+from projservo_cli.robots.mjcf import read_mjcf
+from projservo_cli.robots.urdf import read_urdf
 
 try:  # of a text of the largest size, libyaml makes nodes in half a second, PyYAML itself in five
     from yaml import CSafeLoader as _Parser
@@ -477,10 +478,10 @@ def _fill_in_arm(document: _Document) -> None:
             continue
         try:
             if kind == "mjcf":
-                robot["screws"] = urdf.read_mjcf(file, tip)
+                robot["screws"] = read_mjcf(file, tip)
             else:
                 text = text_of(file, "a URDF", _MAX_BYTES)
-                screws = urdf.read_urdf(file, tip, text)
+                screws = read_urdf(file, tip, text)
                 rest = {key: value for key, value in robot.items() if key not in ("urdf", "tip")}
                 document.values["robot"] = {**rest, "screws": screws}
         except InputError as error:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, expm
 
-from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.prediction import Scene
 from projservo_cli.monitoring.frame_pairs import Look
 from projservo_cli.monitoring.statistics import ErrorModel, Residual, Sums
 from projservo_cli.records import CORNERS, BoolArray, FloatArray, IntArray

@@ -7,8 +7,7 @@ import numpy as np
 from scipy.linalg import cho_solve, solve_triangular
 from scipy.special import chdtri
 
-from projservo_cli.calibration.forward import CAMERA, Scene
-from projservo_cli.calibration.prediction import all_changed, scene_of
+from projservo_cli.calibration.prediction import CAMERA, Scene, all_changed, scene_of
 from projservo_cli.calibration.readings import LEAST_SIGMA, per_rad
 from projservo_cli.monitoring.frame_pairs import Look
 from projservo_cli.records import BoolArray, Calibration, FloatArray, IntArray

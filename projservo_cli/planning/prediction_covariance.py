@@ -1,7 +1,4 @@
-"""How far predictions of a calibration err among joints drawn at random.
-
-Along ways as a few directions that are told apart; and which further poses would make them err less.
-"""
+"""Covariance of predictions among joints drawn at random: a few directions that a planner tells apart."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,16 +7,12 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import all_changed, error_factor, scene_of
-from projservo_cli.calibration.readings import even_choice
 from projservo_cli.records import (
     NO_SPREAD,
     BoolArray,
     Calibration,
     FloatArray,
-    InputError,
-    Observation,
     Spread,
-    WorkFailed,
 )
 
 _BATCH = 1500  # poses drawn at once
@@ -98,112 +91,3 @@ def _showing(calibration: Calibration, face: int, bounds: _Bounds, seed: int) ->
         if len(found) >= _LOOKED_AT:
             break
     return found[:_LOOKED_AT]
-
-
-# Poses drawn to choose from, and to judge by; batches before giving up.
-_CANDIDATES, _TARGETS = 300, 150
-_BATCHES = 20
-# Markers that both views must see at a pose for it to tell the joints.
-_LEAST_SEEN = 3
-# Markers that suggestions are judged by, at most.
-_MOST_SHOWN = 25
-# A prediction that errs by more than this share of the image does not say what will be seen.
-_VAGUE = 0.02
-
-
-@dataclass(frozen=True, eq=False)
-class Suggestion:
-    """A pose to record, in the order of choice."""
-
-    q: FloatArray  # (n,) joint readings, rad or m
-    from_pose: int  # number of the nearest pose recorded
-    delta: FloatArray  # (n,) the way from it, rad or m
-    # variance_before, variance_after: of predicted coordinates over the region of the data, px²
-    variance_before: float
-    variance_after: float
-
-
-def suggest(
-    calibration: Calibration,
-    observation: Observation,
-    candidates: Region,
-    targets: Region,
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[Suggestion, ...]:
-    """Poses that reduce the mean variance of predictions most, one after the other.
-
-    V-optimality, the mean variance over a region, taken greedily over random candidates: A. C.
-    Atkinson, A. N. Donev, R. D. Tobias, "Optimum Experimental Designs, with SAS", 2007, chapter 10.
-    With Λ Λᵀ the covariance, C the derivative of what a pose would show and T that of the targets,
-    both times Λ, the pose leaves tr T (I + Cᵀ C / σ²)⁻¹ Tᵀ. Markers count as seen where they are
-    predicted within the image; of many markers some stand for all.
-
-    calibration : with its covariance.
-    observation : what it was made from.
-    candidates : region of the poses to choose from.
-    targets : region of the poses that are to be predicted well.
-    count : poses to suggest.
-    rng : draws both.
-    Raises InputError if the method of the calibration has no covariance; WorkFailed if no pose of a region
-    shows the markers to both views.
-    """
-    if not calibration.has_covariance:
-        raise InputError(
-            f"suggestions need a covariance, which the method {calibration.method} has not: "
-            "use --set calibration.method=refined"
-        )
-    few = calibration.with_markers(even_choice(len(calibration.M), _MOST_SHOWN))
-    sigma = max(calibration.sigma_px, calibration.sigma_fitted_px)
-    _, T = _shown(few, targets, _TARGETS, rng)
-    q, C = _shown(few, candidates, _CANDIDATES, rng)
-    coordinates = np.count_nonzero(T.any(axis=2))
-    rows = T.reshape(-1, T.shape[2])
-    gram = rows.T @ rows
-    C /= sigma
-    left = np.ones(len(q), dtype=np.bool_)
-    found: list[Suggestion] = []
-    for _ in range(min(count, len(q))):
-        before = float(np.trace(gram)) / coordinates
-        inner = np.eye(C.shape[1]) + C @ np.swapaxes(C, 1, 2)
-        gain = np.trace(np.linalg.solve(inner, C @ gram @ np.swapaxes(C, 1, 2)), axis1=1, axis2=2)
-        best = int(np.argmax(np.where(left, gain, -np.inf)))
-        left[best] = False
-        # What is left of Λ after the pose: its product with the root of (I + Cᵀ C)⁻¹.
-        root = np.linalg.inv(np.linalg.cholesky(np.eye(C.shape[2]) + C[best].T @ C[best])).T
-        C, gram = C @ root, root.T @ gram @ root
-        after = float(np.trace(gram)) / coordinates
-        nearest = int(np.argmin(np.linalg.norm(observation.q - q[best], axis=1)))
-        number = int(observation.pose[nearest])
-        found.append(Suggestion(q[best], number, q[best] - observation.q[nearest], before, after))
-    return tuple(found)
-
-
-def _shown(
-    calibration: Calibration, region: Region, count: int, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """Random poses (k, n) that show enough markers, and the derivative (k, 4 m, r) of what they show.
-
-    Rows of what is not seen are zero.
-    """
-    scene = scene_of(calibration)
-    poses: list[FloatArray] = []
-    rows: list[FloatArray] = []
-    for q, seen in drawn_poses(calibration, region, _BATCHES, rng):
-        enough = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)[: count - len(poses)]
-        if enough.size:
-            J = all_changed(scene, calibration.errors, q[enough] - calibration.q_reference)
-            sharp = np.sqrt((J**2).sum(axis=-1)).max(axis=-1) <= _VAGUE * np.ptp(region.image, axis=1).max()
-            seen = seen[enough] & sharp
-            J[~seen] = 0.0
-            useful = np.flatnonzero(seen.all(axis=1).sum(axis=1) >= _LEAST_SEEN)
-            poses += list(q[enough[useful]])
-            rows += list(J.reshape(len(J), -1, J.shape[-1])[useful])
-        if len(poses) >= count:
-            break
-    if not poses:
-        raise WorkFailed(
-            f"no further pose to suggest: none within the joint ranges shows {_LEAST_SEEN} markers to both "
-            "cameras as far as the calibration can tell; make it better with single-joint trials first"
-        )
-    return np.array(poses), np.array(rows)

@@ -7,7 +7,7 @@ import numpy as np
 
 from projservo_cli.records import CORNERS, ByteArray, FloatArray, InputError
 from projservo_cli.rendered.model import CAMERAS, FINER, RenderedModel, drawn_at, lens_of
-from projservo_cli.robots.urdf import mujoco, no_gl
+from projservo_cli.robots.mjcf import mujoco, no_gl
 
 _STILL = 1e-5  # rad or m: what joints move less in an exposure blurs nothing
 

@@ -15,8 +15,8 @@ from projservo_cli.config.robot import Rig, RobotSettings
 from projservo_cli.detection import TagFinder
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray
+from projservo_cli.robots.mjcf import chain_of, compiled, mujoco, spec_of, tip_of
 from projservo_cli.robots.simulated import Arm, roll_axis
-from projservo_cli.robots.urdf import chain_of, compiled, mujoco, spec_of, tip_of
 
 # Thickness of the first link of an arm and of the last, in lengths of the arm, and of none in any.
 _THICK, _THIN, _LEAST_LINK_M = 0.05, 0.03, 1e-3

@@ -8,7 +8,7 @@ import numpy as np
 
 from projservo_cli.records import PRISMATIC, FloatArray, InputError, WorkFailed
 from projservo_cli.rendered.model import RenderedModel
-from projservo_cli.robots.urdf import mujoco
+from projservo_cli.robots.mjcf import mujoco
 
 _STEP_S = 0.002  # longest step of the integration
 _RATE = 100.0  # 1/s, at which a servo that need not sag takes back an error

@@ -15,7 +15,8 @@ from projservo_cli.calibration import (
 from projservo_cli.config import Config
 from projservo_cli.files import write_whole
 from projservo_cli.observations import Observations
-from projservo_cli.planning.prediction_covariance import Region, Suggestion, suggest
+from projservo_cli.planning.pose_selection import Suggestion, suggest
+from projservo_cli.planning.prediction_covariance import Region
 from projservo_cli.records import Calibration, CrossValidation, FloatArray, Observation
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.record import observed, seed_of_trials

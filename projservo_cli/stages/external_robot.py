@@ -14,9 +14,10 @@ from projservo_cli.monitoring.monitor import ImageMonitor
 from projservo_cli.monitoring.statistics import WINDOW
 from projservo_cli.records import VIEWS, Calibration, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots import plugins
-from projservo_cli.robots.client import DrivenRobot, Known, Steered
+from projservo_cli.robots.client import DrivenRobot, Known
 from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading, Robot
 from projservo_cli.robots.latency import NOTHING_KNOWN, DelayPrior
+from projservo_cli.robots.pacing import Steered
 from projservo_cli.robots.simulated import Plant, observe
 from projservo_cli.stages.scenario import SERVO_NOISE, Scenario
 from projservo_cli.stages.simulation import FaultyRobot, Points, hindrance_of, robot_of

@@ -20,8 +20,8 @@ from projservo_cli.planning.product_space import duration, evenly, plan_path
 from projservo_cli.planning.rrt_connect import Budget, Way, find_way, first_within, margins_at, within_region
 from projservo_cli.planning.time_parameterization import Pace, joints_at, least_time
 from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Plan, Spread, WorkFailed
+from projservo_cli.stages.plan_summary import sight_words, verdict_of
 from projservo_cli.stages.scenario import Scenario
-from projservo_cli.stages.verdicts import sight_words, verdict_of
 from projservo_cli.task.body import SETTLED, fit_body
 from projservo_cli.task.face import Task
 from projservo_cli.task.target import Shown

@@ -37,9 +37,8 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
-from projservo_cli.stages.plan_summary import reason_of, told_of
+from projservo_cli.stages.plan_summary import least_of, reason_of, told_of, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
-from projservo_cli.stages.verdicts import least_of, verdict_of
 from projservo_cli.stages.world import Joints
 from projservo_cli.task.face import Task, center_of, face_plane
 from projservo_cli.task.partition import Parts

@@ -18,8 +18,8 @@ from projservo_cli.config.markers import DICTIONARY, cells_of
 from projservo_cli.config.models import FAULTS
 from projservo_cli.detection import LEAST_CELL
 from projservo_cli.records import CORNERS, VIEWS, FloatArray, InputError, IntArray, Observation, WorkFailed
-from projservo_cli.robots.client import Steered
 from projservo_cli.robots.contract import ForeignRobot, Reading, at_rest_after
+from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages import Progress, silent
 from projservo_cli.stages.external_robot import (
     averaged,

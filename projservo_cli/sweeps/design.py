@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from projservo_cli.calibration.forward import displacements, image_points, moved_points
+from projservo_cli.calibration.prediction import displacements, image_points, moved_points
 from projservo_cli.config import Config, Override, load_config, to_yaml
 from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig

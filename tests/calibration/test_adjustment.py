@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from projservo_cli.calibration import adjustment
 from projservo_cli.calibration.adjustment import LeastSquares, minimize
-from projservo_cli.calibration.forward import Scene, displacements
+from projservo_cli.calibration.prediction import Scene, displacements
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics, image_jacobian, joint_operators
 from projservo_cli.records import Model

@@ -10,8 +10,7 @@ import pytest
 from projservo_cli.calibration import calibrate, predict, residual_statistics
 from projservo_cli.calibration.adjustment import LeastSquares
 from projservo_cli.calibration.fit import Solution
-from projservo_cli.calibration.forward import Scene
-from projservo_cli.calibration.prediction import all_changed
+from projservo_cli.calibration.prediction import Scene, all_changed
 from projservo_cli.calibration.projective import Projective
 from projservo_cli.calibration.readings import Readings
 from projservo_cli.geometry.kinematics import forward_kinematics

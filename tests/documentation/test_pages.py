@@ -12,7 +12,7 @@ import pytest
 import projservo_cli
 from projservo_cli import cli
 from projservo_cli.config import load_config
-from projservo_cli.robots.urdf import mujoco
+from projservo_cli.robots.mjcf import mujoco
 from projservo_cli.stages.world import truth_of
 from tests.detection.rendering import render, square
 from tests.documentation.blocks import DOCS, ROOT, blocks_of, imported, matches, run_page

@@ -10,8 +10,14 @@ from scipy.linalg import expm
 
 from projservo_cli.calibration import calibrate as calibrated
 from projservo_cli.calibration import predict
-from projservo_cli.calibration.forward import Scene, displacements, image_points, moved_points
-from projservo_cli.calibration.prediction import all_changed, scene_of
+from projservo_cli.calibration.prediction import (
+    Scene,
+    all_changed,
+    displacements,
+    image_points,
+    moved_points,
+    scene_of,
+)
 from projservo_cli.monitoring import statistics
 from projservo_cli.monitoring.frame_pairs import Look
 from projservo_cli.monitoring.monitor import ImageMonitor

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from projservo_cli.calibration.forward import Scene
+from projservo_cli.calibration.prediction import Scene
 from projservo_cli.records import LAWS, METRIC_LAWS, MODES_OF, PRISMATIC, Calibration, name_of
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import Material

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.config import load_config
-from projservo_cli.robots.client import Steered
 from projservo_cli.robots.contract import ForeignRobot, at_rest_after
+from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages.external_robot import bounds_of, way_to
 from projservo_cli.stages.simulation import robot_by_itself
 from projservo_cli.stages.world import joints_of, truth_of

@@ -12,8 +12,8 @@ import pytest
 
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots import contract
-from projservo_cli.robots.client import Steered
 from projservo_cli.robots.contract import Bounds, ForeignRobot, at_rest_after
+from projservo_cli.robots.pacing import Steered
 from projservo_cli.stages.external_robot import way_to
 
 PERIOD = 0.04

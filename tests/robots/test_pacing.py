@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from projservo_cli.robots.client import SetPoint
 from projservo_cli.robots.contract import Bounds
+from projservo_cli.robots.pacing import SetPoint
 
 PERIOD = 0.04
 SAG = np.full(2, math.radians(1.0))

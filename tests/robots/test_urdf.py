@@ -7,12 +7,12 @@ import pytest
 
 from projservo_cli.config import load_config
 from projservo_cli.records import InputError
-from projservo_cli.robots import urdf
+from projservo_cli.robots import mjcf
 from projservo_cli.stages.world import arm_of
 from tests.samples import displacement
 
 try:
-    mujoco = urdf.mujoco()
+    mujoco = mjcf.mujoco()
 except InputError as error:
     pytest.skip(str(error), allow_module_level=True)
 

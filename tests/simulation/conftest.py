@@ -7,7 +7,7 @@ from projservo_cli.config import load_config
 from projservo_cli.records import InputError
 from projservo_cli.rendered.cameras import Frames
 from projservo_cli.rendered.model import rendered_model
-from projservo_cli.robots.urdf import mujoco
+from projservo_cli.robots.mjcf import mujoco
 from projservo_cli.stages.world import truth_of
 
 # A two-joint arm before two cameras, of which the left one has skew, the right one unequal focal lengths.

@@ -1,4 +1,4 @@
-"""How the time of a calibration grows with the number of points: ``python -m tests.studies.calibration_scale``.
+"""How the time of a calibration grows with its points: ``python -m tests.studies.calibration_scale``.
 
 Writes docs/scale.csv, a row a number of points: seconds of the processor and peak memory of a process of its
 own, draws docs/scale.svg and prints the slope of log time by log points.

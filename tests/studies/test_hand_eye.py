@@ -10,7 +10,7 @@ cv2 = pytest.importorskip("cv2")
 if not hasattr(cv2, "calibrateHandEye"):
     pytest.skip("OpenCV 5 has no hand-eye calibration", allow_module_level=True)
 
-from tests.studies import hand_eye
+from tests.studies import hand_eye  # noqa: E402
 
 
 def test_every_method_finds_the_cameras_and_the_tool_of_exact_images():

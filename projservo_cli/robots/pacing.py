@@ -1,0 +1,102 @@
+"""Pacing of set-points: one absolute set-point a period, within limits, and lag and sag of servos."""
+
+import math
+
+import numpy as np
+
+from projservo_cli.records import BoolArray, FloatArray
+from projservo_cli.robots.contract import Bounds, ForeignRobot, Reading
+from projservo_cli.robots.latency import History
+
+# Share of the sag allowed for that a servo may still be behind where sag is told from lag.
+_STILL = 0.2
+
+
+class SetPoint:
+    """The set-point of a robot.
+
+    bounds : of its commands, with what is taken of its servos.
+    q : (n,) first reading, rad or m: where it is sent at first.
+    ``target``: (n,) the set-point, rad or m. ``short``: (n,) joints whose last step was cut short because the
+    set-point was too far ahead of the reading.
+    """
+
+    def __init__(self, bounds: Bounds, q: FloatArray) -> None:
+        self._bounds, self.target = bounds, q.copy()
+        self.short: BoolArray = np.zeros(len(q), dtype=np.bool_)
+        self._q, self._sag = q.copy(), np.zeros(len(q))
+        self._behind = np.zeros(len(q))  # by how much a servo of that lag would be
+
+    @property
+    def at_rest(self) -> FloatArray:
+        """Joints (n,) at which the arm comes to rest if nothing more is sent, rad or m."""
+        return self.target - self._sag
+
+    def read(self, q: FloatArray, seconds: float) -> None:
+        """Learn the sag from a reading (n,), so long after the last one: only while hardly anything moves."""
+        self._q = q.copy()
+        weight = 1.0 / (1.0 + (self._behind / (_STILL * self._bounds.sag)) ** 2)
+        share = -math.expm1(-seconds / self._bounds.lag_s)
+        self._sag += share * weight * (self.target - q - self._sag)
+
+    def step(self, dq: FloatArray, seconds: float) -> tuple[FloatArray, FloatArray]:
+        """Go on by a joint step (n,), rad or m, in so many seconds: the set-point (n,) and its speed (n,)."""
+        bounds, lag, before, q = self._bounds, self._bounds.lag_s, self.target, self._q
+        target = np.clip(before + dq, *bounds.not_far_ahead(q))
+        self.short = target != before + dq
+        self.target = np.clip(target, *bounds.within_limits(q))
+        speed = np.clip((self.target - before) / seconds, -bounds.speed, bounds.speed)
+        fades = math.exp(-seconds / lag)
+        self._behind = fades * self._behind + (1.0 - fades) * lag * np.abs(speed)
+        return self.target.copy(), speed
+
+
+class Steered:
+    """A robot that is sent absolute set-points, the sum of the steps asked for, one a period.
+
+    The robot itself accumulates nothing.
+
+    robot : what is driven.
+    ``reading``: of the last look. ``history``: joint readings of all looks. ``set_point``: where it is sent,
+    at first where it is read to stand. ``overruns``: periods that reading and thinking did not fit into.
+    """
+
+    reading: Reading
+    set_point: SetPoint
+
+    def __init__(self, robot: ForeignRobot) -> None:
+        self.robot, self.history, self.overruns = robot, History(), 0
+        self._due: float | None = None
+
+    @property
+    def target(self) -> FloatArray:
+        """The set-point (n,), rad or m."""
+        return self.set_point.target
+
+    def look(self) -> Reading:
+        """Read joints and images."""
+        self.reading = self.robot.read()
+        t, q = self.reading.t_q, self.reading.q
+        if self.history:
+            self.set_point.read(q, t - self.history.last[0])
+        else:
+            self.set_point = SetPoint(self.robot.bounds, q)
+        self.history.add(t, q)
+        return self.reading
+
+    def command(self, step: FloatArray, period: float) -> None:
+        """Move the set-point by a step (n,), rad or m, and wait until the period, s, is over."""
+        now = self.robot.now()
+        due = (now if self._due is None else self._due) + period
+        if now > due:  # thinking took too long, and no set-point must be due in the past
+            due = now + period
+            self.overruns += 1
+        self.robot.command(*self.set_point.step(step, period), due)
+        self._due = due
+        if self.robot.wait_until(due):
+            self.overruns += 1
+
+    def hold(self) -> Reading:
+        """Hold the set-point for a period, and look."""
+        self.command(np.zeros_like(self.reading.q), self.robot.bounds.period)
+        return self.look()
