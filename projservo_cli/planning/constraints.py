@@ -1,18 +1,7 @@
 """Whether joints keep what must hold, as numbers with a sign, from the calibrated model alone.
 
-Each margin is positive where its constraint holds:
-
-- limits: the least distance of a joint from its limits over the margin asked for;
-- front: the least third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
-  the sign, which nothing else fixes in projective space;
-- side: a·O of the face and a camera over its value at the start, carried by the dual motion H⁻ᵀ;
-- width: the least width of the image of the face, px, for an angle means nothing in projective space;
-- border: the least distance of a marker of the face from the border of an image, px, less what its prediction
-  may be off;
-- clear: the least distance from a region that is kept out of, px, less what a prediction may be off: of all
-  markers, and of all points between those of the face.
-
-Of a tool with several tags side, width and border are those of the tag that keeps them best.
+The margins are those of ``planning.margins``. Of a tool with several tags visibility, width and image are
+those of the tag that keeps them best.
 
 Joints are valid where each margin is above what is asked for, and that is no more than a share of what start
 and goal have themselves, rising to its full value within ``RISE`` of them.
@@ -28,12 +17,22 @@ from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import put_row
 from projservo_cli.geometry.kinematics import backward, forward, forward_kinematics, row
 from projservo_cli.planning.keep_out import BOTH, NO_KEEP_OUT, KeepOut, clearance, squared
-from projservo_cli.planning.margins import Demands, from_border, pixel, straight_pixel, tag_planes
+from projservo_cli.planning.margins import (
+    CLEAR,
+    FRONT,
+    IMAGE,
+    JOINTS,
+    MARGINS,
+    VISIBILITY,
+    Demands,
+    from_border,
+    pixel,
+    straight_pixel,
+    tag_planes,
+)
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray, Model, Spread
 from projservo_cli.task.face import Task, center_of, face_plane
 
-LIMITS, FRONT, SIDE, WIDTH, BORDER, CLEAR = 0, 1, 3, 5, 7, 9
-MARGINS = 10  # all but the limits and clear by view
 # Of what start and goal have themselves, so much is asked for there.
 SHARE = 0.5
 # Motion, s at the speed limits, from start or goal within which demands rise to their full value.
@@ -114,7 +113,7 @@ def _put_limits(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
     least = math.inf
     for i in range(q.shape[0]):
         least = min(least, min(q[i] - c.lower[i], c.upper[i] - q[i]) / c.keep[i])
-    margins[LIMITS] = least
+    margins[JOINTS] = least
 
 
 @merged
@@ -176,10 +175,10 @@ def _put_best_sight(c: Constraints, q: FloatArray, shown: bool, trial: "Trial") 
         least = math.inf
         for i in range(6):
             unit = 1.0 if i < 2 else FINE_PX
-            least = min(least, (trial.sight[i] - trial.demands[SIDE + i]) / unit)
+            least = min(least, (trial.sight[i] - trial.demands[VISIBILITY + i]) / unit)
         if tag == 0 or least > best:
             best = least
-            put_row(trial.margins[SIDE:CLEAR], trial.sight)
+            put_row(trial.margins[VISIBILITY:CLEAR], trial.sight)
 
 
 @merged
@@ -283,13 +282,13 @@ def put_margins(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     # What a prediction is off, at most or, where that may tell, there.
     left = right = most = c.spread.most
     anywhere = FAR_OFF * most
-    room = min(margins[BORDER] - c.full[BORDER], margins[BORDER + 1] - c.full[BORDER + 1])
+    room = min(margins[IMAGE] - c.full[IMAGE], margins[IMAGE + 1] - c.full[IMAGE + 1])
     near = room < DEVIATIONS * most or margins[CLEAR] - c.full[CLEAR] < DEVIATIONS * anywhere
     if shown and most > 0.0 and near:
         left, right = most_off(c, q, H)
         anywhere = max(left, right)
-    margins[BORDER] -= DEVIATIONS * left
-    margins[BORDER + 1] -= DEVIATIONS * right
+    margins[IMAGE] -= DEVIATIONS * left
+    margins[IMAGE + 1] -= DEVIATIONS * right
     margins[CLEAR] -= DEVIATIONS * anywhere
 
 
@@ -366,9 +365,9 @@ def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
     for i in range(MARGINS):
         if not trial.margins[i] > trial.demands[i]:
             trial.failures[i] += 1
-            for j in range(q.shape[0] if i == LIMITS else 0):
+            for j in range(q.shape[0] if i == JOINTS else 0):
                 room = min(q[j] - c.lower[j], c.upper[j] - q[j]) / c.keep[j]
-                trial.failures[MARGINS + j] += not room > trial.demands[LIMITS]
+                trial.failures[MARGINS + j] += not room > trial.demands[JOINTS]
             return False
     return True
 

@@ -15,7 +15,6 @@ from projservo_cli.geometry.jit import internal, merged, njit
 from projservo_cli.geometry.kernels import put_row, solve_normal
 from projservo_cli.geometry.kinematics import forward, image_motion, operators_at
 from projservo_cli.planning.constraints import (
-    BORDER,
     DEVIATIONS,
     FINE_PX,
     Constraints,
@@ -26,7 +25,7 @@ from projservo_cli.planning.constraints import (
     put_margins,
     twin_of,
 )
-from projservo_cli.planning.margins import straight_pixel
+from projservo_cli.planning.margins import IMAGE, straight_pixel
 from projservo_cli.records import PRISMATIC, FloatArray
 
 # Newton steps from one start; one that is not near after half of them is given up.
@@ -257,7 +256,7 @@ def _put_solutions(
 def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
     """Whether the goal is shown at joints (n,), but for their limits: ``SHOWN``, ``HIDDEN`` or ``BARRED``."""
     put_margins(c, q, trial)
-    for j in range(1, BORDER):
+    for j in range(1, IMAGE):
         if not trial.margins[j] > 0.0:
             return HIDDEN
     # A goal was chosen, and is seen on arrival: what its prediction may be off speaks for it.

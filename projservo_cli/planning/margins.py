@@ -1,11 +1,21 @@
-"""How far a planned motion is from what must not happen: its joints and its margins.
+"""Constraints of a planned motion, by name and in words, and the margins of a motion along shares or joints.
 
-Each margin is a number, positive where its constraint holds:
+Each margin is a number, positive where its constraint holds. Of joints (n,), as ``planning.constraints``
+writes them, less what a prediction may be off:
 
-- visibility: a·O of the face and a camera over its value at the start, [RH00] section 4.2; 0 where the
-  camera looks along the face;
-- image: distance of a marker from the border of an image less ``border_px``, over half the shorter
-  side of the image less ``border_px``; 1 in the middle of a square image;
+- joints: the least distance of a joint from its limits over the margin asked for;
+- front: the least third coordinate of P·M of a marker over that at the start: [RH00] section 4.2 carries
+  the sign, which nothing else fixes in projective space;
+- visibility: a·O of the face and a camera over its value at the start, carried by the dual motion H⁻ᵀ;
+- width: the least width of the image of the face, px, for an angle means nothing in projective space;
+- image: the least distance of a marker of the face from the border of an image, px;
+- clear: the least distance from a region that is kept out of, px: of all markers, and of all points between
+  those of the face.
+
+Of a motion of the face, the worse camera counts, and
+
+- image: that distance less ``border_px``, over half the shorter side of the image less ``border_px``; 1 in
+  the middle of a square image;
 - joints: distance of a joint from its nearer limit over half its range; 1 in the middle;
 - conditioning: reciprocal condition of the image Jacobian less ``conditioning``.
 
@@ -41,8 +51,47 @@ from projservo_cli.records import FloatArray, IntArray, Model
 from projservo_cli.task.trajectory import displaced
 from projservo_cli.task.visibility import margin_coefficients
 
-CONSTRAINTS = ("visibility", "image", "joints", "conditioning")
-VISIBILITY, IMAGE, JOINTS, CONDITIONING = range(4)
+# Columns of the margins of joints, a pair of them where each camera has its own.
+JOINTS, FRONT, VISIBILITY, WIDTH, IMAGE, CLEAR = 0, 1, 3, 5, 7, 9
+MARGINS = 10
+# No margin of joints alone: the motion between them has it.
+CONDITIONING = MARGINS
+
+
+class Words(NamedTuple):
+    """Name of a constraint and of its value in its own unit; phrases take a joint's number or a view."""
+
+    name: str
+    value: str
+    stops: str  # names what stops a search
+    asked: str  # names what is asked of it
+
+
+CONSTRAINTS = {
+    JOINTS: Words("joints", "joints", "the limits of joint {}", "limit of joint {}"),
+    FRONT: Words("front", "front", "a marker behind the {} camera", "depth before the {} camera"),
+    VISIBILITY: Words(
+        "visibility", "visibility", "the face edge-on to the {} camera", "visibility from the {} camera"
+    ),
+    WIDTH: Words(
+        "width", "width_px", "the width of the face in the {} image", "width of the face in the {} image"
+    ),
+    IMAGE: Words("image", "border_px", "the border of the {} image", "border in the {} image"),
+    CLEAR: Words("clear", "clear_px", "a region that is kept out of", "distance from regions"),
+    CONDITIONING: Words(
+        "conditioning", "condition", "dependent operators", "reciprocal condition of the image Jacobian"
+    ),
+}
+# Constraints of a motion of the face, in the order of its margins.
+OF_MOTION = (VISIBILITY, IMAGE, JOINTS, CONDITIONING)
+
+
+def constraint_at(column: int) -> tuple[Words, int]:
+    """Return what a margin of joints is of, and of which view where each camera has its own."""
+    first = max(first for first in CONSTRAINTS if first <= column)
+    return CONSTRAINTS[first], column - first
+
+
 # A margin this bad is as bad as it gets: joints out of reach.
 WORST = -10.0
 # Distance, px, from the border of an image of what no camera shows.
@@ -102,7 +151,7 @@ class Along(NamedTuple):
     q: FloatArray  # (s, n) joints, rad or m; NaN from where they cannot follow
     limit: FloatArray  # (s,) margins of the joint limits, NaN likewise
     condition: FloatArray  # (s,) reciprocal conditions of the image Jacobian, NaN likewise
-    # (s, 4) the smallest of each of ``CONSTRAINTS``; ``WORST`` where the joints cannot follow
+    # (s, 4) the smallest of each of ``OF_MOTION``; ``WORST`` where the joints cannot follow
     margins: FloatArray
 
 
@@ -348,17 +397,17 @@ def measured(motion: Motion) -> Motion:
     found.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):
         _put_best_tag(reaching, border, found)
-    found.margins[:, VISIBILITY] = found.visibility.min(axis=1)
-    found.margins[:, IMAGE] = image_margin(demands, found.distance.min(axis=1))
+    found.margins[:, OF_MOTION.index(VISIBILITY)] = found.visibility.min(axis=1)
+    found.margins[:, OF_MOTION.index(IMAGE)] = image_margin(demands, found.distance.min(axis=1))
     put_joint_margins(demands, found)
     return motion
 
 
 def put_joint_margins(demands: Demands, found: Along) -> None:
     """Write the margins of joint limits and conditioning."""
-    followed = ~np.isnan(found.condition)
-    found.margins[:, JOINTS] = np.where(followed, found.limit, 1.0)
-    found.margins[:, CONDITIONING] = np.where(followed, found.condition - demands.conditioning, WORST)
+    followed, excess = ~np.isnan(found.condition), found.condition - demands.conditioning
+    found.margins[:, OF_MOTION.index(JOINTS)] = np.where(followed, found.limit, 1.0)
+    found.margins[:, OF_MOTION.index(CONDITIONING)] = np.where(followed, excess, WORST)
 
 
 def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> FloatArray:

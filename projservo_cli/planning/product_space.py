@@ -17,6 +17,7 @@ from projservo_cli.geometry.kernels import put_row
 from projservo_cli.planning.constraints import time_between
 from projservo_cli.planning.margins import (
     IMAGE,
+    OF_MOTION,
     VISIBILITY,
     Along,
     Carrier,
@@ -51,7 +52,7 @@ ROUND_OFF = 1e-9
 CHECKS = 151
 # Shares of this part of the best one are as good; the quicker path is better.
 EQUALLY = 0.95
-VIEWS = [VISIBILITY, IMAGE]
+VIEWS = [OF_MOTION.index(VISIBILITY), OF_MOTION.index(IMAGE)]
 
 
 def duration(motion: Motion) -> float:

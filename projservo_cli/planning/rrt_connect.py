@@ -12,11 +12,7 @@ import numpy as np
 
 from projservo_cli.geometry.jit import internal, njit
 from projservo_cli.planning.constraints import (
-    BORDER,
-    CLEAR,
     DEVIATIONS,
-    FRONT,
-    LIMITS,
     SHARE,
     Constraints,
     Trial,
@@ -27,6 +23,7 @@ from projservo_cli.planning.constraints import (
 )
 from projservo_cli.planning.goal_configurations import STARTS, UNSURE, Aim, goals_of
 from projservo_cli.planning.keep_out import only
+from projservo_cli.planning.margins import CLEAR, FRONT, IMAGE, JOINTS
 from projservo_cli.planning.time_parameterization import Pace, least_time, timed
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray
 
@@ -83,7 +80,7 @@ class Way(NamedTuple):
 
 def may_start(had: FloatArray) -> bool:
     """Whether a way may begin at joints of such margins (10,): at a limit, but not at the edge of a view."""
-    return bool(had[LIMITS] >= 0.0 and (had[FRONT:] > 0.0).all())
+    return bool(had[JOINTS] >= 0.0 and (had[FRONT:] > 0.0).all())
 
 
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
@@ -152,7 +149,7 @@ def find_way(
     far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
     had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
-    had[BORDER:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
+    had[IMAGE:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
     trial = new_trial(n, len(c.M))
     region, nowhere = within_region(c, start), np.empty((0, n))
     way = Way(goals, len(every), *counts, trial.failures, had, region, c, nowhere)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from projservo_cli.config import Config
 from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.kinematics import project
+from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
     IMAGE_TRACK,
     REPLAN,
@@ -43,7 +44,9 @@ Data = dict[str, npt.NDArray[Any]]
 
 PAGE_FILE, VIEW_FILE, ANIMATION_FILE = "report.html", "view.html", "animation.gif"
 CLAIMS_FILE = "claims.json"
-NEAREST = ("visibility", "border_px", "joints", "condition")  # smallest along the planned motion
+NEAREST = tuple(
+    CONSTRAINTS[constraint].value for constraint in OF_MOTION
+)  # smallest along the planned motion
 LISTS = ("outliers", "suspect_joint_readings", "swapped")  # single observations that do not fit
 _COUNTS = ("merged_poses", "merged_markers")
 _NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")

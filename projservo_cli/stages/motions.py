@@ -11,10 +11,10 @@ from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
-from projservo_cli.planning.constraints import BORDER, CLEAR, Constraints, constraints_of
+from projservo_cli.planning.constraints import Constraints, constraints_of
 from projservo_cli.planning.goal_configurations import Aim
 from projservo_cli.planning.keep_out import keep_out_of
-from projservo_cli.planning.margins import Demands, Motion, Reaching, along_joints, along_shares
+from projservo_cli.planning.margins import CLEAR, IMAGE, Demands, Motion, Reaching, along_joints, along_shares
 from projservo_cli.planning.prediction_covariance import spread_of
 from projservo_cli.planning.product_space import duration, evenly, plan_path
 from projservo_cli.planning.rrt_connect import Budget, Way, find_way, first_within, margins_at, within_region
@@ -234,7 +234,7 @@ class Ways:
             P = self._c.model.P.copy()
             P[:, :2] += px[:, :, None] * P[:, 2:]
             c = self._c._replace(spread=NO_SPREAD, model=self._c.model._replace(P=P))
-            if margins_at(c, joints)[0][BORDER:].min() < 0.0:
+            if margins_at(c, joints)[0][IMAGE:].min() < 0.0:
                 return True
         return False
 
@@ -245,7 +245,7 @@ class Ways:
         """
         self._made += 1
         plan, asked, full = self._plan, self._trajectory, self._c.full.copy()
-        full[BORDER:CLEAR] += np.abs(off).max(axis=1)
+        full[IMAGE:CLEAR] += np.abs(off).max(axis=1)
         full[CLEAR] += np.abs(off).max()
         c = self._c._replace(full=full)
         how = Budget(asked.search.samples, asked.search.seed + self._made, asked.goals, shunned)

@@ -6,26 +6,19 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.planning.constraints import (
-    BORDER,
-    CLEAR,
-    FRONT,
-    LIMITS,
-    MARGINS,
-    WIDTH,
-    Constraints,
-    new_trial,
-    put_along,
-    put_demands,
-)
+from projservo_cli.planning.constraints import Constraints, new_trial, put_along, put_demands
 from projservo_cli.planning.margins import (
     BEHIND,
+    CONDITIONING,
     CONSTRAINTS,
     IMAGE,
     JOINTS,
+    MARGINS,
+    OF_MOTION,
     VISIBILITY,
     Demands,
     Motion,
+    constraint_at,
     joint_margin,
 )
 from projservo_cli.planning.rrt_connect import Tree, Way, may_start
@@ -42,9 +35,9 @@ def verdict_of(motion: Motion) -> tuple[bool, str, str]:
     shares = motion.shares()
     nearest = int(np.argmin(shares.min(axis=0)))
     margins = motion.along.margins[:, nearest]
-    name, holds = CONSTRAINTS[nearest], bool(margins.min() > 0.0)
+    name, holds = CONSTRAINTS[OF_MOTION[nearest]].name, bool(margins.min() > 0.0)
     words = _words(
-        motion, nearest, int(np.argmin(shares[:, nearest]) if holds else np.argmax(margins <= 0.0))
+        motion, OF_MOTION[nearest], int(np.argmin(shares[:, nearest]) if holds else np.argmax(margins <= 0.0))
     )
     if holds:
         return True, name, f"all constraints hold; nearest is {name}: {words}"
@@ -58,7 +51,7 @@ def _words(motion: Motion, constraint: int, instant: int) -> str:
     if constraint == VISIBILITY:
         view = int(np.argmin(found.visibility[instant]))
         margin = found.visibility[instant, view]
-        return f"visibility from the {VIEWS[view]} camera is {margin:.3f} of the start's {at}"
+        return f"{CONSTRAINTS[VISIBILITY].asked.format(VIEWS[view])} is {margin:.3f} of the start's {at}"
     if constraint == IMAGE:
         view = int(np.argmin(found.distance[instant]))
         return f"{_border_words(found.distance[instant, view], VIEWS[view], demands)} {at}"
@@ -71,7 +64,7 @@ def _words(motion: Motion, constraint: int, instant: int) -> str:
         here, low, high = (in_unit(values[i], unit, 4) for values in (q, demands.lower, demands.upper))
         return f"joint {i + 1} is at {here}, its limits are {low} to {high}, {at}"
     return (
-        f"the reciprocal condition of the image Jacobian is {found.condition[instant]:.2g} "
+        f"the {CONSTRAINTS[CONDITIONING].asked} is {found.condition[instant]:.2g} "
         f"({demands.conditioning:.2g} allowed) {at}"
     )
 
@@ -176,16 +169,13 @@ def _lowered(c: Constraints, ends: Mapping[str, FloatArray]) -> Iterator[str]:
 
 
 def _instead(c: Constraints, q: FloatArray, margin: int, asked: float) -> str:
-    if margin != LIMITS:
-        name = "distance from regions"
-        if margin < CLEAR:
-            view = VIEWS[(margin - WIDTH) % 2]
-            name = f"{'border' if margin >= BORDER else 'width of the face'} in the {view} image"
-        return f"{name} {asked:.2g} px instead of {c.full[margin]:g} px"
+    words, view = constraint_at(margin)
+    if margin != JOINTS:
+        return f"{words.asked.format(VIEWS[view])} {asked:.2g} px instead of {c.full[margin]:g} px"
     i = int(np.argmin(np.minimum(q - c.lower, c.upper - q) / c.keep))
     slides = c.model.joint_types[i] == PRISMATIC
     full, unit = (1e3 * c.keep[i], " mm") if slides else (math.degrees(c.keep[i]), "°")
-    return f"limit of joint {i + 1} {asked * full:.2g}{unit} instead of {full:.3g}{unit}"
+    return f"{words.asked.format(i + 1)} {asked * full:.2g}{unit} instead of {full:.3g}{unit}"
 
 
 def reason_of(way: Way) -> str:
@@ -219,7 +209,7 @@ def _why_none(way: Way) -> str:
         )
     if not may_start(way.had):
         worst = int(way.had.argmin())
-        what = "a joint limit" if worst == LIMITS else _stopped(way, worst)
+        what = "a joint limit" if worst == JOINTS else _stopped(way, worst)
         return f"the start is already at or beyond {what}"
     failed = way.failures[:MARGINS]
     most = [
@@ -234,14 +224,6 @@ def _why_none(way: Way) -> str:
 
 
 def _stopped(way: Way, margin: int) -> str:
-    if margin == LIMITS:
-        return f"the limits of joint {int(way.failures[MARGINS:].argmax()) + 1}"
-    if margin == CLEAR:
-        return "a region that is kept out of"
-    kind, view = (margin - FRONT) // 2, VIEWS[(margin - FRONT) % 2]
-    return (
-        f"a marker behind the {view} camera",
-        f"the face edge-on to the {view} camera",
-        f"the width of the face in the {view} image",
-        f"the border of the {view} image",
-    )[kind]
+    words, view = constraint_at(margin)
+    joint = int(way.failures[MARGINS:].argmax()) + 1
+    return words.stops.format(joint if margin == JOINTS else VIEWS[view])

@@ -7,16 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.planning.constraints import (
-    BORDER,
-    FRONT,
-    LIMITS,
-    SIDE,
-    WIDTH,
-    new_trial,
-    reached,
-    width,
-)
+from projservo_cli.planning.constraints import new_trial, reached, width
+from projservo_cli.planning.margins import FRONT, IMAGE, JOINTS, VISIBILITY, WIDTH
 from projservo_cli.planning.rrt_connect import margins_at, with_ends
 from tests.planning.joint_space_cases import case
 
@@ -38,15 +30,15 @@ def test_signs_are_those_of_the_metric_truth(name):
     for q in rng.uniform(c.lower, c.upper, (200, len(c.lower))):
         margins, s = margins_at(c, q)
         side, depth = sides(q)
-        np.testing.assert_array_equal(margins[SIDE : SIDE + 2] > 0.0, side * start > 0.0)
+        np.testing.assert_array_equal(margins[VISIBILITY : VISIBILITY + 2] > 0.0, side * start > 0.0)
         if (depth > 0.0).all():
             np.testing.assert_array_equal(margins[FRONT : FRONT + 2] > 0.0, True)
             np.testing.assert_allclose(s, truth.images(q, truth.M_face), atol=1e-6)
             inside = np.minimum(s + 0.5, truth.image_size - 0.5 - s).min(axis=(1, 2))
-            np.testing.assert_allclose(margins[BORDER : BORDER + 2], inside, atol=1e-6)
-        signs.add((*(margins[SIDE : SIDE + 2] > 0.0), *(depth > 0.0)))
+            np.testing.assert_allclose(margins[IMAGE : IMAGE + 2], inside, atol=1e-6)
+        signs.add((*(margins[VISIBILITY : VISIBILITY + 2] > 0.0), *(depth > 0.0)))
         nearest = np.minimum(q - c.lower, c.upper - q) / c.keep
-        assert margins[LIMITS] == pytest.approx(nearest.min())
+        assert margins[JOINTS] == pytest.approx(nearest.min())
     assert len(signs) > 3
 
 
@@ -80,7 +72,7 @@ def test_edges_are_valid_where_dense_samples_are():
         # Without the demands, which rise in between: at every sample before it what must hold does.
         x = np.linspace(0.0, share, 400)[:, None]
         margins = np.array([margins_at(c, q)[0] for q in (1.0 - x) * found.q_start + x * found.q_goal])
-        assert margins[:, [LIMITS, SIDE, SIDE + 1, WIDTH, WIDTH + 1]].min() > 0.0
+        assert margins[:, [JOINTS, VISIBILITY, VISIBILITY + 1, WIDTH, WIDTH + 1]].min() > 0.0
         verdicts.add(share == 1.0)
     assert verdicts == {True, False}
 
@@ -89,10 +81,10 @@ def test_start_and_goal_are_asked_for_no_more_than_they_have():
     # A distance from the border that no image has: the ends are valid all the same, what lies between is not.
     found = case("paper", 3)
     full = found.c.full.copy()
-    full[BORDER : BORDER + 2] = 1e4
+    full[IMAGE : IMAGE + 2] = 1e4
     asked = with_ends(found.c._replace(full=full), np.stack([found.q_start, found.q_goal]))
     trial = new_trial(6, len(asked.M))
     near = found.q_start + 1e-4 * (found.q_goal - found.q_start)
     assert reached(asked, found.q_start, near, trial) == 1.0
     assert reached(asked, found.q_start, found.q_goal, trial) < 1.0
-    assert trial.failures[BORDER : BORDER + 2].sum() == trial.failures.sum() == 1
+    assert trial.failures[IMAGE : IMAGE + 2].sum() == trial.failures.sum() == 1

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from matplotlib.path import Path as Outline
 from scipy.spatial import ConvexHull
 
-from projservo_cli.planning.constraints import CLEAR
 from projservo_cli.planning.keep_out import keep_out_of, outside_polygon
+from projservo_cli.planning.margins import CLEAR
 from projservo_cli.planning.rrt_connect import Budget, find_way, margins_at
 from projservo_cli.planning.time_parameterization import joints_at
 from projservo_cli.records import Spread, WorkFailed

@@ -5,7 +5,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from projservo_cli.planning.constraints import LIMITS, SIDE, WIDTH, new_trial
+from projservo_cli.planning.constraints import new_trial
+from projservo_cli.planning.margins import JOINTS, VISIBILITY, WIDTH
 from projservo_cli.planning.rrt_connect import Budget, find_way, margins_at
 from projservo_cli.planning.time_parameterization import ROOM, joints_at, least_time, timed
 from tests.planning.joint_space_cases import COUNT, case
@@ -31,7 +32,7 @@ def test_every_task_has_a_valid_way_within_the_limits_of_the_joints(name):
         pace, period = way.pace, 1e-3
         q = joints_at(pace, np.arange(0.0, pace.time[-1] + 2 * period, period))
         margins = np.array([margins_at(found.c, row)[0] for row in q[::5]])
-        assert margins[:, [LIMITS, SIDE, SIDE + 1, WIDTH, WIDTH + 1]].min() > 0.0
+        assert margins[:, [JOINTS, VISIBILITY, VISIBILITY + 1, WIDTH, WIDTH + 1]].min() > 0.0
         assert ((q >= found.c.lower) & (q <= found.c.upper)).all()
         # Difference quotients are means of what they approximate: they exceed no bound of it. Between two
         # points of the grid the speed may by the round of a corner, by less than a hundredth.

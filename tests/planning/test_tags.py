@@ -5,7 +5,8 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.planning.constraints import BORDER, FINE_PX, SIDE, constraints_of
+from projservo_cli.planning.constraints import FINE_PX, constraints_of
+from projservo_cli.planning.margins import IMAGE, VISIBILITY
 from projservo_cli.planning.rrt_connect import margins_at
 from projservo_cli.robots.simulated import METRIC_A_INF
 from projservo_cli.stages import calibrate
@@ -65,11 +66,11 @@ def test_the_tag_that_counts_is_the_best_of_all_tried_one_by_one():
             continue
         found = in_truth(truth, q)
         found[:, :2] /= first
-        excess = (found - c.full[SIDE : BORDER + 2]) / np.repeat([1.0, FINE_PX], [2, 4])
+        excess = (found - c.full[VISIBILITY : IMAGE + 2]) / np.repeat([1.0, FINE_PX], [2, 4])
         best = int(excess.min(axis=1).argmax())
         margins = margins_at(c, q)[0]
-        np.testing.assert_allclose(margins[SIDE : BORDER + 2], found[best], rtol=1e-6, atol=1e-6)
-        assert (margins[SIDE:] > c.full[SIDE:]).all() == (excess.min(axis=1) > 0.0).any()
+        np.testing.assert_allclose(margins[VISIBILITY : IMAGE + 2], found[best], rtol=1e-6, atol=1e-6)
+        assert (margins[VISIBILITY:] > c.full[VISIBILITY:]).all() == (excess.min(axis=1) > 0.0).any()
         counted.add((best, bool(excess[best].min() > 0.0)))
     assert len({tag for tag, _ in counted}) >= 3
     assert {kept for _, kept in counted} == {True, False}

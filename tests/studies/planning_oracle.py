@@ -15,7 +15,8 @@ from itertools import count
 import numpy as np
 from tqdm import tqdm
 
-from projservo_cli.planning.constraints import MARGINS, put_demands
+from projservo_cli.planning.constraints import put_demands
+from projservo_cli.planning.margins import MARGINS
 from projservo_cli.planning.rrt_connect import Budget, find_way, margins_at, with_ends
 from projservo_cli.planning.time_parameterization import least_time
 from tests.studies.planning_tables import asked_for, quantiles, task_configs, true_search, write_rows

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics, project
-from projservo_cli.planning.constraints import BORDER, CLEAR, WIDTH
-from projservo_cli.planning.margins import BEHIND
+from projservo_cli.planning.margins import BEHIND, CLEAR, CONSTRAINTS, IMAGE, WIDTH
 from projservo_cli.records import PRISMATIC, FloatArray, IntArray, Plan
 from projservo_cli.report import style
 from projservo_cli.report.figures.images import near_pixels
@@ -87,7 +86,8 @@ def _distances(plan: Plan, border_px: float) -> Data:
         seen = np.where(plan.border_distance > BEHIND, plan.border_distance, np.nan)
         return {"border_px": seen, "border_px_asked": np.full_like(seen, border_px)}
     found: Data = {}
-    for name, i, count in (("border_px", BORDER, 2), ("width_px", WIDTH, 2), ("clear_px", CLEAR, 1)):
+    for i, count in ((IMAGE, 2), (WIDTH, 2), (CLEAR, 1)):
+        name = CONSTRAINTS[i].value
         if np.isfinite(plan.validity[:, i]).all():
             found[name], found[f"{name}_asked"] = (
                 x[:, i : i + count] for x in (plan.validity, plan.validity_asked)
