@@ -235,10 +235,10 @@ def _open(setting: Setting, shown: FloatArray, desk: _Desk) -> tuple[int, float]
     """Measure and partition a task, and measure it as the law will; what is wrong, and the angle θ_p, rad."""
     reset(desk.own_state)
     if not setting.shares_task:
-        status = _put_measured(setting, setting.believed, shown, desk, desk.own_task)
+        status = _measured_into(setting, setting.believed, shown, desk, desk.own_task)
         if status != FOUND:
             return status, 0.0
-    status = _put_measured(setting, setting.model, shown, desk, desk.task)
+    status = _measured_into(setting, setting.model, shown, desk, desk.task)
     if status != FOUND:
         return status, 0.0
     reset(desk.state)
@@ -247,7 +247,7 @@ def _open(setting: Setting, shown: FloatArray, desk: _Desk) -> tuple[int, float]
 
 
 @composed
-def _put_measured(setting: Setting, model: Model, shown: FloatArray, desk: _Desk, task: Task) -> int:
+def _measured_into(setting: Setting, model: Model, shown: FloatArray, desk: _Desk, task: Task) -> int:
     """Measure a task from images (2, 2, b, 2) at its start and goal, px; what is wrong."""
     for view in range(2):
         for k in range(task.s_star.shape[1]):

@@ -17,9 +17,9 @@ from projservo_cli.loop.metrics import Ended, path_deviation, summarize
 from projservo_cli.loop.step import new_log
 from projservo_cli.planning.margins import (
     Reaching,
+    carried_into,
     carrier_of,
     limits_alone,
-    put_carried,
     room_along,
 )
 from projservo_cli.records import Model
@@ -61,6 +61,6 @@ def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     yield pseudo_inverse, (state, 8, q)
     yield put_view, (model, task, task.s_star, state, 0, 0)
     yield single_rotation, (model, NO_PARTS, 1.0, state)
-    yield put_carried, (carrier_of(reaching), O, along)
+    yield carried_into, (carrier_of(reaching), O, along)
     yield summarize, (plant, log, Ended(0, 1, 0.0), 0.04, Ends(np.eye(4), np.eye(4), q))
     yield path_deviation, (plant, log, 1, 0.04, q, q)

@@ -1,11 +1,11 @@
-"""A run that follows a way to the goal is watched, and a way searched anew where it comes to nothing.
+"""A run that follows a path to the goal is watched, and a path searched again where it comes to nothing.
 
-A way is searched anew, from where the robot is, where
+A path is searched again, from where the robot is, where
 
 - what is ahead would leave an image, by what both images are seen to be off their prediction;
-- the face was lost, waited for, and found again on the way back along the path;
+- the face was lost, waited for, and found again on the path back along the path;
 - the law that ends the motion is stopped by a joint limit or a singularity, or comes no nearer: the joints
-  that were taken for the goal are shunned from then on.
+  that were taken for the goal are excluded from then on.
 """
 
 from collections.abc import Callable
@@ -37,8 +37,8 @@ EVERY, LAST = 10, 5
 STOPPED = {JOINT_LIMIT: "a joint limit", SINGULAR_VERDICT: "a singularity", DIVERGED: "growing errors"}
 
 
-class _Ways(Protocol):
-    """Ways to the goal of a task."""
+class Replanner(Protocol):
+    """Paths to the goal of a task."""
 
     def predicted(self, q: FloatArray) -> FloatArray:
         """Pixels (2, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
@@ -46,33 +46,39 @@ class _Ways(Protocol):
     def leaves(self, q: FloatArray, off: FloatArray) -> bool:
         """Whether a path of joints (s, n) leaves an image, where images are off by (s, 2, 2), px."""
 
-    def anew(self, q: FloatArray, shunned: FloatArray, off: FloatArray) -> Plan | None:
-        """Plan of a way from joints (n,), off by (2, 2) px, to other goals than those shunned (k, n)."""
+    def replan(self, q: FloatArray, excluded: FloatArray, off: FloatArray) -> Plan | None:
+        """Plan of a path from joints (n,), off by (2, 2) px, to other goals than those excluded (k, n)."""
 
 
 class Watch:
     """What watches over a run of a built-in law.
 
     law : that is driven, on a plan; follow : the task with a plan as the law is given it.
-    ways : to the goal; searches : how often one may be searched anew.
+    replanner : of paths to the goal; searches : how often one may be searched again.
     limits : of the run.
     standing : judge of a robot that need not follow what it is sent; None for one that does.
-    ``told``: why a way was searched anew each time, and when, in words.
+    ``told``: why a path was searched again each time, and when, in words.
     """
 
     def __init__(
         self,
         law: BuiltInLaw,
         follow: Callable[[Plan], Task],
-        ways: _Ways,
+        replanner: Replanner,
         searches: int,
         limits: Limits,
         standing: Standing | None = None,
     ) -> None:
-        self.law, self.follow, self.ways, self.left, self.limits = law, follow, ways, searches, limits
+        self.law, self.follow, self.replanner, self.left, self.limits = (
+            law,
+            follow,
+            replanner,
+            searches,
+            limits,
+        )
         self.told: list[str] = []
         self._standing = standing
-        self._shunned: list[FloatArray] = []
+        self._excluded: list[FloatArray] = []
         self._goes_back = False
         self._alone = 0  # instants since the law is without a plan
 
@@ -86,17 +92,17 @@ class Watch:
             return verdict
         if self._goes_back and verdict == RUNNING:
             self._goes_back = False
-            return self._anew(log, k, verdict, "the face was lost, and seen again on the way back")
-        way, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
-        if clock < len(way) - 1:
+            return self._replanned(log, k, verdict, "the face was lost, and seen again on the way back")
+        path, clock = self.law.law.task.reference.q, float(self.law.state.clock[0])
+        if clock < len(path) - 1:
             if verdict == DIVERGED and np.isfinite(q_dot).all():
-                verdict = RUNNING  # a way may lead away from the goal
-            return self._on_the_way(log, k, verdict, way[int(clock) :])
+                verdict = RUNNING  # a path may lead away from the goal
+            return self._on_the_way(log, k, verdict, path[int(clock) :])
         self._alone += 1
         if verdict not in STOPPED and not self._stalls(log, k, verdict):
             return verdict
-        self._shunned += [way[-1].copy(), log.read[k].copy()]
-        return self._anew(log, k, verdict, f"{STOPPED.get(verdict, 'no progress')} at the goal")
+        self._excluded += [path[-1].copy(), log.read[k].copy()]
+        return self._replanned(log, k, verdict, f"{STOPPED.get(verdict, 'no progress')} at the goal")
 
     def _stalls(self, log: Log, k: int, verdict: int) -> bool:
         """Whether the law that ends the motion comes no nearer."""
@@ -110,19 +116,19 @@ class Watch:
         """What becomes of a verdict with joints (s, n) ahead."""
         self._alone = 0
         if verdict in STOPPED:
-            return self._anew(log, k, verdict, f"{STOPPED[verdict]} on the way")
+            return self._replanned(log, k, verdict, f"{STOPPED[verdict]} on the way")
         looks = verdict == RUNNING and k % EVERY == 0 and self.left > 0
         if looks and self._leaves_image(log, k, ahead):
-            return self._anew(log, k, verdict, "what is ahead would leave an image")
+            return self._replanned(log, k, verdict, "what is ahead would leave an image")
         return verdict
 
-    def _anew(self, log: Log, k: int, verdict: int, why: str) -> int:
+    def _replanned(self, log: Log, k: int, verdict: int, why: str) -> int:
         """Hold the robot and follow another way, if there is one; else the verdict stays."""
         if not self.left:
             return verdict
         self.left -= 1
-        shunned = np.array(self._shunned).reshape(-1, log.read.shape[1])
-        plan = self.ways.anew(log.read[k], shunned, self._off(log, k))
+        excluded = np.array(self._excluded).reshape(-1, log.read.shape[1])
+        plan = self.replanner.replan(log.read[k], excluded, self._off(log, k))
         if plan is None:
             self.left = 0
             self.told.append(f"at step {k} ({why}) in vain")
@@ -134,21 +140,21 @@ class Watch:
         return WAITING
 
     def _back(self, log: Log, k: int, q_dot: FloatArray) -> int:
-        """Go back a period along the way; the face is lost for good where it began."""
-        way, state = self.law.law.task.reference.q, self.law.state
+        """Go back a period along the path; the face is lost for good where it began."""
+        path, state = self.law.law.task.reference.q, self.law.state
         self._goes_back = True
-        clock = min(float(state.clock[0]), float(len(way) - 1)) - 1.0
+        clock = min(float(state.clock[0]), float(len(path) - 1)) - 1.0
         if clock < 0.0:
             return MARKERS_LOST
         state.clock[0], state.parts[0], state.share[0], state.blocked[0] = clock, 0, -1.0, -1
-        there = np.array([np.interp(clock, np.arange(len(way)), joint) for joint in way.T])
+        there = np.array([np.interp(clock, np.arange(len(path)), joint) for joint in path.T])
         q_dot[:] = (there - log.read[k]) / self.law.gains.period
         return RUNNING
 
     def _off(self, log: Log, k: int) -> FloatArray:
         """What both images (2, 2) were off their prediction in the last instants, px; 0 where unseen."""
         rows = slice(max(0, k + 1 - LAST), k + 1)
-        predicted = np.array([self.ways.predicted(q) for q in log.read[rows]])
+        predicted = np.array([self.replanner.predicted(q) for q in log.read[rows]])
         b = min(log.s.shape[2], predicted.shape[2])
         off = log.s[rows, :, :b] - predicted[:, :, :b]
         seen = np.isfinite(off)
@@ -157,6 +163,6 @@ class Watch:
     def _leaves_image(self, log: Log, k: int, ahead: FloatArray) -> bool:
         """Whether the face leaves an image along joints (s, n), by what images are off now and there."""
         s_star = self.law.law.task.s_star
-        at_goal = (s_star - self.ways.predicted(ahead[-1])[:, : s_star.shape[1]]).mean(axis=1)
+        at_goal = (s_star - self.replanner.predicted(ahead[-1])[:, : s_star.shape[1]]).mean(axis=1)
         x = np.linspace(0.0, 1.0, len(ahead))[:, None, None]
-        return self.ways.leaves(ahead, (1.0 - x) * self._off(log, k) + x * at_goal)
+        return self.replanner.leaves(ahead, (1.0 - x) * self._off(log, k) + x * at_goal)

@@ -1,1 +1,1 @@
-"""Ways through joint space that keep the face in sight: goals, validity, search, timing."""
+"""Paths through joint space that keep the face in sight: goals, validity, search, timing."""

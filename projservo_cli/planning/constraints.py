@@ -109,7 +109,7 @@ def constraints_of(
 
 
 @merged
-def _put_limits(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
+def _limits_into(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
     least = math.inf
     for i in range(q.shape[0]):
         least = min(least, min(q[i] - c.lower[i], c.upper[i] - q[i]) / c.keep[i])
@@ -117,7 +117,7 @@ def _put_limits(c: Constraints, q: FloatArray, margins: FloatArray) -> None:
 
 
 @merged
-def _put_images(c: Constraints, H: Mat4, s: FloatArray, margins: FloatArray) -> bool:
+def _images_into(c: Constraints, H: Mat4, s: FloatArray, margins: FloatArray) -> bool:
     """Write the images (2, b, 2) of the displaced body; False where a marker is behind a camera."""
     for view in range(2):
         nearest = math.inf
@@ -152,7 +152,7 @@ def width(s: FloatArray, which: IntArray) -> float:
 
 
 @internal
-def _put_sight(c: Constraints, tag: int, back: Mat4, shown: bool, s: FloatArray, sight: FloatArray) -> None:
+def _sight_into(c: Constraints, tag: int, back: Mat4, shown: bool, s: FloatArray, sight: FloatArray) -> None:
     """Write side, width and border (6,) of a tag; the latter by images (2, b, 2), if they are shown.
 
     back : inverse of the forward kinematics.
@@ -167,11 +167,11 @@ def _put_sight(c: Constraints, tag: int, back: Mat4, shown: bool, s: FloatArray,
 
 
 @internal
-def _put_best_sight(c: Constraints, q: FloatArray, shown: bool, trial: "Trial") -> None:
+def _best_sight_into(c: Constraints, q: FloatArray, shown: bool, trial: "Trial") -> None:
     """Write side, width and border of the tag whose least excess over what is asked for is largest."""
     best, back = -math.inf, backward(c.model, q)
     for tag in range(c.tags.shape[0]):
-        _put_sight(c, tag, back, shown, trial.s, trial.sight)
+        _sight_into(c, tag, back, shown, trial.s, trial.sight)
         least = math.inf
         for i in range(6):
             unit = 1.0 if i < 2 else FINE_PX
@@ -237,7 +237,7 @@ def _clear_between(c: Constraints, region: int, A: Vec4, B: Vec4) -> float:
 
     Pieces of it, of the segment in space and so the same in both images, are halved until their images are
     short, or short beside the distance of their middles and on the same side of what is asked for: a distance
-    changes by no more than the way.
+    changes by no more than the path.
     """
     least, done, step = math.inf, 0.0, 1.0
     while done < 1.0:
@@ -270,14 +270,14 @@ def combined(x: float, A: Vec4, B: Vec4) -> Vec4:
 
 
 @njit
-def put_margins(c: Constraints, q: FloatArray, trial: "Trial") -> None:
+def margins_into(c: Constraints, q: FloatArray, trial: "Trial") -> None:
     """Write margins, what is asked of them, and images at joints (n,), rad or m."""
     margins, s = trial.margins, trial.s
-    put_demands(c, q, trial.demands)
-    _put_limits(c, q, margins)
+    demands_into(c, q, trial.demands)
+    _limits_into(c, q, margins)
     H = forward(c.model, q)
-    shown = _put_images(c, H, s, margins)
-    _put_best_sight(c, q, shown, trial)
+    shown = _images_into(c, H, s, margins)
+    _best_sight_into(c, q, shown, trial)
     margins[CLEAR] = clear_by(c, H, s) if shown else -math.inf
     # What a prediction is off, at most or, where that may tell, there.
     left = right = most = c.spread.most
@@ -293,16 +293,16 @@ def put_margins(c: Constraints, q: FloatArray, trial: "Trial") -> None:
 
 
 @njit
-def put_along(c: Constraints, q: FloatArray, trial: "Trial", found: FloatArray) -> None:
+def margins_along_into(c: Constraints, q: FloatArray, trial: "Trial", found: FloatArray) -> None:
     """Write margins and what is asked of them (2, k, 10) along joints (k, n)."""
     for i in range(q.shape[0]):
-        put_margins(c, q[i], trial)
+        margins_into(c, q[i], trial)
         put_row(found[0, i], trial.margins)
         put_row(found[1, i], trial.demands)
 
 
 @njit
-def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
+def demands_into(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
     """Write what is asked for (10,) at joints (n,): the full margins, or less near start and goals."""
     for i in range(MARGINS):
         demands[i] = c.full[i]
@@ -315,7 +315,7 @@ def put_demands(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
 
 @merged
 def time_between(speed: FloatArray, q: FloatArray, r: FloatArray) -> float:
-    """Time, s, of the straight way between joints at the speed limits (n,)."""
+    """Time, s, of the straight path between joints at the speed limits (n,)."""
     most = 0.0
     for i in range(q.shape[0]):
         most = max(most, abs(q[i] - r[i]) / speed[i])
@@ -341,7 +341,7 @@ def _keep_images(trial: "Trial") -> None:
 
 
 class Trial(NamedTuple):
-    """Workspace of one test of joints, or of the way between two."""
+    """Workspace of one test of joints, or of the path between two."""
 
     margins: FloatArray
     demands: FloatArray  # margins, demands: (10,)
@@ -361,7 +361,7 @@ def new_trial(n: int, b: int) -> Trial:
 @internal
 def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
     """Whether joints keep all that is asked for; what fails is counted, the images are written."""
-    put_margins(c, q, trial)
+    margins_into(c, q, trial)
     for i in range(MARGINS):
         if not trial.margins[i] > trial.demands[i]:
             trial.failures[i] += 1
@@ -374,7 +374,7 @@ def valid(c: Constraints, q: FloatArray, trial: Trial) -> bool:
 
 @njit
 def reached(c: Constraints, start: FloatArray, end: FloatArray, trial: Trial) -> float:
-    """Share of the straight way from valid joints that is valid: 1 for all of it.
+    """Share of the straight path from valid joints that is valid: 1 for all of it.
 
     Checks are so dense that between two of them no marker moves more than ``FINE_PX`` and no joint more
     than ``FINE_STEP``: a step that did is halved, and the next one made to do so by its speed.

@@ -20,9 +20,9 @@ from projservo_cli.planning.constraints import (
     Constraints,
     Trial,
     clear_by,
+    margins_into,
     most_off,
     new_trial,
-    put_margins,
     twin_of,
 )
 from projservo_cli.planning.margins import IMAGE, straight_pixel
@@ -59,10 +59,10 @@ TURNS = 2
 # Solutions of an arm of more joints than six.
 SAMPLED = 96
 # Where the body is at a solution: in sight, or not, or within a region that is kept out of.
-SHOWN, HIDDEN, BARRED = range(3)
+SHOWN, HIDDEN, BLOCKED = range(3)
 
 
-class Aim(NamedTuple):
+class GoalFeatures(NamedTuple):
     """What the goal shows."""
 
     A_star: FloatArray  # (m, 4) face at the goal, a_inf·A = 1
@@ -78,7 +78,7 @@ class Solutions(NamedTuple):
     deviation: FloatArray  # (k, n) standard deviations of their joints, rad or m
 
 
-class Bench(NamedTuple):
+class Scratch(NamedTuple):
     """Workspace of the solver."""
 
     H_hat: FloatArray  # (n, 4, 4) operators at the joints
@@ -89,24 +89,26 @@ class Bench(NamedTuple):
 
 
 @internal
-def _put_equations(c: Constraints, aim: Aim, q: FloatArray, images: bool, bench: Bench) -> float:
+def _normal_equations_into(
+    c: Constraints, goal: GoalFeatures, q: FloatArray, images: bool, scratch: Scratch
+) -> float:
     """Write the normal equations of points, or images, at joints; returns the sum of squares left.
 
     [RH00] eq. (19) for points; eq. (7), second row corrected, for images.
     """
     n = q.shape[0]
-    N = bench.N
-    H = operators_at(c.model, q, bench.H_hat)
+    N = scratch.N
+    H = operators_at(c.model, q, scratch.H_hat)
     N[:] = 0.0
     total = 0.0
     for k in range(c.face):
-        A, J = apply(H, vec(c.M[k])), bench.J[k]
-        s, aimed = A, vec(aim.A_star[k])
+        A, J = apply(H, vec(c.M[k])), scratch.J[k]
+        s, aimed = A, vec(goal.A_star[k])
         if images:
-            left, right = aim.s_star[0, k], aim.s_star[1, k]
+            left, right = goal.s_star[0, k], goal.s_star[1, k]
             aimed = (left[0], left[1], right[0], right[1])
         for i in range(n):
-            D = apply(mat(bench.H_hat[i]), A)
+            D = apply(mat(scratch.H_hat[i]), A)
             if images:
                 s, D = image_motion(c.model.P, A, D)
             put_vec(J[i], D)
@@ -119,7 +121,7 @@ def _put_equations(c: Constraints, aim: Aim, q: FloatArray, images: bool, bench:
 
 
 @internal
-def _put_step(N: FloatArray, damping: float, L: FloatArray) -> bool:
+def _damped_step_into(N: FloatArray, damping: float, L: FloatArray) -> bool:
     """Solve (N + damping diag N) x = b; x is left in the last column of L."""
     n = L.shape[0]
     most = 0.0
@@ -132,33 +134,35 @@ def _put_step(N: FloatArray, damping: float, L: FloatArray) -> bool:
 
 
 @internal
-def _settled(c: Constraints, aim: Aim, images: bool, settled: float, q: FloatArray, bench: Bench) -> float:
+def _settled(
+    c: Constraints, goal: GoalFeatures, images: bool, settled: float, q: FloatArray, scratch: Scratch
+) -> float:
     """Bring the joints to the least squares of points or images by damped Newton steps; what is left.
 
     K. Levenberg, Quarterly of Applied Mathematics 2, 1944; scaled as by D. Marquardt, SIAM Journal 11, 1963.
     """
     n = q.shape[0]
     damping = 1e-3
-    left = first = _put_equations(c, aim, q, images, bench)
+    left = first = _normal_equations_into(c, goal, q, images, scratch)
     for step in range(STEPS):
-        if (step == 20 and left > GIVEN_UP * first and not images) or not _put_step(
-            bench.N, damping, bench.L
+        if (step == 20 and left > GIVEN_UP * first and not images) or not _damped_step_into(
+            scratch.N, damping, scratch.L
         ):
             break
         longest = 0.0
         for i in range(n):
-            longest = max(longest, abs(bench.L[i, n]))
+            longest = max(longest, abs(scratch.L[i, n]))
         share = min(1.0, STRIDE / longest) if longest > 0.0 else 1.0
         for i in range(n):
-            bench.q[i] = q[i] + share * bench.L[i, n]
-        trial = _put_equations(c, aim, bench.q, images, bench)
+            scratch.q[i] = q[i] + share * scratch.L[i, n]
+        trial = _normal_equations_into(c, goal, scratch.q, images, scratch)
         if trial < left:
             left = trial
-            put_row(q, bench.q)
+            put_row(q, scratch.q)
             damping *= 0.1
         elif longest >= settled and damping <= DAMPED:
             damping *= 10.0
-            _put_equations(c, aim, q, images, bench)
+            _normal_equations_into(c, goal, q, images, scratch)
             continue
         if longest < settled:
             break
@@ -173,7 +177,9 @@ def _seen(P: FloatArray, H: Mat4, M: FloatArray) -> Vec4:
 
 
 @internal
-def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench, deviation: FloatArray) -> float:
+def _explained(
+    c: Constraints, goal: GoalFeatures, q: FloatArray, scratch: Scratch, deviation: FloatArray
+) -> float:
     """Sum of squares, px², that noise and calibration explain of what is left at joints that show the goal.
 
     Of each way in which the calibration may be off, what no motion of the joints makes up for. The motion
@@ -181,30 +187,30 @@ def _explained(c: Constraints, aim: Aim, q: FloatArray, bench: Bench, deviation:
     or m, is written; ``REDUNDANT`` of an arm of more joints than six, which can move them at will.
     """
     n = q.shape[0]
-    noise = aim.sigma * aim.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
+    noise = goal.sigma * goal.sigma + LEAST_SIGMA * LEAST_SIGMA + c.spread.rest * c.spread.rest
     total: float = (4.0 * c.face - min(n, 6)) * noise
-    _put_equations(c, aim, q, True, bench)
+    _normal_equations_into(c, goal, q, True, scratch)
     for i in range(n):
         for j in range(n):
-            bench.N[j, n] = 1.0 if i == j else 0.0
+            scratch.N[j, n] = 1.0 if i == j else 0.0
         deviation[i] = REDUNDANT * REDUNDANT
         if n <= 6:
-            deviation[i] = noise * bench.L[i, n] if _put_step(bench.N, 0.0, bench.L) else UNTOLD
-    H = operators_at(c.model, q, bench.H_hat)
+            deviation[i] = noise * scratch.L[i, n] if _damped_step_into(scratch.N, 0.0, scratch.L) else UNTOLD
+    H = operators_at(c.model, q, scratch.H_hat)
     for j in range(1, c.spread.P.shape[0]):
         twin = twin_of(c, j)
         H_j = forward(twin, q)
         away = 0.0
-        bench.N[:, n] = 0.0
+        scratch.N[:, n] = 0.0
         for k in range(c.face):
             off = sub(_seen(twin.P, H_j, c.spread.M[j, k]), _seen(c.model.P, H, c.M[k]))
             away += dot(off, off)
             for i in range(n):
-                bench.N[i, n] += dot(vec(bench.J[k, i]), off)
-        if _put_step(bench.N, 0.0, bench.L):
+                scratch.N[i, n] += dot(vec(scratch.J[k, i]), off)
+        if _damped_step_into(scratch.N, 0.0, scratch.L):
             for i in range(n):
-                away -= bench.L[i, n] * bench.N[i, n]
-                deviation[i] += bench.L[i, n] * bench.L[i, n] if n <= 6 else 0.0
+                away -= scratch.L[i, n] * scratch.N[i, n]
+                deviation[i] += scratch.L[i, n] * scratch.L[i, n] if n <= 6 else 0.0
         total += max(away, 0.0)
     for i in range(n):
         deviation[i] = math.sqrt(deviation[i])
@@ -227,23 +233,28 @@ def _is_known(c: Constraints, q: FloatArray, base: FloatArray, count: int) -> bo
 
 
 @njit
-def _put_solutions(
-    c: Constraints, aim: Aim, known: FloatArray, starts: FloatArray, found: Solutions, bench: Bench
+def _solutions_into(
+    c: Constraints,
+    goal: GoalFeatures,
+    known: FloatArray,
+    starts: FloatArray,
+    found: Solutions,
+    scratch: Scratch,
 ) -> int:
     """Write solutions; how many. First those known, which need no proof: the goal was seen there."""
     count, last, most = len(known), 0, found.q.shape[0]
     for k in range(count):
         put_row(found.q[k], known[k])
-        _explained(c, aim, known[k], bench, found.deviation[k])
+        _explained(c, goal, known[k], scratch, found.deviation[k])
     for k in range(starts.shape[0]):
         if count == most or k > AT_LEAST + PATIENCE * last:
             break
         q = starts[k]
-        _settled(c, aim, False, NEAR, q, bench)
+        _settled(c, goal, False, NEAR, q, scratch)
         if _is_known(c, q, found.q, count):
             continue
-        left = _settled(c, aim, True, SETTLED, q, bench)
-        explained = _explained(c, aim, q, bench, found.deviation[count])
+        left = _settled(c, goal, True, SETTLED, q, scratch)
+        explained = _explained(c, goal, q, scratch, found.deviation[count])
         if left <= explained and not _is_known(c, q, found.q, count):
             put_row(found.q[count], q)
             found.left[count] = left
@@ -254,8 +265,8 @@ def _put_solutions(
 
 @njit
 def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
-    """Whether the goal is shown at joints (n,), but for their limits: ``SHOWN``, ``HIDDEN`` or ``BARRED``."""
-    put_margins(c, q, trial)
+    """Whether joints (n,) show the goal, but for their limits: ``SHOWN``, ``HIDDEN`` or ``BLOCKED``."""
+    margins_into(c, q, trial)
     for j in range(1, IMAGE):
         if not trial.margins[j] > 0.0:
             return HIDDEN
@@ -263,7 +274,7 @@ def _where(c: Constraints, q: FloatArray, trial: Trial) -> int:
     H = forward(c.model, q)
     left, right = most_off(c, q, H)
     doubt = min(DEVIATIONS * max(left, right), FINE_PX)
-    return SHOWN if clear_by(c, H, trial.s) > -doubt else BARRED
+    return SHOWN if clear_by(c, H, trial.s) > -doubt else BLOCKED
 
 
 def _turns(c: Constraints, start: FloatArray, q: FloatArray, slack: FloatArray) -> FloatArray:
@@ -301,7 +312,7 @@ def _rank(
 
 
 def goals_of(
-    c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, starts: FloatArray
+    c: Constraints, goal: GoalFeatures, start: FloatArray, known: FloatArray, starts: FloatArray
 ) -> tuple[FloatArray, FloatArray, tuple[int, int, int]]:
     """Joints (g, n) that show the goal, and their rank (g,), the least first.
 
@@ -316,7 +327,7 @@ def goals_of(
     n, most = len(start), STARTS if len(start) <= 6 else SAMPLED
     found = Solutions(np.zeros((most, n)), np.zeros(most), np.zeros((most, n)))
     shapes = (n, 4, 4), (n, n + 1), (c.face, n + 1, 4), (n, n + 1), (n,)
-    count = _put_solutions(c, aim, known, starts, found, Bench(*(np.zeros(shape) for shape in shapes)))
+    count = _solutions_into(c, goal, known, starts, found, Scratch(*(np.zeros(shape) for shape in shapes)))
     least = max(found.left[len(known) : count].min(initial=math.inf), 4.0 * c.face * LEAST_SIGMA**2)
     good = np.flatnonzero(found.left[:count] <= MUCH**2 * least)
     goals, ranks, met, trial = [np.zeros((0, n))], [np.zeros(0)], [0, 0, 0], new_trial(n, len(c.M))
@@ -331,4 +342,4 @@ def goals_of(
             ranks.append(_rank(c, start, turns, deviation, certain))
     rank = np.concatenate(ranks)
     order = np.argsort(rank, kind="stable")
-    return np.vstack(goals)[order], rank[order], (len(good), met[HIDDEN], met[BARRED])
+    return np.vstack(goals)[order], rank[order], (len(good), met[HIDDEN], met[BLOCKED])

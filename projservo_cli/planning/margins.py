@@ -110,8 +110,8 @@ class Demands(NamedTuple):
     image_size: FloatArray  # (2,) width and height of both images, px; infinite where an image has no border
     border_px: float  # least distance of a marker from the border of an image, px
     conditioning: float  # least reciprocal condition of the image Jacobian of the face
-    keep: FloatArray  # (n,) least distance from a joint limit, rad or m, along a way through joint space
-    least_face_px: float = 0.0  # least width of the face in an image along such a way, px
+    keep: FloatArray  # (n,) least distance from a joint limit, rad or m, along a path through joint space
+    least_face_px: float = 0.0  # least width of the face in an image along such a path, px
     # (t, 4) corners of tags, markers of the body in the order of their numbers, of which one is to be seen by
     # both cameras; none where the face is
     tags: IntArray = np.zeros((0, 4), np.int64)
@@ -166,7 +166,7 @@ class Motion(NamedTuple):
     """A planned motion at s instants."""
 
     reaching: Reaching  # the task, in the senses of both rotations that were chosen
-    mu: FloatArray  # (s, 3) shares; NaN of a way through joint space
+    mu: FloatArray  # (s, 3) shares; NaN of a path through joint space
     along: Along  # what is along it
 
     def shares(self) -> FloatArray:
@@ -317,7 +317,7 @@ def _reciprocal_condition(carrier: Carrier, H: Mat4) -> float:
 
 
 @merged
-def put_displaced(reaching: Reaching, mu: FloatArray, found: Along, i: int) -> None:
+def displacement_into(reaching: Reaching, mu: FloatArray, found: Along, i: int) -> None:
     """Write displacement and visibility of one instant, at shares (3,)."""
     put_mat(found.H_d[i], displaced(reaching.H_hat, reaching.amplitudes, mu[0], mu[1], mu[2]))
     for view in range(2):
@@ -325,13 +325,13 @@ def put_displaced(reaching: Reaching, mu: FloatArray, found: Along, i: int) -> N
 
 
 @njit
-def put_carried(carrier: Carrier, mu: FloatArray, found: Along) -> None:
+def carried_into(carrier: Carrier, mu: FloatArray, found: Along) -> None:
     """Write all but images and margins at shares mu (s, 3), from the joints at the first on.
 
-    Where the joints would move too far between two of them, the way is made in parts.
+    Where the joints would move too far between two of them, the path is made in parts.
     """
     for i in range(mu.shape[0]):
-        put_displaced(carrier.reaching, mu[i], found, i)
+        displacement_into(carrier.reaching, mu[i], found, i)
     for i in range(mu.shape[0]):
         before = max(0, i - 1)
         parts = 0 if i == 0 else 1
@@ -349,7 +349,7 @@ def put_carried(carrier: Carrier, mu: FloatArray, found: Along) -> None:
 
 
 @njit
-def _put_moved(carrier: Carrier, found: Along) -> None:
+def _moved_into(carrier: Carrier, found: Along) -> None:
     """Write displacement, visibility, limit and condition at joints (s, n), by the forward kinematics."""
     reaching, model = carrier.reaching, carrier.reaching.model
     a, start = vec(reaching.a), forward(model, reaching.q_start)
@@ -369,7 +369,7 @@ def along_shares(reaching: Reaching, mu: FloatArray, q: FloatArray | None = None
     """The motion of shares mu (s, 3) from joints q (n,) at the first; none where it begins at the start."""
     found = room_along(reaching, len(mu))
     found.q[0] = reaching.q_start if q is None else q
-    put_carried(carrier_of(reaching), np.ascontiguousarray(mu), found)
+    carried_into(carrier_of(reaching), np.ascontiguousarray(mu), found)
     return measured(Motion(reaching, mu, found))
 
 
@@ -377,7 +377,7 @@ def along_joints(reaching: Reaching, q: FloatArray) -> Motion:
     """The motion of joints (s, n), displaced as the forward kinematics tell, [RH00] eq. (6)."""
     found = room_along(reaching, len(q))
     found.q[:] = q
-    _put_moved(carrier_of(reaching), found)
+    _moved_into(carrier_of(reaching), found)
     return measured(Motion(reaching, np.full((len(q), 3), np.nan), found))
 
 
@@ -396,14 +396,14 @@ def measured(motion: Motion) -> Motion:
     border = np.where(shown & np.isfinite(border), border, BEHIND)
     found.distance[:] = border[:, :, :m].min(axis=2)
     if len(demands.tags):
-        _put_best_tag(reaching, border, found)
+        _best_tag_into(reaching, border, found)
     found.margins[:, OF_MOTION.index(VISIBILITY)] = found.visibility.min(axis=1)
     found.margins[:, OF_MOTION.index(IMAGE)] = image_margin(demands, found.distance.min(axis=1))
-    put_joint_margins(demands, found)
+    joint_margins_into(demands, found)
     return motion
 
 
-def put_joint_margins(demands: Demands, found: Along) -> None:
+def joint_margins_into(demands: Demands, found: Along) -> None:
     """Write the margins of joint limits and conditioning."""
     followed, excess = ~np.isnan(found.condition), found.condition - demands.conditioning
     found.margins[:, OF_MOTION.index(JOINTS)] = np.where(followed, found.limit, 1.0)
@@ -424,7 +424,7 @@ def tag_planes(tags: IntArray, body: FloatArray, m: int, a: FloatArray) -> Float
     return np.asarray(planes * (float(a @ face) / float(face @ face)))
 
 
-def _put_best_tag(reaching: Reaching, border: FloatArray, found: Along) -> None:
+def _best_tag_into(reaching: Reaching, border: FloatArray, found: Along) -> None:
     """Write visibility and distance of the tag that keeps them best, of distances (s, 2, b) of markers."""
     tags = reaching.demands.tags
     planes = tag_planes(tags, reaching.body, len(reaching.A), reaching.a)

@@ -32,7 +32,7 @@ class Suggestion:
 
     q: FloatArray  # (n,) joint readings, rad or m
     from_pose: int  # number of the nearest pose recorded
-    delta: FloatArray  # (n,) the way from it, rad or m
+    delta: FloatArray  # (n,) the path from it, rad or m
     # variance_before, variance_after: of predicted coordinates over the region of the data, px²
     variance_before: float
     variance_after: float

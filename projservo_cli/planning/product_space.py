@@ -26,10 +26,10 @@ from projservo_cli.planning.margins import (
     along_shares,
     carrier_of,
     carry_joints,
+    displacement_into,
+    joint_margins_into,
     limit_margin,
     measured,
-    put_displaced,
-    put_joint_margins,
     room_along,
 )
 from projservo_cli.planning.time_parameterization import least_time
@@ -39,7 +39,7 @@ from projservo_cli.records import BoolArray, FloatArray, IntArray
 NODES = (13, 19)
 # A joint that moves more than this between two nodes, rad or m, has changed its branch.
 MOST_STRIDE = 1.5
-# Parts in which the way between them is made where the joints do not settle in one.
+# Parts in which the path between them is made where the joints do not settle in one.
 BETWEEN = 4
 # Newton step, rad or m, after which joints at a node are good enough: they are off by its square.
 ROUGH = 1e-2
@@ -150,7 +150,7 @@ def _in_view(reaching: Reaching, size: int) -> _Lattice:
     """A lattice of the views alone, with so many values of each share."""
     mu = np.ascontiguousarray(np.indices((size, size, size)).reshape(3, -1).T / (size - 1.0))
     found = room_along(reaching, len(mu))
-    _put_displaced(reaching, mu, found)
+    _displacements_into(reaching, mu, found)
     return _Lattice(measured(Motion(reaching, mu, found)), False)
 
 
@@ -158,8 +158,8 @@ def _with_joints(view: _Lattice) -> _Lattice:
     """The same with joints, in place, sought where a path in view leads."""
     reaching, mu, found = view.nodes
     value = widest(view.least(view.nodes))
-    _put_joints(carrier_of(reaching), mu, value, _size(value), found)
-    put_joint_margins(reaching.demands, found)
+    _joints_into(carrier_of(reaching), mu, value, _size(value), found)
+    joint_margins_into(reaching.demands, found)
     return _Lattice(view.nodes, True)
 
 
@@ -206,7 +206,7 @@ def _size(nodes: FloatArray) -> int:
 def widest(shares: FloatArray) -> FloatArray:
     """Largest smallest share of all monotone paths from the first node up to each, of shares (size³,)."""
     value = np.empty(len(shares))
-    _put_widest(shares, _size(shares), value)
+    _widest_into(shares, _size(shares), value)
     return value
 
 
@@ -218,7 +218,7 @@ def shortest(free: BoolArray, q: FloatArray, speed: FloatArray) -> IntArray:
     speed : (n,) limits, rad/s or m/s.
     """
     came = np.empty(len(q), dtype=np.int64)
-    _put_shortest(free, q, speed, _size(q), np.empty(len(q)), came)
+    _shortest_into(free, q, speed, _size(q), np.empty(len(q)), came)
     path = [len(q) - 1]
     while path[-1] > 0:
         path.append(int(came[path[-1]]))
@@ -235,7 +235,7 @@ def _before(node: int, step: int, size: int) -> int:
 
 
 @njit
-def _put_widest(shares: FloatArray, size: int, value: FloatArray) -> None:
+def _widest_into(shares: FloatArray, size: int, value: FloatArray) -> None:
     for node in range(shares.shape[0]):
         best = math.inf if node == 0 else -math.inf
         for step in range(1, 8):
@@ -246,7 +246,7 @@ def _put_widest(shares: FloatArray, size: int, value: FloatArray) -> None:
 
 
 @njit
-def _put_shortest(
+def _shortest_into(
     free: BoolArray, q: FloatArray, speed: FloatArray, size: int, cost: FloatArray, came: IntArray
 ) -> None:
     """Write the least time (size³,) up to each node, infinite where none leads there, and where from."""
@@ -263,16 +263,16 @@ def _put_shortest(
 
 
 @njit
-def _put_displaced(reaching: Reaching, mu: FloatArray, found: Along) -> None:
+def _displacements_into(reaching: Reaching, mu: FloatArray, found: Along) -> None:
     for i in range(mu.shape[0]):
-        put_displaced(reaching, mu[i], found, i)
+        displacement_into(reaching, mu[i], found, i)
 
 
 @njit
-def _put_joints(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int, found: Along) -> None:
+def _joints_into(carrier: Carrier, mu: FloatArray, value: FloatArray, size: int, found: Along) -> None:
     """Write joints, limit and condition at those nodes (size³,) whose value is positive.
 
-    Each is continued from the best before it: the values become the least margin of both on the way there,
+    Each is continued from the best before it: the values become the least margin of both on the path there,
     zero where the joints cannot follow within both.
     """
     demands = carrier.reaching.demands

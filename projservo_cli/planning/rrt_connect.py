@@ -1,8 +1,8 @@
-"""A way to the goal through joint space: straight, or by two trees that grow towards each other; or why none.
+"""A path to the goal through joint space: straight, or by two trees that grow towards each other.
 
 J. Kuffner, S. LaValle, "RRT-Connect: an efficient approach to single-query path planning", ICRA 2000. What is
 found is shortened, rounded and timed. Random numbers are those of a seed and drawn before the trees grow: a
-way is the same to the bit whoever searches beside.
+path is the same to the bit whoever searches beside.
 """
 
 import math
@@ -16,71 +16,71 @@ from projservo_cli.planning.constraints import (
     SHARE,
     Constraints,
     Trial,
+    margins_into,
     new_trial,
-    put_margins,
     reached,
     time_between,
 )
-from projservo_cli.planning.goal_configurations import STARTS, UNSURE, Aim, goals_of
+from projservo_cli.planning.goal_configurations import STARTS, UNSURE, GoalFeatures, goals_of
 from projservo_cli.planning.keep_out import only
 from projservo_cli.planning.margins import CLEAR, FRONT, IMAGE, JOINTS
-from projservo_cli.planning.time_parameterization import Pace, least_time, timed
+from projservo_cli.planning.time_parameterization import TimedPath, least_time, time_parameterized
 from projservo_cli.records import NO_SPREAD, FloatArray, IntArray
 
 # Longest edge of a tree, s at the speed limits.
 REACH = 0.8
-# A way shorter than this, s, is none.
+# A path shorter than this, s, is none.
 LEAST = 1e-9
 # Draws that the trees are given at a time.
 CHUNK = 250
-# Ways that are looked for by trees, and draws after which no further one is begun.
+# Paths that are looked for by trees, and draws after which no further one is begun.
 WAYS, FURTHER = 2, 300
 # A straight line that takes so much longer than to the nearest goal is held against what trees find.
 LONGER = 1.2
 SHORTENINGS = 60
 ROUND_OFF = 1e-9
-# Goals within so much of shunned joints, rad or m, are shunned too.
+# Goals within so much of excluded joints, rad or m, are excluded too.
 NEARBY = 0.1
 
 
 class Tree(NamedTuple):
-    """Joints that a start or the goals are joined to by valid straight ways."""
+    """Joints that a start or the goals are joined to by valid straight paths."""
 
     q: FloatArray  # (k, n)
     parent: IntArray  # (k,) −1 at a root
     size: IntArray  # (1,) how many nodes there are
 
 
-class Budget(NamedTuple):
+class SearchLimits(NamedTuple):
     """How long is searched, and with which random numbers."""
 
-    samples: int = 20_000
+    max_samples: int = 20_000
     seed: int = 0
-    goals: int = 64
-    shunned: FloatArray = np.zeros((0, 1))  # (k, n) joints near which no goal is taken, rad or m
+    max_goals: int = 64
+    excluded: FloatArray = np.zeros((0, 1))  # (k, n) joints near which no goal is taken, rad or m
 
 
-class Way(NamedTuple):
+class JointPath(NamedTuple):
     """What a search came to."""
 
     goals: FloatArray  # (g, n) joints that show the goal, nearest in time first
-    shown: int  # how many there are, kept or not
+    n_goals: int  # how many there are, kept or not
     solutions: int  # how many apart from whole turns
     hidden: int  # how many of those lie beyond the limits or do not show the face
-    barred: int  # how many of those lie within a region that is kept out of
+    blocked: int  # how many of those lie within a region that is kept out of
     failures: IntArray  # (10 + n,) how often each margin, and each joint's limit, stopped the search
-    had: FloatArray  # (10,) margins of the start
+    start_clearance: FloatArray  # (10,) margins of the start
     region: int  # the one that the start is within, counted from 1; 0 for none
-    held: Constraints  # what was held against: with less asked for at start and goals
-    corners: FloatArray  # (k, n) of the way; none where none was found
-    pace: Pace | None = None  # in time; None where there is no way or nothing limits its speed
+    constraints: Constraints  # with less asked for at start and goals
+    corners: FloatArray  # (k, n) of the path; none where none was found
+    timing: TimedPath | None = None  # in time; None where there is no path or nothing limits its speed
     draws: int = 0  # by the trees
     trees: tuple[Tree, Tree] | None = None  # from the start and from the goals, where they were grown
 
 
-def may_start(had: FloatArray) -> bool:
-    """Whether a way may begin at joints of such margins (10,): at a limit, but not at the edge of a view."""
-    return bool(had[JOINTS] >= 0.0 and (had[FRONT:] > 0.0).all())
+def may_start(clearance: FloatArray) -> bool:
+    """Whether a path may begin at joints of such margins (10,): at a limit, but not at the edge of a view."""
+    return bool(clearance[JOINTS] >= 0.0 and (clearance[FRONT:] > 0.0).all())
 
 
 def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
@@ -99,7 +99,7 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
 def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Margins (10,) and images (2, b, 2), px, at joints (n,)."""
     trial = new_trial(len(q), len(c.M))
-    put_margins(c, q, trial)
+    margins_into(c, q, trial)
     return trial.margins, trial.s
 
 
@@ -132,10 +132,15 @@ def first_within(c: Constraints, q: FloatArray) -> tuple[int, int]:
     return len(q) - 1, 0
 
 
-def find_way(
-    c: Constraints, aim: Aim, start: FloatArray, known: FloatArray, search: Budget, acceleration: FloatArray
-) -> Way:
-    """Find a way from the start to joints that show the goal.
+def find_path(
+    c: Constraints,
+    aim: GoalFeatures,
+    start: FloatArray,
+    known: FloatArray,
+    search: SearchLimits,
+    acceleration: FloatArray,
+) -> JointPath:
+    """Find a path from the start to joints that show the goal.
 
     start : (n,) joints, rad or m.
     known : (k, n) joints known to show the goal, k ≥ 0.
@@ -143,28 +148,38 @@ def find_way(
     """
     n, rng = len(start), np.random.default_rng(search.seed)
     starts = np.vstack([known, start[None], _drawn(c, start, STARTS, rng)])
-    every, rank, counts = goals_of(c, aim, start, known, starts)
-    goals, rank = every[: search.goals], rank[: search.goals]
-    off = np.abs(goals[:, None] - search.shunned)
+    every, rank, (solutions, hidden, blocked) = goals_of(c, aim, start, known, starts)
+    goals, rank = every[: search.max_goals], rank[: search.max_goals]
+    off = np.abs(goals[:, None] - search.excluded)
     far = np.all(np.max(off, axis=2, initial=0.0) > NEARBY, axis=1)
     goals, rank = goals[far], rank[far]
-    had, _ = margins_at(c._replace(spread=NO_SPREAD), start)
-    had[IMAGE:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
+    clearance, _ = margins_at(c._replace(spread=NO_SPREAD), start)
+    clearance[IMAGE:CLEAR] += DEVIATIONS * c.spread.most  # the face was seen there
     trial = new_trial(n, len(c.M))
-    region, nowhere = within_region(c, start), np.empty((0, n))
-    way = Way(goals, len(every), *counts, trial.failures, had, region, c, nowhere)
-    if len(goals) == 0 or not may_start(had):
-        return way
+    path = JointPath(
+        goals=goals,
+        n_goals=len(every),
+        solutions=solutions,
+        hidden=hidden,
+        blocked=blocked,
+        failures=trial.failures,
+        start_clearance=clearance,
+        region=within_region(c, start),
+        constraints=c,
+        corners=np.empty((0, n)),
+    )
+    if len(goals) == 0 or not may_start(clearance):
+        return path
     c = with_ends(c, np.vstack([start[None], goals]))
-    way = way._replace(held=c)
+    path = path._replace(constraints=c)
     sure = goals[rank < UNSURE]
     for asked in (sure, goals) if 0 < len(sure) < len(goals) else (goals,):
-        most = search.samples - way.draws if asked is goals else min(search.samples // 2, FURTHER)
+        most = search.max_samples - path.draws if asked is goals else min(search.max_samples // 2, FURTHER)
         best, draws, trees = _shortest(c, start, asked, most, rng, trial)
-        way = way._replace(draws=way.draws + draws, trees=trees)
+        path = path._replace(draws=path.draws + draws, trees=trees)
         if len(best) > 0:
-            return way._replace(corners=best, pace=timed(c, best, acceleration, trial))
-    return way
+            return path._replace(corners=best, timing=time_parameterized(c, best, acceleration, trial))
+    return path
 
 
 def _drawn(c: Constraints, start: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
@@ -177,10 +192,10 @@ def _drawn(c: Constraints, start: FloatArray, count: int, rng: np.random.Generat
 def _shortest(
     c: Constraints, start: FloatArray, goals: FloatArray, most: int, rng: np.random.Generator, trial: Trial
 ) -> tuple[FloatArray, int, tuple[Tree, Tree] | None]:
-    """The shortest way (k, n) that was met with to any of the goals (g, n), in so many draws of joints.
+    """The shortest path (k, n) that was found to any of the goals (g, n), in so many draws of joints.
 
     A straight one, if it takes little longer than to the nearest goal; else the best of some that trees find.
-    Returns the way, empty where there is none; how many draws it took; the trees that found it, or the first.
+    Returns the path, empty where there is none; the draws it took; the trees that found it, or the first.
     """
     best, shortest, draws = np.empty((0, len(start))), math.inf, 0
     straight = next((goal for goal in goals if reached(c, start, goal, trial) == 1.0), None)
@@ -303,7 +318,7 @@ def _branch(tree: Tree, node: int) -> FloatArray:
 
 
 def _shortened(c: Constraints, path: FloatArray, rng: np.random.Generator, trial: Trial) -> FloatArray:
-    """What is left of a path (k, n) when straight ways cut it short: first between drawn places on it."""
+    """What is left of a path (k, n) when straight paths cut it short: first between drawn places on it."""
     time = least_time(c.speed, path)
     for ends in np.sort(rng.random((SHORTENINGS, 2)), axis=1):
         if len(path) <= 2:

@@ -30,7 +30,7 @@ BISECTIONS = 48
 LEAST = 1e-12
 
 
-class Pace(NamedTuple):
+class TimedPath(NamedTuple):
     """A path on a grid of its parameter, the time along straight pieces at the speed limits, and its pace."""
 
     s: FloatArray  # (k,) s
@@ -50,22 +50,22 @@ def least_time(speed: FloatArray, q: FloatArray) -> FloatArray:
     return np.concatenate([[0.0], np.cumsum((np.abs(np.diff(q, axis=0)) / speed).max(axis=1))])
 
 
-def timed(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> Pace:
+def time_parameterized(c: Constraints, path: FloatArray, acceleration: FloatArray, trial: Trial) -> TimedPath:
     """The pace of a path of corners (k, n), from rest to rest at ``ROOM`` of the limits."""
     path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > LEAST]]
     if len(path) == 1:
         still = np.zeros((2, path.shape[1]))
-        return Pace(np.array([0.0, 1.0]), path + still, still, still[:1], np.zeros(2), np.zeros(2))
+        return TimedPath(np.array([0.0, 1.0]), path + still, still, still[:1], np.zeros(2), np.zeros(2))
     times = np.diff(least_time(c.speed, path))
     slopes = np.diff(path, axis=0) / times[:, None]
     sizes = np.zeros(len(path))
     for k in range(1, len(path) - 1):
         sizes[k] = _rounding(c, path[k], slopes[k - 1 : k + 1], 0.5 * times[k - 1 : k + 1].min(), trial)
-    pace = _on_grid(path, times, slopes, sizes)
+    timed = _on_grid(path, times, slopes, sizes)
     with np.errstate(divide="ignore", over="ignore"):
-        pace.x[:] = ((ROOM * c.speed / np.abs(pace.dq)) ** 2).min(axis=1)
-    _put_pace(pace, ROOM * acceleration)
-    return pace
+        timed.x[:] = ((ROOM * c.speed / np.abs(timed.dq)) ** 2).min(axis=1)
+    _pace_into(timed, ROOM * acceleration)
+    return timed
 
 
 def _parabola(corner: FloatArray, slopes: FloatArray, size: float, x: FloatArray) -> FloatArray:
@@ -87,7 +87,7 @@ def _rounding(c: Constraints, corner: FloatArray, slopes: FloatArray, size: floa
     return size
 
 
-def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: FloatArray) -> Pace:
+def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: FloatArray) -> TimedPath:
     """The rounded path on its grid, its pace still to be found."""
     steps, q, dq, ddq = [np.zeros(1)], [path[:1]], [slopes[:1]], []
     even = np.ones((STRAIGHT, 1))
@@ -108,7 +108,7 @@ def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: Flo
             dq.append(slope + x * change)
             ddq.append(np.tile(change / (2.0 * size), (ROUNDED, 1)))
     s = np.cumsum(np.concatenate(steps))
-    return Pace(s, np.vstack(q), np.vstack(dq), np.vstack(ddq), np.zeros(len(s)), np.zeros(len(s)))
+    return TimedPath(s, np.vstack(q), np.vstack(dq), np.vstack(ddq), np.zeros(len(s)), np.zeros(len(s)))
 
 
 @merged
@@ -121,52 +121,52 @@ def _narrowed(slope: float, offset: float, bound: float, low: float, high: float
 
 
 @internal
-def _accelerations(pace: Pace, i: int, x: float, ahead: float, most: FloatArray) -> tuple[float, float]:
+def _accelerations(timed: TimedPath, i: int, x: float, ahead: float, most: FloatArray) -> tuple[float, float]:
     """Accelerations d²s/dt² that interval i allows at a pace x, to end at no more than that ahead."""
-    step = pace.s[i + 1] - pace.s[i]
+    step = timed.s[i + 1] - timed.s[i]
     low, high = -x / (2.0 * step), (ahead - x) / (2.0 * step)
     for j in range(most.shape[0]):
-        curve = pace.ddq[i, j]
-        low, high = _narrowed(pace.dq[i, j], curve * x, most[j], low, high)
-        low, high = _narrowed(pace.dq[i + 1, j] + 2.0 * step * curve, curve * x, most[j], low, high)
+        curve = timed.ddq[i, j]
+        low, high = _narrowed(timed.dq[i, j], curve * x, most[j], low, high)
+        low, high = _narrowed(timed.dq[i + 1, j] + 2.0 * step * curve, curve * x, most[j], low, high)
     return low, high
 
 
 @njit
-def _put_pace(pace: Pace, acceleration: FloatArray) -> None:
+def _pace_into(timed: TimedPath, acceleration: FloatArray) -> None:
     """Write the quickest pace from rest to rest within accelerations (n,), and its times.
 
     The pace is as quick as speeds allow yet.
     """
-    count = pace.s.shape[0]
-    pace.x[count - 1] = 0.0
+    count = timed.s.shape[0]
+    timed.x[count - 1] = 0.0
     for i in range(count - 2, -1, -1):
-        low, high = 0.0, pace.x[i]
-        a, b = _accelerations(pace, i, high, pace.x[i + 1], acceleration)
+        low, high = 0.0, timed.x[i]
+        a, b = _accelerations(timed, i, high, timed.x[i + 1], acceleration)
         if a <= b:
             continue
         for _ in range(BISECTIONS):
             middle = 0.5 * (low + high)
-            a, b = _accelerations(pace, i, middle, pace.x[i + 1], acceleration)
+            a, b = _accelerations(timed, i, middle, timed.x[i + 1], acceleration)
             if a <= b:
                 low = middle
             else:
                 high = middle
-        pace.x[i] = low
-    pace.x[0] = 0.0
-    pace.time[0] = 0.0
+        timed.x[i] = low
+    timed.x[0] = 0.0
+    timed.time[0] = 0.0
     for i in range(count - 1):
-        _, u = _accelerations(pace, i, pace.x[i], pace.x[i + 1], acceleration)
-        step = pace.s[i + 1] - pace.s[i]
-        pace.x[i + 1] = max(0.0, pace.x[i] + 2.0 * step * u)
-        pace.time[i + 1] = pace.time[i] + 2.0 * step / (math.sqrt(pace.x[i]) + math.sqrt(pace.x[i + 1]))
+        _, u = _accelerations(timed, i, timed.x[i], timed.x[i + 1], acceleration)
+        step = timed.s[i + 1] - timed.s[i]
+        timed.x[i + 1] = max(0.0, timed.x[i] + 2.0 * step * u)
+        timed.time[i + 1] = timed.time[i] + 2.0 * step / (math.sqrt(timed.x[i]) + math.sqrt(timed.x[i + 1]))
 
 
-def joints_at(pace: Pace, times: FloatArray) -> FloatArray:
+def joints_at(timed: TimedPath, times: FloatArray) -> FloatArray:
     """Joints (k, n) at times (k,), s: at rest before the first and after the last."""
-    t = np.clip(times, 0.0, pace.time[-1])
-    i = np.clip(np.searchsorted(pace.time, t, side="right") - 1, 0, len(pace.time) - 2)
-    since, step = t - pace.time[i], pace.s[i + 1] - pace.s[i]
-    rate, u = np.sqrt(pace.x[i]), (pace.x[i + 1] - pace.x[i]) / (2.0 * step)
+    t = np.clip(times, 0.0, timed.time[-1])
+    i = np.clip(np.searchsorted(timed.time, t, side="right") - 1, 0, len(timed.time) - 2)
+    since, step = t - timed.time[i], timed.s[i + 1] - timed.s[i]
+    rate, u = np.sqrt(timed.x[i]), (timed.x[i + 1] - timed.x[i]) / (2.0 * step)
     done = np.clip(rate * since + 0.5 * u * since**2, 0.0, step)[:, None]
-    return np.asarray(pace.q[i] + done * pace.dq[i] + 0.5 * done**2 * pace.ddq[i])
+    return np.asarray(timed.q[i] + done * timed.dq[i] + 0.5 * done**2 * timed.ddq[i])

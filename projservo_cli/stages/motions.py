@@ -1,4 +1,4 @@
-"""The motion of a plan by its profile, its time, and ways to the goal for a run that is under way."""
+"""The motion of a plan by its profile, its time, and paths to the goal for a run that is under way."""
 
 import math
 from dataclasses import replace
@@ -12,13 +12,20 @@ from projservo_cli.geometry.algebra import as_array
 from projservo_cli.geometry.kinematics import forward, forward_kinematics, project
 from projservo_cli.geometry.lens import straight_views
 from projservo_cli.planning.constraints import Constraints, constraints_of
-from projservo_cli.planning.goal_configurations import Aim
+from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.margins import CLEAR, IMAGE, Demands, Motion, Reaching, along_joints, along_shares
 from projservo_cli.planning.prediction_covariance import spread_of
 from projservo_cli.planning.product_space import duration, evenly, plan_path
-from projservo_cli.planning.rrt_connect import Budget, Way, find_way, first_within, margins_at, within_region
-from projservo_cli.planning.time_parameterization import Pace, joints_at, least_time
+from projservo_cli.planning.rrt_connect import (
+    JointPath,
+    SearchLimits,
+    find_path,
+    first_within,
+    margins_at,
+    within_region,
+)
+from projservo_cli.planning.time_parameterization import TimedPath, joints_at, least_time
 from projservo_cli.records import NO_SPREAD, PRISMATIC, FloatArray, Model, Plan, Spread, WorkFailed
 from projservo_cli.stages.plan_summary import sight_words, verdict_of
 from projservo_cli.stages.scenario import Scenario
@@ -35,8 +42,8 @@ class Found(NamedTuple):
     motion: Motion  # as it is stored, at the instants sigma
     time: FloatArray  # (s,) when it is there, s; NaN where nothing limits the speed
     feasible: bool
-    reason: str  # feasible, reason: whether it may be followed, in words; a way tells that itself
-    way: Way | None = None  # through joint space, where one was looked for
+    reason: str  # feasible, reason: whether it may be followed, in words; a path tells that itself
+    path: JointPath | None = None  # through joint space, where one was looked for
     entered: str = ""  # which region it enters that is kept out of, in words
 
 
@@ -69,7 +76,7 @@ class JointSearch(NamedTuple):
     q_shown: FloatArray  # (k, n) joints known to show the goal, rad or m
     sigma: float  # standard deviation of a coordinate of the images of the goal, px
     spread: Spread = NO_SPREAD  # how far predictions err
-    closed: str = ""  # why no way can be looked for, in words
+    closed: str = ""  # why no path can be looked for, in words
 
 
 def search_of(scenario: Scenario) -> JointSearch:
@@ -92,7 +99,7 @@ def search_of(scenario: Scenario) -> JointSearch:
 
 
 def why_closed(model: Model, demands: Demands, search: JointSearch | None) -> str:
-    """Why no way through joint space can be looked for, or given a time; empty where it can."""
+    """Why no path through joint space can be looked for, or given a time; empty where it can."""
     for i in np.flatnonzero(~np.isfinite(demands.speed)):
         kind = "prismatic" if model.joint_types[i] == PRISMATIC else "joint"
         unit = "m_s" if kind == "prismatic" else "deg_s"
@@ -179,30 +186,30 @@ def kept_out(found: Found, task: Task, trajectory: Trajectory, spread: Spread) -
     return found._replace(feasible=False, reason=entered, entered=entered) if entered else found
 
 
-def joint_way(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
-    """A way through joint space; the linear motion where there is none."""
+def joint_path(reaching: Reaching, task: Task, trajectory: Trajectory, search: JointSearch) -> Found:
+    """A path through joint space; the linear motion where there is none."""
     c = _joint_constraints(reaching, task, trajectory, search.spread)
-    aim = Aim(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
-    how = Budget(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
-    way = find_way(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
-    if way.pace is None:
+    aim = GoalFeatures(task.A_star, straight_views(reaching.model.lens, task.s_star), search.sigma)
+    how = SearchLimits(trajectory.search.samples, trajectory.search.seed, trajectory.goals)
+    path = find_path(c, aim, reaching.q_start, search.q_shown, how, search.acceleration)
+    if path.timing is None:
         linear = given("linear", reaching, trajectory.model_copy(update={"duration_s": None}), 1.0)
         q, unknown = np.full_like(linear.motion.along.q, np.nan), np.full(trajectory.samples, np.nan)
         still = linear.motion.along._replace(q=q, limit=unknown, condition=unknown)
         motion = linear.motion._replace(along=still)
-        return Found(linear.judged, motion, unknown, False, "", way)
-    motion = _sampled_way(reaching, way.pace, trajectory.samples)
-    least = float(way.pace.time[-1])
+        return Found(linear.judged, motion, unknown, False, "", path)
+    motion = _sampled_path(reaching, path.timing, trajectory.samples)
+    least = float(path.timing.time[-1])
     asked = least if trajectory.duration_s is None else trajectory.duration_s
     _require_time(asked, least)
     time = np.linspace(0.0, asked, len(motion.mu))
-    return Found(motion, motion, time, True, "", way)
+    return Found(motion, motion, time, True, "", path)
 
 
-def _sampled_way(reaching: Reaching, pace: Pace, samples: int) -> Motion:
+def _sampled_path(reaching: Reaching, timed: TimedPath, samples: int) -> Motion:
     """The motion at so many places even in time, or more where joints between them were too far off."""
     while True:
-        q = joints_at(pace, np.linspace(0.0, float(pace.time[-1]), 2 * samples - 1))
+        q = joints_at(timed, np.linspace(0.0, float(timed.time[-1]), 2 * samples - 1))
         found, between = along_joints(reaching, q[::2]), 0.5 * (q[:-2:2] + q[2::2])
         off = along_joints(reaching, q[1::2]).along.s - along_joints(reaching, between).along.s
         if np.abs(off).max() <= _INTERPOLATED_PX:
@@ -210,8 +217,8 @@ def _sampled_way(reaching: Reaching, pace: Pace, samples: int) -> Motion:
         samples = 2 * samples - 1
 
 
-class Ways:
-    """Ways to the goal of a scenario, of which a plan was made."""
+class PathReplanner:
+    """Paths to the goal of a scenario, of which a plan was made."""
 
     def __init__(self, scenario: Scenario, plan: Plan) -> None:
         model, shown, self._trajectory = scenario.model, scenario.ends, scenario.config.trajectory
@@ -221,7 +228,7 @@ class Ways:
         body = body_at_start(model, task, shown, plan.A)
         self._reaching = Reaching(model, scenario.demands, *parts, task.O, shown.q_start, body)
         self._c = _joint_constraints(self._reaching, task, self._trajectory, self._search.spread)
-        self._aim = Aim(task.A_star, straight_views(model.lens, task.s_star), self._search.sigma)
+        self._goal = GoalFeatures(task.A_star, straight_views(model.lens, task.s_star), self._search.sigma)
 
     def predicted(self, q: FloatArray) -> FloatArray:
         """Pixels (2, b, 2) of the body at joints (n,), by the calibration, those of the face first."""
@@ -238,8 +245,8 @@ class Ways:
                 return True
         return False
 
-    def anew(self, q: FloatArray, shunned: FloatArray, off: FloatArray) -> Plan | None:
-        """Plan of a way from joints (n,), off by (2, 2) px, to other goals than those shunned (k, n).
+    def replan(self, q: FloatArray, excluded: FloatArray, off: FloatArray) -> Plan | None:
+        """Plan of a path from joints (n,), off by (2, 2) px, to other goals than those excluded (k, n).
 
         It keeps so much farther from borders and regions. Each is searched with a seed of its own.
         """
@@ -248,14 +255,14 @@ class Ways:
         full[IMAGE:CLEAR] += np.abs(off).max(axis=1)
         full[CLEAR] += np.abs(off).max()
         c = self._c._replace(full=full)
-        how = Budget(asked.search.samples, asked.search.seed + self._made, asked.goals, shunned)
+        how = SearchLimits(asked.search.samples, asked.search.seed + self._made, asked.goals, excluded)
         start = np.clip(q, c.lower, c.upper)
-        way = find_way(c, self._aim, start, self._search.q_shown, how, self._search.acceleration)
-        if way.pace is None:
+        path = find_path(c, self._goal, start, self._search.q_shown, how, self._search.acceleration)
+        if path.timing is None:
             return None
-        found = _sampled_way(self._reaching, way.pace, asked.samples)
+        found = _sampled_path(self._reaching, path.timing, asked.samples)
         H, H_start = (forward_kinematics(self._reaching.model, q) for q in (start, plan.q_start))
-        sigma, duration = np.linspace(0.0, 1.0, len(found.mu)), float(way.pace.time[-1])
+        sigma, duration = np.linspace(0.0, 1.0, len(found.mu)), float(path.timing.time[-1])
         return replace(
             plan,
             q_start=start,

@@ -32,7 +32,7 @@ from projservo_cli.stages.motions import (
     body_at_start,
     coupled,
     given,
-    joint_way,
+    joint_path,
     kept_out,
     search_of,
     why_closed,
@@ -182,7 +182,7 @@ def _found(
         shut = why_closed(reaching.model, reaching.demands, search)
         if search is None or shut:
             raise InputError(f"the profile joint: {shut}")
-        return joint_way(reaching, task, trajectory, search)
+        return joint_path(reaching, task, trajectory, search)
     if profile == "constrained":
         found = coupled(reaching, trajectory)
     else:
@@ -206,9 +206,9 @@ def _planned(
     body = body_at_start(model, task, shown, state.A)
     reaching = Reaching(model, demands, H_hat, amplitudes, state.A, a, task.O, shown.q_start, body)
     found = _found(reaching, task, trajectory, search, tau_limit)
-    motion, along, time, way = found.motion, found.motion.along, found.time, found.way
+    motion, along, time, path = found.motion, found.motion.along, found.time, found.path
     tau, theta_r, theta_p = (float(x) for x in motion.reaching.amplitudes)
-    if len(shown.q_start) < COORDINATES and way is None:
+    if len(shown.q_start) < COORDINATES and path is None:
         _require_in_span(model, state.A, shown.q_start, along.s)
     sense, sense_margin = _senses(parts, task)
     holds, constraint, words = verdict_of(found.judged)
@@ -216,7 +216,7 @@ def _planned(
     plan = Plan(
         profile=trajectory.profile,
         feasible=found.feasible,
-        reason=found.reason + note if way is None else reason_of(way),
+        reason=found.reason + note if path is None else reason_of(path),
         tau=tau,
         theta_r=theta_r,
         theta_p=theta_p,
@@ -255,9 +255,9 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        **({} if way is None else told_of(way, along.q, time, trajectory.search.seed)),
+        **({} if path is None else told_of(path, along.q, time, trajectory.search.seed)),
     )
-    return plan, found.entered or ("" if holds or (way is not None and found.feasible) else words)
+    return plan, found.entered or ("" if holds or (path is not None and found.feasible) else words)
 
 
 def _changes(a: FloatArray, H_hat: FloatArray, task: Task) -> tuple[FloatArray, FloatArray]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from projservo_cli.planning.constraints import Constraints, new_trial, put_along, put_demands
+from projservo_cli.planning.constraints import Constraints, demands_into, margins_along_into, new_trial
 from projservo_cli.planning.margins import (
     BEHIND,
     CONDITIONING,
@@ -21,8 +21,8 @@ from projservo_cli.planning.margins import (
     constraint_at,
     joint_margin,
 )
-from projservo_cli.planning.rrt_connect import Tree, Way, may_start
-from projservo_cli.planning.time_parameterization import Pace
+from projservo_cli.planning.rrt_connect import JointPath, Tree, may_start
+from projservo_cli.planning.time_parameterization import TimedPath
 from projservo_cli.records import PRISMATIC, VIEWS, FloatArray, IntArray, in_unit
 
 
@@ -111,28 +111,28 @@ def sight_words(profile: str, motion: Motion) -> tuple[bool, str]:
 
 # Joint vectors of each tree that are stored: those that it grew first.
 _MOST_NODES = 2_000
-# Margins that are told where no way was found: those that stopped most.
+# Margins that are told where no path was found: those that stopped most.
 _TOLD = 2
 
 
-def told_of(way: Way, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
+def told_of(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
     """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none."""
     told: dict[str, Any] = {
-        "goals": way.shown,
-        "goals_tried": len(way.goals),
-        "samples": way.draws,
+        "goals": path.n_goals,
+        "goals_tried": len(path.goals),
+        "samples": path.draws,
         "seed": seed,
         "tree_nodes": 0,
     }
-    if way.trees is not None:
-        told["tree_nodes"] = sum(int(tree.size[0]) for tree in way.trees)
-        told["tree_q"], told["tree_parent"] = _stored(way.trees)
-    if way.pace is None:
+    if path.trees is not None:
+        told["tree_nodes"] = sum(int(tree.size[0]) for tree in path.trees)
+        told["tree_q"], told["tree_parent"] = _stored(path.trees)
+    if path.timing is None:
         return told
-    told["validity"], told["validity_asked"] = _along(way.held, q)
-    took = float(way.pace.time[-1])
-    told["corner"] = _corners_of(way.pace) * (float(time[-1]) / took if took > 0.0 else 1.0)
-    told["lowered"] = tuple(_lowered(way.held, {"start": q[0], "goal": q[-1]}))
+    told["validity"], told["validity_asked"] = _along(path.constraints, q)
+    took = float(path.timing.time[-1])
+    told["corner"] = _corners_of(path.timing) * (float(time[-1]) / took if took > 0.0 else 1.0)
+    told["lowered"] = tuple(_lowered(path.constraints, {"start": q[0], "goal": q[-1]}))
     return told
 
 
@@ -149,21 +149,21 @@ def _stored(trees: tuple[Tree, Tree]) -> tuple[FloatArray, IntArray]:
 def _along(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Margins and what is asked of them, (s, 10), at joints (s, n)."""
     found = np.zeros((2, len(q), MARGINS))
-    put_along(c, np.ascontiguousarray(q), new_trial(q.shape[1], len(c.M)), found)
+    margins_along_into(c, np.ascontiguousarray(q), new_trial(q.shape[1], len(c.M)), found)
     return found[0], found[1]
 
 
-def _corners_of(pace: Pace) -> FloatArray:
+def _corners_of(timed: TimedPath) -> FloatArray:
     """When each rounded stretch begins and ends (k, 2), s: where q'' is not zero."""
-    bent = np.r_[False, (pace.ddq != 0.0).any(axis=1), False]
-    return pace.time[np.flatnonzero(bent[1:] != bent[:-1])].reshape(-1, 2)
+    bent = np.r_[False, (timed.ddq != 0.0).any(axis=1), False]
+    return timed.time[np.flatnonzero(bent[1:] != bent[:-1])].reshape(-1, 2)
 
 
 def _lowered(c: Constraints, ends: Mapping[str, FloatArray]) -> Iterator[str]:
     """What is asked less of at joints (n,) by name, which have less themselves; a sentence each."""
     asked = np.empty(MARGINS)
     for name, q in ends.items():
-        put_demands(c, q, asked)
+        demands_into(c, q, asked)
         if less := [_instead(c, q, int(i), asked[i]) for i in np.flatnonzero(asked < c.full)]:
             yield f"asked less at the {name}: {', '.join(less)}"
 
@@ -178,52 +178,52 @@ def _instead(c: Constraints, q: FloatArray, margin: int, asked: float) -> str:
     return f"{words.asked.format(i + 1)} {asked * full:.2g}{unit} instead of {full:.3g}{unit}"
 
 
-def reason_of(way: Way) -> str:
-    """How a way through joint space leads to the goal, or why none was found, in words."""
-    if way.pace is None:
-        return _why_none(way)
-    g = int(np.abs(way.goals - way.corners[-1]).max(axis=1).argmin())
-    corners = len(way.corners) - 2
+def reason_of(path: JointPath) -> str:
+    """How a path through joint space leads to the goal, or why none was found, in words."""
+    if path.timing is None:
+        return _no_path_reason(path)
+    g = int(np.abs(path.goals - path.corners[-1]).max(axis=1).argmin())
+    corners = len(path.corners) - 2
     how = "a straight way" if corners == 0 else f"a way round {corners} corner{'s' * (corners != 1)}"
     nearest = "the nearest" if g == 0 else f"number {g + 1}"
-    some = "" if way.shown == len(way.goals) else f", of which the {len(way.goals)} nearest were tried"
-    barred = f"; {way.barred} more are within a region" if way.barred else ""
-    goal = "the only joints" if way.shown == 1 else f"{nearest} of {way.shown} joint vectors"
-    return f"{how} in joint space leads to {goal} that show the goal{some}{barred}"
+    some = "" if path.n_goals == len(path.goals) else f", of which the {len(path.goals)} nearest were tried"
+    blocked = f"; {path.blocked} more are within a region" if path.blocked else ""
+    goal = "the only joints" if path.n_goals == 1 else f"{nearest} of {path.n_goals} joint vectors"
+    return f"{how} in joint space leads to {goal} that show the goal{some}{blocked}"
 
 
-def _why_none(way: Way) -> str:
-    """Why no way was found, in words."""
-    if way.region:
-        return f"the start is already within region {way.region}"
-    if way.solutions == 0:
+def _no_path_reason(path: JointPath) -> str:
+    """Why no path was found, in words."""
+    if path.region:
+        return f"the start is already within region {path.region}"
+    if path.solutions == 0:
         return (
             "no joints were found that show the goal: the arm may not reach it, or its images are of "
             "other markers or in another order"
         )
-    if len(way.goals) == 0:
-        barred = f" and {way.barred} within a region that is kept out of" if way.barred else ""
+    if len(path.goals) == 0:
+        blocked = f" and {path.blocked} within a region that is kept out of" if path.blocked else ""
         return (
-            f"of {way.solutions} joint vectors that show the goal, whole turns apart, {way.hidden} lie "
-            f"beyond the joint limits or do not show the face to both cameras{barred}"
+            f"of {path.solutions} joint vectors that show the goal, whole turns apart, {path.hidden} lie "
+            f"beyond the joint limits or do not show the face to both cameras{blocked}"
         )
-    if not may_start(way.had):
-        worst = int(way.had.argmin())
-        what = "a joint limit" if worst == JOINTS else _stopped(way, worst)
+    if not may_start(path.start_clearance):
+        worst = int(path.start_clearance.argmin())
+        what = "a joint limit" if worst == JOINTS else _stopped(path, worst)
         return f"the start is already at or beyond {what}"
-    failed = way.failures[:MARGINS]
+    failed = path.failures[:MARGINS]
     most = [
-        f"{_stopped(way, int(i))} ({failed[i] / failed.sum():.0%})"
+        f"{_stopped(path, int(i))} ({failed[i] / failed.sum():.0%})"
         for i in np.argsort(-failed, kind="stable")[:_TOLD]
         if failed[i] > 0
     ]
     return (
-        f"no way was found to any of {len(way.goals)} joint vectors that show the goal, in {way.draws} "
+        f"no way was found to any of {len(path.goals)} joint vectors that show the goal, in {path.draws} "
         f"samples; what stopped most: {', '.join(most)}"
     )
 
 
-def _stopped(way: Way, margin: int) -> str:
+def _stopped(path: JointPath, margin: int) -> str:
     words, view = constraint_at(margin)
-    joint = int(way.failures[MARGINS:].argmax()) + 1
+    joint = int(path.failures[MARGINS:].argmax()) + 1
     return words.stops.format(joint if margin == JOINTS else VIEWS[view])

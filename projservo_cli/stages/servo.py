@@ -40,7 +40,7 @@ from projservo_cli.robots.contract import at_rest_after
 from projservo_cli.robots.plugins import what_failed
 from projservo_cli.robots.simulated import AnalyticPlant, Plant
 from projservo_cli.stages import external_robot
-from projservo_cli.stages.motions import Ways, search_of, why_closed
+from projservo_cli.stages.motions import PathReplanner, search_of, why_closed
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.simulation import hindrance_of
 from projservo_cli.stages.world import arm_of
@@ -401,7 +401,9 @@ class _Asked:
         if self.is_guided and isinstance(law, BuiltInLaw):
             assert isinstance(self.plan, Plan)
             follow, searches = partial(self._task, law.law.model), scenario.config.control.searches_anew
-            watch = Watch(law, follow, Ways(scenario, self.plan), searches, scenario.limits, standing)
+            watch = Watch(
+                law, follow, PathReplanner(scenario, self.plan), searches, scenario.limits, standing
+            )
         code, steps, log = run_in_python(
             law,
             plant,

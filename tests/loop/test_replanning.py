@@ -22,8 +22,8 @@ WAY = np.linspace([0.0, 0.0], [1.0, -2.0], 21)
 SEEN = np.arange(12.0).reshape(2, 3, 2)
 
 
-class Ways:
-    """Ways that lead on as often as they are asked to, and tell what they were asked."""
+class PathReplanner:
+    """Paths that lead on as often as they are asked to, and tell what they were asked."""
 
     def __init__(self, count=1, leaves=False):
         self.count, self.out, self.asked = count, leaves, []
@@ -35,8 +35,8 @@ class Ways:
         self.ahead = q, off
         return self.out
 
-    def anew(self, q, shunned, off):
-        self.asked.append((q, shunned, off))
+    def replan(self, q, excluded, off):
+        self.asked.append((q, excluded, off))
         self.count -= 1
         return "another way" if self.count >= 0 else None
 
@@ -59,31 +59,31 @@ def watched(ways, clock=0.0, searches=3, **bounds):
 
 @pytest.mark.parametrize("verdict", [CONVERGED, BEHIND_CAMERA, WAITING, RUNNING])
 def test_most_verdicts_stay(verdict):
-    ways = Ways()
+    ways = PathReplanner()
     watch, followed, log = watched(ways, clock=3.0)
     assert watch.ruled(log, 20, verdict, np.zeros(2)) == verdict
     assert (followed, watch.told, ways.asked) == ([], [], [])
 
 
 def test_what_stops_the_law_at_the_goal_has_it_shunned():
-    ways = Ways(count=2)
+    ways = PathReplanner(count=2)
     watch, followed, log = watched(ways, clock=20.0)
     assert watch.ruled(log, 30, JOINT_LIMIT, np.zeros(2)) == WAITING
-    q, shunned, off = ways.asked[0]
+    q, excluded, off = ways.asked[0]
     assert followed == ["another way"]
     np.testing.assert_array_equal(q, log.read[30])
-    np.testing.assert_array_equal(shunned, [WAY[-1], log.read[30]])
+    np.testing.assert_array_equal(excluded, [WAY[-1], log.read[30]])
     np.testing.assert_allclose(off, np.ones((2, 2)))
     assert watch.told == ["at step 30 (a joint limit at the goal)"]
-    # Another goal that fails is shunned beside it; where there is no other way, the verdict stays.
+    # Another goal that fails is excluded beside it; where there is no other way, the verdict stays.
     assert watch.ruled(log, 31, DIVERGED, np.zeros(2)) == WAITING
     assert watch.ruled(log, 32, JOINT_LIMIT, np.zeros(2)) == JOINT_LIMIT
-    assert [len(shunned) for _, shunned, _ in ways.asked] == [2, 4, 6]
+    assert [len(excluded) for _, excluded, _ in ways.asked] == [2, 4, 6]
     assert watch.told[-1] == "at step 32 (a joint limit at the goal) in vain"
 
 
 def test_no_more_ways_are_searched_than_asked_for():
-    ways = Ways(count=9)
+    ways = PathReplanner(count=9)
     watch, _, log = watched(ways, clock=20.0, searches=1)
     assert watch.ruled(log, 5, JOINT_LIMIT, np.zeros(2)) == WAITING
     assert watch.ruled(log, 6, JOINT_LIMIT, np.zeros(2)) == JOINT_LIMIT
@@ -91,7 +91,7 @@ def test_no_more_ways_are_searched_than_asked_for():
 
 
 def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
-    ways = Ways()
+    ways = PathReplanner()
     watch, _, log = watched(ways, clock=20.0, plateau_steps=4)
     log.judged[:] = 3.0
     verdicts = [watch.ruled(log, k, RUNNING, np.zeros(2)) for k in range(40, 46)]
@@ -100,12 +100,12 @@ def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
 
 
 def test_a_way_may_lead_away_from_the_goal():
-    watch, _, log = watched(Ways(), clock=4.0)
+    watch, _, log = watched(PathReplanner(), clock=4.0)
     assert watch.ruled(log, 7, DIVERGED, np.zeros(2)) == RUNNING
 
 
 def test_a_command_that_is_no_number_is_never_let_through():
-    ways = Ways()
+    ways = PathReplanner()
     watch, _, log = watched(ways, clock=4.0)
     assert watch.ruled(log, 7, DIVERGED, np.array([0.0, np.nan])) == WAITING
     assert watch.told == ["at step 7 (growing errors on the way)"]
@@ -113,7 +113,7 @@ def test_a_command_that_is_no_number_is_never_let_through():
 
 
 def test_what_is_ahead_is_looked_at_with_what_images_are_off():
-    ways = Ways(leaves=True)
+    ways = PathReplanner(leaves=True)
     watch, _, log = watched(ways, clock=16.0)
     assert watch.ruled(log, 9, RUNNING, np.zeros(2)) == RUNNING
     assert watch.ruled(log, 10, RUNNING, np.zeros(2)) == WAITING
@@ -124,7 +124,7 @@ def test_what_is_ahead_is_looked_at_with_what_images_are_off():
 
 
 def test_a_lost_face_is_sought_back_along_the_path():
-    ways = Ways()
+    ways = PathReplanner()
     watch, followed, log = watched(ways, clock=3.0)
     q_dot = np.zeros(2)
     for k, place in enumerate((2, 1)):
@@ -137,6 +137,6 @@ def test_a_lost_face_is_sought_back_along_the_path():
 
 
 def test_a_face_that_is_nowhere_on_the_way_back_is_lost():
-    watch, _, log = watched(Ways(), clock=1.5)
+    watch, _, log = watched(PathReplanner(), clock=1.5)
     verdicts = [watch.ruled(log, k, MARKERS_LOST, np.zeros(2)) for k in range(3)]
     assert verdicts == [RUNNING, MARKERS_LOST, MARKERS_LOST]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from projservo_cli.planning.constraints import Constraints, constraints_of
-from projservo_cli.planning.goal_configurations import Aim
+from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import Demands
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweeps.design import random_tasks
@@ -23,7 +23,7 @@ class Case(NamedTuple):
     q_start: object
     q_goal: object
     c: Constraints
-    aim: Aim
+    aim: GoalFeatures
     acceleration: object
 
 
@@ -46,4 +46,4 @@ def case(name, k):
     keep = np.array([0.002 if kind == "P" else np.radians(1.0) for kind in joints.types])
     demands = Demands(joints.lower, joints.upper, speed, truth.image_size, 5.0, 0.0, keep, 8.0)
     c = constraints_of(truth.model, A, task, q_start, demands)
-    return Case(truth, q_start, q_goal, c, Aim(task.A_star, s_star, 0.0), joints.acceleration)
+    return Case(truth, q_start, q_goal, c, GoalFeatures(task.A_star, s_star, 0.0), joints.acceleration)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.planning.goal_configurations import UNSURE, goals_of
-from projservo_cli.planning.rrt_connect import Budget, find_way
+from projservo_cli.planning.rrt_connect import SearchLimits, find_path
 from tests.planning.joint_space_cases import case
 
 NONE = np.empty((0, 7))
@@ -73,8 +73,10 @@ def test_joints_that_turn_often_have_no_more_goals_than_are_near():
 def test_few_are_the_nearest_of_many():
     found = case("ur5", 2)
     many, times, _ = goals_in(found)
-    way = find_way(found.c, found.aim, found.q_start, NONE[:, :6], Budget(goals=5), found.acceleration)
-    assert way.shown == len(many)
+    way = find_path(
+        found.c, found.aim, found.q_start, NONE[:, :6], SearchLimits(max_goals=5), found.acceleration
+    )
+    assert way.n_goals == len(many)
     np.testing.assert_allclose(times[:5], (np.abs(way.goals - found.q_start) / found.c.speed).max(axis=1))
 
 
@@ -82,6 +84,6 @@ def test_a_goal_beyond_the_limits_is_told():
     found = case("paper", 0)
     # Limits around the start that none of the solutions lies within.
     c = found.c._replace(lower=found.q_start - 1e-3, upper=found.q_start + 1e-3)
-    way = find_way(c, found.aim, found.q_start, NONE[:, :6], Budget(), found.acceleration)
-    assert len(way.goals) == len(way.corners) == way.shown == 0
+    way = find_path(c, found.aim, found.q_start, NONE[:, :6], SearchLimits(), found.acceleration)
+    assert len(way.goals) == len(way.corners) == way.n_goals == 0
     assert way.solutions == way.hidden > 0

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from projservo_cli.planning.keep_out import keep_out_of, outside_polygon
 from projservo_cli.planning.margins import CLEAR
-from projservo_cli.planning.rrt_connect import Budget, find_way, margins_at
+from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
 from projservo_cli.planning.time_parameterization import joints_at
 from projservo_cli.records import Spread, WorkFailed
 from projservo_cli.stages import calibrate, plan, servo
@@ -102,9 +102,9 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
     for k in range(COUNT):
         found = case("paper", k)
         nothing = np.empty((0, 6))
-        free = find_way(found.c, found.aim, found.q_start, nothing, Budget(), found.acceleration)
+        free = find_path(found.c, found.aim, found.q_start, nothing, SearchLimits(), found.acceleration)
         middle, (left, right) = box_of(
-            found, joints_at(free.pace, np.array([0.5 * free.pace.time[-1]]))[0], 0.02
+            found, joints_at(free.timing, np.array([0.5 * free.timing.time[-1]]))[0], 0.02
         )
         c = found.c._replace(keep_out=keep_out_of([(left, right, False)]))
         ends = [found.truth.images(q, found.truth.M_face) for q in (found.q_start, found.q_goal)]
@@ -113,11 +113,11 @@ def test_no_marker_enters_a_box_that_stands_on_the_straight_way():
         ):
             continue
         tried += 1
-        way = find_way(c, found.aim, found.q_start, nothing, Budget(), found.acceleration)
+        way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(), found.acceleration)
         if len(way.corners) == 0:
             continue
         around += 1
-        for q in joints_at(way.pace, np.linspace(0.0, way.pace.time[-1], 400)):
+        for q in joints_at(way.timing, np.linspace(0.0, way.timing.time[-1], 400)):
             X = (found.truth.M_face @ found.truth.displacement(q).T)[:, :3]
             x = np.linspace(0.0, 1.0, 20)[:, None, None]
             segments = (1 - x) * X + x * np.roll(X, -1, axis=0)
@@ -131,14 +131,14 @@ def test_a_region_of_one_image_bars_that_image():
     nothing = np.empty((0, 6))
     everywhere = np.array([[-1e4, -1e4], [1e4, -1e4], [1e4, 1e4], [-1e4, 1e4]])
     c = found.c._replace(keep_out=keep_out_of([(everywhere, None, True)]))
-    way = find_way(c, found.aim, found.q_start, nothing, Budget(samples=200), found.acceleration)
+    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200), found.acceleration)
     assert len(way.corners) == 0
     assert reason_of(way) == "the start is already within region 1"
     around = found.aim.s_star[0, 1] + [[-3.0, -3.0], [3.0, -3.0], [0.0, 5.0]]
     c = found.c._replace(keep_out=keep_out_of([(around, None, True)]))
-    way = find_way(c, found.aim, found.q_start, nothing, Budget(samples=200), found.acceleration)
-    assert way.solutions == way.hidden + way.barred
-    assert f"and {way.barred} within a region that is kept out of" in reason_of(way)
+    way = find_path(c, found.aim, found.q_start, nothing, SearchLimits(max_samples=200), found.acceleration)
+    assert way.solutions == way.hidden + way.blocked
+    assert f"and {way.blocked} within a region that is kept out of" in reason_of(way)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Ways from start to goal: valid, timed within the limits, the same whoever searches beside."""
+"""Paths from start to goal: valid, timed within the limits, the same whoever searches beside."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -7,17 +7,17 @@ import pytest
 
 from projservo_cli.planning.constraints import new_trial
 from projservo_cli.planning.margins import JOINTS, VISIBILITY, WIDTH
-from projservo_cli.planning.rrt_connect import Budget, find_way, margins_at
-from projservo_cli.planning.time_parameterization import ROOM, joints_at, least_time, timed
+from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at
+from projservo_cli.planning.time_parameterization import ROOM, joints_at, least_time, time_parameterized
 from tests.planning.joint_space_cases import COUNT, case
 
-SEARCH = Budget()
+SEARCH = SearchLimits()
 
 
 def way_of(found, search=SEARCH):
     """The way of a case."""
     nothing = np.empty((0, len(found.q_start)))
-    return find_way(found.c, found.aim, found.q_start, nothing, search, found.acceleration)
+    return find_path(found.c, found.aim, found.q_start, nothing, search, found.acceleration)
 
 
 @pytest.mark.parametrize("name", ["paper", "ur5", "stanford", "seven"])
@@ -25,12 +25,12 @@ def test_every_task_has_a_valid_way_within_the_limits_of_the_joints(name):
     straight = 0
     for k in range(COUNT):
         found = case(name, k)
-        way = way_of(found)
-        straight += len(way.corners) == 2
-        assert (way.corners[0] == found.q_start).all()
-        assert np.abs(way.goals - way.corners[-1]).max(axis=1).min() == 0.0
-        pace, period = way.pace, 1e-3
-        q = joints_at(pace, np.arange(0.0, pace.time[-1] + 2 * period, period))
+        path = way_of(found)
+        straight += len(path.corners) == 2
+        assert (path.corners[0] == found.q_start).all()
+        assert np.abs(path.goals - path.corners[-1]).max(axis=1).min() == 0.0
+        timed, period = path.timing, 1e-3
+        q = joints_at(timed, np.arange(0.0, timed.time[-1] + 2 * period, period))
         margins = np.array([margins_at(found.c, row)[0] for row in q[::5]])
         assert margins[:, [JOINTS, VISIBILITY, VISIBILITY + 1, WIDTH, WIDTH + 1]].min() > 0.0
         assert ((q >= found.c.lower) & (q <= found.c.upper)).all()
@@ -39,7 +39,7 @@ def test_every_task_has_a_valid_way_within_the_limits_of_the_joints(name):
         speed, acceleration = np.diff(q, axis=0) / period, np.diff(q, n=2, axis=0) / period**2
         assert (np.abs(speed) / found.c.speed).max() <= ROOM * 1.01
         assert (np.abs(acceleration) / found.acceleration).max() <= ROOM * (1.0 + 1e-6)
-        np.testing.assert_allclose(q[-1], way.corners[-1], atol=1e-12)
+        np.testing.assert_allclose(q[-1], path.corners[-1], atol=1e-12)
         assert np.isfinite(acceleration).all()
     assert straight > 0
 
@@ -48,36 +48,38 @@ def test_a_straight_way_takes_the_time_of_its_slowest_joint():
     # At constant acceleration up to the limit of speed and down again, as any textbook has it.
     found = case("paper", 0)
     for q_goal in (found.q_start + 0.02, found.q_start + np.array([0.0, 0.0, -1.0, 0.2, 0.3, 0.1])):
-        pace = timed(found.c, np.stack([found.q_start, q_goal]), found.acceleration, new_trial(6, 4))
+        timed = time_parameterized(
+            found.c, np.stack([found.q_start, q_goal]), found.acceleration, new_trial(6, 4)
+        )
         d, v, a = np.abs(q_goal - found.q_start), ROOM * found.c.speed, ROOM * found.acceleration
         least = np.where(d < v * v / a, 2.0 * np.sqrt(d / a), d / v + v / a).max()
-        assert pace.time[-1] == pytest.approx(least, rel=2e-3)
-        assert pace.time[-1] >= least * (1.0 - 1e-9)
+        assert timed.time[-1] == pytest.approx(least, rel=2e-3)
+        assert timed.time[-1] >= least * (1.0 - 1e-9)
 
 
 def test_the_pace_is_nearly_the_quickest_there_is():
     toppra = pytest.importorskip("toppra", reason="compares with toppra where it is installed")
     found = case("stanford", next(k for k in range(COUNT) if len(way_of(case("stanford", k)).corners) > 2))
-    way = way_of(found)
-    pace = way.pace
-    path = toppra.interpolator.SplineInterpolator(pace.s, pace.q)
+    path = way_of(found)
+    timed = path.timing
+    path = toppra.interpolator.SplineInterpolator(timed.s, timed.q)
     limits = [
         toppra.constraint.JointVelocityConstraint(np.c_[-1, 1] * ROOM * found.c.speed[:, None]),
         toppra.constraint.JointAccelerationConstraint(np.c_[-1, 1] * ROOM * found.acceleration[:, None]),
     ]
     quickest = toppra.algorithm.TOPPRA(limits, path).compute_trajectory(0, 0).duration
-    assert pace.time[-1] <= 1.05 * quickest
+    assert timed.time[-1] <= 1.05 * quickest
 
 
 def test_a_way_is_the_same_to_the_bit_in_threads():
     found = case("stanford", next(k for k in range(COUNT) if len(way_of(case("stanford", k)).corners) > 2))
     alone = way_of(found)
     with ThreadPoolExecutor(4) as pool:
-        for way in pool.map(lambda _: way_of(found), range(8)):
-            np.testing.assert_array_equal(way.corners, alone.corners)
-            np.testing.assert_array_equal(way.pace.time, alone.pace.time)
-            assert way.draws == alone.draws
-    assert not np.array_equal(way_of(found, Budget(seed=1)).corners, alone.corners)
+        for path in pool.map(lambda _: way_of(found), range(8)):
+            np.testing.assert_array_equal(path.corners, alone.corners)
+            np.testing.assert_array_equal(path.timing.time, alone.timing.time)
+            assert path.draws == alone.draws
+    assert not np.array_equal(way_of(found, SearchLimits(seed=1)).corners, alone.corners)
 
 
 def test_no_way_is_told_with_what_stands_in_it():
@@ -85,16 +87,16 @@ def test_no_way_is_told_with_what_stands_in_it():
     found = case("paper", 0)
     full = found.c.full.copy()
     full[WIDTH : WIDTH + 2] = 1e4
-    way = way_of(found._replace(c=found.c._replace(full=full)), Budget(samples=500))
-    assert len(way.goals) > 0
-    assert len(way.corners) == 0
-    assert way.pace is None
-    assert way.draws == 500
-    assert way.failures.argmax() in (WIDTH, WIDTH + 1)
+    path = way_of(found._replace(c=found.c._replace(full=full)), SearchLimits(max_samples=500))
+    assert len(path.goals) > 0
+    assert len(path.corners) == 0
+    assert path.timing is None
+    assert path.draws == 500
+    assert path.failures.argmax() in (WIDTH, WIDTH + 1)
 
 
 def test_a_shortened_way_is_no_longer_than_what_the_trees_found():
     found = case("stanford", next(k for k in range(COUNT) if len(way_of(case("stanford", k)).corners) > 2))
-    way = way_of(found)
-    took = least_time(found.c.speed, way.corners)[-1]
-    assert took >= (np.abs(way.goals[0] - found.q_start) / found.c.speed).max() - 1e-12
+    path = way_of(found)
+    took = least_time(found.c.speed, path.corners)[-1]
+    assert took >= (np.abs(path.goals[0] - found.q_start) / found.c.speed).max() - 1e-12

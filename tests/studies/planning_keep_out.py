@@ -21,10 +21,10 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.config.task import KeptOut
 from projservo_cli.geometry.stereo import optical_centers
 from projservo_cli.planning.constraints import constraints_of
-from projservo_cli.planning.goal_configurations import Aim
+from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.keep_out import keep_out_of
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.planning.rrt_connect import Budget, find_way, within_region
+from projservo_cli.planning.rrt_connect import SearchLimits, find_path, within_region
 from projservo_cli.records import WorkFailed
 from projservo_cli.robots.simulated import METRIC_A_INF
 from projservo_cli.stages import calibrate, plan
@@ -176,14 +176,14 @@ def way_exists(config, truth: Truth, task: Drawn):
     c = true_constraints(config, truth, task, task.q_start)
     s_star = truth.images(task.q_goal, truth.M_face)
     aimed = Shown(task.q_start, truth.images(task.q_start, truth.M_face), s_star, truth.center)
-    aim = Aim(aimed.task(truth.model).A_star, s_star, 0.0)
+    aim = GoalFeatures(aimed.task(truth.model).A_star, s_star, 0.0)
     searches = 0
     for samples, seeds in ESCALATED:
         for seed in range(seeds):
-            how = Budget(samples, seed, 4096)
+            how = SearchLimits(samples, seed, 4096)
             searches += 1
             acceleration = joints_of(config).acceleration
-            if len(find_way(c, aim, task.q_start, task.q_goal[None], how, acceleration).corners):
+            if len(find_path(c, aim, task.q_start, task.q_goal[None], how, acceleration).corners):
                 return True, searches
     return False, searches
 

@@ -1,4 +1,4 @@
-"""Ways of the profile joint against other programs: how long they are by OMPL, how quick by toppra.
+"""Paths of the profile joint against other programs: how long they are by OMPL, how quick by toppra.
 
     python -m tests.studies.planning_oracle [--tasks 500] [--arms paper ur5 stanford seven] [-o ways.csv]
 
@@ -15,16 +15,16 @@ from itertools import count
 import numpy as np
 from tqdm import tqdm
 
-from projservo_cli.planning.constraints import put_demands
+from projservo_cli.planning.constraints import demands_into
 from projservo_cli.planning.margins import MARGINS
-from projservo_cli.planning.rrt_connect import Budget, find_way, margins_at, with_ends
+from projservo_cli.planning.rrt_connect import SearchLimits, find_path, margins_at, with_ends
 from projservo_cli.planning.time_parameterization import least_time
 from tests.studies.planning_tables import asked_for, quantiles, task_configs, true_search, write_rows
 
 SEEDS = 5
 # That OMPL searches, and then shortens, at most, s.
 PATIENCE_S = 20.0, 2.0
-# Way between two of OMPL's checks of an edge, s at the speed limits.
+# JointPath between two of OMPL's checks of an edge, s at the speed limits.
 RESOLUTION_S = 0.01
 
 
@@ -46,7 +46,7 @@ def of_ompl(c, q_start, goals, samples, seed):
 
     def is_valid(state):
         q = joints(state)
-        put_demands(c, q, demands)
+        demands_into(c, q, demands)
         return bool((margins_at(c, q)[0] >= demands).all())
 
     def state_of(q):
@@ -101,16 +101,21 @@ def compared(config):
     """A way of a task, in numbers, against what other programs make of it."""
     c, aim, q_start, q_goal, acceleration = true_search(config, margins=True)
     seed = config.seed
-    how = Budget(config.trajectory.search.samples, seed, config.trajectory.goals)
+    how = SearchLimits(config.trajectory.search.samples, seed, config.trajectory.goals)
     begin = time.process_time()
-    way = find_way(c, aim, q_start, q_goal[None], how, acceleration)
-    row = {"seed": seed, "s": time.process_time() - begin, "found": len(way.corners) > 0, "goals": way.shown}
-    if way.pace is None:
+    way = find_path(c, aim, q_start, q_goal[None], how, acceleration)
+    row = {
+        "seed": seed,
+        "s": time.process_time() - begin,
+        "found": len(way.corners) > 0,
+        "goals": way.n_goals,
+    }
+    if way.timing is None:
         return row
     straight, length = len(way.corners) == 2, least_time(c.speed, way.corners)[-1]
-    row |= {"straight": straight, "length": length, "duration": float(way.pace.time[-1])}
+    row |= {"straight": straight, "length": length, "duration": float(way.timing.time[-1])}
     if find_spec("toppra"):
-        row["toppra"] = of_toppra(way.pace, c.speed, acceleration)
+        row["toppra"] = of_toppra(way.timing, c.speed, acceleration)
     if straight:
         return row | {"slowest_joint": slowest_joint(way, c.speed, acceleration)}
     nearest = (np.abs(way.goals - q_start) / c.speed).max(axis=1).min()

@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 from projservo_cli.config.robot import JointVector
 from projservo_cli.planning.constraints import constraints_of
-from projservo_cli.planning.goal_configurations import Aim
+from projservo_cli.planning.goal_configurations import GoalFeatures
 from projservo_cli.planning.margins import limits_alone
-from projservo_cli.planning.rrt_connect import Budget, find_way
+from projservo_cli.planning.rrt_connect import SearchLimits, find_path
 from projservo_cli.stages.world import joints_of, truth_of
 from projservo_cli.sweeps.design import random_tasks
 from projservo_cli.task.target import Shown
@@ -24,7 +24,7 @@ from tests.known import configured
 
 # Configurations with images of 0.5 px noise, each with a seed of its own for its tasks.
 ARMS = {"paper": 151, "ur5": 152, "stanford": 153, "seven": 154}
-# Ways that are looked for with the true model: joint vectors drawn by each search, and how many searches.
+# Paths that are looked for with the true model: joint vectors drawn by each search, and how many searches.
 SAMPLES, SEARCHES = 100_000, 20
 
 
@@ -60,7 +60,7 @@ def true_search(config, *, margins=False):
         keep = np.array([asked.joint_margin_m if kind == "P" else deg for kind in joints.types])
         demands = demands._replace(border_px=asked.border_px, least_face_px=asked.least_face_px, keep=keep)
     c = constraints_of(truth.model, A, task, q_start, demands)
-    return c, Aim(task.A_star, s_star, 0.0), q_start, q_goal, joints.acceleration
+    return c, GoalFeatures(task.A_star, s_star, 0.0), q_start, q_goal, joints.acceleration
 
 
 def asked_for(study, about, tasks, arms=tuple(ARMS), counted="of each arm"):
@@ -76,7 +76,7 @@ def has_no_way(config):
     """Whether no search with the true model finds a way."""
     c, aim, q_start, q_goal, acceleration = true_search(config)
     return not any(
-        len(find_way(c, aim, q_start, q_goal[None], Budget(SAMPLES, seed), acceleration).corners)
+        len(find_path(c, aim, q_start, q_goal[None], SearchLimits(SAMPLES, seed), acceleration).corners)
         for seed in range(SEARCHES)
     )
 
