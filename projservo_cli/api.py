@@ -14,12 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from projservo_cli.config import Config, Override, load_config, overrides_of, sweep_of, to_yaml
-from projservo_cli.control import CODES
 from projservo_cli.display import checked_array, require_radians
 from projservo_cli.experiment import Experiment, compilation, law_target, listening, scene_of
 from projservo_cli.files import working_in
+from projservo_cli.laws import CODES, REPLAN, law_and_mode, name_of
 from projservo_cli.observations import Observations, rows_of
-from projservo_cli.records import REPLAN, Calibration, InputError, Plan, law_and_mode, name_of
+from projservo_cli.records import Calibration, InputError, Plan
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress

@@ -13,19 +13,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from projservo_cli.config import Config, load_config, shipped, to_yaml
-from projservo_cli.control import CODES
 from projservo_cli.files import working_in
 from projservo_cli.geometry.jit import CACHE_FOLDER
+from projservo_cli.laws import CODES, law_and_mode
 from projservo_cli.progress import Bar
-from projservo_cli.records import (
-    Calibration,
-    CrossValidation,
-    InputError,
-    Observation,
-    Report,
-    WorkFailed,
-    law_and_mode,
-)
+from projservo_cli.records import Calibration, CrossValidation, InputError, Observation, Report, WorkFailed
 from projservo_cli.results import ImageModel, MotionPlan, RunTrace, Scene
 from projservo_cli.robots import plugins
 from projservo_cli.stages import Progress

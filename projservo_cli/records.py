@@ -6,7 +6,7 @@ knows how it is stored.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -364,14 +364,6 @@ class CrossValidation:
     )
 
 
-# All laws built in; compiled code knows each by its place here, as ``control`` has it.
-LAWS = ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points", "exact")
-METRIC_LAWS = ("euclidean_points",)  # laws that are given the metric model, as in the paper
-# Laws that need the points of the face themselves, and those that can measure with the body.
-POINT_LAWS = ("stacked", "blockwise", "euclidean_points")
-BODY_LAWS = tuple(law for law in LAWS if law not in POINT_LAWS)
-
-
 def in_unit(value: float, unit: str, digits: int = 6) -> str:
     """Write a joint reading, rad or m, in the unit deg, rad or m."""
     return f"{math.degrees(value) if unit == 'deg' else value:.{digits}g} {unit}"
@@ -639,41 +631,3 @@ class Report:
     )
     share: FloatArray = _array("share", about="share of the task in both sides of (22)")
     composition_mm: FloatArray = _array("share", "mm", "distance of the centre between both sides of (22)")
-
-
-REPLAN, TRACK, IMAGE_TRACK = "replan", "track", "image_track"
-MODES_OF = {  # of laws of the package that follow a plan as well; all others only replan
-    "direct_three": (REPLAN, TRACK),
-    "direct_two": (REPLAN, TRACK),
-    "exact": (REPLAN, TRACK),
-    "stacked": (REPLAN, IMAGE_TRACK),
-}
-NAMES = {f"{law}_{mode}": (law, mode) for law, modes in MODES_OF.items() for mode in modes if mode != REPLAN}
-
-
-def name_of(law: str, mode: str) -> str:
-    """Name of the run of a law in a mode: the law's own where it replans, such as ``exact_track`` else."""
-    return law if mode == REPLAN else f"{law}_{mode}"
-
-
-def law_and_mode(name: str) -> tuple[str, str]:
-    """Law and mode of the run of a name."""
-    return NAMES.get(name, (name, REPLAN))
-
-
-def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
-    """Names of the runs of laws, each in those of the modes that it has.
-
-    Raises InputError if a law has none of them.
-    """
-    found = []
-    for law in laws:
-        own = MODES_OF.get(law, (REPLAN,))
-        if not set(own) & set(modes):
-            able = [other for other in MODES_OF if set(MODES_OF[other]) & set(modes)]
-            raise InputError(
-                f"control.mode {' and '.join(modes)}: {law} has no such mode, only "
-                f"{' and '.join(own)}; laws that have one: {', '.join(able)} (--law, control.laws)"
-            )
-        found += [name_of(law, mode) for mode in modes if mode in own]
-    return tuple(dict.fromkeys(found))

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Gains, Law, new_state
 from projservo_cli.geometry.lens import bent
 from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.step import VERDICTS, Limits, new_log
 from projservo_cli.records import FloatArray, Model

@@ -286,7 +286,7 @@ def _of_plan(value: dict[str, Any], detailed: bool) -> Iterator[str]:
 
 
 def _of_laws(value: dict[str, Any]) -> Iterator[str]:
-    from projservo_cli.records import name_of
+    from projservo_cli.laws import name_of
 
     known = any(trace["position_error_mm"] is not None for trace in value["laws"])
     keys = ("position_error_mm", "rotation_error_deg", "center_deviation_mm")

@@ -19,7 +19,7 @@ _UNUSED = ("config", "sets", "output", "data", "dry_run", "view", "animation")  
 def _laws(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
     """Laws for the completion of a shell."""
     del context, parameter
-    from projservo_cli.records import LAWS
+    from projservo_cli.laws import LAWS
 
     return [law for law in LAWS if law.startswith(incomplete)]
 
@@ -465,7 +465,7 @@ def _findings(call: _Call) -> Iterator[tuple[str, bool]]:
 
 def _of_runs(chain: Any) -> Iterator[tuple[str, bool]]:
     """A line on each run that did not converge or missed periods, and whether the call fails by it."""
-    from projservo_cli.records import POINT_LAWS, name_of
+    from projservo_cli.laws import POINT_LAWS, name_of
 
     for trace in (chain.run.traces[law] for law in chain.laws_done):
         must, converged = chain.config.control.requires(trace.law), trace.verdict == "converged"

@@ -35,7 +35,8 @@ from projservo_cli.config.robot import (
     are_degrees,
 )
 from projservo_cli.config.task import TaskSettings, Trajectory
-from projservo_cli.records import LAWS, POINT_LAWS, REPLAN, InputError
+from projservo_cli.laws import LAW_SPECS, LAWS, POINT_LAWS, REPLAN
+from projservo_cli.records import InputError
 from projservo_cli.robots import plugins
 
 
@@ -291,7 +292,7 @@ class _Control(Section):
     """The laws to run, in which modes, their gains in 1/s, and how fast the joints may move."""
 
     laws: tuple[Law, ...] = Field(
-        ("direct_three", "direct_two", "stacked", "blockwise", "euclidean_points"),
+        tuple(law for law, spec in LAW_SPECS.items() if spec.paper),
         min_length=1,
         description="laws to run, each from the start; module:Class for a law of yours",
     )

@@ -1,7 +1,6 @@
 """Control laws: the paper's own, that without drift, and classical ones; one contract, one if-chain.
 
-Run files and tables know a law by its name, compiled code by its place among ``records.LAWS``. A law is added
-by its function, its lines here, and its name there.
+Run files and tables know a law by its name, compiled code by its code in ``laws``.
 """
 
 from projservo_cli.control import exact
@@ -10,12 +9,12 @@ from projservo_cli.control.direct import direct_three, direct_two
 from projservo_cli.control.law import LOST, OK, Gains, Law, State, limit_speed
 from projservo_cli.geometry.jit import internal, merged
 from projservo_cli.geometry.lens import bends, straight
-from projservo_cli.records import LAWS, FloatArray
+from projservo_cli.laws import LAWS
+from projservo_cli.records import FloatArray
 from projservo_cli.task.trajectory import Reference, following, near_way, put_aim, under_way
 
 # Share of what the images ask for in a period that corrects a way through joint space.
 _CORRECTED = 0.2
-CODES = {law: code for code, law in enumerate(LAWS)}
 # In the order of their names, and as many.
 _DIRECT_THREE, _DIRECT_TWO, _STACKED, _BLOCKWISE, _EUCLIDEAN_POINTS, _EXACT = range(len(LAWS))
 

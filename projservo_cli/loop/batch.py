@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import literal_unroll
 
-from projservo_cli.control import CODES
 from projservo_cli.control.law import (
     ERRORS,
     MOST_PARTS,
@@ -23,6 +22,7 @@ from projservo_cli.geometry.jit import composed, merged, njit
 from projservo_cli.geometry.kinematics import backward
 from projservo_cli.geometry.lens import straight
 from projservo_cli.geometry.mechanisms import OWN, Span, span_of
+from projservo_cli.laws import CODES
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import Ended, Summary, summarize
 from projservo_cli.loop.step import CONVERGED, RUNNING, Limits, Log, new_log

@@ -12,17 +12,8 @@ from markupsafe import Markup
 
 from projservo_cli.files import replacing, write_whole
 from projservo_cli.geometry.kinematics import forward_kinematics, joint_operators
-from projservo_cli.records import (
-    BODY_LAWS,
-    POINT_LAWS,
-    BoolArray,
-    ByteArray,
-    FloatArray,
-    InputError,
-    IntArray,
-    Plan,
-    Trace,
-)
+from projservo_cli.laws import BODY_LAWS, POINT_LAWS
+from projservo_cli.records import BoolArray, ByteArray, FloatArray, InputError, IntArray, Plan, Trace
 from projservo_cli.report import style
 from projservo_cli.report.figures.frames import frames_of, with_halo
 from projservo_cli.report.figures.images import near_pixels

@@ -8,12 +8,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from projservo_cli.geometry.kinematics import joint_operators
+from projservo_cli.laws import title_of
 from projservo_cli.loop.step import plateau_stretch
 from projservo_cli.records import PRISMATIC, BoolArray, FloatArray, Trace
 from projservo_cli.report.figures.path_deviation import study_numbers
 from projservo_cli.report.report_data import (
     DIRECT,
-    TITLES,
     Material,
     Studies,
     along_line,
@@ -113,7 +113,7 @@ def _exponential(material: Material, studies: Studies, law: str) -> Iterator[_Cl
         )
         holds = off <= _FACTOR_TOLERANCE
     yield _Claim(
-        f"{TITLES[law]}: the control errors decay exponentially",
+        f"{title_of(law)}: the control errors decay exponentially",
         "section 6, Figs. 9 and 10",
         measured,
         f"factor of every settled step within {_FACTOR_TOLERANCE:.0%} of 1 - gain·period",
@@ -183,14 +183,14 @@ def _drift_claims(material: Material, studies: Studies) -> Iterator[_Claim]:
     for i, law in enumerate(DIRECT):
         free, limited = drift[i, 0]
         yield _Claim(
-            f"{TITLES[law]}: the drift falls with the gain",
+            f"{title_of(law)}: the drift falls with the gain",
             "section 6, Fig. 8",
             f"{_listed(free)} mm at gains {gains} per step; calibrated {_listed(drift[i, 1, 0])} mm",
             "strictly, with true operators and no limit",
             bool((np.diff(free[np.argsort(studies.gains)]) > 0).all()),
         )
         yield _Claim(
-            f"{TITLES[law]}: the drift falls with a limit of {studies.step_limit_deg:g}° per step",
+            f"{title_of(law)}: the drift falls with a limit of {studies.step_limit_deg:g}° per step",
             "section 6, Fig. 8",
             f"{_listed(limited)} mm at the same gains; calibrated {_listed(drift[i, 1, 1])} mm",
             f"nowhere larger than without the limit by more than {_SAMPLING:.1%}, "
@@ -220,7 +220,7 @@ def _rate(studies: Studies, revolute: BoolArray) -> Iterator[_Claim]:
         steps = np.diff(studies.rate[law, max(studies.periods)].q[:, revolute], axis=0)
         turn = np.degrees(np.abs(steps).max(initial=0.0))
         yield _Claim(
-            f"{TITLES[law]}: the drift is typical of low control rates",
+            f"{title_of(law)}: the drift is typical of low control rates",
             "section 7",
             f"{_listed(values)} mm at periods of {sweep} ms and a fixed gain in 1/s; "
             f"drift ∝ period^{order:.2f}; a joint turns by up to {turn:.0f}° in a step of the longest period",
@@ -320,7 +320,7 @@ def _classical(material: Material) -> Iterator[_Claim]:
 def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
     left, right = trace.self_occluded_steps_left, trace.self_occluded_steps_right
     yield _Claim(
-        f"{TITLES[law]}: runs through self-occlusion, then converges",
+        f"{title_of(law)}: runs through self-occlusion, then converges",
         "section 6, Fig. 4",
         f"{left} and {right} self-occluded steps in the left and right camera; {trace.verdict}",
         "steps in both cameras, verdict converged",
@@ -332,7 +332,7 @@ def _escape(law: str, trace: Trace, window: int) -> Iterator[_Claim]:
         level = float(trace.stop_error[stretch[0]])
         measured = f"{stretch[1] - stretch[0]} steps from step {stretch[0]} at {level:.0f} px"
     yield _Claim(
-        f"{TITLES[law]}: stands still in a local minimum before it converges",
+        f"{title_of(law)}: stands still in a local minimum before it converges",
         "section 6, Fig. 4",
         f"{measured}; {trace.verdict}",
         f"image error falls < 1 % in {window} steps, verdict converged",
@@ -358,7 +358,7 @@ def _direct(material: Material) -> Iterator[_Claim]:
     traces = {law: material.traces[law] for law in DIRECT if law in material.traces}
     if traces:
         counts = [
-            f"{TITLES[law]} {trace.self_occluded_steps_left} left, {trace.self_occluded_steps_right} right"
+            f"{title_of(law)} {trace.self_occluded_steps_left} left, {trace.self_occluded_steps_right} right"
             for law, trace in traces.items()
         ]
         total = sum(t.self_occluded_steps_left + t.self_occluded_steps_right for t in traces.values())

@@ -19,7 +19,8 @@ from projservo_cli.calibration import WEAK_NOISE, chi2_band
 from projservo_cli.calibration.readings import REACH_M, REACH_RAD
 from projservo_cli.config import Config, load_config
 from projservo_cli.files import lies_inside, write_whole
-from projservo_cli.records import Plan, Report, name_of
+from projservo_cli.laws import name_of
+from projservo_cli.records import Plan, Report
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.figures.path_deviation import drift_rows
 from projservo_cli.report.report_data import ANIMATION_FILE, PAGE_FILE, VIEW_FILE, VIEWS, stage_object, title

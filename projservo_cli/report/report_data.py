@@ -16,11 +16,9 @@ import numpy.typing as npt
 from projservo_cli.config import Config
 from projservo_cli.config.task import Trajectory
 from projservo_cli.geometry.kinematics import project
+from projservo_cli.laws import IMAGE_TRACK, REPLAN, TRACK, law_and_mode, title_of
 from projservo_cli.planning.margins import CONSTRAINTS, OF_MOTION
 from projservo_cli.records import (
-    IMAGE_TRACK,
-    REPLAN,
-    TRACK,
     WHY_LOST,
     Calibration,
     CrossValidation,
@@ -29,7 +27,6 @@ from projservo_cli.records import (
     Observation,
     Plan,
     Trace,
-    law_and_mode,
 )
 from projservo_cli.robots.simulated import Arm, Plant
 from projservo_cli.store import Run
@@ -52,13 +49,6 @@ _COUNTS = ("merged_poses", "merged_markers")
 _NUMBERS = ("rms_px", "sigma_px", "chi2_per_dof", "seconds")
 
 DIRECT = ("direct_three", "direct_two")
-TITLES = {
-    "direct_three": "directTHREE",
-    "direct_two": "directTWO",
-    "stacked": "stacked Jacobians",
-    "blockwise": "block-wise",
-    "euclidean_points": "Euclidean points",
-}
 VIEWS = ("left", "right")
 
 
@@ -66,7 +56,7 @@ def title(name: str) -> str:
     """Name of a run as the figures write it: that of its law, and whether it follows the plan."""
     law, mode = law_and_mode(name)
     follows = {TRACK: ", following the plan", IMAGE_TRACK: ", following planned images"}
-    return TITLES.get(law, law) + follows.get(mode, "")
+    return title_of(law) + follows.get(mode, "")
 
 
 @dataclass(frozen=True, eq=False)

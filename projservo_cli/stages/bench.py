@@ -14,12 +14,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
-from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, Law, State, new_state
+from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.compiled import Course, many_steps, run_compiled
 from projservo_cli.loop.python import BuiltInLaw
 from projservo_cli.loop.step import Log, new_log
-from projservo_cli.records import LAWS, FloatArray
+from projservo_cli.records import FloatArray
 from projservo_cli.robots.simulated import Plant
 from projservo_cli.stages.scenario import scenario_of
 from projservo_cli.task.face import Task

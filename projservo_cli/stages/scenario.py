@@ -16,12 +16,11 @@ from projservo_cli.config import Config
 from projservo_cli.config.task import TaskSettings
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.laws import BODY_LAWS, LAW_SPECS
 from projservo_cli.loop.step import Limits
 from projservo_cli.planning.margins import Demands
 from projservo_cli.records import (
-    BODY_LAWS,
     CORNERS,
-    METRIC_LAWS,
     VIEWS,
     Calibration,
     FloatArray,
@@ -137,7 +136,7 @@ class Scenario:
 
     def believed_by(self, law: str) -> Model:
         """The model that a law is given: the calibrated one, or for a metric law the true one."""
-        if law not in METRIC_LAWS:
+        if not (law in LAW_SPECS and LAW_SPECS[law].metric):
             return self.model
         if None in (self.config.arm, self.config.rig):
             raise InputError(

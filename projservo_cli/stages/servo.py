@@ -11,28 +11,18 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
-from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, LOST, MOST_PARTS, OK, TAU_AFFINE, THETA_S, Gains
 from projservo_cli.geometry.algebra import mat
 from projservo_cli.geometry.kernels import COORDINATES
 from projservo_cli.geometry.mechanisms import in_span
+from projservo_cli.laws import CODES, REPLAN, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import MM, Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
 from projservo_cli.loop.replanning import Watch
 from projservo_cli.loop.settling import Standing
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
-from projservo_cli.records import (
-    REPLAN,
-    Calibration,
-    FloatArray,
-    IntArray,
-    Model,
-    Plan,
-    Trace,
-    WorkFailed,
-    law_and_mode,
-)
+from projservo_cli.records import Calibration, FloatArray, IntArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.results import ImageModel
 from projservo_cli.robots import plugins
 from projservo_cli.robots.client import DrivenRobot

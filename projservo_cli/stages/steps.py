@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 from projservo_cli import provenance
 from projservo_cli.config import Config, digest, to_yaml
 from projservo_cli.config.models import FAULTS
-from projservo_cli.records import InputError, law_and_mode, names_of
+from projservo_cli.laws import law_and_mode, names_of
+from projservo_cli.records import InputError
 from projservo_cli.report.report_data import CLAIMS_FILE, PAGE_FILE
 from projservo_cli.robots.source import source_hash
 from projservo_cli.store import SERVO, Result, Run

@@ -18,15 +18,8 @@ from projservo_cli.config.robot import JointVector
 from projservo_cli.config.sweep import BASE, LAW, Distribution, SweepConfig
 from projservo_cli.config.task import Goal, TaskSettings
 from projservo_cli.geometry.stereo import optical_centers
-from projservo_cli.records import (
-    PRISMATIC,
-    FloatArray,
-    InputError,
-    IntArray,
-    WorkFailed,
-    law_and_mode,
-    names_of,
-)
+from projservo_cli.laws import law_and_mode, names_of
+from projservo_cli.records import PRISMATIC, FloatArray, InputError, IntArray, WorkFailed
 from projservo_cli.robots.simulated import METRIC_A_INF
 from projservo_cli.robots.source import source_hash
 from projservo_cli.stages.steps import affects, key_of

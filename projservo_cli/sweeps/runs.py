@@ -10,12 +10,12 @@ import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
 from projservo_cli.config import Config
-from projservo_cli.control import CODES
 from projservo_cli.geometry.kernels import COORDINATES
+from projservo_cli.laws import BODY_LAWS, CODES
 from projservo_cli.loop.batch import NUMBERS, VERDICT, Setting, Trials
 from projservo_cli.loop.compiled import Course
 from projservo_cli.loop.step import RUNNING, VERDICTS
-from projservo_cli.records import BODY_LAWS, Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
+from projservo_cli.records import Calibration, FloatArray, IntArray, Plan, Trace, WorkFailed
 from projservo_cli.stages import plan as planning
 from projservo_cli.stages.plan import rotation_sense
 from projservo_cli.stages.scenario import Scenario, scenario_of

@@ -13,8 +13,8 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 import projservo_cli as ps
+from projservo_cli.laws import LAWS
 from projservo_cli.loop.compiled import run_compiled
-from projservo_cli.records import LAWS
 from projservo_cli.stages import bench
 from tests.known import configured
 

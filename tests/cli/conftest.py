@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from projservo_cli import calibration, cli, files
-from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed, law_and_mode
+from projservo_cli.laws import law_and_mode
+from projservo_cli.records import Calibration, Observation, Plan, Report, Trace, WorkFailed
 from projservo_cli.stages import calibrate, plan, report, servo, steps
 from projservo_cli.tables import read_table
 from tests.fake_records import fake

@@ -6,7 +6,8 @@ import pytest
 import yaml
 
 from projservo_cli.config import Config, Override, digest, load_config, to_yaml
-from projservo_cli.records import LAWS, InputError
+from projservo_cli.laws import LAWS
+from projservo_cli.records import InputError
 from tests.conftest import SHIPPED
 
 GOOD = """\

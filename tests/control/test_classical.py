@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES
 from projservo_cli.control.law import LOST, OK
 from projservo_cli.geometry.kinematics import image_jacobian
+from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw
 from tests.samples import frame, operators, poe
 from tests.scene import GAINS, scene

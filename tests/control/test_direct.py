@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli import records
-from projservo_cli.control import CODES, classical, direct, exact
+from projservo_cli import laws
+from projservo_cli.control import classical, direct, exact
 from projservo_cli.control.law import TAU, TAU_AFFINE, THETA_P, THETA_R, THETA_S
-from projservo_cli.records import LAWS
+from projservo_cli.laws import CODES, LAWS
 from tests.samples import frame, operators, pixels, poe, revolute
 from tests.scene import GAINS, STEP, Run, limits, scene
 
@@ -158,6 +158,6 @@ def test_laws_are_given_images_joints_and_a_model_and_nothing_else():
 
 
 def test_a_law_that_the_if_chain_does_not_know_is_refused(monkeypatch):
-    monkeypatch.setattr(records, "LAWS", (*LAWS, "another"))
+    monkeypatch.setattr(laws, "LAWS", (*LAWS, "another"))
     with pytest.raises(ValueError, match="unpack"):
         runpy.run_module("projservo_cli.control.__init__", run_name="again")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from projservo_cli.control.law import TAU_AFFINE, THETA_S
-from projservo_cli.records import MODES_OF, TRACK, InputError, WorkFailed
+from projservo_cli.laws import LAW_SPECS, TRACK
+from projservo_cli.records import InputError, WorkFailed
 from projservo_cli.task.target import followed
 from projservo_cli.task.trajectory import (
     NO_REFERENCE,
@@ -19,7 +20,7 @@ from tests.control.following import SPEED, Followed, planned, tracked
 from tests.samples import frame
 from tests.scene import GAINS, Run, limits, scene, with_pins
 
-TRACKING = [law for law, modes in MODES_OF.items() if TRACK in modes]
+TRACKING = [law for law, spec in LAW_SPECS.items() if TRACK in spec.modes]
 
 
 def displacements(plan, periods):

@@ -8,13 +8,13 @@ import json
 
 import numpy as np
 
-from projservo_cli.records import LAWS, MODES_OF
+from projservo_cli.laws import LAW_SPECS, LAWS
 from tests.control.following import Followed
 from tests.samples import frame
 from tests.scene import GAINS, Run, limits, scene, with_pins
 
 # Laws that can follow a plan.
-FOLLOWING = tuple(MODES_OF)
+FOLLOWING = tuple(law for law, spec in LAW_SPECS.items() if len(spec.modes) > 1)
 # Pixel noise of four markers on the face and five pins.
 WHOLE_NOISE = 0.5 * np.random.default_rng(8).standard_normal((16, 2, 9, 2))
 

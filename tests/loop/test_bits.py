@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 
-from projservo_cli.records import LAWS
+from projservo_cli.laws import LAWS
 from tests.conftest import INTERPRETED, ROOT
 from tests.loop.bits import FOLLOWING, hashes
 

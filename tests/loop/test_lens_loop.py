@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from projservo_cli.geometry.lens import bent
-from projservo_cli.records import LAWS, METRIC_LAWS
+from projservo_cli.laws import LAW_SPECS, LAWS
 from tests.samples import frame
 from tests.scene import STEP, Run, limits, with_pins
 from tests.scene import scene as scene_of
@@ -30,7 +30,7 @@ def through_lenses(sc, lens=LENS):
 
 @pytest.mark.parametrize("law", LAWS)
 def test_the_joints_move_as_through_straight_images(law):
-    G = None if law in METRIC_LAWS else frame(3)
+    G = None if LAW_SPECS[law].metric else frame(3)
     bounds = limits(max_steps=40)
     straight, lensed = (
         Run(scene(), law, bounds=bounds, G=G),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES
+from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS
 from projservo_cli.robots.simulated import AnalyticPlant

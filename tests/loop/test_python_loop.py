@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from projservo_cli.control import CODES
 from projservo_cli.control.law import ERRORS, OK
+from projservo_cli.laws import CODES, LAWS
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS
-from projservo_cli.records import LAWS, InputError
+from projservo_cli.records import InputError
 from projservo_cli.robots.simulated import AnalyticPlant
 from tests.control.following import Followed, tracked
 from tests.loop.bits import FOLLOWING

@@ -6,7 +6,8 @@ from functools import lru_cache
 import numpy as np
 
 from projservo_cli.calibration.prediction import Scene
-from projservo_cli.records import LAWS, METRIC_LAWS, MODES_OF, PRISMATIC, Calibration, name_of
+from projservo_cli.laws import LAW_SPECS, LAWS, name_of
+from projservo_cli.records import PRISMATIC, Calibration
 from projservo_cli.report.figures import FIGURES
 from projservo_cli.report.report_data import Material
 from projservo_cli.robots.client import Film
@@ -35,10 +36,12 @@ def case(name="paper", steps=SHORT, whole=False):
     model = studies.projective_twin(true.model)
     plan = planned(scenario, model, samples=21, duration=3.0)
     sense = plan.rotation_sense()
-    traces = {law: driven(scenario, sense, law, true.model if law in METRIC_LAWS else model) for law in LAWS}
+    traces = {
+        law: driven(scenario, sense, law, true.model if LAW_SPECS[law].metric else model) for law in LAWS
+    }
     traces["direct_three"] = filmed(traces["direct_three"], *true.image_size.astype(int))
     for law in FOLLOWING:
-        followed = name_of(law, MODES_OF[law][1])
+        followed = name_of(law, LAW_SPECS[law].modes[1])
         traces[followed] = driven(scenario, plan, followed, model)
     clean = replace(
         known_scenario(config.idealized), limits=scenario.limits._replace(stop_at_joint_limit=False)

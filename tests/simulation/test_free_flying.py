@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from projservo_cli.control import CODES
 from projservo_cli.control.law import Gains
 from projservo_cli.geometry.stereo import optical_centers
+from projservo_cli.laws import CODES
 from projservo_cli.loop.python import BuiltInLaw, run_in_python
 from projservo_cli.loop.step import VERDICTS, Limits
 from projservo_cli.records import REVOLUTE, Model

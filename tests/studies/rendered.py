@@ -22,7 +22,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from projservo_cli.records import POINT_LAWS, WorkFailed
+from projservo_cli.laws import POINT_LAWS
+from projservo_cli.records import WorkFailed
 from projservo_cli.stages import calibrate, plan, record, servo
 from projservo_cli.stages.simulation import FaultyRobot, robot_by_itself, shown_in_frames
 from projservo_cli.stages.world import truth_of

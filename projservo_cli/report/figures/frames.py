@@ -4,7 +4,8 @@ import io
 
 import numpy as np
 
-from projservo_cli.records import BODY_LAWS, ByteArray, IntArray, Trace
+from projservo_cli.laws import BODY_LAWS
+from projservo_cli.records import ByteArray, IntArray, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import VIEWS, Data, Driven, Material, registered, title
 from projservo_cli.task.face import cyclic_order

@@ -3,12 +3,12 @@
 import numpy as np
 
 from projservo_cli.geometry.kinematics import project
+from projservo_cli.laws import POINT_LAWS, title_of
 from projservo_cli.loop.step import plateau_stretch
-from projservo_cli.records import POINT_LAWS, FloatArray
+from projservo_cli.records import FloatArray
 from projservo_cli.report import style
 from projservo_cli.report.report_data import (
     DIRECT,
-    TITLES,
     VIEWS,
     Data,
     Material,
@@ -85,7 +85,7 @@ def _draw_classical(data: Data, figure: "style.Figure") -> None:
             panel.plot(*s[-1].T, "x", color=style.BLACK, markersize=4)
             style.face(panel, s[0], style.START, fill=True)
             style.face(panel, goal, style.GOAL)
-            title = f"{name} camera" if view else f"{TITLES[law]}: {data[f'verdict_{law}']}"
+            title = f"{name} camera" if view else f"{title_of(law)}: {data[f'verdict_{law}']}"
             style.image_axes(panel, title, near_pixels(np.concatenate([s, goal[None]]), size))
             panel.plot(*style.closed(border).T, **_BORDER)
     looks: dict[str, style.Look] = {"start": style.START, "goal": style.GOAL, "path of a marker": _PATH}
@@ -134,7 +134,7 @@ def _draw_direct(data: Data, figure: "style.Figure") -> None:
         style.face(panel, runs[0][0, view], style.START, fill=True)
         style.face(panel, goal, style.GOAL)
         style.image_axes(panel, f"{name} camera", np.concatenate([goal[None], *(s[:, view] for s in runs)]))
-    legend: dict[str, style.Look] = {TITLES[law]: look for law, look in zip(DIRECT, looks, strict=True)}
+    legend: dict[str, style.Look] = {title_of(law): look for law, look in zip(DIRECT, looks, strict=True)}
     style.legend_below(figure, legend | {"start": style.START, "goal": style.GOAL}, 4)
 
 
@@ -146,7 +146,7 @@ def _data_errors(material: Material) -> Data:
         "t_s": trace.period * np.arange(len(trace.s)),
         "e": trace.s - trace.s_star,
         "center_e": material.center_image(trace) - project(material.plant.model.P, goal[None])[:, 0],
-        "law": np.array(TITLES[trace.law]),
+        "law": np.array(title_of(trace.law)),
         "marker": np.array(material.numbers),
     }
 
@@ -204,7 +204,7 @@ def _data_overview(material: Material) -> Data:
             f"s_{law}": trace.s[:, :, order],
             f"hidden_{law}": hidden,
             f"image_error_{law}": trace.image_error,
-            f"verdict_{law}": np.array(f"{TITLES[law]}: {end}"),
+            f"verdict_{law}": np.array(f"{title_of(law)}: {end}"),
         }
     return result
 
@@ -250,7 +250,9 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
             t = data["period_s"] * np.arange(len(values))
             control.plot(t, values, label=label, **style.curve(index))
     style.log_scale(control)
-    control.set(title=f"control errors, {TITLES[DIRECT[0]]}", ylabel="error (% of its start)", ylim=_PERCENT)
+    control.set(
+        title=f"control errors, {title_of(DIRECT[0])}", ylabel="error (% of its start)", ylim=_PERCENT
+    )
     control.legend(loc="upper right")
     for law, look in _SHOWN.items():
         e, hidden = data[f"image_error_{law}"], data[f"hidden_{law}"].any(axis=1)
@@ -262,6 +264,6 @@ def _draw_overview(data: Data, figure: "style.Figure") -> None:
     for panel in (control, image):
         panel.set_xlabel("time (s)")
     looks = {str(data[f"verdict_{law}"]): look for law, look in _SHOWN.items()}
-    looks |= {f"centre under {TITLES[DIRECT[0]]}": _CENTER, "face at the start": style.START}
+    looks |= {f"centre under {title_of(DIRECT[0])}": _CENTER, "face at the start": style.START}
     looks |= {"face at the goal": style.GOAL, "face hidden from the camera": _BAND}
     style.legend_below(figure, looks, 2)

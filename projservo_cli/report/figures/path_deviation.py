@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 
 from projservo_cli.geometry.kinematics import forward_kinematics
+from projservo_cli.laws import title_of
 from projservo_cli.records import FloatArray, Report, Trace
 from projservo_cli.report import style
 from projservo_cli.report.report_data import (
     DIRECT,
-    TITLES,
     Data,
     Material,
     Studies,
@@ -118,14 +118,14 @@ def _draw(data: Data, figure: "style.Figure") -> None:
         least = max(_LEAST_SHARE * min(float(path[:, 1].max()) for path in paths), 1e-6)
         for path, look in zip(paths, looks, strict=True):
             path_axes.plot(path[:, 0], np.maximum(path[:, 1], least), **look)
-        path_axes.set(title=f"{TITLES[law]}: path of the centre, calibrated operators")
+        path_axes.set(title=f"{title_of(law)}: path of the centre, calibrated operators")
         path_axes.set(xlabel=_WAY, ylabel=_OFF)
         style.log_scale(path_axes)
         path_axes.set_ylim(bottom=least)
         for (operators, limited), look in _MAXIMA.items():
             size = 4.5 if operators else 3.0  # an empty marker shows around a full one
             most.plot(gains, deviation[operators, limited], markersize=size, **look)
-        most.set(title=f"{TITLES[law]}: largest distance", xscale="log")
+        most.set(title=f"{title_of(law)}: largest distance", xscale="log")
         most.set(xlabel="gain per step (1)", ylabel="largest distance (mm)")
         most.set_xticks(gains, [f"{gain:g}" for gain in gains])
         most.minorticks_off()

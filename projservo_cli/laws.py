@@ -1,0 +1,72 @@
+"""Control laws of the package, one line each in one table, and the names of their runs.
+
+A law is added by its kernel in a file of ``control``, a line here and a branch of ``control.command``.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from projservo_cli.records import InputError
+
+REPLAN, TRACK, IMAGE_TRACK = "replan", "track", "image_track"
+POINTS, BODY = "points", "body"
+
+
+class LawSpec(NamedTuple):
+    """What holds for one law wherever it is driven, stored and drawn."""
+
+    title: str  # as figures write it
+    modes: tuple[str, ...]  # it follows a plan in all but ``REPLAN``
+    features: str  # needs the ``POINTS`` of the face themselves, or can measure with the ``BODY``
+    metric: bool = False  # is given the metric model
+    paper: bool = True  # is one of [RH00]
+
+
+LAW_SPECS = {
+    "direct_three": LawSpec("directTHREE", (REPLAN, TRACK), BODY),
+    "direct_two": LawSpec("directTWO", (REPLAN, TRACK), BODY),
+    "stacked": LawSpec("stacked Jacobians", (REPLAN, IMAGE_TRACK), POINTS),
+    "blockwise": LawSpec("block-wise", (REPLAN,), POINTS),
+    "euclidean_points": LawSpec("Euclidean points", (REPLAN,), POINTS, metric=True),
+    "exact": LawSpec("exact", (REPLAN, TRACK), BODY, paper=False),
+}
+LAWS = tuple(LAW_SPECS)
+CODES = {law: code for code, law in enumerate(LAWS)}  # by which compiled code knows them
+POINT_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == POINTS)
+BODY_LAWS = tuple(law for law, spec in LAW_SPECS.items() if spec.features == BODY)
+_NAMES = {
+    f"{law}_{mode}": (law, mode) for law, spec in LAW_SPECS.items() for mode in spec.modes if mode != REPLAN
+}
+
+
+def title_of(law: str) -> str:
+    """Return the title of a law; the name itself of a law of somebody else."""
+    return LAW_SPECS[law].title if law in LAW_SPECS else law
+
+
+def name_of(law: str, mode: str) -> str:
+    """Name of the run of a law in a mode: the law's own where it replans, such as ``exact_track`` else."""
+    return law if mode == REPLAN else f"{law}_{mode}"
+
+
+def law_and_mode(name: str) -> tuple[str, str]:
+    """Law and mode of the run of a name."""
+    return _NAMES.get(name, (name, REPLAN))
+
+
+def names_of(laws: Sequence[str], modes: Sequence[str]) -> tuple[str, ...]:
+    """Names of the runs of laws, each in those of the modes that it has.
+
+    Raises InputError if a law has none of them.
+    """
+    found = []
+    for law in laws:
+        own = LAW_SPECS[law].modes if law in LAW_SPECS else (REPLAN,)
+        if not set(own) & set(modes):
+            able = [other for other, spec in LAW_SPECS.items() if set(spec.modes) & set(modes)]
+            raise InputError(
+                f"control.mode {' and '.join(modes)}: {law} has no such mode, only "
+                f"{' and '.join(own)}; laws that have one: {', '.join(able)} (--law, control.laws)"
+            )
+        found += [name_of(law, mode) for mode in modes if mode in own]
+    return tuple(dict.fromkeys(found))
