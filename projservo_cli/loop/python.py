@@ -1,7 +1,6 @@
 """The closed loop in Python: any law on any plant, the same limits, counting and verdicts."""
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -12,23 +11,10 @@ from projservo_cli.control import command
 from projservo_cli.control.law import ERRORS, OK, Gains, Law, State, new_state
 from projservo_cli.geometry.jit import COMPILED, allocating
 from projservo_cli.geometry.mechanisms import span_of
-from projservo_cli.loop.step import (
-    DISTURBED,
-    FAILED,
-    RUNNING,
-    WAITING,
-    Command,
-    Instant,
-    Limits,
-    Log,
-    bounded,
-    new_log,
-    note,
-    verdict_at,
-)
+from projservo_cli.loop.monitors import Monitor, Monitored, Monitors
+from projservo_cli.loop.step import FAILED, RUNNING, WAITING, Command, Instant, Limits, Log, new_log, note
 from projservo_cli.records import FloatArray, Model, WorkFailed
 from projservo_cli.robots.plugins import require_spelt
-from projservo_cli.robots.simulated import Plant
 from projservo_cli.task.face import Task
 
 # Handing some forty arrays over to compiled code takes longer than a control step. They are handed over
@@ -90,28 +76,16 @@ class LoopLaw(Protocol):
         """
 
 
-class _LoopPlant(Protocol):
+class _LoopPlant(Monitored, Protocol):
     """What the Python loop asks of a plant."""
 
-    plant: Plant  # the truth, or what the calibration takes for it: image size, joint limits
     q: FloatArray  # (n,) joints as they are, or as they were read
     H: FloatArray  # (4, 4) displacement of the face from the reference
     hidden: FloatArray
     in_front: bool  # hidden, in_front: as of ``robots.simulated.observe``, when last observed
     markers: int  # how many are observed, those of the face first
-    # why the run cannot go on, the images no longer agree with the calibration or something failed; empty
-    # where it can
-    disturbance: str
     takes_parts: bool  # whether a long step is sent in the parts that the law split it into
     weight: FloatArray | None  # (2, markers) of the pixels last observed in a fit; None for one
-
-    @property
-    def holds(self) -> bool:
-        """Whether images disagree with the calibration so that nothing should move."""
-
-    @property
-    def pending(self) -> bool:
-        """Whether images disagreed and nothing has cleared that yet."""
 
     def joints(self) -> FloatArray:
         """Joint readings (n,), rad or m."""
@@ -124,9 +98,6 @@ class _LoopPlant(Protocol):
 
     def command(self, step: FloatArray, period: float) -> None:
         """Move by the joint step (n,), rad or m, within one period, s."""
-
-    def give_up(self) -> None:
-        """Say what is wrong as far as it is known, where there is no time for more looks."""
 
     def stop(self) -> None:
         """Come to rest."""
@@ -181,15 +152,14 @@ def run_in_python(
     limits: Limits,
     scale: float = 1.0,
     *,
-    standing: Callable[[Log, int, int], int] | None = None,
-    watch: Callable[[Log, int, int, FloatArray], int] | None = None,
+    stall: Monitor | None = None,
+    execution: Monitor | None = None,
 ) -> tuple[int, int, Log]:
     """Drive a law on a plant to its verdict.
 
     plant : any; it is stopped however the run ends.
     s_star : (2, m, 2) target pixels; period : control period, s; scale : factor of every command.
-    standing : what becomes of the verdict of an instant of a robot that need not follow what it is sent.
-    watch : what then becomes of it where the run is watched; joint velocities (n,) may be written instead.
+    stall : of a robot that need not follow what it is sent; execution : of a plan that gives way to another.
     Returns verdict, steps, log: as of the compiled loop, to the bit for the built-in laws. Raises InputError
     if the law has an attribute that is a misspelt one of ``OPTIONAL``; WorkFailed if the plant or the law
     fails before the first instant is complete.
@@ -199,24 +169,16 @@ def run_in_python(
         log = new_log(len(plant.plant.lower), plant.markers, limits.max_steps, len(ERRORS))
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
+        monitors = Monitors(plant, limits, stall, execution)
         k, verdict = 0, RUNNING
         while verdict < 0:
             try:
-                verdict, q_dot = _instant(law, plant, s_star, limits, log, k)
-                if not plant.holds:
-                    if standing is not None:
-                        verdict = standing(log, k, verdict)
-                    if watch is not None:
-                        verdict = watch(log, k, verdict, q_dot)
-                if plant.pending and verdict not in (RUNNING, DISTURBED) and k < limits.max_steps:
-                    verdict = WAITING  # nothing has ended while it is not known what images mean
+                verdict, q_dot = _instant(law, plant, s_star, monitors, log, k)
                 if verdict == RUNNING:
                     told = float(_told(law, "share")[0]), int(_told(law, "blocked")[0])
-                    verdict = bounded(log, k, Command(q_dot, *told, period, scale), plant.plant, limits)
+                    verdict = monitors.of_command(log, k, Command(q_dot, *told, period, scale))
                     if verdict == RUNNING:
                         _send(law, plant, log.scratch[0, : len(q_dot)], limits, period, scale)
-                    elif watch is not None:
-                        verdict = watch(log, k, verdict, q_dot)
                 if verdict == WAITING:
                     plant.command(np.zeros_like(q_dot), period)
             except WorkFailed as error:
@@ -230,7 +192,7 @@ def run_in_python(
 
 
 def _instant(
-    law: LoopLaw, plant: _LoopPlant, s_star: FloatArray, limits: Limits, log: Log, k: int
+    law: LoopLaw, plant: _LoopPlant, s_star: FloatArray, monitors: Monitors, log: Log, k: int
 ) -> tuple[int, FloatArray]:
     """Look and ask the law: the verdict of the instant, and the joint velocity (n,) that it asks for."""
     log.read[k] = plant.joints()
@@ -238,15 +200,11 @@ def _instant(
     log.s[k] = plant.observe()
     log.hidden[k] = plant.hidden
     distance = plant.distance()
-    left = note(log, k, s_star, plant.plant, limits)
+    left = note(log, k, s_star, plant.plant, monitors.limits)
     status, q_dot = OK, np.zeros_like(log.read[k])
-    if plant.disturbance:
-        return DISTURBED, q_dot
-    if plant.holds:
-        if k < limits.max_steps:
-            return WAITING, q_dot
-        plant.give_up()
-        return DISTURBED, q_dot
+    verdict = monitors.of_faults(k)
+    if verdict != RUNNING:
+        return verdict, q_dot
     if plant.in_front:
         if plant.weight is not None and isinstance(law, BuiltInLaw):
             law.weigh(plant.weight)
@@ -254,7 +212,7 @@ def _instant(
         log.errors[k], log.fit[k] = law.errors, _told(law, "fit")
         face_px = float(_told(law, "face_px")[0])
         log.judged[k] = face_px if math.isfinite(face_px) else log.judged[k]
-    return verdict_at(log, k, Instant(plant.in_front, left, distance, status, q_dot), limits), q_dot
+    return monitors.of_instant(log, k, Instant(plant.in_front, left, distance, status, q_dot)), q_dot
 
 
 def _send(

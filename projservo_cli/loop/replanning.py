@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from projservo_cli.loop.python import BuiltInLaw
-from projservo_cli.loop.settling import Standing
+from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import (
     CONVERGED,
     DIVERGED,
@@ -50,14 +50,14 @@ class Replanner(Protocol):
         """Plan of a path from joints (n,), off by (2, 2) px, to other goals than those excluded (k, n)."""
 
 
-class Watch:
-    """What watches over a run of a built-in law.
+class ExecutionMonitor:
+    """Monitor of a built-in law that follows a plan.
 
     law : that is driven, on a plan; follow : the task with a plan as the law is given it.
     replanner : of paths to the goal; searches : how often one may be searched again.
     limits : of the run.
-    standing : judge of a robot that need not follow what it is sent; None for one that does.
-    ``told``: why a path was searched again each time, and when, in words.
+    stall : monitor of a robot that need not follow what it is sent; None for one that does.
+    ``attempts``: why a path was searched again each time, and when, in words.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Watch:
         replanner: Replanner,
         searches: int,
         limits: Limits,
-        standing: Standing | None = None,
+        stall: StallMonitor | None = None,
     ) -> None:
         self.law, self.follow, self.replanner, self.left, self.limits = (
             law,
@@ -76,14 +76,14 @@ class Watch:
             searches,
             limits,
         )
-        self.told: list[str] = []
-        self._standing = standing
+        self.attempts: list[str] = []
+        self._stall = stall
         self._excluded: list[FloatArray] = []
         self._goes_back = False
         self._alone = 0  # instants since the law is without a plan
 
     def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
-        """What becomes of the verdict of an instant."""
+        """Return what becomes of the verdict of an instant; the way back is written to the velocity (n,)."""
         if k == self.limits.max_steps or verdict == CONVERGED:
             return verdict
         if verdict == MARKERS_LOST or (verdict == WAITING and self._goes_back):
@@ -106,8 +106,8 @@ class Watch:
 
     def _stalls(self, log: Log, k: int, verdict: int) -> bool:
         """Whether the law that ends the motion comes no nearer."""
-        if self._standing is not None:
-            return verdict == PLATEAU and self._standing.minimum
+        if self._stall is not None:
+            return verdict == PLATEAU and self._stall.minimum
         window = self.limits.plateau_steps
         still = on_plateau(log.judged, k, window) and on_plateau(log.judged, k, window // 2)
         return verdict == RUNNING and self._alone > window and still
@@ -131,9 +131,9 @@ class Watch:
         plan = self.replanner.replan(log.read[k], excluded, self._off(log, k))
         if plan is None:
             self.left = 0
-            self.told.append(f"at step {k} ({why}) in vain")
+            self.attempts.append(f"at step {k} ({why}) in vain")
             return verdict
-        self.told.append(f"at step {k} ({why})")
+        self.attempts.append(f"at step {k} ({why})")
         self.law.follow(self.follow(plan))
         log.events[2] = -1.0
         self._alone = 0

@@ -40,11 +40,11 @@ _PATIENCE = 8
 _TIMES_LATE = 4.0
 
 
-class Standing:
-    """Judge of a run of a robot that need not follow what it is sent.
+class StallMonitor:
+    """Monitor of a robot that need not follow what it is sent.
 
     robot : what is driven; limits : of the run.
-    ``why``: what holds the robot, once that was found. ``minimum``: whether that is the law alone.
+    ``reason``: what holds the robot, once that was found. ``minimum``: whether that is the law alone.
     """
 
     def __init__(self, robot: DrivenRobot, limits: Limits) -> None:
@@ -58,10 +58,11 @@ class Standing:
         self._sent: list[FloatArray] = []
         self._short: list[BoolArray] = []
         self._more = self._looks = 0  # periods and looks that are left at the goal
-        self.why, self.minimum = "", False
+        self.reason, self.minimum = "", False
 
-    def ruled(self, log: Log, k: int, verdict: int) -> int:
-        """What becomes of the verdict of an instant; none while the arm is held."""
+    def ruled(self, log: Log, k: int, verdict: int, q_dot: FloatArray) -> int:
+        """Return what becomes of the verdict of an instant; it is not asked while the arm is held."""
+        del q_dot
         steered, now = self._robot.steered, len(self._read)
         self._read.append(steered.reading.q)
         self._sent.append(steered.target)
@@ -112,7 +113,7 @@ class Standing:
         if stands and (sent <= _LEAST).all():
             self.minimum = True
             most = self._robot.robot.bounds.told(int(np.argmax(sent)), float(sent.max()), 2)
-            self.why = (
+            self.reason = (
                 f"set-points moved by no more than {most}: play in the joints, coarse set-points or coarse "
                 "readings hide what is left"
                 if near
@@ -128,7 +129,7 @@ class Standing:
         """A joint stays where it is however far its set-point goes."""
         gap = np.abs(self._sent[-1] - self._read[-1]) * stays
         i, told = int(np.argmax(gap)), self._robot.robot.bounds.told
-        self.why = (
+        self.reason = (
             f"joint {i + 1} stands at {told(i, self._read[-1][i])}, {told(i, gap[i], 3)} off its set-point: "
             "look whether it is blocked, braked or in a protective stop, or raise plant.sag_deg or "
             "plant.lead_deg"
@@ -140,6 +141,6 @@ class Standing:
         amounts = f"{told(i, sent[i], 3)}, its readings by {told(i, moved[i], 3)}"
         what = f"set-points of joint {i + 1} moved by {amounts}"
         if moved[i] <= 0.5 * sent[i]:
-            self.why = f"{what}: it does not follow such small steps; coarse set-points, or friction"
+            self.reason = f"{what}: it does not follow such small steps; coarse set-points, or friction"
         else:
-            self.why = f"{what}, and images show no gain: play in the joints, or coarse set-points"
+            self.reason = f"{what}, and images show no gain: play in the joints, or coarse set-points"

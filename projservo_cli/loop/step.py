@@ -1,6 +1,7 @@
 """What one period of the loop does beside the law: limits, counting, verdict.
 
-Precedence of the verdicts at one instant, first match wins:
+Precedence of the verdicts of ``verdict_at`` at one instant, first match wins; ``loop.monitors`` states what
+rules before and after it:
 
 1. ``behind camera``: a marker is not in front of a camera.
 2. ``left image``: a marker is outside an image and ``image_border`` is stop.
@@ -15,14 +16,7 @@ Precedence of the verdicts at one instant, first match wins:
    is stop. A command that would pass a limit is shortened to end there.
 
 While markers are lost the robot is held where it is for up to ``lost_steps`` periods in a row; the run
-goes on when they are seen again. ``disturbed`` is what the run of a robot of the contract, yours
-or a simulated one with faults, ends in before all others, where the images no longer agree with the
-calibration; ``failed`` where a robot or a law of somebody else raises, is late or answers nonsense once the
-run has begun.
-
-A robot that need not follow what it is sent has ``converged`` once it stands as far as images tell; until
-then it is held. Where it stands still away from the goal, ``plateau`` ends the run at once, and ``not
-following`` where a joint stays short of a set-point as far ahead as that may be.
+goes on when they are seen again.
 """
 
 import math

@@ -19,8 +19,8 @@ from projservo_cli.laws import CODES, REPLAN, law_and_mode
 from projservo_cli.loop.compiled import Course, run_compiled
 from projservo_cli.loop.metrics import MM, Ended, Summary, angle_between, path_deviation, summarize
 from projservo_cli.loop.python import BuiltInLaw, LoopLaw, run_in_python
-from projservo_cli.loop.replanning import Watch
-from projservo_cli.loop.settling import Standing
+from projservo_cli.loop.replanning import ExecutionMonitor
+from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import VERDICTS, Log, new_log, plateau_stretch, tolerance
 from projservo_cli.records import Calibration, FloatArray, IntArray, Model, Plan, Trace, WorkFailed
 from projservo_cli.results import ImageModel
@@ -381,19 +381,18 @@ class _Asked:
                     if wrong := driven.agrees():
                         raise WorkFailed(f"stopped on the way to the start, since {wrong}")
             driven.begin()
-            return self._in_python(controller, driven, Standing(driven, scenario.limits))
+            return self._in_python(controller, driven, StallMonitor(driven, scenario.limits))
 
     def _in_python(
-        self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, standing: Standing | None = None
+        self, law: LoopLaw, plant: AnalyticPlant | DrivenRobot, stall: StallMonitor | None = None
     ) -> _Outcome:
         """Drive a law on a plant, every command scaled; a run that is guided is watched."""
-        scenario, watch = self.scenario, None
+        scenario, execution = self.scenario, None
         if self.is_guided and isinstance(law, BuiltInLaw):
             assert isinstance(self.plan, Plan)
             follow, searches = partial(self._task, law.law.model), scenario.config.control.searches_anew
-            watch = Watch(
-                law, follow, PathReplanner(scenario, self.plan), searches, scenario.limits, standing
-            )
+            replanner = PathReplanner(scenario, self.plan)
+            execution = ExecutionMonitor(law, follow, replanner, searches, scenario.limits, stall)
         code, steps, log = run_in_python(
             law,
             plant,
@@ -401,8 +400,8 @@ class _Asked:
             scenario.gains.period,
             scenario.limits,
             scenario.config.plant.speed_scale,
-            standing=None if standing is None else standing.ruled,
-            watch=None if watch is None else watch.ruled,
+            stall=stall,
+            execution=execution,
         )
         limited = float(law.state.limited[0]) if isinstance(law, BuiltInLaw) else 0.0
         driven = plant if isinstance(plant, DrivenRobot) else None
@@ -412,12 +411,12 @@ class _Asked:
         return _Outcome(
             scenario,
             VERDICTS[code],
-            plant.disturbance or ("" if standing is None else standing.why),
+            plant.disturbance or ("" if stall is None else stall.reason),
             steps,
             log,
             limited,
             plant.plant,
-            anew=() if watch is None else tuple(watch.told),
+            anew=() if execution is None else tuple(execution.attempts),
             driven=driven,
         )
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from projservo_cli.loop.replanning import Watch
+from projservo_cli.loop.replanning import ExecutionMonitor
 from projservo_cli.loop.step import (
     BEHIND_CAMERA,
     CONVERGED,
@@ -54,7 +54,11 @@ def watched(ways, clock=0.0, searches=3, **bounds):
     log = new_log(2, 3, 100, 5)
     log.s[:] = SEEN + 1.0
     log.read[:] = 0.25
-    return Watch(law, lambda plan: plan, ways, searches, limits(max_steps=100, **bounds)), followed, log
+    return (
+        ExecutionMonitor(law, lambda plan: plan, ways, searches, limits(max_steps=100, **bounds)),
+        followed,
+        log,
+    )
 
 
 @pytest.mark.parametrize("verdict", [CONVERGED, BEHIND_CAMERA, WAITING, RUNNING])
@@ -62,7 +66,7 @@ def test_most_verdicts_stay(verdict):
     ways = PathReplanner()
     watch, followed, log = watched(ways, clock=3.0)
     assert watch.ruled(log, 20, verdict, np.zeros(2)) == verdict
-    assert (followed, watch.told, ways.asked) == ([], [], [])
+    assert (followed, watch.attempts, ways.asked) == ([], [], [])
 
 
 def test_what_stops_the_law_at_the_goal_has_it_shunned():
@@ -74,12 +78,12 @@ def test_what_stops_the_law_at_the_goal_has_it_shunned():
     np.testing.assert_array_equal(q, log.read[30])
     np.testing.assert_array_equal(excluded, [WAY[-1], log.read[30]])
     np.testing.assert_allclose(off, np.ones((2, 2)))
-    assert watch.told == ["at step 30 (a joint limit at the goal)"]
+    assert watch.attempts == ["at step 30 (a joint limit at the goal)"]
     # Another goal that fails is excluded beside it; where there is no other way, the verdict stays.
     assert watch.ruled(log, 31, DIVERGED, np.zeros(2)) == WAITING
     assert watch.ruled(log, 32, JOINT_LIMIT, np.zeros(2)) == JOINT_LIMIT
     assert [len(excluded) for _, excluded, _ in ways.asked] == [2, 4, 6]
-    assert watch.told[-1] == "at step 32 (a joint limit at the goal) in vain"
+    assert watch.attempts[-1] == "at step 32 (a joint limit at the goal) in vain"
 
 
 def test_no_more_ways_are_searched_than_asked_for():
@@ -96,7 +100,7 @@ def test_a_law_that_comes_no_nearer_at_the_goal_is_given_another_way():
     log.judged[:] = 3.0
     verdicts = [watch.ruled(log, k, RUNNING, np.zeros(2)) for k in range(40, 46)]
     assert verdicts == [RUNNING] * 4 + [WAITING, RUNNING]
-    assert watch.told == ["at step 44 (no progress at the goal)"]
+    assert watch.attempts == ["at step 44 (no progress at the goal)"]
 
 
 def test_a_way_may_lead_away_from_the_goal():
@@ -108,7 +112,7 @@ def test_a_command_that_is_no_number_is_never_let_through():
     ways = PathReplanner()
     watch, _, log = watched(ways, clock=4.0)
     assert watch.ruled(log, 7, DIVERGED, np.array([0.0, np.nan])) == WAITING
-    assert watch.told == ["at step 7 (growing errors on the way)"]
+    assert watch.attempts == ["at step 7 (growing errors on the way)"]
     assert watch.ruled(log, 8, DIVERGED, np.array([np.inf, 0.0])) == DIVERGED
 
 
@@ -133,7 +137,7 @@ def test_a_lost_face_is_sought_back_along_the_path():
         assert watch.law.state.parts[0] == 0  # what the law split its last step into is not sent
     assert watch.ruled(log, 52, RUNNING, q_dot) == WAITING
     assert followed == ["another way"]
-    assert "lost" in watch.told[0]
+    assert "lost" in watch.attempts[0]
 
 
 def test_a_face_that_is_nowhere_on_the_way_back_is_lost():

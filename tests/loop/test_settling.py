@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from projservo_cli.loop.settling import Standing
+from projservo_cli.loop.settling import StallMonitor
 from projservo_cli.loop.step import CONVERGED, NOT_FOLLOWING, PLATEAU, RUNNING, WAITING, new_log
 from projservo_cli.robots.contract import Bounds
 from projservo_cli.robots.latency import NOTHING_KNOWN
@@ -33,7 +33,7 @@ class Robot:
 def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=lambda k: 0.0, most=900):
     """Verdict of a run, why, and when; of what is a function of the instant."""
     robot, log = Robot(), new_log(2, 4, 1000, 5)
-    standing = Standing(robot, LIMITS)
+    stall = StallMonitor(robot, LIMITS)
     for k in range(most):
         log.judged[k] = error(k)
         robot.steered.reading = SimpleNamespace(q=np.array(read(k), dtype=float))
@@ -41,32 +41,32 @@ def judged(error, read, sent, *, short=(False, False), verdict=RUNNING, carried=
         robot.steered.set_point.short = np.array(short)
         robot.carried_px = carried(k)
         told = CONVERGED if log.judged[k] <= LIMITS.image_px else verdict
-        ruled = standing.ruled(log, k, told)
+        ruled = stall.ruled(log, k, told, np.zeros(2))
         if ruled not in (RUNNING, WAITING):
-            return ruled, standing, k
-    return RUNNING, standing, most
+            return ruled, stall, k
+    return RUNNING, stall, most
 
 
 def test_a_law_that_asks_for_nothing_is_at_a_local_minimum():
-    ruled, standing, k = judged(lambda k: 30.0 + 20.0 * 0.9**k, lambda k: (0.5, 0.1), lambda k: (0.5, 0.1))
-    assert (ruled, standing.minimum) == (PLATEAU, True)
-    assert "a local minimum" in standing.why
+    ruled, stall, k = judged(lambda k: 30.0 + 20.0 * 0.9**k, lambda k: (0.5, 0.1), lambda k: (0.5, 0.1))
+    assert (ruled, stall.minimum) == (PLATEAU, True)
+    assert "a local minimum" in stall.reason
     assert k < 100
 
 
 def test_beside_the_goal_the_joints_hide_what_is_left():
     """An image error of up to three tolerances, that of joints within their ticks."""
-    ruled, standing, _ = judged(
+    ruled, stall, _ = judged(
         lambda k: 1.5 + (k % 7) / 7, lambda k: (TICK * (k % 2), 0.0), lambda k: (1e-4 * (k % 3), 0.0)
     )
     assert ruled == PLATEAU
-    assert "set-points moved by no more than 0.0002" in standing.why
-    assert "coarse readings hide what is left" in standing.why
+    assert "set-points moved by no more than 0.0002" in stall.reason
+    assert "coarse readings hide what is left" in stall.reason
 
 
 def test_instants_at_which_the_arm_was_held_count_for_nothing():
     robot, log = Robot(), new_log(2, 4, 1000, 5)
-    standing = Standing(robot, LIMITS)
+    stall = StallMonitor(robot, LIMITS)
     robot.steered = SimpleNamespace(
         reading=SimpleNamespace(q=np.zeros(2)),
         target=np.zeros(2),
@@ -74,15 +74,15 @@ def test_instants_at_which_the_arm_was_held_count_for_nothing():
     )
     for k in [*range(5), *range(200, 205), *range(400, 405)]:
         log.judged[k] = 50.0 * (0.9 if k > 200 else 1.0)
-        assert standing.ruled(log, k, RUNNING) == RUNNING
+        assert stall.ruled(log, k, RUNNING, np.zeros(2)) == RUNNING
 
 
 def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
-    ruled, standing, k = judged(
+    ruled, stall, k = judged(
         lambda k: 50.0, lambda k: (0.5, 0.1), lambda k: (0.9, min(0.1 + 0.01 * k, 0.4)), short=(True, False)
     )
     assert ruled == NOT_FOLLOWING
-    assert standing.why.startswith("joint 1 stands at 0.5 rad, 0.4 rad off")
+    assert stall.reason.startswith("joint 1 stands at 0.5 rad, 0.4 rad off")
     assert k < 60
 
 
@@ -91,11 +91,11 @@ def test_a_joint_that_stays_at_the_end_of_its_lead_is_not_following():
     [(lambda k: 0.2, "coarse set-points, or friction"), (lambda k: 0.2 + 0.004 * (k % 20 > 9), "play")],
 )
 def test_a_robot_that_gains_nothing_is_given_up_with_a_cause(read, what):
-    ruled, standing, k = judged(
+    ruled, stall, k = judged(
         lambda k: 5.0 + (k % 7) / 7, lambda k: (read(k), 0.0), lambda k: (0.2 + 0.005 * (k % 20 > 9), 0.0)
     )
-    assert (ruled, standing.minimum) == (PLATEAU, False)
-    assert what in standing.why
+    assert (ruled, stall.minimum) == (PLATEAU, False)
+    assert what in stall.reason
     assert k < 300
 
 
