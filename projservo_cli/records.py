@@ -140,7 +140,9 @@ def apart(common: FloatArray, own: FloatArray, marker: IntArray, m: int) -> Floa
     return result
 
 
-NO_SPREAD = Spread(np.zeros((0, 2, 3, 4)), np.zeros((0, 0, 4, 4)), np.zeros((0, 0, 4)), 0.0, 0.0)
+NO_SPREAD = Spread(
+    P=np.zeros((0, 2, 3, 4)), H_hat=np.zeros((0, 0, 4, 4)), M=np.zeros((0, 0, 4)), rest=0.0, most=0.0
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -325,7 +327,14 @@ class Calibration:
         """The kernels' view of the calibration."""
         types = np.array([PRISMATIC if t == "P" else REVOLUTE for t in self.joint_types], dtype=np.int64)
         lens = NO_LENS if self.lens is None else self.lens
-        return Model(self.P, self.H_hat_0, types, self.q_reference, self.a_inf, lens)
+        return Model(
+            P=self.P,
+            H_hat_0=self.H_hat_0,
+            joint_types=types,
+            q_reference=self.q_reference,
+            a_inf=self.a_inf,
+            lens=lens,
+        )
 
     @property
     def prismatic(self) -> BoolArray:

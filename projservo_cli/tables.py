@@ -102,14 +102,14 @@ def read_table(
         for names in (sheet.joints, (_MOVING,), _TIMES)
     )
     return Observation(
-        numbers,
-        markers,
-        sheet.in_radians(numbers, q_read, joint_unit),
-        images,
-        moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
-        times[:, 0] if np.isfinite(times[:, 0]).any() else None,
-        times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
-        sigma,
+        pose=numbers,
+        marker=markers,
+        q=sheet.in_radians(numbers, q_read, joint_unit),
+        images=images,
+        moving=moving[:, 0].astype(np.int64) if np.nansum(moving) > 0.0 else None,
+        t_q=times[:, 0] if np.isfinite(times[:, 0]).any() else None,
+        t_view=times[:, 1:] if np.isfinite(times[:, 1:]).any() else None,
+        sigma=sigma,
     )
 
 
@@ -139,7 +139,7 @@ def read_joint_list(
     poses = np.array([*lines], dtype=np.int64)
     q = sheet.in_radians(poses, np.array(readings), joint_unit)
     left, right = zip(*names, strict=True) if names[0] else (None, None)
-    return JointList(poses, q, "pose" in sheet.columns, left, right)
+    return JointList(pose=poses, q=q, numbered="pose" in sheet.columns, left=left, right=right)
 
 
 def recording_of(path: Path | str) -> str | None:

@@ -54,7 +54,9 @@ class _Step(NamedTuple):
 def _scaled(step: _Step, share: float, count: int) -> _Step:
     """A share of the displacement."""
     tau, theta, ahead = share * step.tau, share * step.theta, share * step.ahead
-    return _Step(step.parts, step.H_s, tau, theta, step.sense, ahead, count)
+    return _Step(
+        parts=step.parts, H_s=step.H_s, tau=tau, theta=theta, sense=step.sense, ahead=ahead, pieces=count
+    )
 
 
 @merged
@@ -175,7 +177,7 @@ def exact(model: Model, task: Task, gains: Gains, s: FloatArray, q: FloatArray, 
         return SINGULAR
     tau = translation_rate(task, gains, parts, state) * gains.period
     theta = gains.gain_s * theta_s * gains.period
-    whole = _Step(parts, H_s, tau, theta, sense, 1.0, 1)
+    whole = _Step(parts=parts, H_s=H_s, tau=tau, theta=theta, sense=sense, ahead=1.0, pieces=1)
     if not math.isfinite(_first_order(whole, state)):
         return SINGULAR
     if under_way(task.reference, float(state.clock[0])):

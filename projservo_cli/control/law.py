@@ -134,28 +134,28 @@ def new_state(n: int, m: int, observed: int = 0, span: Span = OWN) -> State:
     own = len(span.H_hat) == 0
     k = n if own else COORDINATES
     return State(
-        workspace(n, 4 * m, span),
-        np.zeros((m, 4)),
-        np.zeros((m, 4)),
-        np.zeros((m, 4)),
-        np.zeros((4, k)),
-        q_dot,
-        q_dot if own else np.zeros(k),
-        np.full(len(ERRORS), np.nan),
-        np.zeros((2, k)),
-        np.zeros(1),
-        np.full(3, np.nan),
-        np.full(1, np.nan),
-        np.zeros((COORDINATES, COORDINATES + 1)),
-        np.zeros((MOST_PARTS + 1, n)),
-        np.full(1, -1.0),
-        np.zeros(1, dtype=np.int64),
-        np.full(1, -1, dtype=np.int64),
-        np.zeros((2, max(m, observed), 2)),
-        np.zeros(1),
-        np.zeros((m, 4)),
-        np.zeros((2, m, 2)),
-        np.zeros(n),
+        work=workspace(n, 4 * m, span),
+        A=np.zeros((m, 4)),
+        A_t=np.zeros((m, 4)),
+        A_r=np.zeros((m, 4)),
+        q_hat=np.zeros((4, k)),
+        q_dot=q_dot,
+        xi_dot=q_dot if own else np.zeros(k),
+        errors=np.full(len(ERRORS), np.nan),
+        driven=np.zeros((2, k)),
+        limited=np.zeros(1),
+        fit=np.full(3, np.nan),
+        face_px=np.full(1, np.nan),
+        normal=np.zeros((COORDINATES, COORDINATES + 1)),
+        path=np.zeros((MOST_PARTS + 1, n)),
+        share=np.full(1, -1.0),
+        parts=np.zeros(1, dtype=np.int64),
+        blocked=np.full(1, -1, dtype=np.int64),
+        straight=np.zeros((2, max(m, observed), 2)),
+        clock=np.zeros(1),
+        A_aim=np.zeros((m, 4)),
+        s_aim=np.zeros((2, m, 2)),
+        q_ahead=np.zeros(n),
     )
 
 
@@ -178,7 +178,9 @@ def reset(state: State) -> None:
 @composed
 def split_of(state: State) -> Split:
     """The arrays of a state in which the task is partitioned."""
-    return Split(state.work, state.A, state.A_t, state.A_r, state.q_hat, state.driven)
+    return Split(
+        work=state.work, A=state.A, A_t=state.A_t, A_r=state.A_r, q_hat=state.q_hat, driven=state.driven
+    )
 
 
 @njit

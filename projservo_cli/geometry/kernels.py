@@ -40,7 +40,11 @@ def new_system(n: int, rows: int) -> System:
     """Arrays for n unknowns and at most so many rows."""
     width = (max(n, rows) + 3) // 4 * 4
     return System(
-        np.zeros((n, width)), np.zeros(width), np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
+        B=np.zeros((n, width)),
+        rhs=np.zeros(width),
+        z=np.zeros(n),
+        norms=np.zeros(n),
+        pivot=np.zeros(n, dtype=np.int64),
     )
 
 

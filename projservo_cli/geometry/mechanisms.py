@@ -72,14 +72,14 @@ def workspace(n: int, rows: int, span: Span = OWN) -> Work:
     H_hat = np.zeros((n, 4, 4))
     own = len(span.H_hat) == 0
     return Work(
-        H_hat,
-        new_system(max(n, COORDINATES), max(n, 8, rows)),
-        span,
-        H_hat if own else span.H_hat,
-        H_hat if own or n < COORDINATES else span.H_hat,
-        np.zeros((COORDINATES, n)),
-        np.zeros(COORDINATES),
-        np.zeros(n),
+        H_hat=H_hat,
+        system=new_system(max(n, COORDINATES), max(n, 8, rows)),
+        span=span,
+        basis=H_hat if own else span.H_hat,
+        columns=H_hat if own or n < COORDINATES else span.H_hat,
+        J=np.zeros((COORDINATES, n)),
+        xi=np.zeros(COORDINATES),
+        newton=np.zeros(n),
     )
 
 

@@ -48,7 +48,9 @@ _HALF_TURN_BAND = math.radians(2.0)
 _REHEARSAL_STEPS = 300
 _REHEARSAL_PX = 1.0
 _REHEARSAL_STEP = math.radians(5.0)
-_REHEARSAL = Gains(0.1, 0.1, 0.1, 0.1, 1.0, 0.1, 1.0, 0.9)
+_REHEARSAL = Gains(
+    gain_t=0.1, gain_r=0.1, gain_p=0.1, gain_s=0.1, ratio_rp=1.0, gain=0.1, period=1.0, delta=0.9
+)
 _DIRECT_TWO = CODES["direct_two"]
 _Bounds = tuple[FloatArray, FloatArray]
 
@@ -86,7 +88,15 @@ class _Rehearsal:
             """Whether a sense fails to arrive, whether it passes a joint limit, and in how many steps."""
             reset(self.state)
             self.state.driven[1] = sense * q_hat_p
-            limits = Limits(step, _REHEARSAL_PX, math.inf, 20, most, False, False)
+            limits = Limits(
+                speed=step,
+                image_px=_REHEARSAL_PX,
+                diverged_factor=math.inf,
+                plateau_steps=20,
+                max_steps=most,
+                stop_at_joint_limit=False,
+                stop_at_border=False,
+            )
             course = Course(plant, limits, self.q_start)
             verdict, steps = run_compiled(law, course, self.noise, self.state, self.log)
             return verdict != CONVERGED, bool(self.log.events[1] >= 0.0), steps
@@ -184,12 +194,14 @@ class Trials:
         body = setting.body._replace(shown=np.zeros((2, len(setting.body.M)), dtype=np.bool_))
         self.setting = setting
         self.desk = _Desk(
-            np.zeros((2, 2, shown, 2)),
-            new_task(setting.model, s_star, plant.center)._replace(body=body),
-            new_task(setting.believed, s_star, plant.center),
-            new_state(n, m, shown),
-            new_state(n, m, observed),
-            new_log(n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if setting.gains.substeps else 0),
+            shown=np.zeros((2, 2, shown, 2)),
+            task=new_task(setting.model, s_star, plant.center)._replace(body=body),
+            own_task=new_task(setting.believed, s_star, plant.center),
+            state=new_state(n, m, shown),
+            own_state=new_state(n, m, observed),
+            log=new_log(
+                n, observed, limits.max_steps, len(ERRORS), MOST_PARTS if setting.gains.substeps else 0
+            ),
         )
         self.rehearsal = _Rehearsal(setting.model, q_start, m, (plant.lower, plant.upper))
 

@@ -60,11 +60,22 @@ def run_compiled(law: Law, course: Course, noise: FloatArray, state: State, log:
                 log.fit[k, i] = state.fit[i]
             if math.isfinite(state.face_px[0]):
                 log.judged[k] = state.face_px[0]
-        verdict = verdict_at(log, k, Instant(in_front, left, distance, status, state.q_dot), limits)
+        verdict = verdict_at(
+            log,
+            k,
+            Instant(in_front=in_front, left=left, distance=distance, status=status, q_dot=state.q_dot),
+            limits,
+        )
         if verdict == WAITING:
             dq[:] = 0.0
         elif verdict == RUNNING:
-            asked = Command(state.q_dot, state.share[0], state.blocked[0], law.gains.period, 1.0)
+            asked = Command(
+                q_dot=state.q_dot,
+                share=state.share[0],
+                blocked=state.blocked[0],
+                period=law.gains.period,
+                scale=1.0,
+            )
             verdict = bounded(log, k, asked, plant, limits)
             if verdict == RUNNING and law.gains.substeps and 0 < state.parts[0] < log.path.shape[1]:
                 log.parts[k] = state.parts[0]
@@ -99,7 +110,7 @@ def many_steps(law: Law, course: Course, state: State, log: Log) -> float:
     total = 0.0
     for k in range(log.s.shape[0]):
         command(law, log.s[k], log.q[k], state)
-        asked = Command(state.q_dot, -1.0, -1, law.gains.period, 1.0)
+        asked = Command(q_dot=state.q_dot, share=-1.0, blocked=-1, period=law.gains.period, scale=1.0)
         bounded(log, k, asked, course.plant, course.limits)
         total += log.factor[k]
     return total

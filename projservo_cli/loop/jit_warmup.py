@@ -51,11 +51,39 @@ def _compile_now() -> None:
 def calls() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     """Kernels and arguments of the types that all runs have; their values mean nothing."""
     q, O, matrices, order = np.zeros(4), np.zeros((2, 4)), np.zeros((4, 4, 4)), np.zeros(4, np.int64)
-    model = Model(np.zeros((2, 3, 4)), matrices, order, q, q)
-    task = Task(np.zeros((2, 4, 2)), matrices[0], order, 0, np.zeros((3, 3)), O, q)
-    plant = Plant(model, matrices[0], order, 0, O, q, q, q, q, True)
+    model = Model(P=np.zeros((2, 3, 4)), H_hat_0=matrices, joint_types=order, q_reference=q, a_inf=q)
+    task = Task(
+        s_star=np.zeros((2, 4, 2)),
+        A_star=matrices[0],
+        order=order,
+        center=0,
+        F=np.zeros((3, 3)),
+        O=O,
+        visible=q,
+    )
+    plant = Plant(
+        model=model,
+        M=matrices[0],
+        order=order,
+        center=0,
+        O=O,
+        visible=q,
+        image_size=q,
+        lower=q,
+        upper=q,
+        opaque=True,
+    )
     state, log = new_state(4, 4), new_log(4, 4, 1, len(ERRORS))
-    reaching = Reaching(model, limits_alone(q, q), matrices, q, matrices[0], q, O, q)
+    reaching = Reaching(
+        model=model,
+        demands=limits_alone(q, q),
+        H_hat=matrices,
+        amplitudes=q,
+        A=matrices[0],
+        a=q,
+        O=O,
+        q_start=q,
+    )
     along = room_along(reaching, 1)
     yield reach, (model, Seen(matrices[0], IDENTITY), IDENTITY, q, state.work, 1.0)
     yield pseudo_inverse, (state, 8, q)

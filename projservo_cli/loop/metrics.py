@@ -69,21 +69,21 @@ def summarize(plant: Plant, log: Log, ended: Ended, period: float, ends: Ends) -
     base_tool, goal_pose = mat(ends.base_tool), mat(ends.goal_pose)
     arrived = ended.verdict == CONVERGED and hidden_left == 0 and hidden_right == 0
     return Summary(
-        1.0 if arrived and _keeps_within(plant, log, steps) else 0.0,
-        float(log.error[steps]),
-        hidden_left,
-        hidden_right,
-        int(log.events[0]),
-        int(log.events[1]),
-        slowed,
-        int(ended.limited),
-        _effort(log, steps, period),
-        math.degrees(angle_between(mul(first, base_tool), goal_pose)),
-        MM * _distance(start, goal),
-        MM * _distance(end, goal),
-        math.degrees(angle_between(mul(last, base_tool), goal_pose)),
-        MM * length,
-        MM * at_samples,
+        success=1.0 if arrived and _keeps_within(plant, log, steps) else 0.0,
+        image_error_px=float(log.error[steps]),
+        self_occluded_steps_left=hidden_left,
+        self_occluded_steps_right=hidden_right,
+        first_outside_image=int(log.events[0]),
+        first_beyond_limit=int(log.events[1]),
+        speed_limited_steps=slowed,
+        visibility_limited_steps=int(ended.limited),
+        effort=_effort(log, steps, period),
+        rotation_deg=math.degrees(angle_between(mul(first, base_tool), goal_pose)),
+        distance_mm=MM * _distance(start, goal),
+        position_error_mm=MM * _distance(end, goal),
+        rotation_error_deg=math.degrees(angle_between(mul(last, base_tool), goal_pose)),
+        path_length_mm=MM * length,
+        center_deviation_at_samples_mm=MM * at_samples,
     )
 
 

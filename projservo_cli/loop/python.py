@@ -212,7 +212,9 @@ def _instant(
         log.errors[k], log.fit[k] = law.errors, _told(law, "fit")
         face_px = float(_told(law, "face_px")[0])
         log.judged[k] = face_px if math.isfinite(face_px) else log.judged[k]
-    return monitors.of_instant(log, k, Instant(plant.in_front, left, distance, status, q_dot)), q_dot
+    return monitors.of_instant(
+        log, k, Instant(in_front=plant.in_front, left=left, distance=distance, status=status, q_dot=q_dot)
+    ), q_dot
 
 
 def _send(

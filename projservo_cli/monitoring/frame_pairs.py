@@ -83,4 +83,4 @@ class Pairing:
         stacked = (np.array([frame[i] for frame in both]) for i in range(len(one)))
         t, q, q_dot, late, images, noise = stacked
         curved = _STRAIGHT * np.abs(one.q_dot - last.q_dot) * abs(one.t - last.t)
-        return Look(t - self._start, q, q_dot, late, images, noise, curved)
+        return Look(t=t - self._start, q=q, q_dot=q_dot, late=late, images=images, noise=noise, curved=curved)

@@ -115,7 +115,12 @@ class Evidence:
         self._offset = float(self._known @ cho_solve(cho_factor(prior), self._known))
         self.rows = float(2.0 * (self.seen * factor[:, None, None] ** 2).sum())
         self.nothing = Changed(
-            self.scene.P, self.scene.lens, self.scene.M, self.away, np.ones(2), np.zeros((2, 2))
+            P=self.scene.P,
+            lens=self.scene.lens,
+            M=self.scene.M,
+            away=self.away,
+            scale=np.ones(2),
+            shift=np.zeros((2, 2)),
         )
         self.at_first = self._off(self.nothing)
         self.before = self._square(self._whitened(self.at_first))
@@ -130,7 +135,13 @@ class Evidence:
     def _off(self, changed: Changed) -> FloatArray:
         """What images (K, 4 m) are off the prediction of a cause, px; zero where unseen."""
         K, _, n = changed.away.shape
-        scene = Scene(changed.P, self.scene.H_hat, self.scene.prismatic, changed.M, changed.lens)
+        scene = Scene(
+            P=changed.P,
+            H_hat=self.scene.H_hat,
+            prismatic=self.scene.prismatic,
+            M=changed.M,
+            lens=changed.lens,
+        )
         s = scene.seen(changed.away.reshape(2 * K, n)).reshape(K, 2, 2, -1, 2)[:, [0, 1], [0, 1]]
         s = changed.scale[:, None, None] * (s + 0.5) - 0.5 + changed.shift[:, None]
         off = np.where(np.isfinite(s), self._images - s, _HIDDEN_PX)
@@ -238,7 +249,13 @@ class Evidence:
         changed_px = float(np.sqrt(change[change > 0.0].mean())) if change.any() else 0.0
         by_view = change.sum(axis=(0, 2)) / np.maximum(self._touched(cause).sum(axis=(0, 2)), 1)
         return Explanation(
-            cause, theta, self.before - square, cost, square, changed_px, float(np.sqrt(by_view.min()))
+            cause=cause,
+            theta=theta,
+            gain=self.before - square,
+            cost=cost,
+            left=square,
+            changed_px=changed_px,
+            least_px=float(np.sqrt(by_view.min())),
         )
 
 
@@ -397,7 +414,13 @@ def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
             return displaced(s, theta, which)
 
         if shown[which].any() and len(tags) > 1:
-            yield Cause("tag", int(which[0]), np.zeros((1, d)), loose, tuple(which.tolist()))
+            yield Cause(
+                kind="tag",
+                which=int(which[0]),
+                starts=np.zeros((1, d)),
+                change=loose,
+                markers=tuple(which.tolist()),
+            )
     for j in np.flatnonzero(shown):
 
         def moved(s: Changed, theta: FloatArray, j: int = int(j)) -> Changed:
@@ -405,7 +428,7 @@ def _body_causes(evidence: Evidence, numbers: IntArray) -> Iterator[Cause]:
             M[j] += evidence._errors.directions.T @ theta * np.linalg.norm(M[j])
             return s._replace(M=M)
 
-        yield Cause("marker", int(j), np.zeros((1, 3)), moved, (int(j),))
+        yield Cause(kind="marker", which=int(j), starts=np.zeros((1, 3)), change=moved, markers=(int(j),))
 
 
 def together(moved: list[Explanation]) -> Explanation:

@@ -159,7 +159,10 @@ class ImageMonitor:
         at_rest = bool(np.abs(q - self._first).max() <= _AT_REST)
         for v in np.flatnonzero(fresh):
             uncertain = max(float(late[v]), LEAST_ERROR)
-            self._pairing.add(int(v), Frame(float(t[v]), q[v], q_dot[v], uncertain, images[v], noise[v]))
+            self._pairing.add(
+                int(v),
+                Frame(t=float(t[v]), q=q[v], q_dot=q_dot[v], late=uncertain, image=images[v], noise=noise[v]),
+            )
         self._pairing.reach(t)
         while not self.fault and (look := self._pairing.next(at_rest)) is not None:
             self._take(look)
@@ -193,7 +196,10 @@ class ImageMonitor:
         # What a hand leaves of a view tells nothing, nor looks between those that disagree.
         if self._sound > WINDOW * self.holds and not covered:
             memory.keep(clean, float(look.t.mean()), not tested.aside.any())
-        self._kept = [*kept, _Kept(look, residual, self._view, memory.views, covered)]
+        self._kept = [
+            *kept,
+            _Kept(look=look, residual=residual, view=self._view, views=memory.views, covered=covered),
+        ]
         crowd = (tested.aside.sum(axis=1) >= _MOST_FOR_LONG * residual.seen.sum(axis=1)).any()
         self._crowded = (self._crowded + 1) * bool(crowd and not covered)
         disagrees = tested.disagrees or self._crowd_is_fault()

@@ -80,11 +80,11 @@ class Sums(NamedTuple):
     def plus(self, other: "Sums", factor: float = 1.0) -> "Sums":
         """Sums and so many times others, which are later."""
         return Sums(
-            self.looks + other.looks,
-            other.t,
-            self.normal + factor * other.normal,
-            self.seen + factor * other.seen,
-            self.bias + factor * other.bias,
+            looks=self.looks + other.looks,
+            t=other.t,
+            normal=self.normal + factor * other.normal,
+            seen=self.seen + factor * other.seen,
+            bias=self.bias + factor * other.bias,
         )
 
     def times(self, factor: float) -> "Sums":
@@ -164,7 +164,9 @@ class ErrorModel:
         # An instant so uncertain that the arm moves on a curve: half the square of the angle.
         bend = 0.5 * np.abs(look.q_dot).sum(axis=1).max() * (late @ look.late)
         R = new @ new.T + np.diag(np.repeat(noise.ravel(), 2) ** 2 + bend**2)
-        return Residual(seen, noise, predicted, r.ravel(), B.reshape(rows, -1), F, R)
+        return Residual(
+            seen=seen, noise=noise, predicted=predicted, r=r.ravel(), B=B.reshape(rows, -1), F=F, R=R
+        )
 
     def _excess(self, away: FloatArray) -> FloatArray:
         """Variance of corners (2, m) over their noise, as sightings of the calibration from near them err.
@@ -210,13 +212,13 @@ class ErrorModel:
         rows = np.concatenate([residual.B, residual.F, residual.r[:, None]], axis=1)
         rows = solve_triangular(np.linalg.cholesky(residual.R), rows, lower=True, check_finite=False)
         bias = 2.0 * residual.seen * (self.bias_px / residual.noise) ** 2
-        return Sums(1, t, rows.T @ rows, np.where(residual.seen, 2.0, 0.0), bias)
+        return Sums(looks=1, t=t, normal=rows.T @ rows, seen=np.where(residual.seen, 2.0, 0.0), bias=bias)
 
     def nothing(self) -> Sums:
         """Sums of no look."""
         c = self.e + self.f + 1
         none = np.zeros((2, len(self.calibration.M)))
-        return Sums(0, 0.0, np.zeros((c, c)), none, none)
+        return Sums(looks=0, t=0.0, normal=np.zeros((c, c)), seen=none, bias=none)
 
     def root(self, sums: Sums) -> FloatArray:
         """Root (e, e) of the information on the errors of the calibration."""

@@ -89,21 +89,21 @@ def constraints_of(
     model = model._replace(P=np.ascontiguousarray(model.P * sides[:, None, None]))
     steep, border = demands.least_face_px, demands.border_px
     return Constraints(
-        model,
-        np.ascontiguousarray(A @ np.linalg.inv(H).T),
-        m,
-        tags if len(tags) else np.arange(m)[None],
-        np.ascontiguousarray((tag_planes(tags, A, m, face) if len(tags) else face[None]) @ H),
-        np.ascontiguousarray(task.O / (task.O @ face)[:, None]),
-        (A @ model.P[:, 2].T).min(axis=0),
-        demands.lower,
-        demands.upper,
-        demands.speed,
-        demands.image_size,
-        np.maximum(demands.keep, 1e-9),
-        np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
-        np.zeros((0, n)),
-        np.zeros((0, MARGINS)),
+        model=model,
+        M=np.ascontiguousarray(A @ np.linalg.inv(H).T),
+        face=m,
+        tags=tags if len(tags) else np.arange(m)[None],
+        a=np.ascontiguousarray((tag_planes(tags, A, m, face) if len(tags) else face[None]) @ H),
+        O=np.ascontiguousarray(task.O / (task.O @ face)[:, None]),
+        depth=(A @ model.P[:, 2].T).min(axis=0),
+        lower=demands.lower,
+        upper=demands.upper,
+        speed=demands.speed,
+        image_size=demands.image_size,
+        keep=np.maximum(demands.keep, 1e-9),
+        full=np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
+        ends=np.zeros((0, n)),
+        had=np.zeros((0, MARGINS)),
         keep_out=keep_out,
     )
 
@@ -185,7 +185,14 @@ def _best_sight_into(c: Constraints, q: FloatArray, shown: bool, trial: "Trial")
 def twin_of(c: Constraints, j: int) -> Model:
     """The calibrated model, off by the deviation j."""
     m = c.model
-    return Model(c.spread.P[j], c.spread.H_hat[j], m.joint_types, m.q_reference, m.a_inf, m.lens)
+    return Model(
+        P=c.spread.P[j],
+        H_hat_0=c.spread.H_hat[j],
+        joint_types=m.joint_types,
+        q_reference=m.q_reference,
+        a_inf=m.a_inf,
+        lens=m.lens,
+    )
 
 
 @internal
@@ -355,7 +362,15 @@ class Trial(NamedTuple):
 def new_trial(n: int, b: int) -> Trial:
     """Workspace for n joints and b markers."""
     one, s = np.zeros(MARGINS), np.zeros((2, b, 2))
-    return Trial(one, one.copy(), np.zeros(6), s, s.copy(), np.zeros(n), np.zeros(MARGINS + n, np.int64))
+    return Trial(
+        margins=one,
+        demands=one.copy(),
+        sight=np.zeros(6),
+        s=s,
+        s_before=s.copy(),
+        q=np.zeros(n),
+        failures=np.zeros(MARGINS + n, np.int64),
+    )
 
 
 @internal

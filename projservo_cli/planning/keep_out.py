@@ -44,12 +44,12 @@ def keep_out_of(regions: Sequence[tuple[ArrayLike | None, ArrayLike | None, bool
         return NO_KEEP_OUT
     views = [int(left is None) if left is None or right is None else BOTH for left, right, _ in regions]
     return KeepOut(
-        np.ascontiguousarray(np.vstack([corners for _, _, corners in polygons])),
-        np.cumsum([0, *(len(corners) for _, _, corners in polygons)]),
-        np.array([view for _, view, _ in polygons]),
-        np.array([r for r, _, _ in polygons]),
-        np.array([int(hides) for _, _, hides in regions]),
-        np.array(views),
+        corners=np.ascontiguousarray(np.vstack([corners for _, _, corners in polygons])),
+        first=np.cumsum([0, *(len(corners) for _, _, corners in polygons)]),
+        image=np.array([view for _, view, _ in polygons]),
+        region=np.array([r for r, _, _ in polygons]),
+        hides=np.array([int(hides) for _, _, hides in regions]),
+        views=np.array(views),
     )
 
 

@@ -121,7 +121,15 @@ class Demands(NamedTuple):
 def limits_alone(lower: FloatArray, upper: FloatArray) -> Demands:
     """Demands of joint limits alone, (n,) rad or m."""
     endless = np.full(len(lower), math.inf)
-    return Demands(lower, upper, endless, np.full(2, math.inf), 0.0, 0.0, np.zeros(len(lower)))
+    return Demands(
+        lower=lower,
+        upper=upper,
+        speed=endless,
+        image_size=np.full(2, math.inf),
+        border_px=0.0,
+        conditioning=0.0,
+        keep=np.zeros(len(lower)),
+    )
 
 
 class Reaching(NamedTuple):

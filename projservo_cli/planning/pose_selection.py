@@ -90,7 +90,15 @@ def suggest(
         after = float(np.trace(gram)) / coordinates
         nearest = int(np.argmin(np.linalg.norm(observation.q - q[best], axis=1)))
         number = int(observation.pose[nearest])
-        found.append(Suggestion(q[best], number, q[best] - observation.q[nearest], before, after))
+        found.append(
+            Suggestion(
+                q=q[best],
+                from_pose=number,
+                delta=q[best] - observation.q[nearest],
+                variance_before=before,
+                variance_after=after,
+            )
+        )
     return tuple(found)
 
 

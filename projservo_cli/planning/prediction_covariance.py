@@ -71,11 +71,11 @@ def spread_of(
     n, b = calibration.H_hat_0.shape[0], calibration.M.shape[0]
     P, H_hat, M = moved[:, :24], moved[:, 24 : 24 + 16 * n], moved[:, -4 * b :]
     return Spread(
-        np.concatenate([calibration.P[None], calibration.P + P.reshape(-1, 2, 3, 4)]),
-        np.concatenate([calibration.H_hat_0[None], calibration.H_hat_0 + H_hat.reshape(-1, n, 4, 4)]),
-        np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)]),
-        rest,
-        float(np.sqrt(variance.max())),
+        P=np.concatenate([calibration.P[None], calibration.P + P.reshape(-1, 2, 3, 4)]),
+        H_hat=np.concatenate([calibration.H_hat_0[None], calibration.H_hat_0 + H_hat.reshape(-1, n, 4, 4)]),
+        M=np.concatenate([calibration.M[None], calibration.M + M.reshape(-1, b, 4)]),
+        rest=rest,
+        most=float(np.sqrt(variance.max())),
     )
 
 

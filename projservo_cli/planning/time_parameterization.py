@@ -55,7 +55,9 @@ def time_parameterized(c: Constraints, path: FloatArray, acceleration: FloatArra
     path = path[np.r_[True, np.abs(np.diff(path, axis=0)).max(axis=1) > LEAST]]
     if len(path) == 1:
         still = np.zeros((2, path.shape[1]))
-        return TimedPath(np.array([0.0, 1.0]), path + still, still, still[:1], np.zeros(2), np.zeros(2))
+        return TimedPath(
+            s=np.array([0.0, 1.0]), q=path + still, dq=still, ddq=still[:1], x=np.zeros(2), time=np.zeros(2)
+        )
     times = np.diff(least_time(c.speed, path))
     slopes = np.diff(path, axis=0) / times[:, None]
     sizes = np.zeros(len(path))
@@ -108,7 +110,9 @@ def _on_grid(path: FloatArray, times: FloatArray, slopes: FloatArray, sizes: Flo
             dq.append(slope + x * change)
             ddq.append(np.tile(change / (2.0 * size), (ROUNDED, 1)))
     s = np.cumsum(np.concatenate(steps))
-    return TimedPath(s, np.vstack(q), np.vstack(dq), np.vstack(ddq), np.zeros(len(s)), np.zeros(len(s)))
+    return TimedPath(
+        s=s, q=np.vstack(q), dq=np.vstack(dq), ddq=np.vstack(ddq), x=np.zeros(len(s)), time=np.zeros(len(s))
+    )
 
 
 @merged

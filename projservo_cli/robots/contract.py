@@ -340,7 +340,9 @@ class ForeignRobot:
             told = sigma[np.isfinite(s[..., 0])]
             if not ((told > 0.0) & (told < math.inf)).all():
                 raise WorkFailed(f"{self.name}: read() gave a sigma_px that is no positive number")
-        return Reading(q, s, before if np.isnan(times[0]) else float(times[0]), times[1:], sigma)
+        return Reading(
+            q=q, s=s, t_q=before if np.isnan(times[0]) else float(times[0]), t_view=times[1:], sigma_px=sigma
+        )
 
     def _wrong(self, target: FloatArray, speed: FloatArray, due: float) -> str:
         """Why a command must not be sent, whoever computed it; empty where it may."""

@@ -90,13 +90,13 @@ class _Fit(NamedTuple):
 
 # The face measured point by point.
 NO_BODY = Body(
-    np.zeros((0, 4)),
-    np.zeros((3, 4)),
-    np.zeros((3, 4, 4)),
-    np.zeros((0, 3, 3)),
-    np.zeros(4),
-    np.zeros((2, 0), dtype=np.bool_),
-    np.ones((2, 0)),
+    M=np.zeros((0, 4)),
+    D=np.zeros((3, 4)),
+    H_hat=np.zeros((3, 4, 4)),
+    turn=np.zeros((0, 3, 3)),
+    a_inf=np.zeros(4),
+    shown=np.zeros((2, 0), dtype=np.bool_),
+    weight=np.ones((2, 0)),
 )
 
 
@@ -124,13 +124,13 @@ def body_of(model: Model, M: FloatArray) -> Body:
     offset = M - M.mean(axis=0)
     carry = np.eye(4) - np.outer(M.mean(axis=0), model.a_inf)
     return Body(
-        np.ascontiguousarray(M),
-        np.ascontiguousarray(D),
-        np.ascontiguousarray(D.T @ L @ D @ carry),
-        np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
-        np.ascontiguousarray(model.a_inf),
-        np.ones((2, len(M)), dtype=np.bool_),
-        np.ones((2, len(M))),
+        M=np.ascontiguousarray(M),
+        D=np.ascontiguousarray(D),
+        H_hat=np.ascontiguousarray(D.T @ L @ D @ carry),
+        turn=np.ascontiguousarray(np.einsum("rab,bc,kc->kra", L, D, offset)),
+        a_inf=np.ascontiguousarray(model.a_inf),
+        shown=np.ones((2, len(M)), dtype=np.bool_),
+        weight=np.ones((2, len(M))),
     )
 
 
@@ -277,7 +277,7 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, n
             normal[3, 6], normal[4, 6], normal[5, 6],
         )  # fmt: skip
         if not solve_normal(normal, COORDINATES, _RANK_TOLERANCE):
-            return _Fit(False, False, H, before, before, views)
+            return _Fit(found=False, settled=False, H=H, before=before, after=before, views=views)
         fall = 0.0
         for i in range(COORDINATES):
             fall += gradient[i] * normal[i, COORDINATES]
@@ -286,7 +286,7 @@ def fit_body(P: FloatArray, body: Body, s: FloatArray, H: Mat4, until: _Until, n
         settled = fall <= until.settled_px * until.settled_px * (2 * views)
         if settled:
             break
-    return _Fit(True, settled, H, before, after, views)
+    return _Fit(found=True, settled=settled, H=H, before=before, after=after, views=views)
 
 
 @njit

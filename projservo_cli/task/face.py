@@ -220,11 +220,11 @@ def new_task(model: Model, s_star: FloatArray, center: int) -> Task:
     m = s_star.shape[1]
     _require_three(m)
     return Task(
-        np.array(s_star, dtype=np.float64, order="C"),
-        np.zeros((m, 4)),
-        np.zeros(m, dtype=np.int64),
-        center,
-        fundamental_matrix(model.P),
-        optical_centers(model.P, model.a_inf),
-        np.zeros(2),
+        s_star=np.array(s_star, dtype=np.float64, order="C"),
+        A_star=np.zeros((m, 4)),
+        order=np.zeros(m, dtype=np.int64),
+        center=center,
+        F=fundamental_matrix(model.P),
+        O=optical_centers(model.P, model.a_inf),
+        visible=np.zeros(2),
     )

@@ -69,7 +69,16 @@ class Parts(NamedTuple):
 _NOWHERE: Vec4 = (0.0, 0.0, 0.0, 0.0)
 # Partition of a task that could not be measured.
 NO_PARTS = Parts(
-    False, 0.0, 0.0, 0.0, NO_OPERATOR, NO_OPERATOR, NO_OPERATOR, _NOWHERE, _NOWHERE, _NOWHERE
+    found=False,
+    tau=0.0,
+    theta_r=0.0,
+    theta_p=0.0,
+    H_t=NO_OPERATOR,
+    H_r=NO_OPERATOR,
+    H_p=NO_OPERATOR,
+    a=_NOWHERE,
+    a_t=_NOWHERE,
+    A_c=_NOWHERE,
 )  # fmt: skip
 
 
@@ -272,4 +281,15 @@ def partition(task: Task, split: Split) -> Parts:
         for i in range(q_hat.shape[1]):
             split.driven[0, i] = q_hat[1, i] if theta_r >= 0.0 else -q_hat[1, i]
             split.driven[1, i] = q_hat[2, i] if theta_p >= 0.0 else -q_hat[2, i]
-    return Parts(found, tau, theta_r, theta_p, H_t, H_r, H_p, a, a_t, A_c)
+    return Parts(
+        found=found,
+        tau=tau,
+        theta_r=theta_r,
+        theta_p=theta_p,
+        H_t=H_t,
+        H_r=H_r,
+        H_p=H_p,
+        a=a,
+        a_t=a_t,
+        A_c=A_c,
+    )

@@ -71,7 +71,7 @@ class Shown(NamedTuple):
             work = workspace(n, 4 * m, span_of(model, task.A_star))
             k = len(work.basis)
             A, A_t, A_r = np.zeros((3, m, 4))
-            split = Split(work, A, A_t, A_r, np.zeros((3, k)), np.zeros((2, k)))
+            split = Split(work=work, A=A, A_t=A_t, A_r=A_r, q_hat=np.zeros((3, k)), driven=np.zeros((2, k)))
             normal = np.zeros((COORDINATES, COORDINATES + 1))
             require_found(*put_body_task(model, self.q_start, shown, task, split, normal))
         return task
@@ -128,7 +128,11 @@ def followed(model: Model, task: Task, plan: Plan, period: float, rate: float) -
     amplitudes = np.array([plan.tau, plan.theta_r, plan.theta_p])
     room = np.zeros(0) if len(mu) else np.where(model.joint_types == PRISMATIC, _ROOM_M, _ROOM_RAD)
     A, s, ahead = (np.ascontiguousarray(x) for x in (A, s, (s_next - s) / _DIFFERENCE))
-    return task._replace(reference=Reference(plan.H_hat, amplitudes, mu, q, A, s, ahead, rate, room))
+    return task._replace(
+        reference=Reference(
+            H_hat=plan.H_hat, amplitudes=amplitudes, mu=mu, q=q, A=A, s=s, s_ahead=ahead, rate=rate, room=room
+        )
+    )
 
 
 def _instants(plan: Plan, period: float) -> FloatArray:

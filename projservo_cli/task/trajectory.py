@@ -90,15 +90,15 @@ class Reference(NamedTuple):
 
 # Every step plans anew.
 NO_REFERENCE = Reference(
-    np.zeros((3, 4, 4)),
-    np.zeros(3),
-    np.zeros((0, 3)),
-    np.zeros((0, 0)),
-    np.zeros((0, 0, 4)),
-    np.zeros((0, 2, 0, 2)),
-    np.zeros((0, 2, 0, 2)),
-    1.0,
-    np.zeros(0),
+    H_hat=np.zeros((3, 4, 4)),
+    amplitudes=np.zeros(3),
+    mu=np.zeros((0, 3)),
+    q=np.zeros((0, 0)),
+    A=np.zeros((0, 0, 4)),
+    s=np.zeros((0, 2, 0, 2)),
+    s_ahead=np.zeros((0, 2, 0, 2)),
+    rate=1.0,
+    room=np.zeros(0),
 )
 
 
