@@ -33,7 +33,7 @@ from projservo_cli.geometry.kinematics import image_velocity, operators_at, row
 from projservo_cli.geometry.lens import straighten
 from projservo_cli.geometry.mechanisms import OWN, Span, Work, joint_motion, rotation_mechanism, workspace
 from projservo_cli.geometry.stereo import triangulate
-from projservo_cli.records import FloatArray, IntArray, Model
+from projservo_cli.records import FloatArray, IntArray, JointLimits, Model, position_limits
 from projservo_cli.task.body import SEEN, SHOWN, carry, fit_body
 from projservo_cli.task.face import Task, center_of
 from projservo_cli.task.partition import NO_PARTS, Parts, Split, partition
@@ -44,7 +44,7 @@ from projservo_cli.task.visibility import limited_translation
 MOST_PARTS = 128
 
 # No limit, for any number of joints a configuration may have.
-UNLIMITED = np.full(64, np.inf)
+UNLIMITED = position_limits(np.full(64, -np.inf), np.full(64, np.inf))
 
 OK = 0
 LOST = 1
@@ -65,9 +65,8 @@ class Gains(NamedTuple):
     gain : of the classical laws, 1/s.
     period : control period, s.
     delta : share of τ_0 that one pure translation may use.
-    speed : (n,) most joint motion per second, rad/s or m/s; infinite for none.
+    limits : of the joints; a path ends at those of position, which are infinite where a run may pass them.
     substeps : whether a step is sent in the parts it was solved in.
-    lower, upper : (n,) joint limits, rad or m, at which a path ends; infinite for none.
     """
 
     gain_t: float
@@ -78,10 +77,8 @@ class Gains(NamedTuple):
     gain: float
     period: float
     delta: float
-    speed: FloatArray = UNLIMITED
+    limits: JointLimits = UNLIMITED
     substeps: bool = False
-    lower: FloatArray = -UNLIMITED
-    upper: FloatArray = UNLIMITED
 
 
 class Law(NamedTuple):

@@ -166,7 +166,7 @@ def run_in_python(
     """
     try:
         require_spelt(f"law {type(law).__name__}", law, ("errors", *OPTIONAL))
-        log = new_log(len(plant.plant.lower), plant.markers, limits.max_steps, len(ERRORS))
+        log = new_log(len(plant.plant.limits.lower), plant.markers, limits.max_steps, len(ERRORS))
         for column in (log.read, log.q, log.s, log.error, log.judged):
             column[:] = math.nan
         monitors = Monitors(plant, limits, stall, execution)

@@ -271,7 +271,7 @@ class FaultyRobot:
 def full_reach(arm: Arm) -> float:
     """Longest lever that a joint has to the tool, m: the most found in postures drawn within the limits."""
     rng = np.random.default_rng(0)
-    low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.lower, arm.upper))
+    low, high = (np.clip(limit, -math.pi, math.pi) for limit in (arm.limits.lower, arm.limits.upper))
     postures = rng.uniform(low, high, (_POSTURES, len(low)))
     turning = arm.joint_types != PRISMATIC
     return float(max(np.linalg.norm(_tool_velocity(arm, q)[turning], axis=1).max() for q in postures))

@@ -161,7 +161,7 @@ def check_guidance(folder, names, read):
     config = load_config(folder / "configs" / "paper.yaml")
     truth, points = truth_of(config), names["points"]
     q, rate = (np.array([point[name] for point in points]) for name in ("positions", "velocities"))
-    assert ((q >= truth.robot.lower) & (q <= truth.robot.upper)).all()
+    assert ((q >= truth.robot.limits.lower) & (q <= truth.robot.limits.upper)).all()
     assert np.abs(rate).max() <= np.radians(config.control.joint_speed_limit_deg_s)
     assert [points[0]["time_from_start"], points[-1]["time_from_start"]] == [0.0, names["plan"].duration]
     np.testing.assert_array_equal(q[0], names["q_start"])
