@@ -69,13 +69,8 @@ class ExecutionMonitor:
         limits: Limits,
         stall: StallMonitor | None = None,
     ) -> None:
-        self.law, self.follow, self.replanner, self.left, self.limits = (
-            law,
-            follow,
-            replanner,
-            searches,
-            limits,
-        )
+        self.law, self.follow, self.replanner = law, follow, replanner
+        self.left, self.limits = searches, limits
         self.attempts: list[str] = []
         self._stall = stall
         self._excluded: list[FloatArray] = []

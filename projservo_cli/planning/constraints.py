@@ -63,7 +63,7 @@ class Constraints(NamedTuple):
     keep: FloatArray  # (n,) distance from a limit that counts as margin one, rad or m
     full: FloatArray  # (10,) margins asked for
     ends: FloatArray  # (k, n) start and goals, near which less is asked for
-    had: FloatArray  # (k, 10) what is asked for there
+    end_demands: FloatArray  # (k, 10) what is asked for there
     spread: Spread = NO_SPREAD
     keep_out: KeepOut = NO_KEEP_OUT
 
@@ -99,7 +99,7 @@ def constraints_of(
         keep=np.maximum(demands.keep, 1e-9),
         full=np.array([1.0, 0.0, 0.0, 0.0, 0.0, steep, steep, border, border, FINE_PX]),
         ends=np.zeros((0, n)),
-        had=np.zeros((0, MARGINS)),
+        end_demands=np.zeros((0, MARGINS)),
         keep_out=keep_out,
     )
 
@@ -313,7 +313,7 @@ def demands_into(c: Constraints, q: FloatArray, demands: FloatArray) -> None:
         rise = time_between(c.limits.speed, q, c.ends[e]) / RISE
         if rise < 1.0:
             for i in range(MARGINS):
-                demands[i] = min(demands[i], c.had[e, i] + rise * (c.full[i] - c.had[e, i]))
+                demands[i] = min(demands[i], c.end_demands[e, i] + rise * (c.full[i] - c.end_demands[e, i]))
 
 
 @merged

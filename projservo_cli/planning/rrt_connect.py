@@ -88,12 +88,12 @@ def with_ends(c: Constraints, ends: FloatArray) -> Constraints:
 
     What they show was seen there, so that a deviation of the prediction takes nothing from it.
     """
-    had = np.array([margins_at(c, q)[0] for q in ends])
+    demands = np.array([margins_at(c, q)[0] for q in ends])
     seen = np.array([margins_at(c._replace(spread=NO_SPREAD), q)[0] for q in ends])
     seen = np.where(np.isfinite(seen), seen, 0.0)
-    had = np.minimum(c.full, np.where(seen > 0.0, had - (1.0 - SHARE) * seen, had - ROUND_OFF))
-    poor = (had < c.full).any(axis=1)
-    return c._replace(ends=np.ascontiguousarray(ends[poor]), had=np.ascontiguousarray(had[poor]))
+    demands = np.minimum(c.full, np.where(seen > 0.0, demands - (1.0 - SHARE) * seen, demands - ROUND_OFF))
+    poor = (demands < c.full).any(axis=1)
+    return c._replace(ends=np.ascontiguousarray(ends[poor]), end_demands=np.ascontiguousarray(demands[poor]))
 
 
 def margins_at(c: Constraints, q: FloatArray) -> tuple[FloatArray, FloatArray]:

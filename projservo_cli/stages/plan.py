@@ -38,7 +38,7 @@ from projservo_cli.stages.motions import (
     search_of,
     why_closed,
 )
-from projservo_cli.stages.plan_summary import least_of, reason_of, told_of, verdict_of
+from projservo_cli.stages.plan_summary import least_of, reason_of, search_summary, verdict_of
 from projservo_cli.stages.scenario import Scenario, scenario_of
 from projservo_cli.stages.world import Joints
 from projservo_cli.task.face import Task, center_of, face_plane
@@ -256,7 +256,7 @@ def _planned(
         theta_0=theta_0,
         sense=sense,
         sense_margin=sense_margin,
-        **({} if path is None else told_of(path, along.q, time, trajectory.search.seed)),
+        **({} if path is None else search_summary(path, along.q, time, trajectory.search.seed)),
     )
     return plan, found.entered or ("" if holds or (path is not None and found.feasible) else words)
 

@@ -116,7 +116,7 @@ _MOST_NODES = 2_000
 _TOLD = 2
 
 
-def told_of(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
+def search_summary(path: JointPath, q: FloatArray, time: FloatArray, seed: int) -> dict[str, Any]:
     """Fields of a plan that a search came to, with joints (s, n) at times (s,); NaN where it found none."""
     told: dict[str, Any] = {
         "goals": path.n_goals,
