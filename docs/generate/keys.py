@@ -1,10 +1,10 @@
 """The keys of configurations as tables, from their JSON Schema."""
 
 import json
-from collections.abc import Container, Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from extensions.tables import table, text
+from docs.generate.markdown import anchor, table, text
 
 # The unit that ends a key, the longest ending first; gains are in 1/s whatever they end in.
 UNITS = {"deg_s": "°/s", "m_s": "m/s", "deg": "°", "rad": "rad", "px": "px", "m": "m", "s": "s"}
@@ -19,11 +19,11 @@ def unit(key: str) -> str:
     return next((symbol for ending, symbol in UNITS.items() if key.endswith(f"_{ending}")), "")
 
 
-def kind(schema: dict[str, Any], sections: Container[str]) -> str:
+def kind(schema: dict[str, Any], sections: Mapping[str, list[str]]) -> str:
     """What a value may be, from its JSON Schema, as Markdown; sections have tables of their own."""
     if "$ref" in schema:
         name = named(schema)
-        return f"[keys](#keys-{name.lower()})" if name in sections else "any keys"
+        return f"[keys](#{anchor(heading(sections[name]))})" if name in sections else "any keys"
     if "anyOf" in schema:
         return " or ".join(kind(part, sections) for part in schema["anyOf"])
     if "enum" in schema:
@@ -53,7 +53,7 @@ def kind(schema: dict[str, Any], sections: Container[str]) -> str:
 def default(schema: dict[str, Any], required: bool) -> str:
     """Default of a key as YAML; empty for a section, whose keys have defaults of their own."""
     value = schema.get("default", {})
-    shown = value if isinstance(value, str) else json.dumps(value).replace('"', "")
+    shown = (value or '""') if isinstance(value, str) else json.dumps(value).replace('"', "")
     return "required" if required else "" if isinstance(value, dict) else f"`{shown}`"
 
 
@@ -63,6 +63,11 @@ def named(schema: Any) -> str:
         return str(schema["$ref"]).rsplit("/", 1)[1]
     inner = schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ()
     return next(filter(None, map(named, inner)), "")
+
+
+def heading(paths: list[str]) -> str:
+    """Heading of a section that stands at some paths."""
+    return ", ".join(f"`{path}`" for path in paths)
 
 
 def places(schema: dict[str, Any]) -> dict[str, list[str]]:
@@ -98,6 +103,5 @@ def all_keys(schema: dict[str, Any]) -> Iterator[str]:
     yield from table(titles, keys(schema, schema))
     for name, paths in places(schema).items():
         section = schema["$defs"][name]
-        heading = ", ".join(f"`{path}`" for path in paths)
-        yield from (f"(keys-{name.lower()})=", f"### {heading}", "", text(section.get("description", "")))
+        yield from (f"### {heading(paths)}", "", text(section.get("description", "")))
         yield from table(titles, keys(schema, section))

@@ -1,23 +1,21 @@
-"""References written by the code they describe: directives that take no arguments."""
+"""Generated regions: references written by the code that they describe."""
 
 import dataclasses
 import inspect
 import types
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import click
-from docutils import nodes
-from sphinx.application import Sphinx
-from sphinx.util.docutils import SphinxDirective
 
-from extensions import keys
-from extensions.tables import table, text
+from docs.generate import keys, python
+from docs.generate.markdown import table, text
 from projservo_cli import records
 from projservo_cli.cli import main
 from projservo_cli.config.schema import json_schema, sweep_schema
 from projservo_cli.equations import REGISTER
+from projservo_cli.loop import step
 from projservo_cli.sweeps.runs import ALL_VERDICTS, BETWEEN, MEASURED, NUMBERED
 
 # Where a run file holds which record.
@@ -66,7 +64,7 @@ def commands() -> Iterator[str]:
         with click.Context(main, info_name="projservo") as group:
             context = click.Context(command, group, info_name=name)
         summary, *paragraphs = inspect.cleandoc(command.help or "").split("\n\n")
-        yield from ("", f"(command-{name})=", f"## projservo {name}", "", text(summary), "")
+        yield from ("", f"## projservo {name}", "", text(summary), "")
         yield from ("```text", command.get_usage(context).removeprefix("Usage: "), "```", "")
         for paragraph in paragraphs:
             yield from (text(" ".join(paragraph.split())), "")
@@ -80,7 +78,7 @@ def commands() -> Iterator[str]:
         )
         for option in command.params:
             if (record := option.get_help_record(context)) is not None:
-                yield from (f"`{record[0]}`", f": {text(record[1])}", "")
+                yield f"- `{record[0]}`: {text(record[1])}"
 
 
 def equations() -> Iterator[str]:
@@ -113,30 +111,25 @@ def sweep_columns() -> Iterator[str]:
             for column in (*NUMBERED, *MEASURED, BETWEEN)
         ),
     )
-    yield from ("", f"`{BETWEEN.name}` is there with `between_samples`. Verdicts are:", "")
+    yield from ("", f"A sweep with `between_samples` has `{BETWEEN.name}`.")
+
+
+def verdicts() -> Iterator[str]:
+    """All verdicts of a run, and their order."""
     yield ", ".join(f"`{verdict}`" for verdict in ALL_VERDICTS) + "."
+    yield ""
+    yield from python.markdown(inspect.cleandoc(step.__doc__ or "").split("\n\n", 1)[1])
 
 
-class _Written(SphinxDirective):
-    """Markdown from a function of this module, parsed in place."""
-
-    def run(self) -> list[nodes.Node]:
-        write = WRITERS[self.name]
-        return self.parse_text_to_nodes("\n".join(write()), allow_section_headings=True)
-
-
-WRITERS = {
+WRITERS: dict[str, Callable[[], Iterator[str]]] = {
     "configuration-keys": lambda: keys.all_keys(json_schema()),
     "sweep-keys": lambda: keys.all_keys(sweep_schema()),
     "sweep-columns": sweep_columns,
     "run-file-groups": run_file,
     "commands": commands,
     "equations": equations,
+    "verdicts": verdicts,
+    "python-interface": python.python_interface,
+    "robot-contract": python.robot_contract,
+    "law-contract": python.law_contract,
 }
-
-
-def setup(app: Sphinx) -> dict[str, bool]:
-    """Register the directives."""
-    for name in WRITERS:
-        app.add_directive(name, _Written)
-    return {"parallel_read_safe": True, "parallel_write_safe": True}
